@@ -27,10 +27,6 @@ SEED = 5
 WAIT_S = 120.0
 
 
-def spec_of(hardware: VirtualDevice) -> str:
-    return f"camera:{hardware.config}?pages={hardware.folder / 'pages.h5'}"
-
-
 @pytest.fixture
 def symbols(tmp_path: Path) -> np.ndarray:
     """Pages of the device."""
@@ -41,13 +37,18 @@ def symbols(tmp_path: Path) -> np.ndarray:
 
 
 @contextmanager
+def opened(hardware: VirtualDevice, old: str, new: str) -> Iterator[CameraSource]:
+    """A device, and something that its configuration says changed."""
+    hardware.config.write_text(hardware.config.read_text().replace(old, new))
+    with open_source(f"camera:{hardware.config}?pages={hardware.folder / 'pages.h5'}") as source:
+        assert isinstance(source, CameraSource)
+        yield source
+
+
+@contextmanager
 def running(folder: Path, device: Device, **settings: object) -> Iterator[tuple[VirtualDevice, CameraSource]]:
     with VirtualDevice(PROFILE, device, folder, SEED, **settings) as hardware:  # type: ignore[arg-type]
-        text = hardware.config.read_text()
-        hardware.config.write_text(text.replace("repeats = 3", "repeats = 50\nreference_frames = 2\ndark_frames = 2"))
-        source = open_source(spec_of(hardware))
-        assert isinstance(source, CameraSource)
-        with source:
+        with opened(hardware, "repeats = 3", "repeats = 50\nreference_frames = 2\ndark_frames = 2") as source:
             yield hardware, source
         hardware.check()
 
@@ -93,11 +94,9 @@ def test_a_missed_trigger_a_lost_packet_an_unplugged_line_and_a_camera_that_goes
 
         def read(page: int) -> bool:
             """Whether a page's shot shows what is on display."""
-            shot, light = source.shot(WAIT_S, page), hardware.light
-            seen = light.pair()
-            return light.page_index == page and bool(
-                (shot.pair.in_phase == seen.in_phase).all() and (shot.pair.quadrature == seen.quadrature).all()
-            )
+            pair, seen = source.shot(WAIT_S, page).pair, hardware.light.pair()
+            both = ((pair.in_phase, seen.in_phase), (pair.quadrature, seen.quadrature))
+            return hardware.light.page_index == page and all((taken == shown).all() for taken, shown in both)
 
         assert read(0)
         hardware.wire = missing
@@ -105,27 +104,23 @@ def test_a_missed_trigger_a_lost_packet_an_unplugged_line_and_a_camera_that_goes
         assert source.shots_by_outcome()["TAKEN"] == 2
         assert source.shots_by_outcome()["MISSING_FRAME"] >= 1
         hardware.wire = edge
-
         lost: list[Reason] = []
 
         def mend(page: int, error: LostShotError) -> None:
             lost.append(error.reason)
-            if error.reason is Reason.TRIGGER_GONE:
-                hardware.port.plug()
-            elif error.reason is Reason.CAMERA_GONE:
-                hardware.cameras[1].start()
-            elif error.reason is Reason.INCOMPLETE_FRAME:
-                hardware.cameras[0].lose(0.0)
+            if error.reason in faults:
+                faults[error.reason][1]()
 
+        faults = {
+            Reason.INCOMPLETE_FRAME: (lambda: hardware.cameras[0].lose(0.3), lambda: hardware.cameras[0].lose(0.0)),
+            Reason.TRIGGER_GONE: (hardware.port.unplug, hardware.port.plug),
+            Reason.CAMERA_GONE: (hardware.cameras[1].close, hardware.cameras[1].start),
+        }
         source.on_lost = mend
-        for page, reason, break_it in (
-            (0, Reason.INCOMPLETE_FRAME, lambda: hardware.cameras[0].lose(0.3)),
-            (1, Reason.TRIGGER_GONE, hardware.port.unplug),
-            (0, Reason.CAMERA_GONE, hardware.cameras[1].close),
-        ):
+        for page, (reason, (break_it, _)) in enumerate(faults.items()):
             lost.clear()
             break_it()
-            assert read(page)
+            assert read(page % 2)
             assert reason in lost
 
 
@@ -133,13 +128,8 @@ def test_channels_that_no_camera_is_on_and_a_device_that_does_not_run_are_named(
     tmp_path: Path, symbols: np.ndarray
 ) -> None:
     with VirtualDevice(PROFILE, Device(), tmp_path, SEED) as hardware:
-        with open_source(spec_of(hardware)) as source:
-            source.shot(WAIT_S)
-        hardware.config.write_text(hardware.config.read_text().replace("channels = [1, 2]", "channels = [3, 4]"))
-        with open_source(spec_of(hardware)) as source, pytest.raises(LostShotError) as raised:
+        with opened(hardware, "[1, 2]", "[3, 4]") as source, pytest.raises(LostShotError) as raised:
             source.shot(WAIT_S)
         assert raised.value.reason is Reason.MISSING_FRAME
-    source = open_source(spec_of(hardware))
-    with pytest.raises(SourceError, match=r"modulator\.sock"):
+    with pytest.raises(SourceError, match=r"modulator\.sock"), opened(hardware, "", "") as source:
         source.arm()
-    source.close()

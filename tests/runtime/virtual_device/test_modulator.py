@@ -64,19 +64,11 @@ def test_a_device_that_is_not_there_is_named(tmp_path: Path) -> None:
     assert raised.value.reason is Reason.BEAM_CONTROL_FAILED
 
 
-@pytest.mark.parametrize(
-    "message",
-    [
-        b"noise",
-        b"{}",
-        b'{"levels": 4, "shape": [2, 2], "page": 0}\nabc',
-        b'{"levels": 1, "shape": [1, 3], "page": 0}\nabc',
-    ],
-)
-def test_messages_that_make_no_sense_are_answered_and_the_next_is_heeded(tmp_path: Path, message: bytes) -> None:
+def test_messages_that_make_no_sense_are_answered_and_the_next_is_heeded(tmp_path: Path) -> None:
     light = Light(small_profile(), Device())
+    wrong = (b"noise", b"{}", b'{"levels": 4, "shape": [2, 2], "page": 0}\nabc')
     with ModulatorSocket(light, tmp_path / "device.sock"), Client(str(tmp_path / "device.sock")) as connection:
-        for sent, keys in ((message, {"error"}), (b'{"signal": false, "reference": false}', set())):
+        for sent in (*wrong, b'{"signal": false, "reference": false}'):
             connection.send_bytes(sent)
-            assert set(json.loads(connection.recv_bytes())) == keys
+            assert set(json.loads(connection.recv_bytes())) == ({"error"} if sent in wrong else set())
     assert not light.pair().in_phase.any()

@@ -1,0 +1,103 @@
+"""The emulated pulse generator answers as the manual says; ports and private networks are there, or said not to be."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from lightpage.errors import LightpageError
+from runtime.errors import SourceError
+from runtime.virtual_device import namespace
+from runtime.virtual_device.pulse_generator import IDENTITY, PulseGeneratorEmulator
+from runtime.virtual_device.serial_port import Pty, TcpPort
+from tests.skips import NO_NETWORKS
+
+
+@pytest.mark.parametrize(
+    ("message", "answer"),
+    [
+        ("*IDN?", IDENTITY),
+        (":puls1:width 1e-3", "ok"),
+        (":PULSe8:DELay?", "0.00000000000"),
+        (":PULSE0:TRIG:MODE TRIGGERED", "ok"),
+        (":SPULSE:TRIGGER:MODE?", "DIS"),
+        ("PULSE1:WIDT?", "?1"),
+        (":", "?2"),
+        (":PULSE9:STATE ON", "?3"),
+        (":PULSE1:WIDT", "?4"),
+        (":PULSE1:WIDT 1e4", "?5"),
+        (":PULSE0:MODE SI", "?5"),
+        ("*IDN", "?6"),
+        ("*TRG?", "?7"),
+    ],
+)
+def test_grammar(message: str, answer: str) -> None:
+    assert PulseGeneratorEmulator().answer(message) == answer
+
+
+def test_single_shots_and_edges_reach_the_channels_that_are_on() -> None:
+    fired: list[int] = []
+    told: list[tuple[int, bool]] = []
+    cables = {1: lambda: fired.append(1), 2: lambda: fired.append(2)}
+    device = PulseGeneratorEmulator(cables, on_state=lambda channel, on: told.append((channel, on)))
+    device.answer(":PULSE2:STATE ON")
+    device.answer(":PULSE0:STATE ON")
+    assert fired == []  # a train of pulses is no single shot
+    device.answer(":PULSE0:STATE OFF")
+    device.answer(":PULSE0:MODE SING")
+    device.answer(":PULSE0:STATE ON")
+    assert (fired, device.answer(":PULSE0:STATE?")) == ([2], "0")
+    device.answer(":PULSE0:TRIG:MODE TRIG")
+    device.external_edge()
+    assert (device.answer("*TRG"), device.shots) == ("?8", 1)
+    device.answer(":PULSE0:STATE ON")
+    assert device.answer("*TRG") == "ok"
+    device.external_edge()
+    assert fired == [2, 2, 2]
+    device.answer(":PULSE2:STATE 1")
+    assert device.answer("*RST") == "ok"
+    assert device.answer(":PULSE2:STATE?") == "0"
+    assert told == [(2, True), (2, False)]
+
+
+def test_an_address_that_cannot_be_had(tmp_path: Path) -> None:
+    with pytest.raises(LightpageError, match=r"^serial port"):
+        Pty(str.upper, tmp_path / "missing" / "tty").plug()
+    with TcpPort(str.upper) as port, pytest.raises(LightpageError, match=r"^serial port"):
+        TcpPort(str.upper, int(port.address.rpartition(":")[2])).plug()
+
+
+PROGRAM = """
+import socket
+first, second = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+first.bind(("127.0.0.1", 3956))
+second.bind(("127.0.0.2", 3956))
+first.sendto(b"hello", ("127.0.0.2", 3956))
+assert second.recv(16) == b"hello"
+assert [name for _, name in socket.if_nameindex()] == ["lo"]
+raise SystemExit(7)
+"""
+
+
+def test_a_private_network_has_both_addresses_and_no_way_out() -> None:
+    if namespace.available() is not None:
+        pytest.skip(NO_NETWORKS)
+    assert subprocess.run(namespace.enter([sys.executable, "-c", PROGRAM]), timeout=60).returncode == 7
+
+
+def test_a_machine_that_cannot_have_one_and_a_shared_network_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(socket, "if_nameindex", lambda: [(1, "lo"), (2, "eth0")])
+    with pytest.raises(SystemExit, match="other interfaces"):
+        namespace.main(["true"])
+    monkeypatch.setenv("PATH", os.devnull)
+    namespace.available.cache_clear()
+    try:
+        with pytest.raises(SourceError, match=r"^private network"):
+            namespace.require()
+    finally:
+        namespace.available.cache_clear()
