@@ -115,8 +115,8 @@ def test_no_page_is_taken_while_a_beam_may_be_blocked(tmp_path: Path) -> None:
     source, modulator = source_of(lab, pages_of(tmp_path), dark_frames=1, reference_frames=1)
     let_through, fails = modulator.let_through, [True]
     seen: list[str] = []
-    scene = lab.cameras[0].scene
-    lab.cameras[0].scene = lambda: (seen.append(source.trouble()), scene())[1]  # type: ignore[func-returns-value]
+    edge = lab.cameras[0].edge
+    lab.cameras[0].edge = lambda: (seen.append(source.trouble()), edge())  # type: ignore[assignment,method-assign,func-returns-value]
 
     def failing(*, signal: bool, reference: bool) -> None:
         if signal and fails:
@@ -136,23 +136,27 @@ def test_no_page_is_taken_while_a_beam_may_be_blocked(tmp_path: Path) -> None:
         assert (source.trouble(), modulator.beams[-1]) == ("", (True, True))
 
 
-def test_whoever_waits_while_the_beams_are_opened_hears_of_them(tmp_path: Path) -> None:
+def test_whoever_waits_for_others_waits_no_longer_than_it_wants_and_hears_of_the_beams(tmp_path: Path) -> None:
     lab = Lab()
     source, modulator = source_of(lab, pages_of(tmp_path), reference_frames=1)
-    again, leave = threading.Event(), threading.Event()
+    moves, leave = threading.Semaphore(0), threading.Semaphore(0)
 
     def failing(*, signal: bool, reference: bool) -> None:
+        moves.release()
+        assert leave.acquire(timeout=60)
         if signal:
-            if source.trouble():  # it has failed before
-                again.set()
-                leave.wait(60)
             raise lost()
 
     modulator.let_through = failing  # type: ignore[method-assign]
     with source:
-        reason_of(source.references)
+        other = threading.Thread(target=reason_of, args=(source.references,))
+        other.start()
+        assert moves.acquire(timeout=60)
+        assert reason_of(lambda: source.shot(0.01, page=0)) is Reason.MISSING_FRAME
+        leave.release(2)
+        other.join(60)
         lab.clock.until_somebody_waits()
         lab.clock.advance(0.5)
-        assert again.wait(60)
+        assert all(moves.acquire(timeout=60) for _ in range(2))
         assert reason_of(lambda: source.shot(0.01, page=0)) is Reason.BEAM_CONTROL_FAILED
-        leave.set()
+        leave.release(100)
