@@ -8,7 +8,6 @@ import struct
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +48,7 @@ class XServer:
         ours, its = os.pipe()
         with os.fdopen(ours) as reader:
             command = ["Xvfb", "-displayfd", str(its), "-nolisten", "tcp", "-fbdir", str(folder), *options]
-            self.process = subprocess.Popen(command, pass_fds=[its], stderr=subprocess.DEVNULL)
+            self._process = subprocess.Popen(command, pass_fds=[its], stderr=subprocess.DEVNULL)
             os.close(its)
             self.display = ":" + reader.readline().strip()  # an Xvfb that ends closes its end
         assert self.display != ":"
@@ -69,21 +68,17 @@ class XServer:
         assert (picture == picture[..., :1]).all()
         return picture[..., 0]
 
+    def __enter__(self) -> XServer:
+        return self
 
-@contextmanager
-def x_server(folder: Path, *options: str) -> Iterator[XServer]:
-    """An X server with one screen of ROWS x COLUMNS, or with other options."""
-    server = XServer(folder, *(options or ("-screen", "0", f"{COLUMNS}x{ROWS}x24")))
-    try:
-        yield server
-    finally:
-        server.process.kill()
-        server.process.wait(WAIT_S)
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.wait(WAIT_S)
 
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[XServer]:
-    with x_server(tmp_path_factory.mktemp("screen")) as running:
+    with XServer(tmp_path_factory.mktemp("screen"), "-screen", "0", f"{COLUMNS}x{ROWS}x24") as running:
         yield running
 
 
@@ -121,15 +116,9 @@ def windows_of(parent: int) -> list[int]:
     return children(parent, "runtime.modulator.screen_window")
 
 
-def test_each_pixel_of_the_screen_shows_the_grey_value_of_its_symbol(server: XServer, screen: ScreenModulator) -> None:
-    for page in (1, 2):
-        expected = shown(screen, page)
-        np.testing.assert_array_equal(server.greys(), expected)
-        assert screen.shows()
-    assert len(windows_of(os.getpid())) == 1
-
-
-def test_the_mouse_pointer_is_not_in_the_picture(server: XServer, screen: ScreenModulator) -> None:
+def test_each_pixel_shows_the_grey_of_its_symbol_and_no_mouse_pointer(
+    server: XServer, screen: ScreenModulator
+) -> None:
     connection = xcffib.connect(server.display)
     root = connection.setup.roots[0].root
     font, cursor = connection.generate_id(), connection.generate_id()
@@ -138,7 +127,10 @@ def test_the_mouse_pointer_is_not_in_the_picture(server: XServer, screen: Screen
     connection.core.ChangeWindowAttributesChecked(root, xproto.CW.Cursor, [cursor]).check()
     connection.core.WarpPointerChecked(0, root, 0, 0, 0, 0, COLUMNS // 2, ROWS // 2).check()
     eventually(lambda: server.picture().any())  # it is there
-    np.testing.assert_array_equal(shown(screen), server.greys())
+    for page in (1, 2):
+        np.testing.assert_array_equal(shown(screen, page), server.greys())
+        assert screen.shows()
+    assert len(windows_of(os.getpid())) == 1
     connection.core.ChangeWindowAttributesChecked(root, xproto.CW.Cursor, [0]).check()
     connection.disconnect()
 
@@ -168,7 +160,7 @@ def test_what_covers_the_window_is_noticed_and_put_below_by_the_next_page(
 def test_the_chosen_screen_and_monitor_alone_are_covered(tmp_path: Path) -> None:
     """The second screen has two monitors side by side, as the server's list of monitors has them."""
     options = ("-screen", "0", "640x480x24", "-screen", "1", f"{640 + COLUMNS}x{ROWS}x24")
-    with x_server(tmp_path / "screens", *options) as server:
+    with XServer(tmp_path / "screens", *options) as server:
         display = server.display + ".1"
         connection = xcffib.connect(display)
         root, monitors = connection.setup.roots[1].root, connection(randr.key)
@@ -200,7 +192,7 @@ def test_a_server_that_is_not_as_it_must_be_is_refused(
     refused(":4077.1", r":4077\.1")
     for number, (depth, *options) in enumerate(((24, "-extension", "RANDR"), (16,))):
         given = ("-screen", "0", f"{COLUMNS}x{ROWS}x{depth}", *options)
-        with x_server(tmp_path / str(number), *map(str, given)) as other:
+        with XServer(tmp_path / str(number), *map(str, given)) as other:
             refused(other.display, "RANDR" if options else "16 bits")
     monkeypatch.delenv("DISPLAY", raising=False)
     refused(None, "DISPLAY")
