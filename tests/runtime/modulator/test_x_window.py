@@ -116,9 +116,7 @@ def windows_of(parent: int) -> list[int]:
     return children(parent, "runtime.modulator.screen_window")
 
 
-def test_each_pixel_shows_the_grey_of_its_symbol_and_no_mouse_pointer(
-    server: XServer, screen: ScreenModulator
-) -> None:
+def test_each_pixel_shows_the_grey_of_its_symbol_and_no_mouse_pointer(server: XServer, screen: ScreenModulator) -> None:
     connection = xcffib.connect(server.display)
     root = connection.setup.roots[0].root
     font, cursor = connection.generate_id(), connection.generate_id()
