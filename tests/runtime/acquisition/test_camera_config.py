@@ -17,6 +17,7 @@ from runtime.acquisition.camera_source import CameraSource
 from runtime.cameras.aravis import AravisCamera
 from runtime.cameras.gentl import GenTLCamera
 from runtime.errors import SourceError
+from runtime.modulator.external import ExternalBeams, ExternalModulator
 from runtime.modulator.screen import ScreenModulator
 from runtime.modulator.shutters import ShutterBeams
 
@@ -58,13 +59,6 @@ def test_what_is_left_out_is_done_by_hand(tmp_path: Path) -> None:
     assert source.modulator is None
     with pytest.raises(SourceError, match=r"^operator"):
         source.references()
-    asked: list[str] = []
-    source.operator = asked.append
-    source.beams.let_through(signal=False, reference=True)
-    assert asked == ["Block the signal beam"]
-
-
-def test_a_camera_may_have_a_producer_beside_the_file(tmp_path: Path) -> None:
     source = opened(tmp_path, PLAIN.replace('serial = "2"', 'serial = "2"\ndriver = "gentl"\nproducer = "maker.cti"'))
     assert [type(camera) for camera in source.cameras] == [AravisCamera, GenTLCamera]
     with pytest.raises(SourceError) as raised:
@@ -118,6 +112,8 @@ def test_shutters_need_spare_channels_of_a_pulse_generator(tmp_path: Path) -> No
     with pytest.raises(InvalidInputError, match=r"^beams"):
         opened(tmp_path, PLAIN + SHUTTERS % 3)
     assert isinstance(opened(tmp_path, PULSES + SHUTTERS % 3).beams, ShutterBeams)
+    external = opened(tmp_path, PLAIN + '[modulator]\nkind = "external"\n[beams]\nkind = "external"\n')
+    assert (type(external.modulator), type(external.beams)) == (ExternalModulator, ExternalBeams)
 
 
 def test_files_that_are_not_there_are_named(tmp_path: Path) -> None:

@@ -139,10 +139,10 @@ def test_light_where_none_should_be_is_the_sources_fault_and_changes_nothing(lab
         source.dark_frames()
         lit = modulator.device.references().in_phase
         lab.cameras[0].scene = lambda: lit
-        with pytest.raises(SourceError):
+        with pytest.raises(SourceError, match=r"^I: dark"):
             source.dark_frames()
         lab.cameras[0].scene = lambda: np.zeros_like(lit)
-        with pytest.raises(SourceError):
+        with pytest.raises(SourceError, match=r"^camera:lab: reference"):
             source.references()
         lab.cameras[0].scene = lambda: modulator.pair.in_phase
         assert (source.shot(page=0).pair.in_phase[0] == np.maximum(modulator.pair.in_phase[0], 3) - 3).all()

@@ -188,10 +188,9 @@ def test_a_server_that_is_not_as_it_must_be_is_refused(
 
     refused(server.display, "1920x1080", rows_px=1080, columns_px=1920)
     refused(":4077.1", r":4077\.1")
-    for number, (depth, *options) in enumerate(((24, "-extension", "RANDR"), (16,))):
-        given = ("-screen", "0", f"{COLUMNS}x{ROWS}x{depth}", *options)
-        with XServer(tmp_path / str(number), *map(str, given)) as other:
-            refused(other.display, "RANDR" if options else "16 bits")
+    for named, depth, *options in (("RANDR", 24, "-extension", "RANDR"), ("16 bits", 16)):
+        with XServer(tmp_path / named, "-screen", "0", f"{COLUMNS}x{ROWS}x{depth}", *options) as other:
+            refused(other.display, named)
     monkeypatch.delenv("DISPLAY", raising=False)
     refused(None, "DISPLAY")
     (tmp_path / "xcffib.py").write_text("raise ModuleNotFoundError('none here')")
