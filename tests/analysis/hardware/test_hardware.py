@@ -83,13 +83,12 @@ def test_a_row_that_was_cut_off_is_measured_again(tmp_path: Path) -> None:
     assert [json.loads(line)["page"] for line in path.read_text().splitlines()] == [0, 1, 2, 3]
 
 
-def drift(page: int) -> dict[str, object]:
-    margin = 0.12 - 0.002 * max(0, page)
-    return {"page": page, "lost": "body" if margin <= 0 else "", "figures": {"margin_bits": margin, "unread": 0.0}}
-
-
 def test_the_alarm_is_held_against_the_first_page_whose_margin_is_gone() -> None:
-    rows = [drift(page) for page in range(-25, 70)]
+    margins = {page: 0.12 - 0.002 * max(0, page) for page in range(-25, 70)}
+    rows: list[dict[str, object]] = [
+        {"page": page, "lost": "body" if left <= 0 else "", "figures": {"margin_bits": left, "unread": 0.0}}
+        for page, left in margins.items()
+    ]
     told = judged(1, rows)
     assert told["gone"] == 60
     assert told["alarm"] == pytest.approx(34, abs=2)

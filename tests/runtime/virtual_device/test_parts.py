@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import os
 import socket
-import subprocess
-import sys
 from multiprocessing.connection import Client
 from pathlib import Path
 
@@ -26,7 +24,6 @@ from runtime.virtual_device.pulse_generator import IDENTITY, PulseGeneratorEmula
 from runtime.virtual_device.serial_port import Pty, TcpPort
 from tests.lightpage.small import small_profile
 from tests.runtime.acquisition.lab import reason_of
-from tests.skips import NO_NETWORKS
 
 
 @pytest.mark.parametrize(
@@ -81,24 +78,6 @@ def test_an_address_that_cannot_be_had(tmp_path: Path) -> None:
         Pty(str.upper, tmp_path / "missing" / "tty").plug()
     with TcpPort(str.upper) as port, pytest.raises(LightpageError, match=r"^serial port"):
         TcpPort(str.upper, int(port.address.rpartition(":")[2])).plug()
-
-
-PROGRAM = """
-import socket
-first, second = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
-first.bind(("127.0.0.1", 3956))
-second.bind(("127.0.0.2", 3956))
-first.sendto(b"hello", ("127.0.0.2", 3956))
-assert second.recv(16) == b"hello"
-assert [name for _, name in socket.if_nameindex()] == ["lo"]
-raise SystemExit(7)
-"""
-
-
-def test_a_private_network_has_both_addresses_and_no_way_out() -> None:
-    if namespace.available() is not None:
-        pytest.skip(NO_NETWORKS)
-    assert subprocess.run(namespace.enter([sys.executable, "-c", PROGRAM]), timeout=60).returncode == 7
 
 
 def test_a_machine_that_cannot_have_one_and_a_shared_network_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
