@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from lightpage.recording.layout import FrameInfo
 from runtime.acquisition.pairing import Pairing, PairingSettings
@@ -144,6 +145,8 @@ def test_the_reference_follows_by_a_tenth(bench: Bench, after_s: float, taken: b
 def test_a_reference_expires_before_clocks_can_have_drifted_by_a_quarter_of_the_tolerance(bench: Bench) -> None:
     assert SETTINGS.expires_s == pytest.approx(0.012 / 4 / 1e-4)
     PairingSettings(tolerance_s=0.04, spacing_s=0.1)  # just far enough
+    with pytest.raises(ValidationError, match="spacing"):
+        PairingSettings(tolerance_s=0.041, spacing_s=0.1)
     for waited, shots in ((SETTINGS.expires_s - 1, 1), (SETTINGS.expires_s + 1, 1 + SYNCHRONISING)):
         bench.clock.advance(waited)
         assert bench.shot() is None

@@ -1,4 +1,4 @@
-"""What is asked of a GigE camera beside its driver and of the kernel, and what drivers are named and hand over."""
+"""What is asked of a GigE camera beside its driver, and of the kernel; and a driver that is missing."""
 
 from __future__ import annotations
 
@@ -6,21 +6,15 @@ import socket
 import struct
 import threading
 from collections.abc import Iterator
-from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
-from lightpage.errors import FrameError
 from runtime.cameras import gige_network
 from runtime.cameras.aravis_library import ENVIRONMENT, PACKAGE, aravis
-from runtime.cameras.gentl_device import pixel_bytes
 from runtime.cameras.gige_network import CONTROL_PRIVILEGE, LARGEST_PACKET, read_register, receive_buffer_problem
-from runtime.cameras.pixel_formats import pack
 from runtime.errors import SourceError
 
 LOCAL = "127.0.0.1"
-SHAPE = (6, 16)
 
 
 @pytest.fixture
@@ -88,19 +82,3 @@ def test_a_library_that_is_missing_or_another_one_is_named(
     with pytest.raises(SourceError, match=PACKAGE) as raised:
         aravis()
     assert named in raised.value.got
-
-
-@pytest.mark.parametrize("given", [{}, {"padding_x": 4}, {"image_offset": 32}, {"padding_x": 4, "image_offset": 32}])
-def test_what_surrounds_the_pixels_is_left_out(given: dict[str, int]) -> None:
-    pixels = pack(np.random.default_rng(1).integers(0, 4096, SHAPE, np.uint16), "Mono12p")
-    lines = np.pad(pixels.reshape(SHAPE[0], -1), ((0, 0), (0, given.get("padding_x", 0))), constant_values=0xA5)
-    content = bytes(given.get("image_offset", 0)) + lines.tobytes()
-    for behind in (b"", bytes(300)):
-        buffer = SimpleNamespace(raw_buffer=content + behind, **given)
-        assert pixel_bytes(buffer, SHAPE, "Mono12p", (AttributeError,)) == pixels.tobytes()
-
-
-@pytest.mark.parametrize("padding", [0, 4])
-def test_too_few_bytes_are_a_fault_of_the_frame(padding: int) -> None:
-    with pytest.raises(FrameError, match="95"):
-        pixel_bytes(SimpleNamespace(raw_buffer=bytes(95), padding_x=padding), SHAPE, "Mono8", (AttributeError,))

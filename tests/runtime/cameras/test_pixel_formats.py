@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from lightpage.errors import FrameError, InvalidInputError
+from runtime.cameras.gentl_device import pixel_bytes
 from runtime.cameras.pixel_formats import bit_depth, pack, pixel_format, pixel_format_of, unpack, without_padding
 
 BYTES = {
@@ -86,3 +89,19 @@ def test_padding_is_left_out(name: str, padding: int) -> None:
     sent = np.concatenate([lines, np.full((5, padding), 0xA5, np.uint8)], axis=1).reshape(-1)
     for raw in (sent, sent[: sent.size - padding], np.append(sent, np.zeros(300, np.uint8))):
         assert (unpack(without_padding(raw, frame.shape, name, padding), frame.shape, name) == frame).all()
+
+
+@pytest.mark.parametrize("given", [{}, {"padding_x": 4}, {"image_offset": 32}, {"padding_x": 4, "image_offset": 32}])
+def test_what_surrounds_the_pixels_is_left_out(given: dict[str, int]) -> None:
+    pixels = pack(np.random.default_rng(1).integers(0, 4096, (6, 16), np.uint16), "Mono12p")
+    lines = np.pad(pixels.reshape(6, -1), ((0, 0), (0, given.get("padding_x", 0))), constant_values=0xA5)
+    content = bytes(given.get("image_offset", 0)) + lines.tobytes()
+    for behind in (b"", bytes(300)):
+        buffer = SimpleNamespace(raw_buffer=content + behind, **given)
+        assert pixel_bytes(buffer, (6, 16), "Mono12p", (AttributeError,)) == pixels.tobytes()
+
+
+@pytest.mark.parametrize("padding", [0, 4])
+def test_too_few_bytes_are_a_fault_of_the_frame(padding: int) -> None:
+    with pytest.raises(FrameError, match="95"):
+        pixel_bytes(SimpleNamespace(raw_buffer=bytes(95), padding_x=padding), (6, 16), "Mono8", (AttributeError,))
