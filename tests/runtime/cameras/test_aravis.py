@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lightpage.errors import FrameError
 from lightpage.recording.layout import FrameInfo
 from runtime.cameras.aravis import AravisCamera
 from runtime.cameras.aravis_library import AravisLibrary
@@ -289,17 +288,3 @@ def test_a_camera_whose_pixel_format_somebody_changes_is_set_up_again(own: str, 
         stage.camera.arm()
         assert stage.camera.opened == 1
         assert stage.take().status is FrameStatus.COMPLETE
-
-
-def test_a_fake_camera_has_an_address_for_itself_and_keeps_what_went_wrong_until_it_is_told() -> None:
-    with scene() as stage:
-        for address in (ADDRESS, "192.0.2.1"):
-            with pytest.raises(SourceError, match=f"^fake camera on {address}"):
-                FakeCamera(address, "B", lambda: noise("Mono8", 0), SENSOR)
-        stage.camera.arm()
-        for wrong, named in ((np.zeros((3, 3), np.uint8), r"\(3, 3\)"), (np.full(SENSOR, 300, np.uint16), "300")):
-            stage.seen[0] = wrong
-            stage.take()
-            with pytest.raises(FrameError, match=named):
-                stage.fake.check()
-        stage.fake.check()
