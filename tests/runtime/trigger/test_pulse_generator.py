@@ -34,15 +34,10 @@ class Lab:
         self.made.append(PulseGenerator(given, self.port.clock))
         return self.made[-1]
 
-    def instead(self, message: str, answer: str) -> None:
-        """From now on messages that begin so are answered by this, and not heeded."""
-        own = self.device.answer
-        self.port.answer = lambda found: answer if found.startswith(message) else own(found)
-
-    def altered(self, message: str, instead: str) -> None:
-        """From now on this message is taken for another one."""
-        own = self.device.answer
-        self.port.answer = lambda found: own(instead if found.startswith(message) else found)
+    def instead(self, message: str, new: str) -> None:
+        """From now on messages that begin so are answered by this, or are taken for this message."""
+        own, other = self.device.answer, new if new.startswith("?") else None
+        self.port.answer = lambda found: other or own(new) if found.startswith(message) else own(found)
 
     def beams(self) -> ShutterBeams:
         return ShutterBeams(self.generator(reset=True), SIGNAL, REFERENCE, self.port.clock)
@@ -110,13 +105,13 @@ def test_set_up_and_fired(lab: Lab, fire: str, reset: bool) -> None:
     ],
 )
 def test_a_setting_that_is_not_taken_is_named(lab: Lab, setting: str, instead: str) -> None:
-    lab.altered(setting, instead)
+    lab.instead(setting, instead)
     with pytest.raises(SourceError, match=setting.split()[0]):
         lab.generator().arm()
     lab.instead(setting, "?3")
     with pytest.raises(SourceError, match=setting.split()[0]):
         lab.generator().arm()
-    lab.altered(":PULSE1:WIDT ", ":PULSE1:WIDT 0.001000009")  # as its resolution rounds it
+    lab.instead(":PULSE1:WIDT ", ":PULSE1:WIDT 0.001000009")  # as its resolution rounds it
     lab.generator().arm()
     lab.instead(":PULSE1:CMOD", "?3")  # it has no dividers
     lab.generator().arm()
