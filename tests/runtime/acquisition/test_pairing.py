@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -92,7 +92,7 @@ def test_a_page_stands_for_the_tolerance_before_its_trigger_and_triggers_keep_th
     assert last == pytest.approx([displayed + SETTINGS.tolerance_s, displayed + 0.012 + SETTINGS.spacing_s])
 
 
-FAULTS: dict[str, tuple[list[dict[str, Any] | None], dict[str, float], list[Reason | None]]] = {
+FAULTS: dict[str, tuple[Sequence[dict[str, Any] | None], dict[str, float], list[Reason | None]]] = {
     "missed by one": ([{}, None], {}, [Reason.MISSING_FRAME]),
     "missed by both": ([None, None], {}, [Reason.MISSING_FRAME]),
     "one late": ([{"after_s": 0.04}, {}], {}, [Reason.OTHER_SHOT]),

@@ -91,10 +91,10 @@ def test_a_simulated_page_depends_on_seed_and_number_only() -> None:
     assert [page.page_index for page in first] == [0, 1, 2]
     again = same.shot(page=2)
     assert again.symbols is not None
-    assert np.array_equal(again.symbols, first[2].symbols)
-    assert (other.shot(page=2).symbols != again.symbols).any()
+    assert again.symbols.tolist() == np.asarray(first[2].symbols).tolist()
+    assert again.symbols.tolist() != np.asarray(other.shot(page=2).symbols).tolist()
     assert again.symbols.max() < 8
-    assert (again.pilot_mask == pilot_mask(toy.PROFILE)).all()
+    assert np.array_equal(np.asarray(again.pilot_mask), pilot_mask(toy.PROFILE))
     with pytest.raises(PageError):
         one.shot(page=-1)
     with pytest.raises(InvalidInputError, match=r"^source simulator"):

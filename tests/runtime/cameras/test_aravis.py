@@ -93,10 +93,11 @@ def test_every_format_arrives_to_the_byte(pixel_format: str) -> None:
         assert camera.name == f"in-phase camera ({ADDRESS})"
         camera.arm()
         assert camera.name == f"in-phase camera ({SERIAL})"
-        for seed in range(3):
+        for seed in range(2):
             stage.seen[0] = noise(pixel_format, seed)
-            info = stage.info()
-            assert (info.serial, info.pixel_format, info.frame_id) == (SERIAL, pixel_format, 65401 + seed)
+            assert stage.info().frame_id == 65401 + seed
+        info = stage.info()
+        assert (info.serial, info.pixel_format) == (SERIAL, pixel_format)
         assert info.exposure_s == pytest.approx(750e-6)
         assert 1.7e9 < info.host_time_s < 1e10  # since 1970
         assert (camera.frame_shape, camera.frame_numbers, camera.opened) == (SENSOR, 65535, 1)

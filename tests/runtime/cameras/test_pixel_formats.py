@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ DEPTHS = {name: int("".join(filter(str.isdigit, name))) for name in BYTES}
 FIRST_TWO = {8: (0x21, 0x43), 10: (0x321, 0x243), 12: (0xA21, 0xB43), 14: (0x2A21, 0x3B43), 16: (0xFA21, 0xEB43)}
 
 
-def kind(depth: int) -> type[np.uint8] | type[np.uint16]:
+def kind(depth: int) -> Any:
     return np.uint8 if depth == 8 else np.uint16
 
 

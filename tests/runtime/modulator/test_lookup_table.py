@@ -88,7 +88,8 @@ def image(**settings: object) -> np.ndarray:
 
 def test_each_symbol_is_a_square_and_the_page_lies_in_the_middle() -> None:
     shown = image()
-    assert (shown.dtype, shown.shape) == (np.uint8, (8, 11))
+    assert shown.dtype == np.uint8
+    assert shown.shape == (8, 11)
     assert shown[2:6, 2:8].tolist() == 2 * [[10, 10, 20, 20, 30, 30]] + 2 * [[40, 40, 50, 50, 60, 60]]
     shown[2:6, 2:8] = 1
     assert (shown == 1).all()

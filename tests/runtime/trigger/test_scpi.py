@@ -6,6 +6,7 @@ import re
 import termios
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -322,17 +323,9 @@ def width_of(line: ScpiLine, channel: int = 1) -> float:
 
 def test_many_callers_each_get_their_own_answer(real: tuple[VirtualSerialPort, ScpiLine]) -> None:
     _, line = real
-    wrong: list[tuple[int, float]] = []
-
-    def ask(channel: int) -> None:
-        wrong.extend((channel, found) for _ in range(5) if (found := width_of(line, channel)) != float(f"{channel}e-5"))
-
-    threads = [threading.Thread(target=ask, args=(channel,)) for channel in range(1, 9)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(60)
-    assert wrong == []
+    with ThreadPoolExecutor(8) as pool:
+        found = pool.map(lambda channel: [width_of(line, channel) for _ in range(5)], range(1, 9))
+    assert list(found) == [5 * [float(f"{channel}e-5")] for channel in range(1, 9)]
     assert (line.identity, line.session) == (IDENTITY, 1)
 
 

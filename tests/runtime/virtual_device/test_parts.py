@@ -21,7 +21,7 @@ from runtime.virtual_device import namespace
 from runtime.virtual_device.light import Light
 from runtime.virtual_device.modulator import ModulatorSocket
 from runtime.virtual_device.pulse_generator import IDENTITY, PulseGeneratorEmulator
-from runtime.virtual_device.serial_port import Pty, TcpPort
+from runtime.virtual_device.serial_port import TcpPort
 from tests.lightpage.small import small_profile
 from tests.runtime.acquisition.lab import reason_of
 
@@ -70,9 +70,7 @@ def test_single_shots_and_edges_reach_the_channels_that_are_on() -> None:
     assert told == [(2, True), (2, False)]
 
 
-def test_an_address_that_cannot_be_had(tmp_path: Path) -> None:
-    with pytest.raises(LightpageError, match=r"^serial port"):
-        Pty(str.upper, tmp_path / "missing" / "tty").plug()
+def test_an_address_that_cannot_be_had() -> None:
     with TcpPort(str.upper) as port, pytest.raises(LightpageError, match=r"^serial port"):
         TcpPort(str.upper, int(port.address.rpartition(":")[2])).plug()
 
