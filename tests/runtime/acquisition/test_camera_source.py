@@ -1,7 +1,4 @@
-"""Cameras, trigger, modulator and beams make pages; what is lost is repeated, named and counted.
-
-Beams are open again after whatever goes wrong, or the source says that they may not be, and tries on.
-"""
+"""Cameras, trigger, modulator and beams make pages; what goes wrong is repeated or mended, named and counted."""
 
 from __future__ import annotations
 

@@ -17,8 +17,7 @@ from runtime.errors import LostShotError, Reason
 from tests.runtime.acquisition.lab import Lab
 
 SETTINGS = PairingSettings(tolerance_s=0.012, frame_s=0.15, quiet_s=0.05, spacing_s=0.032)
-SYNCHRONISING = 3
-"""Shots of a synchronisation."""
+SYNCHRONISING = 3  # shots
 
 
 class Bench:

@@ -28,7 +28,6 @@ SENSOR = (96, 128)
 ADDRESS = "127.0.0.1"
 SERIAL = "CAM-I"
 WAIT_S = 30.0
-"""Bounds every wait for something that comes within milliseconds."""
 
 Counts = NDArray[np.unsignedinteger[Any]]
 
