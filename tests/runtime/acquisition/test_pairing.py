@@ -18,6 +18,7 @@ from tests.runtime.acquisition.lab import Lab
 
 SETTINGS = PairingSettings(tolerance_s=0.012, frame_s=0.15, quiet_s=0.05, spacing_s=0.032)
 SYNCHRONISING = 3  # shots
+SUBJECTS = ("I", "frame", "frame number", "frames", "page", "shot", "cameras", "synchronisation", "lab trigger")
 
 
 class Bench:
@@ -32,6 +33,7 @@ class Bench:
         try:
             frames = self.pairing.shot(self.clock.now() + seconds, self.lab.display, displayed)
         except LostShotError as error:
+            assert error.subject.removeprefix("I: ").removeprefix("Q: ") in SUBJECTS
             return error.reason
         for frame in frames:
             assert frame.pixels is not None
