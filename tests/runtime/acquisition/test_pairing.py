@@ -33,7 +33,7 @@ class Bench:
         try:
             frames = self.pairing.shot(self.clock.now() + seconds, self.lab.display, displayed)
         except LostShotError as error:
-            assert error.subject.removeprefix("I: ").removeprefix("Q: ") in SUBJECTS
+            assert error.subject.removeprefix("I: ").removeprefix("Q: ") in SUBJECTS  # noqa: PT017
             return error.reason
         for frame in frames:
             assert frame.pixels is not None
