@@ -1,4 +1,4 @@
-"""What is asked of a GigE camera beside its driver, and of the kernel."""
+"""What is asked of a GigE camera beside its driver, and of the kernel; and a driver that is missing."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from runtime.cameras import gige_network
+from runtime.cameras.aravis_library import ENVIRONMENT, PACKAGE, aravis
 from runtime.cameras.gige_network import CONTROL_PRIVILEGE, LARGEST_PACKET, read_register, receive_buffer_problem
 from runtime.errors import SourceError
 
@@ -60,20 +61,24 @@ def test_silence_is_asked_three_times_and_is_no_answer(camera: socket.socket) ->
         camera.recv(64)
     camera.close()
     assert read_register(LOCAL, CONTROL_PRIVILEGE) is None
-
-
-def test_packets_as_large_as_the_way_takes() -> None:
-    assert gige_network.route_mtu(LOCAL) == LARGEST_PACKET
-
-
-def test_a_name_that_nobody_knows_is_an_error() -> None:
     with pytest.raises(SourceError, match=r"no\.host\.invalid"):
         read_register("no.host.invalid", CONTROL_PRIVILEGE)
 
 
-def test_a_receive_buffer_that_is_too_small_names_the_setting(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_packets_and_buffers_are_as_large_as_the_kernel_lets_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert gige_network.route_mtu(LOCAL) == LARGEST_PACKET
     monkeypatch.setattr(gige_network, "may_read_packets", lambda: False)
     assert receive_buffer_problem(2048) == ""
     assert "net.core.rmem_max=1000000000" in receive_buffer_problem(1_000_000_000)
     monkeypatch.setattr(gige_network, "may_read_packets", lambda: True)
     assert receive_buffer_problem(1_000_000_000) == ""
+
+
+@pytest.mark.parametrize(("path", "named"), [("/nowhere/none.so", "none.so"), ("libc.so.6", "arv_")])
+def test_a_library_that_is_missing_or_another_one_is_named(
+    path: str, named: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(ENVIRONMENT, path)
+    with pytest.raises(SourceError, match=PACKAGE) as raised:
+        aravis()
+    assert named in raised.value.got
