@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-import gc
 import threading
-import weakref
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 
 import grpc
-import numpy as np
 import pytest
 
 from lightpage.errors import LightpageError, StorageError
-from lightpage.page.pilots import Pilots
-from lightpage.recording.frame_pair import FramePair
-from runtime.acquisition.source import Shot
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.page import DecodedPage
-from runtime.decoding.tracking import NoTracker
 from runtime.errors import (
     CallerLeft,
     LostShotError,
@@ -29,62 +19,10 @@ from runtime.errors import (
     SourceError,
     UnconfirmedPageError,
 )
-from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.rpc.call import Call
-from runtime.rpc.page_calls import PageCalls
 from runtime.service.caller import Caller
-from runtime.service.dataplane import DataPlane
-from runtime.service.monitor import Monitor
-from runtime.service.registry import ModelRegistry
 from runtime.service.replays import Replays
 from runtime.wire.status import status_of
 from tests.clock import HandClock
-from tests.runtime import toy
-
-
-class Losing(NoTracker):
-    """Believes no page."""
-
-    def decode(self, pair: FramePair, levels: int, pilots: Pilots | None = None) -> DecodedPage:
-        raise UnconfirmedPageError("pilots", "none", "some", Reason.PILOTS_DISAGREE).of(
-            super().decode(pair, levels, pilots)
-        )
-
-
-class Watching(toy.ToySource):
-    """Remembers its frames for as long as somebody else does."""
-
-    def __init__(self) -> None:
-        super().__init__(toy.ToyDevice())
-        self.frames: list[weakref.ref[np.ndarray]] = []
-
-    def shot(self, timeout_s: float = 1.0, page: int | None = None) -> Shot:
-        shot = super().shot(timeout_s, page)
-        self.frames += [weakref.ref(shot.pair.in_phase), weakref.ref(shot.pair.quadrature)]
-        return shot
-
-
-@pytest.fixture
-def collected_by_nobody() -> Iterator[None]:
-    """What a cycle of frames and their errors holds stays: seconds pass before it is looked for."""
-    gc.collect()
-    gc.disable()
-    yield
-    gc.enable()
-
-
-@pytest.mark.usefixtures("collected_by_nobody")
-@pytest.mark.parametrize("request_id", ["", "shift-1"])
-def test_nothing_holds_the_frames_of_a_lost_page(request_id: str, decoder: Decoder) -> None:
-    source = Watching()
-    plane = DataPlane(ModelRegistry(decoder, Losing), source, monitor=Monitor())
-    calls, request = PageCalls(plane), pb.ReadPageRequest(request_id=request_id)
-    for _ in range(3 if request_id else 1):
-        with suppress(UnconfirmedPageError):  # `pytest.raises` would keep it
-            calls.ReadPage(request, Call("ReadPage", Caller(), ThreadPoolExecutor(1)))
-            raise AssertionError("given out")
-    assert len(source.frames) == 2  # one shot
-    assert not any(frame() is not None for frame in source.frames)
 
 
 @pytest.mark.parametrize(
