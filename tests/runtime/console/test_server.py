@@ -1,12 +1,13 @@
-"""The console says what the service sees, takes no orders, and is bounded."""
+"""The console says what the service sees and takes no orders; what it keeps, and its connections, are bounded."""
 
 from __future__ import annotations
 
-import http.client
+import errno
 import io
 import json
 import math
 import socket
+import ssl
 from dataclasses import replace
 from pathlib import Path
 from urllib.error import HTTPError
@@ -32,6 +33,7 @@ from tests.clock import HandClock
 from tests.runtime import toy
 from tests.runtime.console.stage import Stage, stage
 from tests.runtime.identity.authority import Authority
+from tests.waiting import eventually
 
 
 def fetched(url: str, method: str = "GET") -> tuple[int, bytes, dict[str, str]]:
@@ -41,6 +43,18 @@ def fetched(url: str, method: str = "GET") -> tuple[int, bytes, dict[str, str]]:
     except HTTPError as error:
         with error:
             return error.code, error.read(), dict(error.headers)
+
+
+def is_answered(running: Stage, context: ssl.SSLContext | None = None) -> bool:
+    try:
+        with urlopen(f"{running.url}/metrics", timeout=60, context=context) as reply:
+            return bool(reply.status == 200)
+    except OSError:
+        return False
+
+
+def connected(running: Stage) -> socket.socket:
+    return socket.create_connection(("localhost", running.server.port), timeout=60)
 
 
 def test_the_state_is_that_of_the_pages(decoder: Decoder) -> None:
@@ -78,25 +92,22 @@ def test_metrics_are_beside_it_and_nothing_takes_orders(decoder: Decoder) -> Non
         assert b"lightpage_calls_in_flight" in fetched(f"{running.url}/metrics")[1]
         for method in ("POST", "PUT", "DELETE"):
             assert fetched(f"{running.url}/state.json", method)[0] == 405
-        for path in ("/nothing", "/static/console.js", "/../server.py", "//etc/passwd", "/frames/other.png"):
+        for path in ("/static/console.js", "/../server.py", "//etc/passwd", "/frames/other.png"):
             assert fetched(running.url + path)[0] == 404
-        for path in ("/", "/metrics", "/nothing"):
+        for path in ("/", "/nothing"):
             status, content, headers = fetched(running.url + path)
             found, nothing, told = fetched(running.url + path, "HEAD")
             assert (found, nothing, told["Content-Type"]) == (status, b"", headers["Content-Type"])
-            assert int(told["Content-Length"]) > 0
-        assert int(headers["Content-Length"]) == int(told["Content-Length"]) == len(content)
+            assert int(headers["Content-Length"]) == int(told["Content-Length"]) == len(content)
 
 
 def test_answers_tell_no_versions_of_what_runs_them(decoder: Decoder, monkeypatch: pytest.MonkeyPatch) -> None:
     with stage(decoder) as running:
-        for path in ("/", "/metrics", "/nothing"):
-            assert fetched(running.url + path)[2]["Server"] == "lightpage"
+        assert fetched(f"{running.url}/metrics")[2]["Server"] == "lightpage"
         monkeypatch.setattr(running.console, "state", lambda *_: 1 // 0)
         status, content, headers = fetched(f"{running.url}/state.json")
         assert (status, content, headers["Server"]) == (500, b"see the log\n", "lightpage")
-        with socket.create_connection(("localhost", running.server.port)) as connection:
-            connection.settimeout(60)
+        with connected(running) as connection:
             connection.sendall(b"GET / HTTP/1.1\r\n" + 200 * b"A: b\r\n" + b"\r\n")
             told = connection.recv(1000)
         assert told.startswith(b"HTTP/1.0 431 ")
@@ -126,14 +137,11 @@ def test_the_condition_is_that_of_the_last_pages(decoder: Decoder) -> None:
             history.observe(Observation("page", 1, "toy-1", clock.now(), 0.1, each))
         told.append(console.state()["condition"])
 
-    seen()
-    seen(None)
-    seen(Reason.MISSING_FRAME, None, None, None, None)
-    seen(None)
-    clock.advance(30.0)
-    seen()
-    clock.advance(0.1)
-    seen()
+    for lost in ((), (None,), (Reason.MISSING_FRAME, None, None, None, None), (None,)):
+        seen(*lost)
+    for later_s in (30.0, 0.1):
+        clock.advance(later_s)
+        seen()
     for _ in range(8):
         monitor.follow("toy-1", {"unread": 1.0})
     seen()
@@ -164,50 +172,39 @@ def test_pictures_are_thinned_and_show_saturation() -> None:
 def test_the_command_finds_a_console_or_says_what_it_lacks(
     decoder: Decoder, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def found(url: str, *options: str) -> str:
+    def found(running: Stage) -> str:
         """Where the command finds it; what it says where it does not."""
-        command = ["console", "--address", url.partition("://")[2], "--no-browser", *options]
+        command = ["console", "--address", running.url.partition("://")[2], "--no-browser"]
         status = cli_main.run(lightpage, command)
         out, err = capsys.readouterr()
         assert status == (0 if out else EXIT_ERROR)
         return out.strip() or err
 
     with stage(decoder) as running:
-        assert found(running.url) == f"{running.url}/"
-    assert running.url.removeprefix("http://") in found(running.url)
+        assert found(running) == f"{running.url}/"
+    assert running.url.removeprefix("http://") in found(running)
     authority = Authority(tmp_path)
     with stage(decoder, authority.service()) as running:
-        own = vars(authority.caller("watcher", ["read"]))
-        assert (
-            found(running.url, *(word for name in own for word in (f"--{name}", str(own[name])))) == f"{running.url}/"
-        )
-        assert "--certificate" in found(running.url)
-        for name, path in own.items():
+        assert "--certificate" in found(running)
+        for name, path in vars(authority.caller("watcher", ["read"])).items():
             monkeypatch.setenv(f"LIGHTPAGE_CLIENT_{name.upper()}", str(path))
-        assert found(running.url) == f"{running.url}/"
+        assert found(running) == f"{running.url}/"
 
 
 def status_of_host(running: Stage, host: str | None, path: str = "/state.json", method: str = "GET") -> int:
-    connection = http.client.HTTPConnection("127.0.0.1", running.server.port, timeout=60)
-    try:
-        connection.putrequest(method, path, skip_host=True)
-        if host is not None:
-            connection.putheader("Host", host)
-        connection.endheaders()
-        return connection.getresponse().status
-    finally:
-        connection.close()
+    with connected(running) as connection:
+        named = "" if host is None else f"Host: {host}\r\n"
+        connection.sendall(f"{method} {path} HTTP/1.1\r\n{named}\r\n".encode())
+        return int(connection.recv(1000).split()[1])
 
 
 def test_a_name_that_a_stranger_made_resolve_to_this_machine_reads_nothing(decoder: Decoder) -> None:
     with stage(decoder) as running:
-        port = running.server.port
-        for host in (f"127.0.0.1:{port}", f"localhost:{port}", f"[::1]:{port}", socket.gethostname(), None):
+        for host in (f"127.0.0.1:{running.server.port}", "localhost", "[::1]", socket.gethostname(), None):
             assert status_of_host(running, host) == 200, host
-        for path in ("/", "/state.json", "/metrics", "/frames/in_phase.png", "/console.js"):
-            assert status_of_host(running, f"rebound.example:{port}", path) == 421
-        for method in ("HEAD", "POST"):
-            assert status_of_host(running, "rebound.example", "/actions", method) == 421
+        for path in ("/", "/metrics", "/frames/in_phase.png", "/console.js"):
+            assert status_of_host(running, "rebound.example", path) == 421
+        assert status_of_host(running, "rebound.example", "/actions", "POST") == 421
         with ConsoleServer(running.console, 0, names=("Device.example",)) as named:
             running.server.close()
             running.server = named
@@ -223,6 +220,65 @@ def test_metrics_are_shown_on_ipv6(decoder: Decoder) -> None:
             with ConsoleServer(running.console, 0, host) as server:
                 for name in asked:
                     assert fetch("metrics", f"{name}:{server.port}", "metrics").startswith(b"# HELP")
-        for host in ("no-host.invalid", "a" * 64):
-            with pytest.raises(OSError, match=r"\w"):
-                ConsoleServer(running.console, 0, host)
+        with pytest.raises(OSError, match="no host"):
+            ConsoleServer(running.console, 0, "a" * 64)
+
+
+def test_callers_that_say_nothing_or_hang_up_hold_up_nobody(
+    decoder: Decoder, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    authority = Authority(tmp_path)
+    own = authority.caller("watcher", ["read"])
+    context = ssl.create_default_context(cafile=str(own.ca))
+    context.load_cert_chain(own.certificate, own.key)
+    with stage(decoder, authority.service()) as running, connected(running):
+        assert is_answered(running, context)
+        with context.wrap_socket(connected(running), server_hostname="localhost") as hung_up:
+            hung_up.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
+        assert is_answered(running, context)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_body_that_does_not_come_is_refused_and_nothing_else_is_said(
+    decoder: Decoder, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("runtime.console.server.SILENCE_S", 0.1)
+    with stage(decoder) as running, connected(running) as connection:
+        connection.sendall(b"POST /actions HTTP/1.1\r\nContent-Length: 100\r\n\r\nx")
+        assert b" 408 " in connection.recv(1000)
+    assert capfd.readouterr().err == ""
+
+
+def test_connections_are_bounded_in_number_and_in_time(decoder: Decoder, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("runtime.console.server.MOST_CONNECTIONS", 3)
+    monkeypatch.setattr("runtime.console.server.LONGEST_S", 0.5)
+    with stage(decoder) as running:
+        silent = [connected(running) for _ in range(3)]
+        with connected(running) as late:
+            assert late.recv(1) == b"", "there is no room for a fourth one"
+        for connection in silent:
+            assert connection.recv(1) == b"", "it was held for long enough"
+            connection.close()
+        assert eventually(lambda: is_answered(running))
+
+
+@pytest.mark.parametrize(
+    ("lacking", "error"),
+    [
+        ("threading.Timer.start", RuntimeError("can't start new thread")),
+        ("socket.socket.dup", OSError(errno.EMFILE, "Too many open files")),
+    ],
+)
+def test_a_connection_that_cannot_be_answered_gives_its_room_back(
+    decoder: Decoder, monkeypatch: pytest.MonkeyPatch, lacking: str, error: Exception
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("runtime.console.server.MOST_CONNECTIONS", 1)
+    with stage(decoder) as running:
+        with monkeypatch.context() as patch:
+            patch.setattr(lacking, fail)
+            with connected(running) as connection:
+                assert connection.recv(1) == b""
+        assert eventually(lambda: is_answered(running))
