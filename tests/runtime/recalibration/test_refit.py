@@ -11,7 +11,7 @@ import pytest
 
 from lightpage.calibration.calibrate import LEAST_KEPT, Registered
 from lightpage.device.state import Device
-from lightpage.errors import CalibrationError, RecalibrationRefusedError
+from lightpage.errors import CalibrationError
 from lightpage.metrics.measures import measure
 from lightpage.page.symbols import random_symbols
 from lightpage.simulator.simulator import Simulator
@@ -27,7 +27,7 @@ from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.outcome import RefitResult
 from runtime.recalibration.recalibration import recalibrate
 from runtime.recalibration.refit import refit
-from tests.runtime.recalibration.known import quiet
+from tests.runtime.recalibration.toy_worker import quiet
 
 LEVELS = 256
 QUIET = Device().with_settings(["drift.shift_px=0.0"])
@@ -118,20 +118,7 @@ def test_earlier_reference_frames_hold_where_none_were_taken(
     assert np.array_equal(found.table["reference_quadrature"], moved.references.quadrature)
 
 
-# Half a minute each: two simulated pages of a bench device and a whole fit. The demo has such a fit too, and what
-# refuses is tried above and on the toy device.
-@pytest.mark.long
-def test_a_device_that_is_another_and_not_drifted_is_refused(bench: Decoder, tmp_path: Path) -> None:
-    geometry, profile = Device().geometry, bench.bundle.profile
-    other = Device(geometry=geometry.model_copy(update={"pipe_angle_deg": geometry.pipe_angle_deg + 1}))
-    written = random_symbols(profile, LEVELS, 2, np.random.default_rng(8))
-    simulator = Simulator(profile, other, LEVELS, 8)
-    known = KnownPages(tuple(map(simulator.page, written)), tuple(written), LEVELS, simulator.references())
-    with pytest.raises(RecalibrationRefusedError, match="calibrate anew"):
-        recalibrate(bench, known, tmp_path / "n.zip", "bench+r1", refit, quiet)
-    assert list(tmp_path.iterdir()) == []
-
-
+# Half a minute: simulated pages of a bench device and a whole fit. The demo has such a fit too.
 @pytest.mark.long
 def test_a_moved_image_is_read_as_well_as_before_by_both_models(bench: Decoder, tmp_path: Path) -> None:
     """Both are judged as the service reads, which has followed the image; no light leaves the cameras at that side."""
