@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import http.client
 import io
 import json
-import ssl
 from collections.abc import Iterator
 from pathlib import Path
-from urllib.error import HTTPError
-from urllib.request import Request, urlopen
 from wsgiref.util import setup_testing_defaults
 
 import pytest
@@ -25,11 +21,8 @@ from runtime.service.dataplane import DataPlane
 from runtime.service.monitor import Monitor
 from runtime.service.recalibrator import Recalibrator
 from runtime.service.registry import ModelRegistry
-from runtime.wire.tls import TlsFiles
 from tests.clock import HandClock
 from tests.runtime import toy
-from tests.runtime.console.stage import Stage, stage
-from tests.runtime.identity.authority import Authority
 
 ROLL_BACK = {"action": "roll back", "expected": "toy-2"}
 OPERATOR = Identity("operator 7", frozenset([Role.ADMIN]), until=2000.0)
@@ -152,30 +145,3 @@ def test_who_proves_nothing_does_nothing(asked: Asked) -> None:
 def test_other_requests_change_nothing(content: object, headers: dict[str, str], status: int, asked: Asked) -> None:
     assert asked.act(content=content, **headers)[0] == status
     assert asked.version == ("toy-1" if status == 200 else "toy-2")
-
-
-def test_a_certificate_says_who_acts(decoder: Decoder, tmp_path: Path) -> None:
-    authority = Authority(tmp_path / "certificates")
-
-    def asked(running: Stage, own: TlsFiles) -> int:
-        context = ssl.create_default_context(cafile=str(authority.folder / "ca.pem"))
-        context.load_cert_chain(own.certificate, own.key)
-        headers = {"Content-Type": "application/json"}
-        try:
-            with urlopen(
-                Request(f"{running.url}/actions", json.dumps(ROLL_BACK).encode(), headers), timeout=60, context=context
-            ) as reply:
-                return int(reply.status)
-        except HTTPError as error:
-            error.close()
-            return error.code
-
-    with stage(decoder, authority.service()) as running:
-        other = toy.write_toy_bundle(tmp_path / "c.zip", version="toy-2")
-        running.plane.adopt(running.plane.registry.opened(other))
-        with pytest.raises((OSError, http.client.HTTPException)):
-            asked(running, Authority(tmp_path / "foreign").caller("o", ["admin"]))
-        assert asked(running, authority.caller("watcher", ["read"])) == 403
-        assert running.plane.registry.current.version == "toy-2"
-        assert asked(running, authority.caller("operator 7", ["admin"])) == 200
-        assert running.plane.registry.current.version == "toy-1"

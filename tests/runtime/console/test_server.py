@@ -227,12 +227,12 @@ def test_metrics_are_shown_on_ipv6(decoder: Decoder) -> None:
 def test_callers_that_say_nothing_or_hang_up_hold_up_nobody(
     decoder: Decoder, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    authority = Authority(tmp_path)
-    own = authority.caller("watcher", ["read"])
-    context = ssl.create_default_context(cafile=str(own.ca))
-    context.load_cert_chain(own.certificate, own.key)
+    authority, foreign = Authority(tmp_path), Authority(tmp_path / "foreign")
+    strangers = authority.caller("nobody"), replace(foreign.caller("o", ["admin"]), ca=tmp_path / "ca.pem")
+    context, *others = (of.client_context() for of in (authority.caller("watcher", ["read"]), *strangers))
     with stage(decoder, authority.service()) as running, connected(running):
         assert is_answered(running, context)
+        assert not any(is_answered(running, other) for other in others)
         with context.wrap_socket(connected(running), server_hostname="localhost") as hung_up:
             hung_up.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
         assert is_answered(running, context)

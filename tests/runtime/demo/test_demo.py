@@ -101,11 +101,3 @@ def test_a_picture_is_lost_by_drift_and_won_back_with_the_shipped_bundle(
     assert (tmp_path / "after-drift.pgm").read_bytes() != read
 
 
-# Ten times the pages, read by the same code.
-@pytest.mark.long
-def test_the_whole_demo(tmp_path: Path) -> None:
-    result = CliRunner().invoke(demo, ["--out", str(tmp_path)], standalone_mode=False, catch_exceptions=False)
-    assert result.exception is None
-    figures = json.loads((tmp_path / "demo.json").read_text())
-    assert figures["pages"] >= 20
-    assert [phase["picture_exact"] for phase in figures["phases"]] == [True, False, True]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ import pytest
 from lightpage.calibration.calibrate import LEAST_KEPT, Registered
 from lightpage.device.state import Device
 from lightpage.errors import CalibrationError
-from lightpage.metrics.measures import measure
 from lightpage.page.symbols import random_symbols
 from lightpage.simulator.simulator import Simulator
 from runtime.bundle.bundle import Bundle, npz
@@ -20,12 +18,9 @@ from runtime.bundle.calibrated import calibration_of
 from runtime.bundle.manifest import TABLE
 from runtime.bundle.shipped import DEFAULT, bundle_path
 from runtime.decoding.decoder import Decoder
-from runtime.decoding.image_tracker import tracker_for
-from runtime.decoding.page import DecodedPage
 from runtime.recalibration import refit as module
 from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.outcome import RefitResult
-from runtime.recalibration.recalibration import recalibrate
 from runtime.recalibration.refit import refit
 from tests.runtime.recalibration.toy_worker import quiet
 
@@ -118,29 +113,3 @@ def test_earlier_reference_frames_hold_where_none_were_taken(
     assert np.array_equal(found.table["reference_quadrature"], moved.references.quadrature)
 
 
-# Half a minute: simulated pages of a bench device and a whole fit. The demo has such a fit too.
-@pytest.mark.long
-def test_a_moved_image_is_read_as_well_as_before_by_both_models(bench: Decoder, tmp_path: Path) -> None:
-    """Both are judged as the service reads, which has followed the image; no light leaves the cameras at that side."""
-    profile = bench.bundle.profile
-    written = [np.asarray(page) for page in random_symbols(profile, LEVELS, 2, np.random.default_rng(8))]
-    tracker, simulator, rates = tracker_for(bench), Simulator(profile, QUIET, LEVELS, 8), []
-    for _ in range(2):
-        rates.append(air_of(tracker.decode(simulator.page(written[0]), LEVELS), written[0]))
-        simulator.knock((-1.0, 9.0))
-    known = KnownPages(tuple(map(simulator.page, written)), tuple(written), LEVELS, simulator.references())
-    outcome = recalibrate(bench, known, tmp_path / "n.zip", "bench+r1", refit, quiet, tracker)
-    # 98% are the aim; this is one page, and pages differ by 1%
-    assert outcome.air_before > 0.97 * rates[0]
-    assert outcome.air_after > 0.97 * rates[0]
-    assert outcome.pages_lost_before == 0
-    assert tracker.image_px == pytest.approx((-1, 9), abs=0.1)  # the service's own is left alone
-    new = calibration_of(Bundle.open(outcome.path)).parameters
-    old = calibration_of(bench.bundle).parameters
-    for camera in ("in_phase", "quadrature"):
-        shifts = [new[f"{camera}_shift_{axis}_px"] - old[f"{camera}_shift_{axis}_px"] for axis in "xy"]
-        assert shifts == pytest.approx((-2, 18), abs=0.1)
-
-
-def air_of(page: DecodedPage, written: np.ndarray) -> float:
-    return measure(page.phase, page.concentration, written, LEVELS).air_bits_per_symbol

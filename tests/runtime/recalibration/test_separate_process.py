@@ -27,7 +27,6 @@ from runtime.recalibration.worker import LOWEST, NICENESS, ROOM, work, yield_mor
 from tests.clock import HandClock
 from tests.runtime import toy
 from tests.runtime.recalibration.toy_worker import known, quiet, shuffled
-from tests.waiting import eventually
 
 SOUND = ("-m", "tests.runtime.recalibration.toy_worker")
 _STEP = """print('{"step": "fit in %d", "fraction": 0.5}' % os.getpid(), flush=True)"""
@@ -149,29 +148,21 @@ def test_the_worker_leaves_its_refusal_in_its_folder(
     assert steps[0] == ("measure the model in service", 0.0)
 
 
-def test_it_ends_when_its_parent_is_killed() -> None:
+def test_it_ends_with_its_parent() -> None:
     worker = (
-        "import os, sys, threading\n"
+        "import sys, threading\n"
         "from runtime.recalibration.worker import end_with_parent\n"
         "end_with_parent(sys.stdin.fileno())\n"
-        "print(os.getpid(), flush=True)\n"
+        "print(1, flush=True)\n"
         "threading.Event().wait()\n"
     )
-    parent_program = (
-        "import signal, subprocess, sys\n"
-        f"child = subprocess.Popen([sys.executable, '-c', {worker!r}], stdin=subprocess.PIPE)\n"
-        "signal.pause()\n"
-    )
-    parent = subprocess.Popen([sys.executable, "-c", parent_program], stdout=subprocess.PIPE)
-    assert parent.stdout is not None
-    try:
-        child = int(parent.stdout.readline())
-        assert not gone(child)
-    finally:
-        parent.kill()
-        parent.wait()
-        parent.stdout.close()
-    assert eventually(lambda: gone(child))
+    with subprocess.Popen([sys.executable, "-c", worker], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
+        assert child.stdin is not None
+        assert child.stdout is not None
+        assert child.stdout.readline()
+        assert child.poll() is None
+        child.stdin.close()  # as when its parent is killed
+        assert child.wait(60) != 0
 
 
 def test_what_is_there_already_is_never_overwritten(decoder: Decoder, tmp_path: Path) -> None:

@@ -212,13 +212,6 @@ def test_pinned_loaded_and_foreign_bundles_are_never_pruned_and_pruned_ones_leav
     assert ModelStore(store.folder, decoder.bundle).read().history == (None, *(f"{name}.zip" for name in names[1:6]))
 
 
-def test_what_was_in_service_last_is_told(store: ModelStore) -> None:
-    put(store, "toy-1+r1")
-    for path, last in ((store.path_of("toy-1+r1"),) * 2, (None, None), (store.path_of("gone+r2"), None)):
-        store.remember(path)
-        assert store.last() == last
-
-
 def _read_only(*_: object, **__: object) -> None:
     raise OSError(errno.EROFS, "Read-only file system")
 
