@@ -76,7 +76,6 @@ def test_a_bundle_without_code_field_or_calibration_is_no_demo(decoder: Decoder,
 def test_a_picture_is_lost_by_drift_and_won_back_with_the_shipped_bundle(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of three pages, instead of twenty."""
     small = picture()[:ROWS]
     for name, value in {"picture": lambda: small, "DRIFT_STEPS": (0.3,), "GROUPS": 1, "PARITY_PAGES": 1}.items():
         monkeypatch.setattr(f"runtime.demo.demo.{name}", value)

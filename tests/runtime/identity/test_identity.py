@@ -20,7 +20,6 @@ from runtime.rpc.call import SERVICE
 from runtime.rpc.inference_calls import INFERENCE, PREFIX
 from runtime.wire.tls import TlsFiles
 from tests.runtime.identity.authority import Authority
-from tests.waiting import eventually
 
 
 @pytest.fixture
@@ -55,26 +54,6 @@ def test_earlier_files_that_are_put_back_count(tmp_path: Path) -> None:
         link.symlink_to(folder)
         assert certificates.pem().ca == (folder / "ca.pem").read_bytes()
         assert certificates.context().get_ca_certs(binary_form=True) == [_der(folder / "ca.pem")]
-
-
-def test_files_that_are_overwritten_with_their_times_kept_count(authority: Authority, tmp_path: Path) -> None:
-    """As by `cp -p`; one that is made readable for the service changes no more than this either."""
-    files, other = authority.service(), Authority(tmp_path / "other").folder / "ca.pem"
-    texts = [path.read_text() for path in (files.ca, other)]
-    size = max(map(len, texts))
-    files.ca.write_text(texts[0].ljust(size, "\n"))
-    certificates, before = Certificates(files), files.ca.stat()
-    files.ca.write_text(texts[1].ljust(size, "\n"))
-    times = before.st_atime_ns, before.st_mtime_ns
-
-    def changed() -> bool:  # its clock is coarse
-        os.utime(files.ca, ns=times)
-        return files.ca.stat().st_ctime_ns != before.st_ctime_ns
-
-    eventually(changed)
-    after = files.ca.stat()
-    assert (after.st_ino, after.st_size, after.st_mtime_ns) == (before.st_ino, before.st_size, before.st_mtime_ns)
-    assert certificates.context().get_ca_certs(binary_form=True) == [_der(other)]
 
 
 def _der(path: Path) -> bytes:

@@ -50,8 +50,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @dataclass
 class Apart:
-    """A recalibration in a process of its own, and what became known of it."""
-
     decoder: Decoder
     out: Path
     worker: tuple[str, ...] = SOUND
@@ -173,25 +171,19 @@ def test_what_is_there_already_is_never_overwritten(decoder: Decoder, tmp_path: 
 
 
 def test_all_that_is_known_of_the_pages_comes_over(decoder: Decoder, tmp_path: Path) -> None:
-    folder, mask = WorkFolder(tmp_path), np.zeros(toy.PAGE, bool)
+    mask = np.zeros(toy.PAGE, bool)
     job = Job(bundle=tmp_path / "b.zip", out=tmp_path / "n.zip", version="v", threads=2, memory=None)
-    pages = replace(known(), pilot_mask=mask, image_px=(1.5, -2.0))
-    folder.write_task(decoder.bundle, pages, job)
-    bundle, found, read = folder.read_task()
-    assert (read, bundle.path, bundle.manifest.version) == (job, tmp_path / "b.zip", decoder.version)
-    assert (found.levels, found.image_px) == (16, (1.5, -2.0))
-    assert found.pilot_mask is not None
-    assert not found.pilot_mask.any()
-    for one, other in zip((*found.pairs, found.references), (*pages.pairs, pages.references), strict=True):
-        assert one is not None
-        assert other is not None
-        assert np.array_equal(one.in_phase, other.in_phase)
-        assert np.array_equal(one.quadrature, other.quadrature)
-        assert one.quadrature.dtype == other.quadrature.dtype
-    assert np.array_equal(found.symbols, pages.symbols)
-    (plain := WorkFolder(tmp_path / "plain")).path.mkdir()
-    plain.write_task(decoder.bundle, replace(known(), references=None), job)
-    assert (plain.read_task()[1].references, plain.read_task()[1].pilot_mask) == (None, None)
+    for pages in (replace(known(), pilot_mask=mask, image_px=(1.5, -2.0)), replace(known(), references=None)):
+        (folder := WorkFolder(tmp_path / str(pages.image_px))).path.mkdir()
+        folder.write_task(decoder.bundle, pages, job)
+        bundle, found, read = folder.read_task()
+        assert (read, bundle.path, bundle.manifest.version) == (job, tmp_path / "b.zip", decoder.version)
+        assert (found.levels, found.image_px) == (16, pages.image_px)
+        for name in ("references", "pilot_mask"):
+            assert (getattr(found, name) is None) == (getattr(pages, name) is None)
+        assert found.pilot_mask is None or not found.pilot_mask.any()
+        assert np.array_equal(found.pairs[1].in_phase, pages.pairs[1].in_phase)
+        assert np.array_equal(found.symbols, pages.symbols)
 
 
 def test_errors_keep_their_class_and_words(tmp_path: Path) -> None:

@@ -18,7 +18,6 @@ from runtime.recalibration.outcome import RecalibrationOutcome, Refit, RefitRepo
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.jobs import DAMAGED, FILE, Jobs
-from runtime.service.limits import Limits
 from runtime.service.recalibrator import Recalibrator
 from runtime.service.registry import ModelRegistry
 from runtime.service.store import ModelStore
@@ -26,7 +25,6 @@ from tests.clock import HandClock
 from tests.lightpage.full_disk import full_disk
 from tests.runtime import toy
 from tests.runtime.slow_fit import SlowFit
-from tests.waiting import eventually
 
 OUTCOME = RecalibrationOutcome(Path("x.zip"), "toy-1+r1", "toy-1", RefitReport(angle_deg=0.5), 1.0, 3.5, 1, 3, 2, 4.0)
 
@@ -47,6 +45,10 @@ def test_one_runs_at_a_time_and_the_second_hears_which() -> None:
     with pytest.raises(BusyError):
         jobs.check_free()
     assert not jobs.wait_idle(0)
+    jobs.cancel(running.id)
+    assert not running.caller.is_here
+    with pytest.raises(JobCancelledError):
+        running.check()
     jobs.tell("fit", 0.5)
     job = jobs.job(running.id)
     assert (job.state, job.progress.step, job.progress.fraction) == (pb.JOB_STATE_RUNNING, "fit", 0.5)
@@ -124,7 +126,6 @@ def test_what_a_kill_interrupted_is_told_by_the_model_in_service(
     "content",
     [
         b"\xff\xfe",
-        b"[]",
         b'{"format": "lightpage-jobs", "version": 2, "jobs": []}',
         b'{"format": "lightpage-jobs", "version": 1, "jobs": [{"state": "JOB_STATE_DONE"}]}',
         b'{"format": "lightpage-jobs", "version": 1, "jobs": [{"id": "x", "ended_s": "soon"}]}',
@@ -170,50 +171,33 @@ def test_what_nobody_foresaw_is_logged_with_its_traceback(caplog: pytest.LogCapt
     assert "a bug" not in jobs.all()[0].refusal.detail.got  # its text may hold anything
 
 
-Make = Callable[..., tuple[DataPlane, Recalibrator]]
+Make = Callable[..., Recalibrator]
 
 
 @pytest.fixture
 def make(decoder: Decoder) -> Make:
-    def begin(
-        fit: Refit = toy.fit_references, store: Path | None = None, limits: Limits | None = None
-    ) -> tuple[DataPlane, Recalibrator]:
-        registry = ModelRegistry(decoder)
-        models = None if store is None else ModelStore(store, registry.current.decoder.bundle)
-        plane = DataPlane(registry, toy.ToySource(toy.ToyDevice()), models, limits)
-        return plane, Recalibrator(plane, fit)
+    def begin(fit: Refit = toy.fit_references, store: Path | None = None) -> Recalibrator:
+        models = None if store is None else ModelStore(store, decoder.bundle)
+        return Recalibrator(DataPlane(ModelRegistry(decoder), toy.ToySource(toy.ToyDevice()), models), fit)
 
     return begin
 
 
 def test_the_end_of_the_service_interrupts_the_job_and_the_next_start_knows(make: Make, tmp_path: Path) -> None:
     fit = SlowFit()
-    _, recalibrator = make(fit, tmp_path)
+    recalibrator = make(fit, tmp_path)
     job = recalibrator.start(recalibrator.source_pages(2), correlation_id="night")
     assert fit.entered.wait(60)
     recalibrator.close(60.0)
     with pytest.raises(StoppingError):
         recalibrator.start(recalibrator.source_pages(2))
-    found = make(store=tmp_path)[1].jobs.job(job.id)
+    found = make(store=tmp_path).jobs.job(job.id)
     assert (found.state, found.correlation_id) == (pb.JOB_STATE_INTERRUPTED, "night")
     assert found.refusal.detail.kind == "StoppingError"
 
 
-def test_a_job_that_waits_for_a_slot_is_cancelled_at_once(make: Make) -> None:
-    plane, recalibrator = make(limits=Limits(concurrent_decodes=1))
-    with plane.decodes.held(Caller()):
-        job = recalibrator.start(recalibrator.source_pages(2))
-        eventually(lambda: plane.decodes.queued == 1)
-        recalibrator.jobs.cancel(job.id)
-        assert recalibrator.jobs.wait_idle(60)
-    found = recalibrator.jobs.job(job.id)
-    assert found.state == pb.JOB_STATE_CANCELLED
-    assert found.refusal.detail.exact_kind == "JobCancelledError"
-    assert plane.decodes.busy == 0
-
-
 def test_a_thread_that_cannot_be_started_leaves_nothing_that_runs(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    _, recalibrator = make()
+    recalibrator = make()
 
     def none(self: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")

@@ -46,7 +46,6 @@ def call(method: str = "ReadPage", correlation_id: str = "order 7") -> Call:
 
 @contextmanager
 def json_lines(level: str = "debug", most: int = 100) -> Iterator[list[dict[str, Any]]]:
-    """The lines that are logged inside; they are there when the block ends."""
     stream, lines = io.StringIO(), list[dict[str, Any]]()
     with logging_to_stderr("json", level, most, stream):
         yield lines
@@ -192,14 +191,11 @@ def test_the_record_is_put_aside_when_it_is_large_and_only_so_many_stay(tmp_path
     file = tmp_path / "deep" / "audit.jsonl"
     for number in range(40):
         AuditLog(file, 1000, 3).record("activate", f"a{number}", "b", actor=Actor("ipv4:1", f"é{number}"))
-    names = sorted(path.name for path in file.parent.iterdir())
-    assert names == ["audit.jsonl", "audit.jsonl.1", "audit.jsonl.2", "audit.jsonl.3"]
-    assert all(path.stat().st_size <= 1000 for path in file.parent.iterdir())
-    newest_last = [file.with_name(name) for name in (*reversed(names[1:]), names[0])]
+    newest_last = [file.with_name(f"audit.jsonl{number}") for number in (".3", ".2", ".1", "")]
+    assert set(file.parent.iterdir()) == set(newest_last)
+    assert all(path.stat().st_size <= 1000 for path in newest_last)
     entries = [json.loads(line) for path in newest_last for line in path.read_text("utf-8").splitlines()]
-    numbers = [int(entry["from"][1:]) for entry in entries]
-    assert numbers == list(range(numbers[0], 40))
-    assert entries[-1]["correlation_id"] == "é39"
+    assert [entry["correlation_id"] for entry in entries] == [f"é{number}" for number in range(40)][-len(entries) :]
 
 
 def test_a_change_that_cannot_be_written_down_is_logged_and_leaves_whole_lines(tmp_path: Path) -> None:

@@ -163,27 +163,6 @@ def test_what_a_page_says_of_the_device(page: DecodedPage) -> None:
     assert figures.of(observation(None, lost=Reason.MISSING_FRAME)) == {}
 
 
-def test_answers_and_lost_pages_carry_it(decoder: Decoder) -> None:
-    settings = MonitorSettings(baseline_pages=3)
-    source, monitor = toy.ToySource(toy.ToyDevice()), Monitor(settings)
-    plane = DataPlane(ModelRegistry(decoder), source, monitor=monitor)
-    for _ in range(8):
-        assert not plane.read_page(None, None, Caller()).answer.recalibration_due
-    pair = source.shot(page=1).pair
-    source.device.offsets = (230.0, 20.0)
-    for _ in range(8):
-        with pytest.raises(UnconfirmedPageError) as caught:
-            plane.read_page(None, None, Caller())
-        assert caught.value.recalibration_due
-    source.device.offsets = toy.OFFSETS
-    answer = plane.decode(pair, 16, Caller())
-    assert not answer.page.check.recalibration_due
-    assert answer.recalibration_due
-    for _ in range(8):
-        answer = plane.read_page(None, None, Caller()).answer
-    assert not answer.recalibration_due
-
-
 PAGES = 8
 """Of another device, after which there is no doubt."""
 

@@ -1,4 +1,4 @@
-"""Answers by request id are bounded, whatever callers send."""
+"""What callers send again or leave behind is bounded: answers by request id, and the memory of pairs."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import grpc
+import numpy as np
 import pytest
 
 from lightpage.errors import LightpageError, StorageError
@@ -16,10 +17,10 @@ from runtime.errors import (
     Reason,
     RequestIdError,
     SlotsTakenError,
-    SourceError,
     UnconfirmedPageError,
 )
 from runtime.service.caller import Caller
+from runtime.service.receiver import PairReceiver, ReceiveBudget
 from runtime.service.replays import Replays
 from runtime.wire.status import status_of
 from tests.clock import HandClock
@@ -30,7 +31,6 @@ from tests.clock import HandClock
     [
         LostShotError("page 1", "no frame", "one", Reason.MISSING_FRAME),
         UnconfirmedPageError("pilots", "none", "some", Reason.PILOTS_DISAGREE, recalibration_due=True),
-        SourceError("source", "black", "light"),
     ],
     ids=lambda error: type(error).__name__,
 )
@@ -153,3 +153,52 @@ def test_who_waits_goes_when_its_time_is_up_or_it_leaves(asked: Asked) -> None:
         left.result(60)
     with pytest.raises(RequestIdError):
         asked.replays.once("a", b"another request", Caller(), bytes)
+
+
+SHAPE = (4, 5)
+
+
+def received(budget: ReceiveBudget, value: int) -> PairReceiver:
+    receiver = PairReceiver(SHAPE, "uint8", 1000, budget)
+    receiver.add(bytes([value]) * receiver.size)
+    return receiver
+
+
+def address(receiver: PairReceiver) -> int:
+    return receiver.pair().in_phase.ctypes.data
+
+
+def test_a_pair_lies_where_one_lay_before_that_nobody_looks_at() -> None:
+    budget = ReceiveBudget(1000)
+    first = received(budget, 1)
+    before = address(first)
+    first.close()
+    first.close()  # is nothing new
+    held = np.empty(40, np.uint8)  # would have got it from the system otherwise
+    second = received(budget, 2)
+    assert address(second) == before
+    assert (second.pair().in_phase == 2).all()
+    assert (budget.used, budget.taken) == (held.size, 2 * held.size)
+
+
+def test_frames_that_are_still_held_stay_as_they_are() -> None:
+    budget = ReceiveBudget(1000)
+    first = received(budget, 1)
+    frame = first.pair().quadrature[1:, ::2]  # a view of a view
+    first.close()
+    second = received(budget, 2)
+    assert (frame == 1).all()
+    assert (second.pair().in_phase == 2).all()
+    assert address(second) != frame.ctypes.data
+
+
+def test_another_size_takes_memory_of_its_own_and_one_pair_at_a_time_is_kept() -> None:
+    budget = ReceiveBudget(1000)
+    first, second = received(budget, 1), received(budget, 2)
+    assert address(first) != address(second)
+    first.close()
+    small = PairReceiver((2, 2), "uint16", 1000, budget)
+    small.add(bytes(16))
+    assert small.pair().in_phase.shape == (2, 2)
+    second.close()
+    assert budget.used == 16

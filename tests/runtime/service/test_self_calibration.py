@@ -44,8 +44,6 @@ class RecordedSource(toy.ToySource):
 
 @dataclass
 class Loop:
-    """A service with what recalibrates it, which looks when it is told to, or runs."""
-
     decoder: Decoder
     fit: Refit
     settings: SelfCalibrationSettings = OWN
@@ -60,7 +58,6 @@ class Loop:
         self.read(8)
 
     def look(self, later_s: float = 0.0) -> str:
-        """Let time pass and have it look; returns the version that is then in service."""
         self.clock.advance(later_s)
         self.running.look()
         return self.version

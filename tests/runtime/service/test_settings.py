@@ -66,11 +66,10 @@ def test_the_environment_gives_every_type_and_paths_that_look_like_numbers() -> 
             "LIGHTPAGE_SERVICE__TRACKING": "false",
             "LIGHTPAGE_SELF_CALIBRATION__PAGES": "1, 2",
             "LIGHTPAGE_SELF_CALIBRATION__LEAST_S": "5",
-            "LIGHTPAGE_METRICS__PORT": "0",
             "LIGHTPAGE_HEALTH_TARGET": "of another program",
         },
     ).settings
-    assert (settings.service.store, settings.service.tracking, settings.metrics.port) == (Path("123"), False, 0)
+    assert (settings.service.store, settings.service.tracking) == (Path("123"), False)
     assert (settings.self_calibration.pages, settings.self_calibration.least_s) == ((1, 2), 5.0)
     assert settings.self_calibrates
     assert settings.audit_file == Path("123/audit.jsonl")
@@ -101,7 +100,6 @@ def test_the_short_name_of_the_store_counts_less_than_the_long_one() -> None:
         ("[self_calibration]\nenabled = true", "enabled = True", "service.source"),
         ("[self_calibration]\nlongest_s = 5", "longest_s = 5.0", "self_calibration.least_s"),
         ("[traces]\nendpoint = 'collector:4317'", "traces.endpoint = 'collector:4317'", "http://HOST:PORT"),
-        ("[traces]\nshare = 1.5", "traces.share = 1.5", "at most 1"),
         ("[service", "", "TOML"),
     ],
 )
@@ -163,12 +161,10 @@ def test_a_secret_is_never_shown(tmp_path: Path) -> None:
     file = tmp_path / "toy.toml"
     file.write_text('[login]\nkey = "hunter2"\nkeys = ["hunter3"]')
     effective = read_settings(Toy, file, {})
-    assert effective.settings.login.key is not None
-    assert effective.settings.login.key.get_secret_value() == "hunter2"
-    assert "hunter" not in effective.to_toml()
+    assert effective.settings.login.key == Secret("hunter2")
     assert 'key = "********"' in effective.to_toml()
-    assert "hunter" not in repr(effective)
-    for wrong in ("key = 5012345", 'keys = "5012345"', "keys = [5012345]", "key = 5012345\nother = 1"):
+    assert "hunter" not in effective.to_toml() + repr(effective)
+    for wrong in ("key = 5012345", "keys = [5012345]"):
         file.write_text(f"[login]\n{wrong}")
         with pytest.raises(InvalidInputError) as raised:
             read_settings(Toy, file, {})

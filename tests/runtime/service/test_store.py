@@ -8,8 +8,8 @@ import json
 import os
 import shutil
 import threading
-from collections import namedtuple
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -24,8 +24,6 @@ from runtime.service.store_health import LONGEST_S, StoreHealth
 from tests.clock import HandClock
 from tests.runtime import toy
 from tests.waiting import eventually
-
-Usage = namedtuple("Usage", "total used free")
 
 
 @pytest.fixture
@@ -222,12 +220,12 @@ def test_a_full_disk_is_noticed_and_said_until_there_is_room(
     plane = a_plane(decoder, store)
     size = sum(map(len, decoder.bundle.files.values()))
     with monkeypatch.context() as patch:
-        patch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, 2 * size - 1))
+        patch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=2 * size - 1))
         with pytest.raises(StoreError, match="model store"):
             plane.models.check_store()
         assert str(2 * size) in plane.store_trouble()
         assert figure(plane, "lightpage_store_trouble", reason="full") == 1
-        patch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, 2 * size))
+        patch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=2 * size))
         assert plane.store_trouble() == ""
         with pytest.raises(StoreError, match="model store"):
             plane.models.check_store(2 * size + 1)
@@ -295,8 +293,6 @@ WAIT_S = 2.0
 
 
 class Disk:
-    """A disk that may hang."""
-
     def __init__(self) -> None:
         self.trouble, self.looks = "", 0
         self.answers = threading.Event()

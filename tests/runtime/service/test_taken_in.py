@@ -16,7 +16,6 @@ from runtime.bundle.bundle import Bundle
 from runtime.bundle.signature import BundleKey
 from runtime.bundle.signature_file import signature_path
 from runtime.decoding.decoder import Decoder
-from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.incoming import Incoming
 from runtime.service.registry import ModelRegistry
@@ -119,8 +118,6 @@ def begin(folder: Path, signer: Signer | None) -> DataPlane:
 
 
 class Signed:
-    """A service that wants signatures, and whoever can make them."""
-
     def __init__(self, folder: Path) -> None:
         self.signer, self.folder, self.store = Signer(folder), folder, folder / "store"
         self.plane = begin(folder, self.signer)
@@ -129,7 +126,6 @@ class Signed:
         self.incoming.mkdir()
 
     def bundle(self, version: str) -> tuple[Path, bytes]:
-        """A new bundle, and what would sign it."""
         path = toy.write_toy_bundle(self.folder / f"{version}.zip", version=version)
         return path, self.signer.signature(path)
 
@@ -138,7 +134,6 @@ class Signed:
         self.models.take_in(path, signature=signature)
 
     def looked(self) -> set[str]:
-        """Versions that there are once the folder of incoming bundles was looked at."""
         taking = Incoming(self.plane, self.incoming)
         taking.look()
         taking.look()
@@ -150,27 +145,15 @@ def service(tmp_path: Path) -> Signed:
     return Signed(tmp_path)
 
 
-def uploaded(service: Signed, path: Path, signature: bytes) -> str:
-    """Send a bundle to the service; returns the version that it then has."""
-    content = path.read_bytes()
-    upload = service.models.upload(len(content), hashlib.sha256(content).digest(), Caller(), signature)
-    try:
-        upload.begin()
-        upload.add(content)
-        return upload.finish().manifest.version
-    finally:
-        upload.drop()
-
-
-def test_an_upload_needs_a_signature(service: Signed) -> None:
+def test_a_new_bundle_needs_a_signature(service: Signed) -> None:
     (good, signature), (bad, _) = service.bundle("toy-2"), service.bundle("toy-3")
     for wrong in (b"", signature):
         with pytest.raises(BundleError, match="new bundle: signature"):
-            uploaded(service, bad, wrong)
-    assert uploaded(service, good, signature) == "toy-2"
+            service.models.take_in(bad, signature=wrong)
+    service.models.take_in(good, signature=signature)
     assert service.models.activate("toy-2")[0].version == "toy-2"
     assert signature_path(service.store / "toy-2.zip").read_bytes() == signature
-    assert not [path for path in service.store.iterdir() if "toy-3" in path.name or "upload" in path.name]
+    assert not list(service.store.glob("*toy-3*"))
 
 
 def test_incoming_bundles_need_one(service: Signed) -> None:
