@@ -17,10 +17,10 @@ from runtime.commands.demo import demo
 from runtime.decoding.decoder import Decoder
 from runtime.demo.demo import drifted, pgm, run_demo, summarise
 from runtime.demo.picture import picture
-from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.refit import refit
 from runtime.wire.pages import RemotePage, RemoteTimings
 from tests.runtime import toy
+from tests.runtime.recalibration.toy_worker import known, quiet
 
 ROWS = 28
 """Of the picture: what two pages hold."""
@@ -63,13 +63,8 @@ def test_drift_leaves_what_cannot_drift() -> None:
 def test_a_bundle_without_code_field_or_calibration_is_no_demo(decoder: Decoder, tmp_path: Path) -> None:
     with pytest.raises(BundleError, match="code: got none"):
         run_demo(decoder.bundle.path, tmp_path, 0)
-    device = toy.ToyDevice()
-    symbols = toy.symbols_of(16, 1)[0]
-    pair = device.page(symbols, 16)
     with pytest.raises(CalibrationError, match="calibration"):
-        refit(decoder.bundle, KnownPages((pair,), (symbols,), 16, device.references()), lambda *_: None, decoder)
-    with pytest.raises(BundleError, match="bundle"):
-        decoder.field_solver(pair, pair, np.zeros((2, 2, 10), np.float32), np.ones(2, np.float32))
+        refit(decoder.bundle, known(count=1), quiet, decoder)
 
 
 @pytest.mark.timeout(1800)  # its recalibration takes only what time others leave

@@ -147,5 +147,3 @@ def test_other_devices_and_bundles_that_cannot_be_tracked_are_refused(decoder: D
     with pytest.raises(BundleError, match="got 10 bits"):
         ModelRegistry(decoder).check(deep)
     ModelRegistry(decoder).check(same)
-
-
