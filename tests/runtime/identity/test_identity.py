@@ -73,13 +73,6 @@ def test_half_replaced_files_leave_the_earlier_ones(authority: Authority) -> Non
     assert certificates.context() is not context
 
 
-def test_authorities_may_have_comments_of_any_letters(authority: Authority) -> None:
-    files = authority.service()
-    files.ca.write_bytes("Autorité de l’appareil, 設備\n".encode() + files.ca.read_bytes())
-    assert Certificates(files).context().get_ca_certs()
-    assert files.client_context().get_ca_certs()
-
-
 def test_the_commands_for_operators_make_good_certificates_and_renew_them(tmp_path: Path) -> None:
     commands, _ = documented()
     bash(commands, tmp_path)
@@ -140,11 +133,10 @@ def test_the_first_end_is_told(authority: Authority, tmp_path: Path) -> None:
     certificates = Certificates(files)
     assert certificates.ends_s() == until(files.ca) < until(files.certificate)
     longer = Authority(tmp_path / "longer", valid_for=timedelta(days=400))
-    for days in (30, 90):
-        newer = longer.service(valid_for=timedelta(days=days))
-        for source, target in zip(vars(newer).values(), vars(files).values(), strict=True):
-            shutil.copy(source, target)
-        assert certificates.ends_s() == until(newer.certificate), "nobody has connected meanwhile"
+    newer = longer.service(valid_for=timedelta(days=30))
+    shutil.copy(newer.ca, files.ca)
+    _replace(files, newer)
+    assert certificates.ends_s() == until(newer.certificate), "nobody has connected meanwhile"
     between = longer.service("between", valid_for=timedelta(days=7))
     with files.certificate.open("ab") as chain:
         chain.write(between.certificate.read_bytes())

@@ -6,14 +6,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from prometheus_client import generate_latest
 
 from lightpage.errors import FrameError
 from lightpage.page.pilots import Pilots
 from lightpage.von_mises import information
 from runtime.acquisition.source import SHOT_S, Shot
 from runtime.decoding.decoder import Decoder
-from runtime.decoding.page import DecodedPage
 from runtime.errors import LostShotError, Reason, SourceError, UnconfirmedPageError
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
@@ -96,27 +94,8 @@ def test_a_page_is_timed_from_its_begin_to_its_end() -> None:
     assert ended == Observation("page 4", 3, "toy-1", 1e9 + 7.0, 0.25, Reason.MISSING_FRAME, "dark", levels=16)
 
 
-@pytest.fixture
-def page(decoder: Decoder) -> DecodedPage:
-    return decoder.decode(toy.ToyDevice().page(toy.symbols_of(16, 1)[0], 16, 0.5), 16)
-
-
-def test_the_figures_are_in_the_format_of_prometheus(page: DecodedPage) -> None:
-    metrics = ServiceMetrics()
-    metrics.in_service("toy-1")
-    metrics.page(page, "toy-1")
-    metrics.in_service("toy-2")
-    text = generate_latest(metrics.registry).decode()
-    assert 'lightpage_pages_total{model_version="toy-1"} 1.0' in text
-    assert 'lightpage_model_info{version="toy-2"} 1.0' in text
-    assert 'version="toy-1"} 1.0' not in text.replace("model_version", "")
-    assert "lightpage_decode_seconds_count 1.0" in text
-    assert "\nprocess_open_fds" in text
-    assert "\npython_info" in text
-
-
-def test_pages_are_told_apart_by_the_newest_models_only(page: DecodedPage) -> None:
-    metrics = ServiceMetrics()
+def test_pages_are_told_apart_by_the_newest_models_only(decoder: Decoder) -> None:
+    metrics, page = ServiceMetrics(), decoder.decode(toy.ToyDevice().page(toy.symbols_of(16, 1)[0], 16, 0.5), 16)
     for number in range(3 * VERSIONS):
         metrics.in_service(f"toy-{number}")
         metrics.pages.labels(f"toy-{number}").inc()

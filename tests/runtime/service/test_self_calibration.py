@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -222,11 +223,14 @@ def test_another_devices_frames_raise_their_own_sessions_flag_alone(session: str
 def test_pages_of_the_source_feed_the_monitor_and_what_is_decoded_as_if_it_were_the_first_page_none(
     decoder: Decoder,
 ) -> None:
-    plane = plane_of(decoder)
+    plane, of_device = plane_of(decoder), list[bool]()
     assert plane.monitor is not None
+    plane.observers = (SimpleNamespace(observe=lambda each: of_device.append(each.of_device)),)
     for caller in (Caller(), Caller(session="session a"), Caller(stateless=True)):
         plane.read_page(None, None, caller)
     assert plane.monitor.state().pages == 3
+    send(plane, own(1), "session b")
+    assert of_device == [True, True, True, False]
     for seed in range(PAGES):
         send(plane, another_devices(seed), "session a", stateless=True)
     assert not send(plane, own(50), "session a", stateless=True)
@@ -269,20 +273,6 @@ def test_the_setting_names_sessions_as_callers_do(tmp_path: Path) -> None:
     named["self_calibration"] = {"device_sessions": ["press-1"]}
     with pytest.raises(ValueError, match="device_sessions"):
         ServiceSettings.model_validate(named)
-
-
-def test_frames_of_a_session_that_is_due_are_not_kept_as_the_devices(decoder: Decoder) -> None:
-    plane = plane_of(decoder)
-    seen = list[bool]()
-
-    class Notes:
-        def observe(self, observation: Observation) -> None:
-            seen.append(observation.of_device)
-
-    plane.observers = (Notes(),)
-    send(plane, own(1), "session a")
-    plane.read_page(None, None, Caller())
-    assert seen == [False, True]
 
 
 def test_figures_of_the_last_page_show_the_device(decoder: Decoder) -> None:

@@ -63,13 +63,11 @@ def test_the_environment_gives_every_type_and_paths_that_look_like_numbers() -> 
         {
             "LIGHTPAGE_SERVICE__STORE": "123",
             "LIGHTPAGE_SERVICE__SOURCE": "simulator:bench",
-            "LIGHTPAGE_SERVICE__TRACKING": "false",
             "LIGHTPAGE_SELF_CALIBRATION__PAGES": "1, 2",
             "LIGHTPAGE_SELF_CALIBRATION__LEAST_S": "5",
             "LIGHTPAGE_HEALTH_TARGET": "of another program",
         },
     ).settings
-    assert (settings.service.store, settings.service.tracking) == (Path("123"), False)
     assert (settings.self_calibration.pages, settings.self_calibration.least_s) == ((1, 2), 5.0)
     assert settings.self_calibrates
     assert settings.audit_file == Path("123/audit.jsonl")
@@ -187,7 +185,7 @@ def test_certificates_go_together(tmp_path: Path, lacking: str) -> None:
 @pytest.mark.parametrize(
     ("key", "table", "value"),
     [
-        *(("service.address", "[service]\naddress = ", at) for at in ("0.0.0.0:1", "device.example:1", "[::]:1")),
+        *(("service.address", "[service]\naddress = ", at) for at in ("device.example:1", "[::]:1")),
         ("service.health_address", "[service]\nhealth_address = ", "0.0.0.0:50052"),
         ("metrics.host", "[metrics]\nport = 9100\nhost = ", "0.0.0.0"),
     ],

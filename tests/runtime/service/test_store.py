@@ -292,22 +292,15 @@ def test_a_service_without_a_store_has_no_trouble_and_shows_none(decoder: Decode
 WAIT_S = 2.0
 
 
-class Disk:
-    def __init__(self) -> None:
-        self.trouble, self.looks = "", 0
-        self.answers = threading.Event()
-        self.answers.set()
-
-    def __call__(self) -> str:
-        self.looks += 1
-        self.answers.wait()
-        return self.trouble
-
-
 def test_a_look_at_the_store_that_hangs_is_waited_for_by_nobody_and_shared_by_all() -> None:
-    clock, disk = HandClock(), Disk()
-    health = StoreHealth(disk, clock=clock)
-    disk.answers.clear()
+    clock, answers, trouble, looks = HandClock(), threading.Event(), "", list[int]()
+
+    def look() -> str:
+        looks.append(1)
+        answers.wait()
+        return trouble
+
+    health = StoreHealth(look, clock=clock)
     assert [health.is_well() for _ in range(8)] == [True] * 8  # nothing is known yet
     clock.advance(LONGEST_S)
     assert health.is_well()
@@ -315,15 +308,13 @@ def test_a_look_at_the_store_that_hangs_is_waited_for_by_nobody_and_shared_by_al
     clock.advance(0.1)
     assert health.hangs
     assert not health.is_well(WAIT_S)  # no wait: nobody moves the clock
-    assert disk.looks == 1
-    (look,) = [thread for thread in threading.enumerate() if thread.name == "lightpage-store-look"]
-    assert look.daemon  # it does not hold the end of the process
-    disk.answers.set()
+    assert len(looks) == 1
+    assert [each.daemon for each in threading.enumerate() if each.name == "lightpage-store-look"] == [True]
+    answers.set()
     eventually(lambda: not health.hangs)
     for trouble in ("full", ""):
-        disk.trouble = trouble
         assert health.is_well(WAIT_S) == (not trouble)
-    assert disk.looks == 3
+    assert len(looks) == 3
 
 
 def test_a_look_that_breaks_is_followed_by_another(monkeypatch: pytest.MonkeyPatch) -> None:
