@@ -163,13 +163,6 @@ def test_it_ends_with_its_parent() -> None:
         assert child.wait(60) != 0
 
 
-def test_what_is_there_already_is_never_overwritten(decoder: Decoder, tmp_path: Path) -> None:
-    (tmp_path / "new.zip").write_text("mine")
-    with pytest.raises(BundleError, match="bundle"):
-        Apart(decoder, tmp_path / "new.zip").run()
-    assert (tmp_path / "new.zip").read_text() == "mine"
-
-
 def test_all_that_is_known_of_the_pages_comes_over(decoder: Decoder, tmp_path: Path) -> None:
     mask = np.zeros(toy.PAGE, bool)
     job = Job(bundle=tmp_path / "b.zip", out=tmp_path / "n.zip", version="v", threads=2, memory=None)
