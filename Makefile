@@ -62,9 +62,10 @@ test-lowest: $(STAMP)  ## a share of the tests with the lowest versions that pyp
 	$(ONE_THREAD) $(LOWEST)/bin/python -m pytest -q -p no:cacheprovider tests/lightpage/recording tests/lightpage/test_files.py \
 	    tests/runtime/bundle tests/runtime/decoding/test_following.py tests/runtime/wire tests/runtime/scaling/test_storage.py
 
-lint: $(STAMP)  ## ruff, mypy --strict, hadolint
+lint: $(STAMP)  ## ruff, layers of imports, mypy --strict, hadolint
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports --no-cache --no-logo
 	$(BIN)/mypy
 	$(BIN)/mypy packaging/*.py
 	$(BIN)/hadolint Dockerfile

@@ -53,6 +53,11 @@ class HelperProcess:
                 self._link.close()
                 raise
 
+    @property
+    def pid(self) -> int:
+        """Its number."""
+        return self._process.pid
+
     def send(self, data: bytes, deadline: float) -> None:
         """Send it until then, a `time.monotonic` moment.
 

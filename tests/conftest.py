@@ -5,8 +5,10 @@ from __future__ import annotations
 import fcntl
 import os
 import signal
+from collections.abc import Callable
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -37,52 +39,97 @@ def pytest_configure() -> None:
 @pytest.fixture(scope="session")
 def bench_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three pages of the realistic bench device, M = 16."""
-    out = _shared_folder(tmp_path_factory) / "bench.h5"
-    with open(f"{out}.lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # one worker makes it, the others wait and take it
-        if not out.exists():
-            arguments = f"--profile bench --pages {BENCH_PAGES} --levels 16 --seed 11 --out {out}"
-            CliRunner().invoke(simulate, arguments.split(), standalone_mode=False, catch_exceptions=False)
-    return out
+    arguments = f"--profile bench --pages {BENCH_PAGES} --levels 16 --seed 11 --out"
+    return _made_once(tmp_path_factory, "bench.h5", lambda out: _command(simulate, *arguments.split(), out))
 
 
 @pytest.fixture(scope="session")
 def bench_calibration(
     bench_recording: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Profile, Path, Calibration]:
-    """The bench profile, a recording of a realistic device, and that device's calibration, made by the command."""
-    from train.commands.calibrate import calibrate
+    """The bench profile, a recording of a realistic device, and what the command finds by its first page."""
 
-    out = _shared_folder(tmp_path_factory) / "bench-calibration.toml"
-    with open(f"{out}.lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not out.exists():
-            arguments = f"--profile bench --recording {bench_recording} --out {out} --json {out}.json"
-            CliRunner().invoke(calibrate, arguments.split(), standalone_mode=False, catch_exceptions=False)
-    return load_profile("bench"), bench_recording, load_calibration(out)
+    def make(out: Path) -> None:
+        from train.commands.calibrate import calibrate
 
+        _command(calibrate, "--profile", "bench", "--recording", bench_recording, "--pages", 1, "--out", out)
 
-def _shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder that all workers of one run of the tests share."""
-    base = tmp_path_factory.getbasetemp()
-    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared"
-    folder.mkdir(exist_ok=True)
-    return folder
+    calibration = load_calibration(_made_once(tmp_path_factory, "bench-calibration.toml", make))
+    return load_profile("bench"), bench_recording, calibration
 
 
 @pytest.fixture(scope="session")
 def small_device(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """Options that name a small device's profile, its recording of eight pages and its (right) calibration."""
-    folder = tmp_path_factory.mktemp("device")
-    profile, state = small_profile(), Device()
-    (folder / "small.toml").write_text(profile.to_toml())
-    made = f"--profile {folder}/small.toml --pages {SMALL_PAGES} --seed 4 --out {folder}/R.h5"
-    CliRunner().invoke(simulate, made.split(), standalone_mode=False, catch_exceptions=False)
-    truth, turn = true_parameters(profile, state), state.homodyne.turn_rad
-    right = Registered(truth, np.ones(len(NAMES)), turn, 0.0, 0.5, 1.0, 0.5)
-    Calibration.from_registered(right, profile, ["0" * 64]).save(folder / "C.toml")
+
+    def make(folder: Path) -> None:
+        folder.mkdir()
+        profile, state = small_profile(), Device()
+        (folder / "small.toml").write_text(profile.to_toml())
+        made = f"--profile {folder}/small.toml --pages {SMALL_PAGES} --seed 4 --out {folder}/R.h5"
+        _command(simulate, *made.split())
+        truth, turn = true_parameters(profile, state), state.homodyne.turn_rad
+        right = Registered(truth, np.ones(len(NAMES)), turn, 0.0, 0.5, 1.0, 0.5)
+        Calibration.from_registered(right, profile, ["0" * 64]).save(folder / "C.toml")
+
+    folder = _made_once(tmp_path_factory, "small-device", make)
     named = {"--profile": "small.toml", "--recording": "R.h5", "--calibration": "C.toml"}
     return [word for option, name in named.items() for word in (option, str(folder / name))]
+
+
+@pytest.fixture(scope="session")
+def small_run(small_device: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A training of two passes on the small device: four pages to train on, two to validate, two left."""
+
+    def make(out: Path) -> None:
+        from train.commands.train import train
+
+        size = "--channels 12 --blocks 1 --synthetic-pages 0 --validation-share 0.25 --test-share 0.25 --steps 120"
+        _command(train, *small_device, *size.split(), "--out", out)
+
+    return _made_once(tmp_path_factory, "small-run", make)
+
+
+@pytest.fixture(scope="session")
+def small_bundle(small_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The bundle of that training, version small-1."""
+
+    def make(out: Path) -> None:
+        from export.command import export_run
+
+        export_run(small_run, out, version="small-1")
+
+    return _made_once(tmp_path_factory, "small.zip", make)
+
+
+@pytest.fixture(scope="session")
+def ray_run(small_device: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A few steps of the published decoder by rays on the small device."""
+
+    def make(out: Path) -> None:
+        from train.commands.train import train
+
+        _command(train, *small_device, "--localizer", "ray", "--channels", 4, "--steps", 12, "--out", out)
+
+    return _made_once(tmp_path_factory, "ray-run", make)
+
+
+def _command(command: click.Command, *words: object) -> None:
+    CliRunner().invoke(command, [str(word) for word in words], standalone_mode=False, catch_exceptions=False)
+
+
+def _made_once(tmp_path_factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
+    """A file or folder that one worker makes, and that all workers of one run of the tests share."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared"
+    (folder / "unfinished").mkdir(parents=True, exist_ok=True)
+    out = folder / name
+    with open(f"{out}.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not out.exists():
+            make(folder / "unfinished" / name)
+            (folder / "unfinished" / name).rename(out)
+    return out
 
 
 @pytest.fixture(scope="session")

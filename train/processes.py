@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 import torch
 
+from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import InvalidInputError, LightpageError
 from lightpage.progress import State
 
@@ -106,25 +106,26 @@ def is_first_process() -> bool:
     return process_number() == 0
 
 
-def wait_for_first(done: Callable[[], int], count: int, what: str) -> None:
+def wait_for_first(done: Callable[[], int], count: int, what: str, clock: Clock = SYSTEM) -> None:
     """Wait for work of the first process, so long as any of it is done.
 
     Args:
         done: how much is there.
         count: that is waited for.
         what: for the error.
+        clock: to wait by.
 
     Raises:
         LightpageError: no more has come for half an hour.
     """
-    seen, since = -1, time.monotonic()
+    seen, since = -1, clock.now()
     while (now := done()) < count:
         if now != seen:
-            seen, since = now, time.monotonic()
-        if time.monotonic() - since > _PATIENCE_S:
+            seen, since = now, clock.now()
+        if clock.now() - since > _PATIENCE_S:
             expected = "the first process at work in the same folder: --out on storage that every node sees"
             raise LightpageError(what, f"{now} of {count}, and no more for {_PATIENCE_S:.0f} s", expected)
-        time.sleep(_LOOK_S)
+        clock.sleep(_LOOK_S)
 
 
 class Silence:

@@ -2,9 +2,10 @@
 
     python -m analysis.service.hostile --json FILE
 
-First bytes that cannot be parsed, many times the same: the service's memory must not grow by them. Then requests of
-every kind, made from the contract's own descriptors and by mutating the bytes of good ones. A call may end with any
-status but INTERNAL and UNKNOWN, must end in time, and the service must decode a good page behind each round.
+First bytes that cannot be parsed, then pairs of another size, many times the same: the service's memory must not grow
+by them. Then requests of every kind, made from the contract's own descriptors and by mutating the bytes of good ones. A
+call may end with any status but INTERNAL and UNKNOWN, must end in time, and the service must decode a good page behind
+each round.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.files import write_json
 from lightpage.progress import track
+from runtime.pb.inference import open_inference_pb2 as oip
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.rpc.call import ENDLESS, SERVICE
 from runtime.rpc.inference_calls import INFERENCE
@@ -138,12 +140,24 @@ def requests_of(method: Any, chance: random.Random, pages: PagesToSend) -> list[
 
 def unparsable(service: RunningService, count: int) -> dict[str, float]:
     """Bytes that are no message, `count` times; what each leaves in the service's memory."""
-    data, grown = b"\xff" * 50, list[int]()
+    return _left_behind(service, f"/{SERVICE.full_name}/ReadPage", b"\xff" * 50, count, "unparsable messages")
+
+
+def refused(service: RunningService, count: int) -> dict[str, float]:
+    """Pairs of another size than the device's, `count` times; what each leaves in the service's memory."""
+    request = oip.ModelInferRequest.FromString(PagesToSend().inference())
+    request.inputs[0].shape[0] += 1
+    data = request.SerializeToString()
+    return _left_behind(service, f"/{INFERENCE.full_name}/ModelInfer", data, count, "pairs of another size")
+
+
+def _left_behind(service: RunningService, method: str, data: bytes, count: int, what: str) -> dict[str, float]:
+    grown = list[int]()
     with service.channel() as channel:
-        read = channel.unary_unary(f"/{SERVICE.full_name}/ReadPage", None, None)
-        for number in track(range(count), "unparsable messages", total=count):
+        call = channel.unary_unary(method, None, None)
+        for number in track(range(count), what, total=count):
             try:
-                read(data, timeout=_CALL_S)
+                call(data, timeout=_CALL_S)
             except grpc.RpcError as error:
                 if error.code() is not grpc.StatusCode.INVALID_ARGUMENT:
                     raise
@@ -212,6 +226,8 @@ def main(messages: int, requests: int, seed: int, json_path: Path | None) -> Non
         service = stack.enter_context(RunningService("--source", f"recording:{source}", "--threads", "1"))
         memory = unparsable(service, messages)
         click.echo(f"{messages} unparsable messages: {memory['bytes_per_message']:.0f} bytes of memory each")
+        large = refused(service, messages // 10)
+        click.echo(f"{messages // 10} refused pairs: {large['bytes_per_message']:.0f} bytes of memory each")
         found = hostile(service, requests, seed)
         log = service.log()
         status = service.stop()
@@ -219,7 +235,13 @@ def main(messages: int, requests: int, seed: int, json_path: Path | None) -> Non
     click.echo(f"{requests} hostile requests: {told}; {len(found['bad'])} bad; exit status {status}")
     for each in found["bad"][:10]:
         click.echo(f"  {each}")
-    figures = {"unparsable": memory, **found, "exit_status": status, "tracebacks": log.count("Traceback")}
+    figures = {
+        "unparsable": memory,
+        "refused": large,
+        **found,
+        "exit_status": status,
+        "tracebacks": log.count("Traceback"),
+    }
     click.echo(f"tracebacks in the log: {figures['tracebacks']}")
     if json_path is not None:
         write_json(json_path, figures)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import os
 import secrets
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -15,6 +14,7 @@ import grpc
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import FrameError, InvalidInputError, LightpageError, PageError
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.recording.frame_pair import FramePair
@@ -78,14 +78,17 @@ class LightpageClient:
         target: where the service is.
         timeout_s: deadline of a call.
         tls: certificates to connect with; None for a service without TLS.
+        clock: by which a watch of a job ends, and waits for a service that is away.
 
     Raises:
         InvalidInputError: no address, or certificates that are no good.
     """
 
-    def __init__(self, target: str, timeout_s: float = CALL_S, tls: TlsFiles | None = None) -> None:
+    def __init__(
+        self, target: str, timeout_s: float = CALL_S, tls: TlsFiles | None = None, clock: Clock = SYSTEM
+    ) -> None:
         check_address("target", target)
-        self.target, self._timeout = target, timeout_s
+        self.target, self._timeout, self._clock = target, timeout_s, clock
         self._session = f"client {secrets.token_hex(16)}" if target.startswith("unix:") else ""
         self._channel = open_channel(target, tls)
         self._stub = pb_grpc.LightpageStub(self._channel)  # type: ignore[no-untyped-call]
@@ -581,10 +584,10 @@ class LightpageClient:
             NoSuchJobError: there is no such job, or it ended long ago.
             LightpageError: no answer at all, or the job has not ended within `timeout_s`; it goes on.
         """
-        until, last = time.monotonic() + timeout_s, None
+        until, last = self._clock.now() + timeout_s, None
         request = message_of(pb.WatchJobRequest, id=job_id)
         while True:
-            left_s = until - time.monotonic()
+            left_s = until - self._clock.now()
             call = self._stub.WatchJob(request, timeout=max(0.0, min(left_s, _WATCH_S)))
             try:
                 for job in call:
@@ -594,11 +597,11 @@ class LightpageClient:
                     if job.state != pb.JOB_STATE_RUNNING:
                         return
             except grpc.RpcError as error:
-                if last is None or time.monotonic() >= until or not is_lost_connection(error):
+                if last is None or self._clock.now() >= until or not is_lost_connection(error):
                     raise error_of(error, self.target) from None
             finally:
                 call.cancel()
-            time.sleep(max(0.0, min(_AGAIN_S, until - time.monotonic())))
+            self._clock.sleep(min(_AGAIN_S, until - self._clock.now()))
 
     def cancel_job(self, job_id: str) -> JobInfo:
         """Have a job end at its next step; returns it as it is then. One that has ended stays as it is.

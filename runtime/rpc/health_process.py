@@ -27,8 +27,17 @@ SILENCE_S = 3.0
 """A service that says nothing for so long has stopped."""
 
 
-async def serve(address: str, link: socket.socket, tls: TlsFiles | None = None) -> None:
-    """Answer health checks at an address until the link is closed; says first at which port, or why not."""
+async def serve(
+    address: str, link: socket.socket, tls: TlsFiles | None = None, silence_s: float = SILENCE_S
+) -> None:
+    """Answer health checks at an address until the link is closed; says first at which port, or why not.
+
+    Args:
+        address: HOST:PORT.
+        link: to the service.
+        tls: with which it answers; None for no TLS.
+        silence_s: a service that says nothing for so long has stopped.
+    """
     reader, writer = await asyncio.open_connection(sock=link)
     server = grpc.aio.server(options=(("grpc.so_reuseport", 0), *SERVER_KEEPALIVE))
     servicer = HealthServicer()
@@ -47,7 +56,7 @@ async def serve(address: str, link: socket.socket, tls: TlsFiles | None = None) 
     names = {""}
     while True:
         try:
-            line = await asyncio.wait_for(reader.readline(), SILENCE_S)
+            line = await asyncio.wait_for(reader.readline(), silence_s)
         except TimeoutError:
             states = dict.fromkeys(names, False)
         else:

@@ -65,6 +65,11 @@ class HealthServer:
         host = self._address.rpartition(":")[0]
         return f"{'127.0.0.1' if host in ('0.0.0.0', '[::]', '') else host}:{self.port}"
 
+    @property
+    def pid(self) -> int | None:
+        """Number of the process, None before there is one."""
+        return None if self._process is None else self._process.pid
+
     def start(self) -> Self:
         """Answer health checks.
 

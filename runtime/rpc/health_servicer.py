@@ -44,6 +44,11 @@ class HealthServicer(health.aio.HealthServicer):  # type: ignore[misc,name-defin
         finally:
             self._watchers.discard(task)
 
+    @property
+    def is_watched(self) -> bool:
+        """Whether anybody watches."""
+        return bool(self._watchers)
+
     def end_watches(self) -> None:
         """End them."""
         self._ending = True

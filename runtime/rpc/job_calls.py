@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from functools import partial
 
 from lightpage.errors import InvalidInputError
@@ -32,11 +32,14 @@ class JobCalls:
     Args:
         plane: says what frames and how many bytes are taken.
         recalibrator: of the service.
+        clock: seconds that never go back.
     """
 
-    def __init__(self, plane: DataPlane, recalibrator: Recalibrator) -> None:
+    def __init__(
+        self, plane: DataPlane, recalibrator: Recalibrator, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self._plane, self._recalibrator, self._jobs = plane, recalibrator, recalibrator.jobs
-        self._watches = 0
+        self._clock, self._watches = clock, 0
 
     def Recalibrate(self, request: pb.RecalibrateRequest, call: Call) -> Iterator[pb.RecalibrateReply]:
         """Recalibrate and tell how it goes."""
@@ -97,8 +100,8 @@ class JobCalls:
     async def CancelJob(self, request: pb.CancelJobRequest, call: Call) -> pb.Job:
         """Have a job end at its next step."""
         self._jobs.cancel(request.id)
-        until = time.monotonic() + _CANCEL_S
-        while (job := self._jobs.job(request.id)).state == pb.JOB_STATE_RUNNING and time.monotonic() < until:
+        until = self._clock() + _CANCEL_S
+        while (job := self._jobs.job(request.id)).state == pb.JOB_STATE_RUNNING and self._clock() < until:
             await asyncio.sleep(_POLL_S)
         return job
 

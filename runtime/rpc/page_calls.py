@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from lightpage.errors import InvalidInputError, LimitError
 from runtime.errors import CallerLeft, SlotsTakenError
@@ -27,10 +27,11 @@ class PageCalls:
 
     Args:
         plane: reads and decodes.
+        clock: seconds that never go back.
     """
 
-    def __init__(self, plane: DataPlane) -> None:
-        self._plane = plane
+    def __init__(self, plane: DataPlane, clock: Callable[[], float] = time.monotonic) -> None:
+        self._plane, self._clock = plane, clock
 
     def ReadPage(self, request: pb.ReadPageRequest, call: Call) -> pb.ReadPageReply:
         """Read a page from the source and decode it; with a request id at most once."""
@@ -44,8 +45,8 @@ class PageCalls:
 
         def work() -> bytes:
             # The answer is wanted even where its caller leaves meanwhile, and asks again.
-            until = time.monotonic() + limit_s
-            detached = Caller(lambda: until - time.monotonic(), caller.session, caller.stateless, caller.actor)
+            until = self._clock() + limit_s
+            detached = Caller(lambda: until - self._clock(), caller.session, caller.stateless, caller.actor)
             return self._read(request, detached, stages).SerializeToString()
 
         same = pb.ReadPageRequest()

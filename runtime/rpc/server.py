@@ -193,7 +193,8 @@ class LightpageServer:
         self._stopping = True
         await self._health.enter_graceful_shutdown()
         self._dispatcher.refuse()
-        await asyncio.sleep(_LAST_WORD_S)
+        if self._health.is_watched:
+            await asyncio.sleep(_LAST_WORD_S)
         self._health.end_watches()
         self._dispatcher.end_watches()
         if not await self._dispatcher.ended_within(grace_s):

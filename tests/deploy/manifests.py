@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,10 +16,6 @@ from tests.deploy.promql import DEPLOY
 FOLDER = DEPLOY / "kubernetes"
 SCHEMAS = Path(__file__).parent / "schemas"
 KUSTOMIZATION = "kustomization.yaml"
-FREE = {"labels", "matchLabels", "requests", "limits", "rayStartParams", "data"}
-OWN = {"app.kubernetes.io/name"}
-"""Tables whose keys are names of the user's own: by their own name, or by a key."""
-
 _schemas = {path.name: json.loads(path.read_text()) for path in sorted(SCHEMAS.glob("*.json"))}
 _registry: Registry[Any] = Registry().with_resources(
     (name, Resource.from_contents(schema)) for name, schema in _schemas.items()
@@ -65,28 +60,6 @@ def manifest(kind: str, name: str) -> dict[str, Any]:
     """The one of that kind and name."""
     (found,) = [one for _, one in manifests() if (one["kind"], one["metadata"]["name"]) == (kind, name)]
     return found
-
-
-def tables(value: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
-    """Where the tables are whose keys a schema knows."""
-    if isinstance(value, dict):
-        if not (path and (path[-1] in FREE or value.keys() & OWN)):
-            yield path
-        for key, each in value.items():
-            yield from tables(each, (*path, key))
-    elif isinstance(value, list):
-        for index, each in enumerate(value):
-            yield from tables(each, (*path, index))
-
-
-def planted(manifest: dict[str, Any], path: tuple[str | int, ...], key: str = "planted") -> dict[str, Any]:
-    """A copy with a key that nobody knows in the table at a path."""
-    changed = copy.deepcopy(manifest)
-    table: Any = changed
-    for step in path:
-        table = table[step]
-    table[key] = 1
-    return changed
 
 
 def templates(value: Any) -> Iterator[dict[str, Any]]:

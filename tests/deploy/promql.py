@@ -13,19 +13,11 @@ import yaml
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 DASHBOARD = DEPLOY / "grafana" / "lightpage.json"
 RULES = DEPLOY / "prometheus" / "rules.yml"
-PROMETHEUS_OWN = {"up", "ALERTS"}
-"""Metrics that Prometheus makes itself."""
-
-_GROUPING = re.compile(r"\b(by|without|on|ignoring|group_left|group_right)\s*\([^)]*\)")
-_ASIDE = re.compile(r'"[^"]*"|\{[^}]*\}|\[[^\]]*\]')
-_WORDS = {"and", "or", "unless", "bool", "offset", "inf", "nan", "by", "without", "on", "ignoring"}
 
 
 def metrics_in(expression: str) -> set[str]:
-    """Names of metrics, with the suffixes that they are asked for with."""
-    left = _GROUPING.sub(" ", _ASIDE.sub(" ", re.sub(r'"[^"]*"', '""', expression)))
-    names = re.findall(r"(?<![\w.])[a-zA-Z_:][a-zA-Z0-9_:]*\b(?!\s*\()", left)
-    return {name for name in names if name.lower() not in _WORDS} - PROMETHEUS_OWN
+    """Names of the service's metrics, and of its process, with the suffixes that they are asked for with."""
+    return set(re.findall(r"\b(?:lightpage|process|python)_\w+", re.sub(r'"[^"]*"', "", expression)))
 
 
 def dashboard() -> dict[str, Any]:

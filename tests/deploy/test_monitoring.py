@@ -79,12 +79,9 @@ def test_every_metric_that_somebody_asks_for_is_shown(shown: str) -> None:
     known = names_of(shown)
     asked = [*promql.dashboard_expressions(), *(rule["expr"] for rule in promql.rules())]
     assert len(asked) > 50
-    missing = {name for expression in asked for name in promql.metrics_in(expression)} - known
-    assert missing == set()
-    planted = (
-        'sum by (job) (rate(lightpage_page_total{a="lightpage_pages_total"}[5m])) / on (job) lightpage_store_ok > 1e3'
-    )
-    assert promql.metrics_in(planted) - known == {"lightpage_page_total"}
+    named = {one: promql.metrics_in(one) for one in asked}
+    assert [one for one, names in named.items() if not (names or re.search(r"\b(up|ALERTS)\b", one))] == []
+    assert set().union(*named.values()) <= known
 
 
 def test_every_own_metric_is_documented_with_its_labels(shown: str) -> None:
@@ -110,30 +107,17 @@ def test_every_alert_is_documented_and_tested() -> None:
     assert alerts == raised
 
 
-def test_promtool_takes_rules_and_configuration_and_the_alerts_do_what_they_say(promtool: str, tmp_path: Path) -> None:
-    folder = promql.RULES.parent
-    secured = ("check", "config", "--syntax-only", "prometheus.tls.yml")  # its certificates are in a container
-    for arguments in (("check", "config", "prometheus.yml"), secured, ("test", "rules", "rules_test.yml")):
-        done = checked(promtool, *arguments, folder=folder)
+def test_promtool_takes_rules_configurations_and_what_the_dashboard_asks(promtool: str, tmp_path: Path) -> None:
+    asked = [{"record": f"dashboard:{n}", "expr": one} for n, one in enumerate(promql.dashboard_expressions())]
+    (tmp_path / "asked.yml").write_text(yaml.safe_dump({"groups": [{"name": "dashboard", "rules": asked}]}))
+    for arguments in (
+        ("check", "config", "prometheus.yml"),
+        ("check", "config", "--syntax-only", "prometheus.tls.yml"),  # its certificates are in a container
+        ("test", "rules", "rules_test.yml"),
+        ("check", "rules", str(tmp_path / "asked.yml")),
+    ):
+        done = checked(promtool, *arguments, folder=promql.RULES.parent)
         assert done.returncode == 0, done.stdout + done.stderr
-    shutil.copy(folder / "rules_test.yml", tmp_path)
-    deaf = promql.RULES.read_text().replace("lightpage_store_ok == 0", "lightpage_store_ok == 2")
-    (tmp_path / "rules.yml").write_text(deaf)
-    done = checked(promtool, "test", "rules", "rules_test.yml", folder=tmp_path)
-    assert done.returncode != 0
-    assert "LightpageStoreTrouble" in done.stdout + done.stderr
-
-
-def test_every_expression_of_the_dashboard_can_be_parsed(promtool: str, tmp_path: Path) -> None:
-    def parsed(expressions: list[str]) -> subprocess.CompletedProcess[str]:
-        numbered = [{"record": f"dashboard:{number}", "expr": one} for number, one in enumerate(expressions)]
-        (tmp_path / "rules.yml").write_text(yaml.safe_dump({"groups": [{"name": "dashboard", "rules": numbered}]}))
-        return checked(promtool, "check", "rules", str(tmp_path / "rules.yml"))
-
-    expressions = list(promql.dashboard_expressions())
-    done = parsed(expressions)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert parsed([*expressions, "sum by (code (lightpage_calls_total)"]).returncode != 0
 
 
 def test_the_metrics_are_named_as_prometheus_would_have_them(promtool: str, shown: str) -> None:
@@ -243,26 +227,6 @@ def test_the_composition_is_valid_and_nothing_of_it_can_be_reached_or_written_fr
             source = volume.split(":")[0]
             assert source in volumes or (file.parent / source).exists(), volume
             assert source in volumes or volume.endswith(":ro"), volume
-    for wrong in (
-        text.replace("read_only", "red_only"),
-        text.replace("networks: [monitoring]", "networks: [other]"),
-        text.replace("127.0.0.1:9090:9090", "127.0.0.1:9090:99999"),
-    ):
-        with pytest.raises(ValueError, match=r"red_only|other|99999"):
-            composed(wrong)
-
-
-def test_images_of_others_can_be_named_by_digest() -> None:
-    text, digest = (promql.DEPLOY / "compose.yml").read_text(), f"sha256:{64 * 'a'}"
-    told = dict(re.findall(r"(\w+_IMAGE)=([\w/]+)@sha256:DIGEST", DOCUMENT.read_text()))
-    named = {variable: f"{image}@{digest}" for variable, image in told.items()}
-    plain, pinned = composed(text).services, composed(text, **named).services
-    assert plain is not None
-    assert pinned is not None
-    for name in plain.keys() - {"lightpage"}:
-        variable = f"{name.upper()}_IMAGE"
-        assert str(plain[name].image).startswith(f"{told[variable]}:")
-        assert str(pinned[name].image) == named[variable]
 
 
 def test_the_parts_of_the_composition_find_each_other() -> None:

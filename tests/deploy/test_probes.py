@@ -9,8 +9,8 @@ import shutil
 import socket
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -22,11 +22,11 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
-from runtime.rpc.health_server import HealthServer
 from runtime.wire.tls import TlsFiles
 from tests.deploy import manifests
+from tests.runtime import toy
 from tests.runtime.identity.authority import Authority
-from tests.runtime.rpc.test_edge import header
+from tests.waiting import eventually
 
 ROOT = manifests.FOLDER.parents[1]
 PROBES = ("startupProbe", "readinessProbe", "livenessProbe")
@@ -50,7 +50,6 @@ class Pod:
     def __init__(self, folder: Path, bundle: Path) -> None:
         whole = manifests.manifest("StatefulSet", "lightpage")
         self.container = manifests.container(whole)
-        self.grace_s = whole["spec"]["template"]["spec"]["terminationGracePeriodSeconds"]
         self.ports = {port["containerPort"]: free_port() for port in self.container["ports"]}
         self.folder, self.tls = folder, self._mounted(folder, bundle)
         settings = (manifests.FOLDER / "service" / "service.toml").read_text()
@@ -118,43 +117,35 @@ class Pod:
         return bool(reply.status == health_pb2.HealthCheckResponse.SERVING)
 
 
-def soon(condition: Callable[[], bool], process: subprocess.Popen[str]) -> bool:
-    """Whether it holds while the process runs, within the time."""
-    until = time.monotonic() + LIMIT_S
-    while time.monotonic() < until and process.poll() is None:
-        if condition():
-            return True
-    return False
-
-
 def test_the_probes_say_no_before_yes_while_it_serves_and_no_while_it_ends(tmp_path: Path, toy_zip: Path) -> None:
-    pod = Pod(tmp_path, toy_zip)
+    pod, ended = Pod(tmp_path, toy_zip), threading.Event()
     assert not any(pod.answers(name) for name in PROBES)
     with pod.running() as process:
+
+        def runs() -> bool:
+            assert process.poll() is None, process.communicate()
+            return True
+
         assert not pod.answers("readinessProbe")  # it loads its bundle
-        assert soon(lambda: pod.answers("startupProbe"), process), process.stdout.read()  # type: ignore[union-attr]
+        eventually(lambda: runs() and pod.answers("startupProbe"))
         assert all(pod.answers(name) for name in PROBES)
         with grpc.secure_channel(pod.target("grpc"), pod.tls.channel_credentials()) as channel:
-            ended = False
 
             def frames() -> Iterator[pb.DecodeFramesRequest]:
-                yield pb.DecodeFramesRequest(header=header())
-                while not ended:  # so slowly that it is in flight all the time
+                rows, columns = toy.PROFILE.frame_shape
+                size = {"rows_px": rows, "columns_px": columns, "pixel_type": pb.PIXEL_TYPE_UINT8, "bit_depth": 8}
+                yield pb.DecodeFramesRequest(header=pb.DecodeHeader(options=pb.DecodeOptions(levels=16), **size))
+                while not ended.wait(0.1):  # so slowly that it is in flight all the time
                     yield pb.DecodeFramesRequest(chunk=b"\0")
-                    time.sleep(0.1)
 
             call = pb_grpc.LightpageStub(channel).DecodeFrames.future(frames(), timeout=LIMIT_S)
-            assert soon(lambda: calls_in_flight(pod) == 1, process)
-            began = time.monotonic()
+            eventually(lambda: runs() and calls_in_flight(pod) == 1)
             process.terminate()
-            assert soon(lambda: not pod.answers("readinessProbe"), process)
-            assert process.poll() is None  # it ends, and has not ended
+            eventually(lambda: runs() and not pod.answers("readinessProbe"))
             assert not call.done()
-            ended = True
-            before = pod.container["lifecycle"]["preStop"]["sleep"]["seconds"]
-            out, _ = process.communicate(timeout=pod.grace_s - before)
+            ended.set()
+            out, _ = process.communicate(timeout=LIMIT_S)
         assert process.returncode == 0, out
-        assert time.monotonic() - began < pod.grace_s - before
     assert not any(pod.answers(name) for name in PROBES)
 
 
@@ -169,14 +160,3 @@ def calls_in_flight(pod: Pod) -> int:
     found = re.search(r"^lightpage_calls_in_flight (\S+)$", text, re.MULTILINE)
     assert found is not None
     return int(float(found[1]))
-
-
-def test_a_health_port_with_tls_is_nothing_for_kubelet(tmp_path: Path, toy_zip: Path) -> None:
-    pod = Pod(tmp_path, toy_zip)
-    tls = TlsFiles(*(tmp_path / "tls" / name for name in ("ca.crt", "tls.crt", "tls.key")))
-    for files, expected in ((tls, False), (None, True)):
-        with HealthServer(pod.target("health"), lambda: {"": True}, files):
-            until = time.monotonic() + LIMIT_S
-            while expected and not pod.answers("readinessProbe"):
-                assert time.monotonic() < until
-            assert pod.answers("readinessProbe") is expected

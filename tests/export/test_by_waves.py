@@ -1,8 +1,7 @@
-"""Decoders that know waves as bundles: parity with torch, decoding without it, and following a device that drifts."""
+"""Decoders that know waves as bundles: they follow a device that drifts, and the image."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +9,7 @@ import pytest
 from click.testing import CliRunner
 from scipy import ndimage
 
-from export.command import export, export_run
-from export.operators.check import fallbacks, page_part
-from export.operators.operator_list import PROVIDERS
+from export.command import export_run
 from lightpage.calibration.sampling_table import sampling_table
 from lightpage.device.state import Device
 from lightpage.metrics.measures import measure
@@ -22,9 +19,6 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
-from runtime.bundle.bundle import Bundle
-from runtime.bundle.manifest import DECODER
-from runtime.commands.evaluate import evaluate
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_drift import SHIFT, DriftModel
 from runtime.decoding.image_tracker import WIDEST, ImageTracker, tracker_for
@@ -32,57 +26,26 @@ from runtime.execution.twin import OnnxTwin
 from tests.lightpage.small import small_profile
 from train.commands.train import train
 from train.models.twin import RayTwin, TorchTwin
-from train.runs import load_run
 
 DEVICE = Device()
 
 
-ONE_PASS, TWO_PASSES = "--localizer wave --refinements 0", "--refinements 1"
-
-
-@pytest.fixture(scope="module", params=[ONE_PASS, TWO_PASSES])
-def made(
-    request: pytest.FixtureRequest, small_device: list[str], tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, Path, float]:
-    """Run, bundle, and how far the bundle is from torch."""
+@pytest.fixture(scope="module", params=[pytest.param("wave", marks=pytest.mark.long), "coherent, two passes"])
+def bundle(request: pytest.FixtureRequest, small_device: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A decoder by waves alone is exported for it; the other is everybody's."""
+    if request.param != "wave":
+        return Path(request.getfixturevalue("small_bundle"))
     folder = tmp_path_factory.mktemp("by-waves")
-    size = ["--channels", "12", "--blocks", "1", "--steps", "120", "--synthetic-pages", "0"]
-    options = [*small_device, *request.param.split(), *size, "--out", str(folder / "run")]
+    size = "--localizer wave --refinements 0 --channels 12 --blocks 1 --steps 120 --synthetic-pages 0"
+    options = [*small_device, *size.split(), "--out", str(folder / "run")]
     CliRunner().invoke(train, options, standalone_mode=False, catch_exceptions=False)
     _, error = export_run(folder / "run", folder / "bundle.zip")
-    return folder / "run", folder / "bundle.zip", error
-
-
-def test_the_bundle_decodes_without_torch_what_the_run_decoded(
-    made: tuple[Path, Path, float], small_device: list[str], tmp_path: Path
-) -> None:
-    run, bundle, error = made
     assert error <= 1e-3
-    asked = ["--bundle", str(bundle), "--recording", small_device[3], "--json", str(tmp_path / "E.json")]
-    CliRunner().invoke(evaluate, asked, standalone_mode=False, catch_exceptions=False)
-    # of the same light as the validation page, with calibrated concentrations on top; a dozen pilots show the piston
-    found = json.loads((tmp_path / "E.json").read_text())["air_bits_per_symbol"]
-    assert found > load_run(run).validation_air - 0.6 > 1
+    return folder / "bundle.zip"
 
 
-@pytest.mark.parametrize("made", [pytest.param(ONE_PASS, marks=pytest.mark.long), TWO_PASSES], indirect=True)
-def test_half_precision_reads_as_much(made: tuple[Path, Path, float], small_device: list[str], tmp_path: Path) -> None:
-    run, bundle, _ = made
-    half = tmp_path / "half.zip"
-    result = CliRunner().invoke(export, [str(run), "--out", str(half), "--precision", "float16"])
-    assert result.exit_code == 0, result.output
-    rates = []
-    for one in (bundle, half):
-        asked = ["--bundle", str(one), "--recording", small_device[3], "--json", str(tmp_path / "E.json")]
-        CliRunner().invoke(evaluate, asked, standalone_mode=False, catch_exceptions=False)
-        rates.append(json.loads((tmp_path / "E.json").read_text())["air_bits_per_symbol"])
-    assert abs(rates[1] - rates[0]) < 0.01
-    for provider in PROVIDERS:
-        assert fallbacks(page_part(Bundle.open(half).files[DECODER]), provider) == [], provider
-
-
-def test_with_the_drifted_devices_table_it_decodes_the_drifted_device(made: tuple[Path, Path, float]) -> None:
-    profile, decoder = small_profile(), Decoder.load(made[1])
+def test_with_the_drifted_devices_table_it_decodes_the_drifted_device(bundle: Path) -> None:
+    profile, decoder = small_profile(), Decoder.load(bundle)
     drifted = DEVICE.with_settings([f"geometry.pipe_angle_deg={DEVICE.geometry.pipe_angle_deg + 0.12}"])
     symbols = random_symbols(profile, 256, 1, np.random.default_rng(9))[0]
     pair = Simulator(profile, drifted, seed=9).page(symbols)
@@ -98,8 +61,8 @@ def test_with_the_drifted_devices_table_it_decodes_the_drifted_device(made: tupl
     assert air(decoder.with_table(own)) > air(decoder) + 0.5
 
 
-def test_the_image_is_followed(made: tuple[Path, Path, float], small_device: list[str]) -> None:
-    decoder = Decoder.load(made[1])
+def test_the_image_is_followed(bundle: Path, small_device: list[str]) -> None:
+    decoder = Decoder.load(bundle)
     assert isinstance(tracker_for(decoder), ImageTracker)
     with Recording.open(small_device[3]) as recording:
         pair, symbols = recording.frames(0), recording.symbols(0)

@@ -47,18 +47,18 @@ def test_a_device_without_what_it_needs_is_told(tmp_path: Path) -> None:
     (made_run(tmp_path / "bare", own) / WEIGHTS).unlink()
     stranger = toy.write_toy_bundle(tmp_path / "stranger.zip")
     for model, run, pages, told in (
-        (bundle, None, 40, "run: got none, wanted the folder of the training run"),
-        (bundle, good, 7, "known pages: got 7, wanted at least 8"),
-        (bundle, tmp_path / "none", 40, "none: got .*No such file.*wanted a finished training run"),
-        (bundle, tmp_path / "bare", 40, f"bare: got no {WEIGHTS}"),
-        (bundle, other, 40, "other: got devices of profile small"),
-        (stranger, good, 40, r"good: got pages that .*stranger\.zip was not trained on"),
+        (bundle, None, 40, "^run"),
+        (bundle, good, 7, "known pages"),
+        (bundle, tmp_path / "none", 40, "none"),
+        (bundle, tmp_path / "bare", 40, WEIGHTS),
+        (bundle, other, 40, "profile small"),
+        (stranger, good, 40, r"stranger\.zip"),
     ):
         with pytest.raises(InvalidInputError, match=told):
             DEEP.check(model, run, pages)
 
 
-@pytest.mark.long
+@pytest.mark.long  # trains twice and exports twice; what it is made of is tested by itself
 def test_a_drifted_device_is_found_trained_on_and_judged_by_pages_of_its_own(
     small_device: list[str], tmp_path: Path
 ) -> None:

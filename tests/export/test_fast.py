@@ -30,7 +30,7 @@ QUICK = Hyperparameters(channels=8, blocks=1, field_rounds=0, binning=2, samples
 COARSE = replace(QUICK, field_step=3)
 
 
-@pytest.mark.long
+@pytest.mark.long  # exports three decoders for a camera that no device has
 def test_it_agrees_with_torch_and_sees_nearly_what_the_standard_one_sees() -> None:
     device = Device()
     simulator = Simulator(PROFILE, device, seed=1)

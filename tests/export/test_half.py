@@ -5,24 +5,11 @@ from __future__ import annotations
 import numpy as np
 import onnx
 import pytest
-import torch
 from onnx import TensorProto, parser
 
-from export.graph import DecoderGraph, table_tensors
-from export.half import check_deviation, deviation, in_half, rounded
-from export.onnx_files import decoder_onnx
-from lightpage.calibration.sampling_table import sampling_table
-from lightpage.device.state import Device
+from export.half import check_deviation, in_half, rounded
 from lightpage.errors import BundleError, InvalidInputError
-from lightpage.page.symbols import random_symbols
-from lightpage.simulator.simulator import Simulator
-from lightpage.simulator.true_optics import true_parameters
-from runtime.decoding.decoder import PAGE_INPUTS
 from runtime.execution.session import open_session
-from tests.lightpage.small import small_profile
-from train.models.decoder import SymbolDecoder
-from train.models.hyperparameters import Hyperparameters
-from train.models.twin import RayTwin, TorchTwin
 
 GRAPH = """<ir_version: 10, opset_import: ["" : 20]>
 decoder (float[2, 3] in_phase, float[2, 3] quadrature, float[3] gain = {1, 0.3, 2}) => (float[2, 3] p)
@@ -72,7 +59,7 @@ def test_rounding_shows_on_a_cpu() -> None:
 def test_too_large_a_deviation_is_refused() -> None:
     p = np.ones((2, 4, 5), np.float32)
     assert check_deviation(p, p * np.float32(1.009), "half.zip") == pytest.approx(0.009, abs=1e-5)
-    with pytest.raises(BundleError, match=r"parity of half.zip with torch: got p off by 0.011 .*, wanted <= 0.01"):
+    with pytest.raises(BundleError, match=r"0\.011"):
         check_deviation(p, p * np.float32(1.011), "half.zip")
     with pytest.raises(BundleError, match="nan"):
         check_deviation(p, p * np.float32(np.nan), "half.zip")
@@ -82,32 +69,5 @@ def test_a_graph_without_a_network_is_refused() -> None:
     model = onnx.load_from_string(graph())
     for node in model.graph.node:
         node.name = node.name.replace("decoder/network", "decoder/net")
-    with pytest.raises(InvalidInputError, match=r"decoder.onnx: got no node of a network, wanted nodes named"):
+    with pytest.raises(InvalidInputError, match=r"^decoder\.onnx"):
         in_half(model.SerializeToString(), ())
-
-
-@pytest.mark.long
-def test_a_network_that_halves_its_resolution_runs_in_half_precision() -> None:
-    profile, device = small_profile(), Device()
-    parameters = true_parameters(profile, device)
-    choices = Hyperparameters(channels=8, blocks=1, depth=1, refinements=1)
-    torch.manual_seed(4)
-    decoder = SymbolDecoder(profile, parameters, "coherent", choices)
-    for part in (decoder.network, decoder.refiners[0].unet):
-        torch.nn.init.normal_(part.head.weight, std=0.05)
-    module = DecoderGraph(profile, decoder, 1.0).eval()
-    table = sampling_table(TorchTwin(RayTwin(profile)), parameters, device.homodyne.turn_rad, profile)
-    simulator = Simulator(profile, device, seed=1)
-    tensors = table_tensors(module, table, simulator.references())
-    model = decoder_onnx(module, "uint8", profile.frame_shape, tensors)
-    half = in_half(model, PAGE_INPUTS)
-    types = {value.name: value.type.tensor_type.elem_type for value in onnx.load_from_string(half).graph.value_info}
-    for part in ("network", "refiners", "prediction/waves", "prediction/back"):
-        made = [node.output[0] for node in onnx.load_from_string(half).graph.node if f"decoder/{part}" in node.name]
-        assert any(types.get(name) == TensorProto.FLOAT16 for name in made), part
-    pair = simulator.page(random_symbols(profile, 256, 1, np.random.default_rng(0))[0])
-    feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature}
-    exact = open_session(model, "exact", 1, once=True).run(["p"], feeds)[0]
-    for one in (half, rounded(model, PAGE_INPUTS)):
-        found = open_session(one, "half", 1, once=True).run(["p"], feeds)[0]
-        assert 0 < deviation(exact, found) < 0.01

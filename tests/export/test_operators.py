@@ -6,13 +6,12 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import onnx
 import pytest
 from click.testing import CliRunner
 from onnx import TensorProto, helper, parser
 
-from export.graph import DecoderGraph, table_tensors
+from export.graph import FRAME_INPUTS, DecoderGraph, table_tensors
 from export.onnx_files import OPSET, decoder_onnx
 from export.operators.check import fallbacks, page_part, repeated_products, shape_computations
 from export.operators.collect import collect
@@ -22,33 +21,27 @@ from lightpage.device.state import Device
 from lightpage.errors import InvalidInputError
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
+from runtime.bundle.bundle import Bundle
+from runtime.bundle.manifest import DECODER
 from tests.lightpage.small import small_profile
 from train.models.decoder import SymbolDecoder
-from train.models.presets import ACCURATE, FAST, PRESETS, STANDARD
+from train.models.presets import FAST, PRESETS
 from train.models.twin import RayTwin, TorchTwin
 
 ORIGIN = "someone/project docs/file.md at 0000000 (1.0)"
 SMALL = "agraph (float[1, 2, 6, 8] x, float[1, 4, 4, 2] grid) => (float[1, 2, 4, 4] y)"
 
 
-def exported(localizer: str, preset: str, frame_dtype: str = "uint8") -> bytes:
-    """A small device's decoder; what operators it has does not depend on the network's size."""
-    profile, device = small_profile(), Device()
-    parameters = true_parameters(profile, device)
-    choices = replace(PRESETS[preset].choices, channels=8, blocks=1)
-    graph = DecoderGraph(profile, SymbolDecoder(profile, parameters, localizer, choices), 1.0).eval()
-    table = sampling_table(TorchTwin(RayTwin(profile)), parameters, device.homodyne.turn_rad, profile)
-    tensors = table_tensors(graph, table, Simulator(profile, device, seed=1).references())
-    wide = {
-        name: value.astype(frame_dtype) if name.startswith("reference") else value for name, value in tensors.items()
-    }
-    return decoder_onnx(graph, frame_dtype, profile.frame_shape, wide)
-
-
 @pytest.fixture(scope="module")
 def fast() -> bytes:
-    """What runs for every page of a fast decoder."""
-    return page_part(exported("coherent", FAST))
+    """What runs for every page of a small device's fast decoder."""
+    profile, device = small_profile(), Device()
+    parameters = true_parameters(profile, device)
+    choices = replace(PRESETS[FAST].choices, channels=8, blocks=1)
+    graph = DecoderGraph(profile, SymbolDecoder(profile, parameters, "coherent", choices), 1.0).eval()
+    table = sampling_table(TorchTwin(RayTwin(profile)), parameters, device.homodyne.turn_rad, profile)
+    tensors = table_tensors(graph, table, Simulator(profile, device, seed=1).references())
+    return page_part(decoder_onnx(graph, "uint8", profile.frame_shape, tensors))
 
 
 def small(body: str, header: str = SMALL, opset: int = OPSET) -> bytes:
@@ -64,16 +57,9 @@ def test_no_node_of_a_fast_decoder_leaves_the_provider(fast: bytes) -> None:
     assert repeated_products(fast) == []
 
 
-@pytest.mark.parametrize(
-    ("localizer", "preset"),
-    [
-        ("coherent", ACCURATE),  # holds the operators of the two below
-        pytest.param("coherent", STANDARD, marks=pytest.mark.long),
-        pytest.param("wave", STANDARD, marks=pytest.mark.long),
-    ],
-)
-def test_nor_does_one_of_the_others(localizer: str, preset: str) -> None:
-    part = page_part(exported(localizer, preset))
+def test_nor_does_one_of_a_decoder_of_two_passes(small_bundle: Path) -> None:
+    """It holds the operators of one pass, by beams or by waves, too."""
+    part = page_part(Bundle.open(small_bundle).files[DECODER])
     for provider in PROVIDERS:
         assert fallbacks(part, provider) == [], provider
     assert shape_computations(part) == []
@@ -84,12 +70,9 @@ def test_nor_does_one_of_the_others(localizer: str, preset: str) -> None:
     ("left", "right", "repeated"),
     [
         ("2, 1, 3, 4", "1, 2, 4, 5", True),
-        ("2, 1, 3, 4", "2, 1, 1, 4, 5", True),
         ("2, 3, 4", "2, 1, 4, 5", True),
         ("2, 1, 3, 4", "2, 2, 4, 5", False),
         ("3, 4", "2, 2, 4, 5", False),
-        ("2, 2, 3, 4", "1, 2, 4, 5", False),
-        ("3, 4", "4, 5", False),
     ],
 )
 def test_a_product_that_repeats_both_of_its_factors_is_found(left: str, right: str, repeated: bool) -> None:
@@ -97,16 +80,13 @@ def test_a_product_that_repeats_both_of_its_factors_is_found(left: str, right: s
     assert repeated_products(model) == (["y"] if repeated else [])
 
 
-def test_a_product_of_unknown_shapes_is_not_passed_over() -> None:
-    model = small("y = MatMul (a, b)", "agraph (float[N, 4] a, float[4, 5] b) => (float[N, 5] y)")
-    with pytest.raises(InvalidInputError, match="node y: got no shape of a, wanted shapes of both factors"):
-        repeated_products(model)
-
-
-def test_frames_of_16_bits_are_converted_elsewhere_by_tensorrt_alone() -> None:
-    part = page_part(exported("coherent", FAST, "uint16"))
-    assert fallbacks(part, "cuda") == []
-    found = fallbacks(part, "tensorrt")
+def test_frames_of_16_bits_are_converted_elsewhere_by_tensorrt_alone(fast: bytes) -> None:
+    model = onnx.load_from_string(fast)
+    for value in model.graph.input:
+        if value.name in FRAME_INPUTS:
+            value.type.tensor_type.elem_type = TensorProto.UINT16
+    assert fallbacks(model.SerializeToString(), "cuda") == []
+    found = fallbacks(model.SerializeToString(), "tensorrt")
     assert [(one.operator, "uint16" in one.got) for one in found] == [("Cast", True), ("Cast", True)]
 
 
@@ -126,17 +106,9 @@ def test_a_cast_planted_before_the_sampling_is_found_and_named(fast: bytes) -> N
     assert fallbacks(model.SerializeToString(), "tensorrt") == fallbacks(fast, "tensorrt")  # that samples in halves too
 
 
-def test_a_network_in_half_precision_stays_on_the_provider() -> None:
-    halves = small(
-        """h = Cast <to: int = 10> (x)
-        w = Cast <to: int = 10> (weights)
-        c = Conv (h, w)
-        g = Gelu (c)
-        s = Add (g, c)
-        y = Cast <to: int = 1> (s)""",
-        "agraph (float[1, 2, 6, 8] x) => (float[1, 2, 6, 8] y) <float[2, 2, 1, 1] weights = {1, 0, 0, 1}>",
-    )
-    assert [fallbacks(halves, provider) for provider in PROVIDERS] == [[], []]
+SHAPED = "agraph (float[4] a) => (float[4] y)"
+SAMPLED = "agraph (float[1, 1, 4, 4, 4] x, float[1, 2, 2, 2, 3] grid) => (float[1, 1, 2, 2, 2] y)"
+SLICED = "agraph (float[4, 4] a, int64[1] b) => (float[n, m] y)"
 
 
 @pytest.mark.parametrize(
@@ -144,52 +116,17 @@ def test_a_network_in_half_precision_stays_on_the_provider() -> None:
     [
         ("cuda", small("y = MatMul (a, a)", "agraph (int64[4, 4] a) => (int64[4, 4] y)"), "MatMul", "of int64"),
         ("tensorrt", small("y = Add (a, a)", "agraph (double[4] a) => (double[4] y)"), "Add", "of float64"),
-        ("tensorrt", small("y = Pow (a, a)", "agraph (int64[4] a) => (int64[4] y)"), "Pow", "of int64"),
         ("cuda", small("y = Det (a)", "agraph (float[4, 4] a) => (float y)"), "Det", "operator Det"),
-        (
-            "cuda",
-            small("y = com.microsoft.Unheard (a)", "agraph (float[4] a) => (float[4] y)"),
-            "com.microsoft:Unheard",
-            "operator com.microsoft:Unheard",
-        ),
-        (
-            "cuda",
-            small("y = com.microsoft.BiasGelu (a, a)", "agraph (int32[4] a) => (int32[4] y)"),
-            "com.microsoft:BiasGelu",
-            "of int32",
-        ),
-        (
-            "tensorrt",
-            small("y = Slice (a, b, b, b)", "agraph (float[4, 4] a, int64[1] b) => (float[n, m] y)"),
-            "Slice",
-            "axes that is computed",
-        ),
-        (
-            "tensorrt",
-            small(
-                "y = GridSample (x, grid)",
-                "agraph (float[1, 1, 4, 4, 4] x, float[1, 2, 2, 2, 3] grid) => (float[1, 1, 2, 2, 2] y)",
-            ),
-            "GridSample",
-            "x of 5 axes",
-        ),
-        ("tensorrt", small("y = Neg (a)", "agraph (float[4] a) => (float[4] y)", opset=21), "Neg", "opset 21"),
+        ("cuda", small("y = com.microsoft.Unheard (a)", SHAPED), "com.microsoft:Unheard", "com.microsoft:Unheard"),
+        ("tensorrt", small("y = Slice (a, b, b, b)", SLICED), "Slice", "is computed"),
+        ("tensorrt", small("y = GridSample (x, grid)", SAMPLED), "GridSample", "x of 5 axes"),
+        ("tensorrt", small("y = Neg (a)", SHAPED, opset=21), "Neg", "opset 21"),
     ],
 )
 def test_what_a_provider_lacks_is_found(provider: str, model: bytes, operator: str, got: str) -> None:
     (found,) = fallbacks(model, provider)
     assert found.operator == operator
     assert got in found.got
-
-
-def test_a_type_that_nobody_knows_is_not_taken_for_a_right_one() -> None:
-    model = small(
-        "b = com.microsoft.Unheard (a)\ny = Neg (b)",
-        "agraph (float[4] a) => (float[4] y)",
-    )
-    unheard, negated = fallbacks(model, "cuda")
-    assert (unheard.operator, negated.operator) == ("com.microsoft:Unheard", "Neg")
-    assert negated.got == "b of unknown"
 
 
 def test_what_depends_on_constants_alone_is_not_asked_for() -> None:
@@ -211,21 +148,13 @@ def test_computations_of_shapes_are_told_apart() -> None:
     assert fallbacks(model, "cuda") == []
 
 
-def test_a_graph_within_a_node_is_refused() -> None:
-    inner = helper.make_graph([], "inner", [], [])
-    node = helper.make_node("If", ["x"], ["y"], name="choice", then_branch=inner, else_branch=inner)
-    model = helper.make_model(helper.make_graph([node], "outer", [], []))
-    with pytest.raises(InvalidInputError, match=r"node choice: got a graph within it, wanted .*without inner graphs"):
-        fallbacks(model.SerializeToString(), "cuda")
-
-
 def test_the_committed_lists_say_where_they_are_from() -> None:
     for provider in PROVIDERS:
         listed = OperatorList.load(provider)
         assert re.fullmatch(r"[\w-]+/[\w-]+ docs/\w+\.md at [0-9a-f]{40} \(.+\)", listed.origin)
         assert {domain for domain, _ in listed.operators} <= {"", "com.microsoft"}
         assert len(listed.operators) > 100
-    with pytest.raises(InvalidInputError, match=r"execution provider: got 'abacus', wanted one of cuda, tensorrt"):
+    with pytest.raises(InvalidInputError, match="'abacus'"):
         OperatorList.load("abacus")
 
 
@@ -270,15 +199,6 @@ def test_cudas_list_is_read_from_its_projects_document(tmp_path: Path) -> None:
     assert (fused.inputs, fused.outputs) == (("T", "T1"), ("T",))
 
 
-def test_a_kernel_without_a_last_version_is_taken_for_its_first_alone(tmp_path: Path) -> None:
-    """So onnxruntime before 1.26 did with GridSample as this project exports it."""
-    listed = made(KERNELS, "cuda", tmp_path)
-    assert fallbacks(small("y = GridSample (x, grid)", opset=19), listed) == []
-    (found,) = fallbacks(small("y = GridSample (x, grid)"), listed)
-    assert (found.got, found.expected) == ("version 20", "version 16")
-    assert fallbacks(small("y = GridSample (x, grid)"), "cuda") == []
-
-
 def test_tensorrts_list_is_read_from_its_projects_document(tmp_path: Path) -> None:
     document = """
 TensorRT 10.0 supports operators in the inclusive range of opset 9 to opset 20.
@@ -294,19 +214,11 @@ TensorRT 10.0 supports operators in the inclusive range of opset 9 to opset 20.
     assert {name for _, name in listed.operators} == {"Acos", "GridSample", "Slice"}
     assert listed.operators["", "GridSample"].rank == 4
     assert listed.operators["", "Slice"].constant == ("axes",)
-    with pytest.raises(InvalidInputError, match=r"types of Acos: got FP33"):
+    with pytest.raises(InvalidInputError, match="FP33"):
         made(document.replace("FP32, FP16", "FP33"), "tensorrt", tmp_path)
 
 
 @pytest.mark.parametrize("provider", PROVIDERS)
 def test_another_document_is_refused(provider: str, tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match="operator document: got no "):
+    with pytest.raises(InvalidInputError, match="operator document"):
         made("# Something else", provider, tmp_path)
-
-
-def test_the_cut_part_takes_what_the_table_gives_with_its_types(fast: bytes) -> None:
-    inputs = {value.name: value.type.tensor_type for value in onnx.load_from_string(fast).graph.input}
-    assert {"in_phase", "quadrature", "registration"} < set(inputs)
-    assert all(described.elem_type for described in inputs.values())
-    shape = [size.dim_value for size in inputs["in_phase"].shape.dim]
-    np.testing.assert_array_equal(shape, small_profile().frame_shape)

@@ -16,27 +16,28 @@ SKIPPED = {"name": "torch", "skip_reason": "Dependency not found on PyPI"}
 
 
 @pytest.mark.parametrize(
-    ("rows", "status", "line"),
+    ("rows", "status", "named"),
     [
-        ([GOOD, {**BAD, "vulns": []}], 0, "2 of 2 packages audited"),
-        ([GOOD, BAD], audit.FOUND, "torch 2.13.0: PYSEC-1, mended in 2.14"),
-        ([BAD, {"name": "click", "skip_reason": "no"}], audit.FOUND, "torch 2.13.0: PYSEC-1, mended in 2.14"),
-        ([GOOD, SKIPPED], audit.UNKNOWN, "not audited: torch; Dependency not found on PyPI"),
-        ([GOOD], audit.UNKNOWN, "1 of 2 packages audited"),
+        ([GOOD, {**BAD, "vulns": []}], 0, "2 of 2"),
+        ([GOOD, BAD], audit.FOUND, "torch 2.13.0: PYSEC-1"),
+        ([BAD, {"name": "click", "skip_reason": "no"}], audit.FOUND, "torch 2.13.0: PYSEC-1"),
+        ([GOOD, SKIPPED], audit.UNKNOWN, "not audited: torch"),
+        ([GOOD], audit.UNKNOWN, "1 of 2"),
     ],
 )
-def test_what_pip_audit_found_decides(rows: list[dict[str, object]], status: int, line: str) -> None:
+def test_what_pip_audit_found_decides(rows: list[dict[str, object]], status: int, named: str) -> None:
     found, lines = audit.judged(PACKAGES, json.dumps({"dependencies": rows, "fixes": []}), "")
     assert found == status
-    assert line in lines
+    assert any(line.startswith(named) for line in lines)
 
 
 @pytest.mark.parametrize("printed", ["", "Traceback", "[]", "{}"])
 def test_a_database_that_does_not_answer_is_no_success(printed: str) -> None:
-    said = "Traceback\nrequests.exceptions.ConnectionError: no route to the database\n"
+    said = "Traceback\nrequests.exceptions.ConnectionError: no route\n"
     status, [line] = audit.judged(PACKAGES, printed, said)
     assert status == audit.UNKNOWN != 0
-    assert line == "0 of 2 packages audited: requests.exceptions.ConnectionError: no route to the database"
+    assert line.startswith("0 of 2")
+    assert "ConnectionError: no route" in line
 
 
 def test_a_build_of_its_own_is_looked_up_by_its_version() -> None:

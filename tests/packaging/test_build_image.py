@@ -28,36 +28,29 @@ def build(target: str, **environment: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize(
-    ("environment", "said"),
+    ("environment", "named"),
     [
-        ({"LIGHTPAGE_RELEASE": "1"}, "a release needs a base with a digest; got 'debian:bookworm-slim'"),
-        (
-            {"LIGHTPAGE_RELEASE": "1", "LIGHTPAGE_BASE": "debian:12"},
-            "a release needs a base with a digest; got 'debian:12'",
-        ),
-        (
-            {"LIGHTPAGE_BASE": "debian@sha256:12"},
-            "has the digest 'sha256:12'; sha256: and 64 hexadecimal digits wanted",
-        ),
-        ({"LIGHTPAGE_RELEASE": "yes"}, "LIGHTPAGE_RELEASE is 'yes'; 1 or nothing wanted"),
-        ({"LIGHTPAGE_PLATFORM": "linux/riscv64"}, "platform 'linux/riscv64' is none of linux/amd64, linux/arm64"),
-        ({"LIGHTPAGE_BASE": DIGEST}, "LIGHTPAGE_BUILDER is 'nobody'"),
+        ({"LIGHTPAGE_RELEASE": "1"}, "'debian:bookworm-slim'"),
+        ({"LIGHTPAGE_RELEASE": "1", "LIGHTPAGE_BASE": "debian:12"}, "'debian:12'"),
+        ({"LIGHTPAGE_BASE": "debian@sha256:12"}, "'sha256:12'"),
+        ({"LIGHTPAGE_RELEASE": "yes"}, "'yes'"),
+        ({"LIGHTPAGE_PLATFORM": "linux/riscv64"}, "'linux/riscv64'"),
+        ({"LIGHTPAGE_BASE": DIGEST}, "'nobody'"),
     ],
 )
-def test_what_cannot_be_built_is_refused(environment: dict[str, str], said: str) -> None:
+def test_what_cannot_be_built_is_refused(environment: dict[str, str], named: str) -> None:
     refused = build("runtime", **environment)
     assert refused.returncode == 2
-    assert said in refused.stderr
+    assert named in refused.stderr
 
 
 @pytest.mark.parametrize("target", lock.TARGETS)
 def test_a_target_without_wheels_for_arm_is_refused_there(target: str) -> None:
     refused = build(target, LIGHTPAGE_PLATFORM="linux/arm64")
     assert refused.returncode == 2
-    if "aarch64" in lock.TARGETS[target].machines:
-        assert "LIGHTPAGE_BUILDER is 'nobody'" in refused.stderr
-    else:
-        assert f"no image '{target}' for linux/arm64: {lock.TARGETS[target].refused}" in refused.stderr
+    assert (
+        "'nobody'" if "aarch64" in lock.TARGETS[target].machines else lock.TARGETS[target].refused
+    ) in refused.stderr
 
 
 def test_the_base_is_an_argument_and_no_stage_names_another() -> None:

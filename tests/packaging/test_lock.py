@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Iterable, Mapping
-from importlib.metadata import PackageNotFoundError, distribution
+from importlib.metadata import distribution
 from pathlib import Path
 from typing import Any
 
@@ -141,7 +141,7 @@ def spoiled(folder: Path, old: str, new: str) -> Path:
     ("old", "new", "said"),
     [
         (r"^(click==\S+) \\\n(    --hash=\S+( \\)?\n)+", r"\1\n", "click==8.5.1"),
-        (r"^(click==\S+ \\\n    --hash=sha256:)", r"\1x", "click==8.5.1: got '--hash=sha256:x"),
+        (r"^(click==\S+ \\\n    --hash=sha256:)", r"\1x", "click==8.5.1"),
         (r"^click==", r"--index-url https://example.com/simple\nclick==", "--index-url"),
         (r"^click==\S+", r"click @ https://example.com/click.whl", "click @"),
         (r"^click==", "click>=", "click>="),
@@ -153,18 +153,14 @@ def test_a_line_that_is_no_pin_with_hashes_is_refused(tmp_path: Path, old: str, 
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "name"),
     [
-        (r"^click==\S+", "click==8.5.0", "click is 8.5.0, and 8.5.1 in constraints.txt"),
-        (r"^pydantic-core==\S+ \\\n(    --hash=\S+( \\)?\n)+", "", "pydantic-core is not locked"),
-        (r"^click==", "idna==3.20 --hash=sha256:" + 64 * "0" + "\nclick==", "idna is needed by nothing"),
+        (r"^click==\S+", "click==8.5.0", "click"),
+        (r"^pydantic-core==\S+ \\\n(    --hash=\S+( \\)?\n)+", "", "pydantic-core"),
+        (r"^click==", "idna==3.20 --hash=sha256:" + 64 * "0" + "\nclick==", "idna"),
     ],
 )
-def test_a_version_and_a_package_that_do_not_agree_are_named(tmp_path: Path, old: str, new: str, said: str) -> None:
+def test_a_version_and_a_package_that_do_not_agree_are_named(tmp_path: Path, old: str, new: str, name: str) -> None:
     locked = lock.read_lock(spoiled(tmp_path, old, new))
-    assert disagreements(locked, constrained(), closure(asked("runtime"), "x86_64")) == [said]
-
-
-def test_a_dependency_that_is_not_installed_here_cannot_be_judged() -> None:
-    with pytest.raises(PackageNotFoundError):
-        closure([Requirement("lightpage-has-no-such-dependency")], "x86_64")
+    [line] = disagreements(locked, constrained(), closure(asked("runtime"), "x86_64"))
+    assert line.startswith(f"{name} is ")

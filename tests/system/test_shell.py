@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
+import ast
+import io
+import json
 import os
 import re
 import shutil
@@ -11,20 +13,29 @@ import sys
 import sysconfig
 import tomllib
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.packaging.scripts import script
+
 ROOT = Path(__file__).resolve().parents[2]
-PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+SETTINGS: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())
+PROJECT, DATA = SETTINGS["project"], SETTINGS["tool"]["setuptools"]["package-data"]
 COMMANDS: dict[str, str] = {**PROJECT["scripts"], **PROJECT["entry-points"]["lightpage.commands"]}
+PLUG_INS: dict[str, str] = {
+    **PROJECT["entry-points"]["lightpage.sources"],
+    **PROJECT["entry-points"]["lightpage.recalibrations"],
+}
 EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
 LOCKS = ROOT / "packaging" / "locks"
 # What a wheel is made of, and what the image build is given beside that.
 PACKAGES = ("lightpage", "train", "export", "runtime", "analysis")
 SOURCES = ("pyproject.toml", "LICENSE", "README.md", *PACKAGES)
 PACKAGING = ("packaging",)
+TYPED = ("lightpage", "train", "export", "runtime")
 
 
 def run(command: Sequence[str | Path], *, cwd: Path = ROOT, timeout_s: float = 60) -> subprocess.CompletedProcess[str]:
@@ -51,41 +62,30 @@ def pins() -> dict[str, str]:
 # ---- make and continuous integration ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("target", ["setup", "demo", "test", "bench", "image", "sbom", "lock", "proto", "lint"])
-def test_make_knows_what_to_do_for(target: str) -> None:
-    planned = run(["make", "--dry-run", target])
+def test_make_knows_what_to_do_and_its_first_target_only_tells() -> None:
+    targets = ["setup", "demo", "test", "bench", "image", "sbom", "lock", "proto", "lint"]
+    planned = run(["make", "--dry-run", *targets])
     assert planned.returncode == 0, planned.stderr
-
-
-def test_the_first_target_only_tells() -> None:
     assert run(["make", "--dry-run"]).stdout == run(["make", "--dry-run", "help"]).stdout
 
 
-@pytest.mark.parametrize("script", [".ci/run", *(str(path.relative_to(ROOT)) for path in ROOT.glob("packaging/*.sh"))])
-def test_scripts_are_executable_and_parse(script: str) -> None:
-    assert os.access(ROOT / script, os.X_OK)
-    parsed = run(["bash", "-n", script])
-    assert parsed.returncode == 0, parsed.stderr
-
-
-def test_continuous_integration_is_make_test() -> None:
-    assert (ROOT / ".ci/run").read_text().splitlines()[-1] == "make test"
+def test_scripts_are_executable_and_parse() -> None:
+    scripts = [ROOT / ".ci/run", *ROOT.glob("packaging/*.sh")]
+    assert [path for path in scripts if not os.access(path, os.X_OK)] == []
+    assert [run(["bash", "-n", path]).stderr for path in scripts] == [""] * len(scripts)
+    assert scripts[0].read_text().splitlines()[-1] == "make test"  # continuous integration does no more
 
 
 # ---- versions -----------------------------------------------------------------------------------------------------
 
 
-def test_constraints_are_plain_pins_that_resolve_anywhere() -> None:
+def test_requirements_are_pinned() -> None:
     for line in (ROOT / "constraints.txt").read_text().splitlines():
         assert line.startswith("#") or re.fullmatch(r"[\w.-]+==[\w.]+", line), line  # no URL, no path, no local tag
 
-
-def test_every_direct_requirement_is_pinned() -> None:
     expected = [*PROJECT["dependencies"], *EXTRAS["train"], *EXTRAS["dev"]]
     assert {normal(requirement) for requirement in expected} <= pins().keys()
 
-
-def test_torch_is_pinned_for_those_who_install_without_constraints_too() -> None:
     assert f"torch=={pins()['torch']}" in EXTRAS["train"]
     assert not any(normal(requirement) == "torch" for requirement in PROJECT["dependencies"])
 
@@ -93,57 +93,57 @@ def test_torch_is_pinned_for_those_who_install_without_constraints_too() -> None
 # ---- commands -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_the_command_is_there(name: str) -> None:
-    module, _, attribute = COMMANDS[name].partition(":")
-    assert callable(getattr(importlib.import_module(module), attribute))
+def defined(module: str) -> set[str]:
+    """Names that a module defines, read from its text: some take seconds to import."""
+    names = set()
+    for node in ast.parse(ROOT.joinpath(*module.split(".")).with_suffix(".py").read_text()).body:
+        names |= {node.name} if isinstance(node, ast.FunctionDef | ast.ClassDef) else set()
+        targets = [node.target] if isinstance(node, ast.AnnAssign) else getattr(node, "targets", [])
+        names |= {target.id for target in targets if isinstance(target, ast.Name)}
+    return names
+
+
+def test_every_command_and_plug_in_is_there() -> None:
+    for name, value in [*COMMANDS.items(), *PLUG_INS.items()]:
+        module, _, attribute = value.partition(":")
+        assert attribute in defined(module), name
+
+
+def test_data_files_of_the_packages_travel_with_the_wheel() -> None:
+    for package in TYPED:
+        for path in (ROOT / package).rglob("*"):
+            if path.is_file() and path.suffix not in (".py", ".pyc", ".pyi", ".typed"):
+                within = [parent for parent in path.relative_to(ROOT).parents if ".".join(parent.parts) in DATA]
+                patterns = [within[0] / pattern for pattern in DATA[".".join(within[0].parts)]] if within else []
+                assert any(path.relative_to(ROOT).match(str(pattern)) for pattern in patterns), path
 
 
 # ---- image --------------------------------------------------------------------------------------------------------
 
 
-def hadolint(*words: str | Path) -> subprocess.CompletedProcess[str]:
-    return run([Path(sysconfig.get_path("scripts")) / "hadolint", "--config", ROOT / ".hadolint.yaml", *words])
-
-
 def test_the_dockerfile_passes_hadolint() -> None:
-    linted = hadolint(ROOT / "Dockerfile")
+    hadolint = Path(sysconfig.get_path("scripts")) / "hadolint"
+    linted = run([hadolint, "--config", ROOT / ".hadolint.yaml", ROOT / "Dockerfile"])
     assert linted.returncode == 0, linted.stdout
-
-
-def test_hadolint_would_say_so_if_it_did_not(tmp_path: Path) -> None:
-    spoiled = tmp_path / "Dockerfile"
-    spoiled.write_text((ROOT / "Dockerfile").read_text().replace("--no-install-recommends ", ""))
-    linted = hadolint(spoiled)
-    assert linted.returncode != 0
-    assert "DL3015" in linted.stdout
 
 
 def stages() -> dict[str, str]:
     """The Dockerfile's named stages: name to text."""
-    text = (ROOT / "Dockerfile").read_text()
-    return {
-        found["name"]: found["text"]
-        for found in re.finditer(
-            r"^FROM \S+ AS (?P<name>\S+)\n(?P<text>.*?)(?=^FROM |\Z)", text, re.MULTILINE | re.DOTALL
-        )
-    }
+    pattern = re.compile(r"^FROM \S+ AS (?P<name>\S+)\n(?P<text>.*?)(?=^FROM |\Z)", re.MULTILINE | re.DOTALL)
+    return {found["name"]: found["text"] for found in pattern.finditer((ROOT / "Dockerfile").read_text())}
 
 
-def test_the_image_is_not_root_quiet_and_checked() -> None:
-    runtime = stages()["service"]
-    assert "USER 10001:10001" in runtime
-    assert "ORT_DISABLE_TELEMETRY=1" in runtime
-    assert "PYTHONDONTWRITEBYTECODE=1" in runtime
-    assert 'CMD ["python", "-m", "runtime.commands.healthcheck"]' in runtime
-    assert 'ENTRYPOINT ["lightpage", "serve"]' in runtime
-    text = (ROOT / "Dockerfile").read_text()
+def test_the_image_is_not_root_quiet_and_checked_and_installs_its_own_lock() -> None:
+    for line in (
+        "USER 10001:10001",
+        "ORT_DISABLE_TELEMETRY=1",
+        "PYTHONDONTWRITEBYTECODE=1",
+        'CMD ["python", "-m", "runtime.commands.healthcheck"]',
+        'ENTRYPOINT ["lightpage", "serve"]',
+    ):
+        assert line in stages()["service"]
     for name in ("runtime", "camera", "deep", "gpu"):  # whatever is installed, it is run alike
-        assert f"FROM service AS {name}" in text
-
-
-def test_every_image_installs_its_own_lock() -> None:
-    for name in ("runtime", "camera", "deep", "gpu"):
+        assert f"FROM service AS {name}" in (ROOT / "Dockerfile").read_text()
         installed = re.findall(r"packaging/install_locked.sh (\S+) (\S+)$", stages()[f"build-{name}"], re.MULTILINE)
         assert installed == [(f"packaging/locks/{name}.txt", "/opt/lightpage")]
         assert re.findall(r"--from=(\S+)", stages()[name]) == [f"build-{name}"]
@@ -172,22 +172,18 @@ def test_the_image_is_built_of_what_the_wheel_is_built_of() -> None:
 
 def lend(listing: str, out: Path) -> tuple[str, list[str]]:
     """Run the helper of build_image.sh: the pip.conf that it writes and the folders that it prints."""
-    done = subprocess.run(
-        [sys.executable, ROOT / "packaging/lend_pip_settings.py", out],
-        input=listing,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return (out / "pip.conf").read_text(), done.stdout.split()
+    helper, told = script("lend_pip_settings"), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(told):
+        patch.setattr(sys, "argv", ["lend_pip_settings.py", str(out)])
+        patch.setattr(sys, "stdin", io.StringIO(listing))
+        helper.main()
+    return (out / "pip.conf").read_text(), told.getvalue().split()
 
 
-def test_a_machine_without_settings_lends_none(tmp_path: Path) -> None:
+def test_settings_of_pip_are_lent_to_the_build_of_an_image(tmp_path: Path) -> None:
     assert lend("", tmp_path) == ("[global]\n", [])
     assert not (tmp_path / "ca_bundle").exists()
 
-
-def test_local_folders_and_certificates_are_lent_under_neutral_names(tmp_path: Path) -> None:
     out, index, wheels, cert = (tmp_path / name for name in ("out", "index", "wheels", "my.pem"))
     for folder in (out, index / "simple", wheels):
         folder.mkdir(parents=True)
@@ -205,8 +201,6 @@ def test_local_folders_and_certificates_are_lent_under_neutral_names(tmp_path: P
     assert (out / "ca_bundle").read_text() == "certificates\n"
     assert str(tmp_path) not in settings
 
-
-def test_the_environment_beats_the_file_whatever_the_order(tmp_path: Path) -> None:
     listing = [
         ":env:.index-url='https://two.example/simple'",
         "WARNING: chatter",
@@ -222,76 +216,85 @@ def test_the_environment_beats_the_file_whatever_the_order(tmp_path: Path) -> No
 NEED_AN_EXTRA = {"runtime.modulator.present": "xcffib", "runtime.modulator.x_window": "xcffib"}
 """Modules that the process of a modulator's window alone loads, and what they lack without the extra `screen`."""
 
-
-@pytest.fixture(scope="module")
-def torchless(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The scripts folder of a fresh environment with lightpage in it as the runtime image has it: no torch."""
-    folder = tmp_path_factory.mktemp("torchless")
-    source = folder / "source"
-    source.mkdir()
-    for name in SOURCES:  # a copy: a build leaves its traces beside pyproject.toml
-        if (ROOT / name).is_dir():
-            shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
-        else:
-            shutil.copy(ROOT / name, source)
-    made = run([sys.executable, "-m", "venv", folder / "environment"])
-    assert made.returncode == 0, made.stderr
-    scripts = folder / "environment" / "bin"
-    locked = ["--require-hashes", "--only-binary", ":all:", "--requirement", LOCKS / "runtime.txt"]
-    for words in (locked, ["--no-deps", "."]):
-        installed = run([scripts / "pip", "install", *words], cwd=source, timeout_s=500)
-        assert installed.returncode == 0, installed.stderr
-    return scripts
-
-
-def ask(scripts: Path, code: str) -> str:
-    """What the environment's python prints, away from the source tree."""
-    said = run([scripts / "python", "-I", "-c", code], cwd=scripts)
-    assert said.returncode == 0, said.stderr
-    return said.stdout.strip()
-
-
-def test_the_runtime_needs_no_torch(torchless: Path) -> None:
-    assert ask(torchless, "from importlib.util import find_spec; print(find_spec('torch'))") == "None"
-    imports_everything = """
-import importlib, pkgutil, sys
-lacking = {}
+IN_THE_IMAGE = f"""
+import importlib, json, pkgutil, sys
+lacking = {{}}
 for package in ("lightpage", "runtime"):
     for module in pkgutil.walk_packages(importlib.import_module(package).__path__, package + "."):
         try:
             importlib.import_module(module.name)
         except ModuleNotFoundError as error:
             lacking[module.name] = error.name
-print(lacking)
-print("lightpage.cli.main" in sys.modules, "runtime.commands.healthcheck" in sys.modules)
-"""
-    assert ask(torchless, imports_everything) == f"{NEED_AN_EXTRA}\nTrue True"
-
-
-def test_the_command_runs_without_torch(torchless: Path) -> None:
-    helped = run([torchless / "lightpage", "--help"], cwd=torchless)
-    assert helped.returncode == 0, helped.stderr
-    for name in ("serve", "decode", "evaluate", "recalibrate"):
-        assert re.search(rf"^  {name} ", helped.stdout, re.MULTILINE), helped.stdout
-
-
-def test_profiles_and_type_markers_travel_with_the_wheel(torchless: Path) -> None:
-    lists_files = """
-from importlib.resources import files
-print(sorted(file.name for file in files("lightpage.device").joinpath("profiles").iterdir()))
-print(all(files(package).joinpath("py.typed").is_file() for package in ("lightpage", "train", "export", "runtime")))
-"""
-    assert ask(torchless, lists_files) == "['bench.toml', 'paper.toml']\nTrue"
-
-
-def test_the_shipped_bundle_decodes_without_torch(torchless: Path) -> None:
-    decodes = """
-import sys
+assert lacking == {NEED_AN_EXTRA}, lacking
+assert {{"lightpage.cli.main", "runtime.commands.healthcheck"}} <= sys.modules.keys()
 import numpy as np
-from runtime.decoding.decoder import Decoder
+from importlib.resources import files
+from click.testing import CliRunner
+from lightpage.cli.main import lightpage
+from lightpage.device.profile import load_profile
 from runtime.bundle.shipped import bundle_path
+from runtime.decoding.decoder import Decoder
 decoder = Decoder.load(bundle_path("bench"), threads=1)
 page = decoder.decode(decoder.bundle.golden.pair, 16)
-print(page.symbols.shape, bool(np.median(page.confidence) > 0.5), "torch" in sys.modules)
+print(json.dumps({{
+    "decoded": [page.symbols.shape, bool(np.median(page.confidence) > 0.5)],
+    "help": CliRunner().invoke(lightpage, ["--help"]).output,
+    "profiles": [load_profile(name).name for name in ("bench", "paper")],
+    "torch": "torch" in sys.modules,
+    "typed": [name for name in {TYPED} if files(name).joinpath("py.typed").is_file()],
+}}))
 """
-    assert ask(torchless, decodes) == "(56, 87) True False"
+"""What must go well with what the runtime image has, all in one process: importing everything takes seconds."""
+
+
+def does_its_work(said: str) -> None:
+    told = json.loads(said)
+    assert told["decoded"] == [[56, 87], True]
+    assert told["profiles"] == ["bench", "paper"]
+    assert (told["torch"], len(told["typed"])) == (False, 4)
+    for name in ("serve", "decode", "evaluate", "recalibrate"):
+        assert re.search(rf"^  {name} ", told["help"], re.MULTILINE), told["help"]
+
+
+def test_the_runtime_needs_nothing_but_what_its_image_has() -> None:
+    locked = set(re.findall(r"^([\w.-]+)==", (LOCKS / "runtime.txt").read_text(), re.MULTILINE))
+    hides = f"""
+import sys
+from importlib.metadata import packages_distributions
+known = {{normal.lower().replace("_", "-") for normal in {sorted(locked)}}} | {{"lightpage"}}
+hidden = {{
+    name for name, owners in packages_distributions().items()
+    if not known & {{owner.lower().replace("_", "-").replace(".", "-") for owner in owners}}
+}}
+class Hides:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in hidden:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name.partition(".")[0])
+sys.meta_path.insert(0, Hides())
+"""
+    said = run([sys.executable, "-c", hides + IN_THE_IMAGE], timeout_s=120)
+    assert said.returncode == 0, said.stderr
+    does_its_work(said.stdout)
+
+
+@pytest.mark.long  # pip installs forty locked packages for half a minute; the test above hides all others
+def test_it_installs_from_its_lock_and_does_its_work(tmp_path: Path) -> None:
+    source = tmp_path / "source"
+    source.mkdir()
+    for name in SOURCES:  # a copy: a build leaves its traces beside pyproject.toml
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(ROOT / name, source)
+    made = run([sys.executable, "-m", "venv", tmp_path / "environment"], timeout_s=120)
+    assert made.returncode == 0, made.stderr
+    scripts = tmp_path / "environment" / "bin"
+    locked = ["--require-hashes", "--only-binary", ":all:", "--requirement", LOCKS / "runtime.txt"]
+    for words in (locked, ["--no-deps", "."]):
+        installed = run([scripts / "pip", "install", *words], cwd=source, timeout_s=500)
+        assert installed.returncode == 0, installed.stderr
+    said = run([scripts / "python", "-I", "-c", IN_THE_IMAGE], cwd=scripts, timeout_s=120)
+    assert said.returncode == 0, said.stderr
+    does_its_work(said.stdout)
+    helped = run([scripts / "lightpage", "--help"], cwd=scripts)
+    assert helped.returncode == 0, helped.stderr

@@ -68,19 +68,12 @@ class Patches(Dataset[Page]):
     def __getitem__(self, index: int) -> Page:
         """A patch of page `index // patches of a page`."""
         store, page = self._places[index // self._each]
-        starts = [self._start(count, side) for count, side in zip(self._shape, self._sides, strict=True)]
+        sizes = zip(self._shape, self._sides, strict=True)
+        starts = [patch_start(count, side, self._rim, self._step) for count, side in sizes]
         rows, columns = (slice(start, start + side) for start, side in zip(starts, self._sides, strict=True))
         light, positions, *estimate, phases = store.part(page, rows, columns)
         where = with_page_coordinates(positions, self._shape, (rows, columns))
         return light, where, *estimate, torch.where(self._asked(rows, columns), phases, torch.nan)
-
-    def _start(self, count: int, side: int) -> int:
-        """Where a patch begins on an axis: drawn from beyond the page too, so that its edge is asked for as often."""
-        if side == count:
-            return 0
-        beyond = max(0, side - 2 * self._rim - 1)  # an axis shorter than that has one place
-        drawn = int(torch.randint(-beyond, count - side + beyond + 1, ()))
-        return min(max(drawn, 0), count - side) // self._step * self._step
 
     def _asked(self, rows: slice, columns: slice) -> Tensor:
         """Symbols of a patch that are data and have their neighbours, or the page's edge, around them."""
@@ -92,3 +85,18 @@ class Patches(Dataset[Page]):
             if part.stop < count:
                 along[-self._rim :] = False
         return asked
+
+
+def patch_start(count: int, side: int, rim: int, step: int = 1) -> int:
+    """Draw where a patch begins on an axis, from beyond the page too: its edge is asked for as often as its middle.
+
+    Args:
+        count, side: symbols of the page and of the patch.
+        rim: symbols at an edge of the patch that are not asked for, unless it is the page's.
+        step: a patch begins at multiples of it.
+    """
+    if side == count:
+        return 0
+    beyond = max(0, side - 2 * rim - 1)  # an axis shorter than that has one place
+    drawn = int(torch.randint(-beyond, count - side + beyond + 1, ()))
+    return min(max(drawn, 0), count - side) // step * step

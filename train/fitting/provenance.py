@@ -19,7 +19,7 @@ _FIRST = "begun_by.json"
 
 def provenance() -> dict[str, Any]:
     """The command that is running, and the commit of this source tree when first asked for, empty without one."""
-    return {"command": f"{_program()} {shlex.join(sys.argv[1:])}".strip(), "commit": _commit()}
+    return {"command": f"{_program()} {shlex.join(sys.argv[1:])}".strip(), "commit": commit()}
 
 
 def provenance_of(folder: Path) -> dict[str, Any]:
@@ -42,13 +42,16 @@ def _program() -> str:
 
 
 @cache
-def _commit() -> str:
-    """Asked for once: what is committed while a process works is not what it runs."""
+def commit() -> str:
+    """Return the commit of this source tree when first asked for.
+
+    What is committed while a process works is not what it runs.
+    """
     tree = Path(__file__).parents[2]
-    toplevel, _, commit = _git(tree, "rev-parse", "--show-toplevel", "HEAD").partition("\n")
-    if not commit or Path(toplevel) != tree.resolve():
+    toplevel, _, found = _git(tree, "rev-parse", "--show-toplevel", "HEAD").partition("\n")
+    if not found or Path(toplevel) != tree.resolve():
         return ""
-    return commit + (CHANGED if _git(tree, "status", "--porcelain", "--untracked-files=no") else "")
+    return found + (CHANGED if _git(tree, "status", "--porcelain", "--untracked-files=no") else "")
 
 
 def _git(tree: Path, *arguments: str) -> str:

@@ -8,6 +8,7 @@ A real lens adds a phase to each ray: a phase and a tilt, about the middle of th
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -74,8 +75,15 @@ class RayTwin(nn.Module):
         Returns:
             places [B, N, 2], phases [B, N], positions [N, 2], pixels [2, M, 2].
         """
-        value = dict(zip(NAMES, parameters.unbind(0), strict=True))
-        return (*self._trace(value, points, anchors), self._pixels(value, places))
+        return (*self.trace(parameters, points, anchors), self.pixels(parameters, places))
+
+    def trace(self, parameters: Tensor, points: Tensor, anchors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Rays of page points alone; see `forward`."""
+        return self._trace(_named(parameters), points, anchors)
+
+    def pixels(self, parameters: Tensor, places: Tensor) -> Tensor:
+        """Pixels of camera-plane places alone; see `forward`."""
+        return self._pixels(_named(parameters), places)
 
     def _trace(self, value: dict[str, Tensor], points: Tensor, anchors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         geometry: Any = fitted_geometry(self.profile, value)  # its numbers are tensors here
@@ -186,6 +194,10 @@ class RayTwin(nn.Module):
         return torch.stack(cameras)
 
 
+def _named(parameters: Tensor) -> dict[str, Tensor]:
+    return dict(zip(NAMES, parameters.unbind(0), strict=True))
+
+
 def _turn(points: Tensor, angle: Tensor) -> Tensor:
     """Rotate [N, 2] from x towards y."""
     cos, sin = torch.cos(angle), torch.sin(angle)
@@ -202,19 +214,20 @@ class TorchTwin:
     def trace(self, parameters: Real, points: Real, anchors: Real | None = None) -> Rays:
         """See `lightpage.calibration.interfaces.Twin`."""
         decided_by = points if anchors is None else anchors
-        places, phases, positions, _ = self._run(parameters, points, decided_by, points[:1])
-        return Rays(places, phases, positions)
+        return Rays(*self._run(self.module.trace, parameters, points, decided_by))
 
     def pixels(self, parameters: Real, places: Real) -> Real:
         """See `lightpage.calibration.interfaces.Twin`."""
-        return self._run(parameters, places[:1], places[:1], places)[3]
+        (pixels,) = self._run(lambda vector, at: (self.module.pixels(vector, at),), parameters, places)
+        return pixels
 
-    def _run(self, parameters: Real, *inputs: Real) -> tuple[Real, ...]:
+    @staticmethod
+    def _run(asked: Callable[..., tuple[Tensor, ...]], parameters: Real, *inputs: Real) -> tuple[Real, ...]:
         vector = torch.tensor(parameters, dtype=torch.float64)
         tensors = [torch.tensor(array, dtype=torch.float64) for array in inputs]
         with torch.no_grad():
             if vector.ndim == 1:
-                outputs = self.module(vector, *tensors)
+                outputs = asked(vector, *tensors)
             else:
-                outputs = torch.func.vmap(self.module, in_dims=(0, *(None for _ in tensors)))(vector, *tensors)
+                outputs = torch.func.vmap(asked, in_dims=(0, *(None for _ in tensors)))(vector, *tensors)
         return tuple(output.numpy() for output in outputs)

@@ -27,8 +27,8 @@ Real = NDArray[np.floating]
 
 OVERSAMPLING = 1.1
 """Of light on sparse samples: an error of 0.003."""
-_WAVES = 170
-"""Waves that a tile is wide, about: more need more samples of the facet, fewer need more tiles."""
+WAVES_A_TILE = 170
+"""Waves that a tile of the lens is wide, about: more need more samples of the facet, fewer need more tiles."""
 _PLACES = 3
 """Places along an axis that are asked how fast the phase varies."""
 
@@ -79,7 +79,7 @@ class TiledLens(nn.Module):
         super().__init__()
         wave = geometry.wavelength_m * geometry.focal_length_m / geometry.pipe_width_m
         self.shape = len(plane[1]), len(plane[0])
-        self._tiles = tuple(max(1, round(float(np.ptp(axis)) / wave / _WAVES)) for axis in plane)
+        self._tiles = tuple(max(1, round(float(np.ptp(axis)) / wave / WAVES_A_TILE)) for axis in plane)
         self._sides = tuple(-(-len(axis) // tiles) for axis, tiles in zip(plane, self._tiles, strict=True))
         pitches = [float(axis[1] - axis[0]) for axis in plane]
         offsets = [(np.arange(side) - (side - 1) / 2) * pitch for side, pitch in zip(self._sides, pitches, strict=True)]

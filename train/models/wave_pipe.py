@@ -18,7 +18,7 @@ from lightpage.waves.geometry import WaveGeometry, detuning
 from lightpage.waves.pipe import ParityBasis, modes_by_parity
 from train.models.parts import Parts, conjugate, multiply, phasor
 
-_BLOCK = 120
+MODES_A_BLOCK = 120
 """Modes of a parity along each side of a block, at least."""
 _RIM = 12
 """Modes of a parity around a block, beyond those that a mirror of twice the shear couples."""
@@ -54,7 +54,10 @@ class TiledPipe(nn.Module):
         width, nk = geometry.pipe_width_m, geometry.refractive_index * geometry.wave_number
         sheared = abs(geometry.pipe_angle) > 0
         counts = [cell // 2 for cell in cells]
-        edges = [np.linspace(0, count, (max(1, count // _BLOCK) if sheared else 1) + 1).astype(int) for count in counts]
+        edges = [
+            np.linspace(0, count, (max(1, count // MODES_A_BLOCK) if sheared else 1) + 1).astype(int)
+            for count in counts
+        ]
         rims = [math.ceil(abs(geometry.pipe_angle) * other) + _RIM for other in reversed(cells)]
         blocks = []
         for y in pairwise(edges[0]):

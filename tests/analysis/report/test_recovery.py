@@ -108,62 +108,36 @@ def test_the_facts_of_a_recovery(tmp_path: Path) -> None:
 
 def test_losses_are_counted_by_cause(tmp_path: Path) -> None:
     data = report_of_recovery(JsonFile.read(written(WHOLE, tmp_path / "r.json")))
-    assert [(cause, count, share) for cause, _, count, share in data.causes] == [
-        ("optics", 1, 1 / 8),
-        ("body", 2, 0.25),
-    ]
+    found = [(cause, count, share) for cause, _, count, share in data.causes]
+    assert found == [("optics", 1, 1 / 8), ("body", 2, 0.25)]
     assert set(LOSSES) == set(Loss)
 
 
-def test_lost_data_are_said_to_be_lost(tmp_path: Path) -> None:
+def test_a_file_of_which_pages_or_all_are_lost(tmp_path: Path) -> None:
     text, _ = page_of(written(replace(WHOLE, lost=(1, 2, 4), restored=()), tmp_path / "r.json"), tmp_path / "r.html")
-    assert "3 data pages lost." in text
     assert "3 data pages: 1-2, 4" in text
     assert "came back" not in text
-
-
-def test_a_file_of_which_no_page_was_read(tmp_path: Path) -> None:
-    text, seen = page_of(written(NOTHING, tmp_path / "r.json"), tmp_path / "r.html")
-    check_whole(text, seen, SECTIONS)
-    assert "No page of the file could be read" in text
-    assert "Margin over the recorded pages, no page was read." in text
+    _, seen = page_of(written(NOTHING, tmp_path / "r.json"), tmp_path / "r.html")
+    assert {"read (0)", "optics (1)"} <= labels(seen.pictures["pages"][0])
     facts = facts_of(NOTHING, tmp_path)
-    assert facts["Volume"] == facts["File size"] == "unknown: no page of it could be read"
-    assert facts["Page failure rate"] == "1.0000, with 95% confidence at most 1.0000"
-    assert facts["Iterations"] == "not known"
-
-
-def test_frames_without_light_have_no_margin_to_draw(tmp_path: Path) -> None:
-    dark = replace(NOTHING, pages=tuple(replace(LOST[0], page=page) for page in range(3)))
-    _, seen = page_of(written(dark, tmp_path / "r.json"), tmp_path / "r.html")
-    assert {"read (0)", "optics (3)"} <= labels(seen.pictures["pages"][0])
-
-
-def test_a_recovery_without_pages_or_losses(tmp_path: Path) -> None:
+    assert facts["Volume"] == facts["File size"]
+    assert facts["Page failure rate"].startswith("1.0000")
     none = {"page_results": [], "pages": 0, "pages_unread": 0, "page_failure_rate": None, "seconds_per_page": None}
     text, seen = page_of(written(NOTHING, tmp_path / "r.json", **none), tmp_path / "r.html")
     check_whole(text, seen, SECTIONS)
     assert not seen.pictures
-    text, _ = page_of(written(replace(WHOLE, pages=(READ,)), tmp_path / "r.json"), tmp_path / "r.html")
-    assert "Every recorded page gave its bytes." in text
 
 
-def test_long_lists_end(tmp_path: Path) -> None:
-    lost = tuple(replace(LOST[1], page=page, number=page, reason=9 * "very long " * 100) for page in range(2500))
+def test_long_lists_end_and_text_is_escaped(tmp_path: Path) -> None:
+    evil = '<script>alert("1")</script>'
+    lost = tuple(replace(LOST[1], page=page, number=page, reason=evil + 900 * "very long ") for page in range(2500))
     many = replace(WHOLE, pages=lost, missing=tuple(range(0, 5000, 2)))
     text, seen = page_of(written(many, tmp_path / "r.json"), tmp_path / "r.html")
     assert text.count("<td>body</td>") == 200 + 1  # one of them counts the cause
-    assert "And 2,300 more" in text
-    assert "36, 38 and 2,480 more" in text
+    assert "2,300 more" in text
+    assert "2,480 more" in text
     assert all(picture.startswith("data:image/png") for picture in seen.pictures["pages"])
     assert len(text) < 500_000
-
-
-def test_text_of_a_recovery_is_escaped(tmp_path: Path) -> None:
-    evil = '<script>alert("1")</script>'
-    text, seen = page_of(
-        written(replace(WHOLE, pages=(replace(LOST[1], reason=evil),)), tmp_path / "r.json"), tmp_path / "r.html"
-    )
     assert "script" not in seen.tags
     assert html.escape(evil).replace("&quot;", "&#34;") in text
 
@@ -179,57 +153,38 @@ def one(**changes: Any) -> dict[str, Any]:
     [
         ({"user_bytes_per_page": "1000"}, "user_bytes_per_page"),
         ({"q": 2.0}, "q"),
+        ({"air_bytes_per_page": float("inf")}, "air_bytes_per_page"),
         ({"lost": [-1]}, r"lost\.0"),
-        ({"code": CODE.model_dump() | {"levels": "16"}}, r"code\.levels"),
         ({"code": CODE.model_dump() | {"levels": 17}}, "code"),
-        ({"volume": VOLUME.to_json() | {"data_pages": 0}}, r"volume \(.*group of pages"),
+        ({"volume": VOLUME.to_json() | {"data_pages": 0}}, "volume"),
         ({"page_results": None}, "page_results"),
-        ({"pages": 9}, r"file \(.*pages, pages_unread: 9, 3, but page_results has 8 pages, 3"),
+        ({"pages": 9}, "file"),
         (one(loss="<b>"), r"page_results\.0\.loss"),
-        (one(margin_bits=1e308), r"page_results\.0\.margin_bits"),
         (one(page=1 << 70), r"page_results\.0\.page"),
-        (one(reason=5), r"page_results\.0\.reason"),
-        (one(failed_blocks=BLOCKS + 1), r"file \(.*failed_blocks: 4 of the 3 of a page"),
+        (one(failed_blocks=BLOCKS + 1), "file"),
     ],
 )
 def test_figures_that_cannot_be_are_refused(changes: dict[str, Any], named: str, tmp_path: Path) -> None:
-    path = written(WHOLE, tmp_path / "r.json", **changes)
-    with pytest.raises(InvalidInputError, match=rf"r\.json: got {named}.*wanted a finished training run, a bulk run"):
+    path = tmp_path / "r.json"
+    path.write_text(json.dumps(WHOLE.to_json() | changes))
+    with pytest.raises(InvalidInputError, match=rf"r\.json: got {named} "):
         run(report, path, "--out", tmp_path / "r.html")
     assert not (tmp_path / "r.html").exists()
-
-
-def test_what_is_not_finite_is_refused(tmp_path: Path) -> None:
-    (path := tmp_path / "r.json").write_text(json.dumps(WHOLE.to_json() | {"air_bytes_per_page": float("inf")}))
-    with pytest.raises(InvalidInputError, match=r"got air_bytes_per_page \(.*finite number"):
-        run(report, path, "--out", tmp_path / "r.html")
 
 
 @pytest.mark.parametrize(
     ("content", "named"),
     [
-        (
-            {"target": "127.0.0.1:50051", "levels": 256, "pages": [], "refused_pages": []},
-            "the JSON of `lightpage decode`",
-        ),
-        ({"pages": 3, "\x1b[2J": 1}, r"JSON with the keys 'pages', '\\x1b\[2J'"),
-        ({str(number): 0 for number in range(9)}, "JSON with the keys '0', '1', '2', '3', '4' and 4 more"),
-        ({}, "JSON without keys"),
-        ([1, 2], "JSON that is no object"),
+        (json.dumps({"target": "127.0.0.1:50051", "levels": 256, "pages": [], "refused_pages": []}), "decode"),
+        (json.dumps({"pages": 3, "\x1b[2J": 1}), r"'\\x1b\[2J'"),
+        (json.dumps({str(number): 0 for number in range(9)}), "4 more"),
+        ("{}", "without keys"),
+        ("[1, 2]", "no object"),
+        ("[" * 100_000, "no JSON"),
+        ("", "no JSON"),
     ],
 )
-def test_other_json_is_named(content: Any, named: str, tmp_path: Path) -> None:
-    (path := tmp_path / "j.json").write_text(json.dumps(content))
-    json_of = "or the JSON that this version's `lightpage evaluate` or `recover` writes"
-    wanted = f"wanted a finished training run, a bulk run, {json_of}"
-    with pytest.raises(InvalidInputError, match=f"j.json: got {named}, {wanted}"):
+def test_other_json_is_named(content: str, named: str, tmp_path: Path) -> None:
+    (path := tmp_path / "j.json").write_text(content)
+    with pytest.raises(InvalidInputError, match=named):
         run(report, path, "--out", tmp_path / "r.html")
-    for text in (b"\xff", b"[" * 100_000, b""):
-        path.write_bytes(text)
-        with pytest.raises(InvalidInputError, match=r"got (text that is no JSON \(|byte 0xff in line 1).*wanted"):
-            run(report, path, "--out", tmp_path / "r.html")
-
-
-def test_a_recording_is_of_no_use_with_a_recovery(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match=r"--recording: got .*none with the JSON of `lightpage recover`"):
-        run(report, written(WHOLE, tmp_path / "r.json"), "--out", tmp_path / "r.html", "--recording", "r.h5")

@@ -3,8 +3,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +10,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from analysis.results.measurements import COMPARISONS, Measurement, collected, kept_measurements
-from analysis.results.page import PAGE, ROOT, Results, kilobytes, main, render
+from analysis.results.page import PAGE, ROOT, Results, main, render
 from lightpage.errors import InvalidInputError
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.shipped import bundle_path
@@ -103,41 +101,30 @@ def test_figures_are_collected_without_their_curves_and_what_lacks_is_left_out(t
     figures = toy(outcome("ray", 2.344, gained=0.02), outcome("coherent", 4.5), outcome("refined 1", 5.0))
     path = written(tmp_path / "runs" / "sheared" / "figures.json", figures)
     (path.parent / "figure.png").write_bytes(b"picture")
-    written(tmp_path / "runs" / "dim" / "figures.json", toy(outcome("coherent", 2.0)))
     os.utime(path, (1_700_000_000, 1_700_000_000))
     (tmp_path / "kept").mkdir()
     Measurement(toy(outcome("ray", 1.0)), "a document", "a caveat").write(tmp_path / "kept" / "sheared.json")
     done = command(tmp_path, "--from", tmp_path / "runs", "--commit", "0123456789abcdef")
     assert done.exit_code == 0
     kept = kept_measurements(tmp_path / "kept")
-    assert list(kept) == ["dim", "sheared"]
+    assert list(kept) == ["sheared"]
     assert (kept["sheared"].source, kept["sheared"].note) == ("measured 2023-11-14 on commit 0123456", "")
     for one in figures["lights"][0]["outcomes"]:
         del one["training_curve"], one["validation_curve"]
     assert kept["sheared"].figures == figures
     assert (tmp_path / "images" / "decoders.png").read_bytes() == b"picture"
     page = (tmp_path / "page.md").read_text()
-    assert "| published, ray localizer | 2.34 | 1.17 | all 1,200 steps of its authors; still gaining |\n" in page
-    assert "| `--preset accurate`: two passes, coherent | 5.00 | 2.50 | and 1,200 for the second pass |\n" in page
-    assert "mode localizer |" not in page  # nor any row of the other files
-    assert "kB a page |" in page
-    assert "bits, " not in page
+    assert "| published, ray localizer | 2.34 | 1.17 |" in page
+    assert "mode localizer |" not in page
     told = done.output.splitlines()
-    assert f"not collected, no {tmp_path}/runs/square/figures.json" in told
-    for lacking in ("sheared, -0.6 degree, mode", "dim, -0.6 degree, oracle", "full-size", "evaluation", "demo"):
-        assert f"left out, no figures: {lacking}" in told
-    assert "left out, no figures: sheared, -0.6 degree, ray" not in told
-
-
-def test_a_comparison_that_is_not_finished_replaces_nothing(tmp_path: Path) -> None:
-    path = written(tmp_path / "runs" / "sheared" / "figures.json", toy(outcome("ray", 2.0)))
-    (path.parent / "figure.png").write_bytes(b"picture")
-    (tmp_path / "kept").mkdir()
-    Measurement(toy(outcome("ray", 1.0), outcome("mode", 3.0)), "a document").write(tmp_path / "kept" / "sheared.json")
+    assert any("square/figures.json" in line for line in told)
+    for lacking in ("sheared, -0.6 degree, mode", "full-size", "evaluation", "demo"):
+        assert any(line.endswith(lacking) for line in told), lacking
+    # a comparison that is not finished replaces nothing
+    written(path, toy(outcome("ray", 3.0)))
     done = command(tmp_path, "--from", tmp_path / "runs", "--commit", "0123456")
-    assert f"not collected, unfinished: {path} lacks mode at -0.6 degree" in done.output.splitlines()
-    assert kept_measurements(tmp_path / "kept")["sheared"].source == "a document"
-    assert not (tmp_path / "images").exists()
+    assert "unfinished" in done.output
+    assert kept_measurements(tmp_path / "kept")["sheared"].figures == figures
 
 
 def test_a_page_of_nothing_has_no_figures(tmp_path: Path) -> None:
@@ -148,60 +135,7 @@ def test_a_page_of_nothing_has_no_figures(tmp_path: Path) -> None:
     assert not any(re.search(r"\d\.\d", row) for row in rows)
 
 
-def test_the_other_benchmarks_are_collected_as_numbers(tmp_path: Path) -> None:
-    evaluation = {"air_bits_per_symbol": 6.5, "page_kB": 3.914, "pages": 14, "maps": {"air": [[1.0]]}, "bundle": {}}
-    drift = {"seed": 0, "pages": 6, "levels": 16, "recalibration": {"pages_used": 2}, "seconds": 1.0}
-    drift["phases"] = [{"air_bits_per_symbol": air} for air in (6.0, 3.0, 5.7)]
-    kind = {"pages": 20, "found": 3, "given_out": 1}
-    search = {"options": {}, "32 e-: walk": {"rows": [{"found": False}]}}
-    search |= {f"{e} e-: offsets": {"rows": [{"offset_px": 8.0, "found": True}, {"offset_px": 12.0}]} for e in (9, 32)}
-    search |= {f"{e} e-: wrong pages": {"kinds": {"noise": kind, "others": kind}, "shares": [1.0]} for e in (9, 32)}
-    timed = [{"decoder": "coherent", "seconds": 0.5}, {"decoder": "wave", "seconds": 1.0}]
-    times = {"profile": "bench", "threads": 2, "repeats": 3, "decoders": timed}
-    given = {"evaluation": evaluation, "demo": drift, "image-search": search, "speed": times}
-    words = [f"--{name}={written(tmp_path / f'{name}.json', figures)}" for name, figures in given.items()]
-    assert command(tmp_path, *words, "--commit", "0123456").exit_code == 0
-    kept = kept_measurements(tmp_path / "kept")
-    assert kept["evaluation"].figures == {"air_bits_per_symbol": 6.5, "page_kB": 3.914, "pages": 14}
-    assert kept["speed-bench"].figures == times
-    page = (tmp_path / "page.md").read_text()
-    assert "| 6.50 bits a symbol, 3.91 kB a page |" in page
-    assert "a drift that costs 50% of the AIR, recalibrated with 2 pages | 95.0% of the AIR before |" in page
-    assert "image up to 12 pixels off | found 2 of 4 times |" in page
-    assert "given out | 4 of 80 |" in page
-    assert Results(kept).times("bench", "wave", "coherent") == 2
-
-
-@pytest.mark.skipif(shutil.which("git") is None, reason="no git")
-def test_figures_of_an_unknown_commit_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
-    path = written(tmp_path / "figures.json", toy())
-    with pytest.raises(InvalidInputError, match="no checkout"):
-        collected("dim", path)
-    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
-    subprocess.run([*git, "init", "-q"], check=True)
-    subprocess.run([*git, "commit", "-q", "--allow-empty", "-m", "measured"], check=True)
-    commit = subprocess.run([*git, "rev-parse", "HEAD"], check=True, capture_output=True, text=True).stdout
-    path.write_text(path.read_text())
-    assert collected("dim", path).source.endswith(f" on commit {commit[:7]}")
-    os.utime(path, (1_700_000_000, 1_700_000_000))
-    with pytest.raises(InvalidInputError, match="younger commit"):
-        collected("dim", path)
-    monkeypatch.setenv("PATH", "")
-    with pytest.raises(InvalidInputError, match="no checkout"):
-        collected("dim", path)
-
-
 @pytest.mark.parametrize(("name", "figures"), [("dim", {"pages": 3}), ("demo", {}), ("speed-bench", {}), ("dim", [])])
 def test_figures_of_another_benchmark_are_refused(name: str, figures: object, tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError):
         collected(name, written(tmp_path / "F.json", figures), "0123456")
-
-
-def test_a_file_without_a_source_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match="source"):
-        Measurement.read(written(tmp_path / "F.json", {"figures": {}}))
-
-
-def test_large_pages_are_told_with_fewer_digits() -> None:
-    assert [kilobytes(size) for size in (8.966, 19.994, 43.56, 159.4)] == ["8.97", "19.99", "43.6", "159"]

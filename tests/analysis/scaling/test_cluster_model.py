@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
-from analysis.scaling.cluster_model import Cluster, Driver, Work, nodes_that_saturate, simulated, whole_job_pages_per_s
+from analysis.scaling.cluster_model import Cluster, Driver, Work, nodes_that_saturate, simulated
 
 WORK = Work(page_seconds=(0.5,), read_bytes=1e6, written_bytes=1e4, range_s=0.02, range_pages=8)
 IDLE = Driver(base_s=1e-6, in_flight_s=0.0, ahead=2)
@@ -24,12 +23,6 @@ def test_a_storage_that_is_slower_than_the_workers_sets_the_rate() -> None:
     rate = simulated(replace(WIDE, storage_bytes_per_s=5e6), WORK, IDLE, ranges_per_worker=40)
     assert rate.pages_per_s == pytest.approx(5e6 / 1.01e6, rel=0.02)
     assert rate.bound == "storage"
-
-
-def test_a_page_is_read_while_the_one_before_it_is_decoded() -> None:
-    one = replace(WIDE, nodes=1, workers=1, link_bytes_per_s=2.5e6)  # 0.4 s a page, of which the first is waited for
-    rate = simulated(one, WORK, IDLE)
-    assert rate.pages_per_s == pytest.approx(8 / (0.02 + 0.4 + 8 * 0.5 + 0.032), rel=1e-3)
 
 
 def test_a_driver_that_is_slower_than_the_workers_sets_the_rate() -> None:
@@ -51,19 +44,3 @@ def test_the_nodes_that_saturate_a_part_by_arithmetic_do_so_in_the_queues(part: 
     assert (below.bound, above.bound) == ("workers", part)
     assert below.efficiency > 0.95
     assert getattr(above, part) == pytest.approx(1, abs=0.05)
-
-
-def test_stragglers_cost_a_short_job_its_end_and_a_long_one_next_to_nothing() -> None:
-    slow = replace(WORK, page_seconds=(0.4,) * 9 + (1.4,))
-    wide = replace(WIDE, nodes=16)
-    steady = simulated(wide, slow, IDLE, ranges_per_worker=60)
-    assert whole_job_pages_per_s(wide, slow, IDLE, ranges=32) < 0.5 * steady.pages_per_s
-    assert steady.efficiency == pytest.approx(1, abs=0.05)
-
-
-def test_ranges_of_nodes_that_fail_are_read_again_and_cost_what_was_lost_of_them() -> None:
-    failing = replace(WIDE, nodes=20, mtbf_s=200.0, repair_s=20.0)
-    rate = simulated(failing, WORK, IDLE, ranges_per_worker=100, seed=1)
-    assert rate.lost_ranges > 20
-    up = 200 / 220 * np.exp(-4.02 / 2 / 200)  # while it is not under repair, half a range is lost each time
-    assert rate.efficiency == pytest.approx(up, abs=0.05)

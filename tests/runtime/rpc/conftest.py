@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from runtime.bundle.bundle import Bundle
 from runtime.client.client import LightpageClient
 from runtime.decoding.decoder import Decoder
 from runtime.recalibration.outcome import Refit
 from runtime.rpc.server import LightpageServer
+from runtime.service.audit import AuditLog
 from runtime.service.dataplane import DataPlane
 from runtime.service.limits import Limits
+from runtime.service.monitor import Monitor
 from runtime.service.recalibrator import Recalibrator
 from runtime.service.registry import ModelRegistry, TrackerFactory, no_tracker
 from runtime.service.store import ModelStore
@@ -21,30 +23,47 @@ from tests.runtime import toy
 from tests.runtime.rpc.stage import Running, Start
 
 
+def begun(
+    decoder: Decoder,
+    recordings: Path | None = None,
+    *,
+    limits: Limits | None = None,
+    fit: Refit = toy.fit_references,
+    store: Path | None = None,
+    tracker: TrackerFactory = no_tracker,
+    source: Any = "toy",
+    monitor: Monitor | None = None,
+    audit: AuditLog | None = None,
+    **server: Any,
+) -> Running:
+    """A service, as `lightpage serve` starts one; further arguments are of `LightpageServer`."""
+    shown = toy.ToySource(toy.ToyDevice()) if source == "toy" else source
+    models = ModelStore(store, decoder.bundle) if store is not None else None
+    plane = DataPlane(ModelRegistry(decoder, tracker), shown, models, limits, monitor=monitor, audit=audit)
+    plane.models.resume()
+    recalibrator = Recalibrator(plane, fit, recordings)
+    running = LightpageServer(plane, recalibrator, **server).start()
+    return Running(plane, recalibrator, running, shown, LightpageClient(running.target, timeout_s=20))
+
+
 @pytest.fixture
-def start(toy_zip: Path, tmp_path: Path) -> Iterator[Start]:
-    """Starts services on free loopback ports and ends them."""
+def start(decoder: Decoder, tmp_path: Path) -> Iterator[Start]:
+    """Starts services on free loopback ports, whose recordings lie in the test's folder, and ends them."""
     running: list[Running] = []
 
-    def begin(
-        limits: Limits | None = None,
-        fit: Refit = toy.fit_references,
-        bundle: Path = toy_zip,
-        store: Path | None = None,
-        tracker: TrackerFactory = no_tracker,
-        inference: bool = True,
-    ) -> Running:
-        source = toy.ToySource(toy.ToyDevice())
-        registry = ModelRegistry(Decoder(Bundle.open(bundle), threads=1), tracker)
-        models = ModelStore(store, registry.current.decoder.bundle) if store is not None else None
-        plane = DataPlane(registry, source, models, limits)
-        recalibrator = Recalibrator(plane, fit, tmp_path)
-        server = LightpageServer(plane, recalibrator, inference=inference).start()
-        client = LightpageClient(server.target, timeout_s=20)
-        running.append(Running(plane, recalibrator, server, source, client))
+    def begin(bundle: Path | None = None, **options: Any) -> Running:
+        made = decoder if bundle is None else Decoder.load(bundle, threads=1)
+        running.append(begun(made, **{"recordings": tmp_path, **options}))
         return running[-1]
 
     yield begin
     for service in running:
-        service.client.close()
-        service.server.stop(0.5)
+        service.end()
+
+
+@pytest.fixture(scope="session")
+def service(decoder: Decoder) -> Iterator[Running]:
+    """One service for all tests that leave its models, its limits and its source as they are."""
+    running = begun(decoder)
+    yield running
+    running.end()

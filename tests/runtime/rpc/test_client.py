@@ -1,103 +1,34 @@
-"""The Python client has all that the contract offers to one who decodes and reads."""
+"""The Python client has all that the contract offers to one who decodes and reads, bytes of users among it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from lightpage.errors import FrameError, InvalidInputError, LimitError
+from lightpage.codec.page_bytes import Loss
+from lightpage.errors import BundleError, FrameError, InvalidInputError, LightpageError, LimitError, PageError
 from lightpage.recording.frame_pair import FramePair
 from runtime.acquisition.source import Shot
-from runtime.client.client import LightpageClient
-from runtime.errors import LostShotError, Reason, RequestIdError
-from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.rpc.server import LightpageServer
-from runtime.service.limits import Limits
-from runtime.wire.channel import open_channel
+from runtime.errors import LostShotError, Reason
+from runtime.service.caller import Caller
+from runtime.service.dataplane import DataPlane
+from runtime.service.user_data import read_data
 from runtime.wire.pages import RemotePage
-from tests.runtime.rpc.stage import Start, a_page
-from tests.runtime.rpc.test_edge import Remembering, parts
+from tests.runtime import coded, toy
+from tests.runtime.rpc.stage import Running, Start, a_page
 
 
-def test_a_description_has_the_limits_and_the_default_levels(start: Start) -> None:
-    told = start(Limits(replay_s=7.0, range_pages=9)).client.describe()
-    assert told.default_levels == 16
-    assert told.limits is not None
-    assert (told.limits.replay_s, told.limits.range_pages) == (7.0, 9)
-
-
-def test_what_the_caller_says_of_a_pair_comes_back(start: Start) -> None:
+def test_many_pairs_in_one_call(service: Running) -> None:
     symbols, pair = a_page()
-    page = start().client.decode(pair, frame_id=2**60, captured_s=1.5, correlation_id="mine")
-    assert (page.frame_id, page.captured_s, page.correlation_id) == (2**60, 1.5, "mine")
-    assert page.levels == 16  # the default is the source's
-    assert (page.symbols == symbols).all()
-    assert (page.frames, page.replayed, page.recalibration_reasons) == ((), False, ())
-
-
-def test_the_black_level_is_taken_off(start: Start) -> None:
-    symbols, pair = a_page()
-    frames = (pair.in_phase, pair.quadrature)
-    raised = FramePair(*(np.minimum(frame.astype(int) + 6, 255).astype(np.uint8) for frame in frames))
-    assert (start().client.decode(raised, 16, black_level=6).symbols == symbols).all()
-
-
-def test_sessions_and_pages_without_one(start: Start) -> None:
-    client, pair = start(tracker=Remembering).client, a_page()[1]
-    assert [client.decode(pair, session="mine").piston_rad for _ in range(2)] == [1, 2]
-    assert [client.decode(pair, stateless=True).piston_rad for _ in range(2)] == [1, 1]
-    assert [client.read_page(1, session="mine").piston_rad, client.read_page(1).piston_rad] == [3, 1]
-    assert client.decode(pair, session="x" * 1024).piston_rad == 1
-    with pytest.raises(InvalidInputError, match="session: got 1025 characters, wanted at most 1024"):
-        client.decode(pair, session="x" * 1025)
-
-
-def test_clients_at_one_unix_socket_are_followed_apart(start: Start, tmp_path: Path) -> None:
-    running, address, pair = start(tracker=Remembering), f"unix:{tmp_path}/s", a_page()[1]
-    with (
-        LightpageServer(running.plane, running.recalibrator, address),
-        LightpageClient(address, timeout_s=20) as one,
-        LightpageClient(address, timeout_s=20) as two,
-    ):
-        assert [one.decode(pair).piston_rad for _ in range(3)] == [1, 2, 3]
-        assert [two.decode(pair).piston_rad for _ in range(2)] == [1, 2]
-        assert [one.decode(pair).piston_rad, one.decode(pair, stateless=True).piston_rad] == [4, 1]
-        assert [client.decode(pair, session="both").piston_rad for client in (one, two)] == [1, 2]
-        pages = [page for page in two.decode_pages([pair]) if isinstance(page, RemotePage)]
-        assert [page.piston_rad for page in pages] == [3]
-        assert one.read_page().piston_rad == 1  # the device's own
-
-
-def test_pages_at_a_unix_socket_that_name_no_session_are_decoded_each_as_the_first(
-    start: Start, tmp_path: Path
-) -> None:
-    running, address, pair = start(tracker=Remembering), f"unix:{tmp_path}/s", a_page()[1]
-    with LightpageServer(running.plane, running.recalibrator, address), open_channel(address) as channel:
-        decode = running.stub(channel).DecodeFrames
-        assert [decode(parts(pair), timeout=20).piston_rad for _ in range(2)] == [1, 1]
-        named = pb.DecodeOptions(levels=16, session="mine")
-        assert [decode(parts(pair, options=named), timeout=20).piston_rad for _ in range(2)] == [1, 2]
-
-
-def test_a_page_that_is_asked_for_again(start: Start) -> None:
-    client = start().client
-    first = client.read_page(request_id="a", correlation_id="mine")
-    again = client.read_page(request_id="a", correlation_id="mine")
-    assert (first.page, first.replayed, first.correlation_id) == (0, False, "mine")
-    assert (again.page, again.replayed) == (0, True)
-    with pytest.raises(RequestIdError):
-        client.read_page(3, request_id="a")
-
-
-def test_many_pairs_in_one_call(start: Start) -> None:
-    client, (symbols, pair) = start().client, a_page()
-    swapped = FramePair(np.zeros_like(pair.in_phase), pair.quadrature)
-    found = list(client.decode_pages([pair, swapped, pair], correlation_id="mine"))
-    assert [type(one) for one in found] == [RemotePage, type(found[1]), RemotePage]
+    one = service.client.decode(pair, frame_id=2**60, captured_s=1.5, correlation_id="mine")
+    assert (one.frame_id, one.captured_s, one.correlation_id) == (2**60, 1.5, "mine")
+    dark = FramePair(np.zeros_like(pair.in_phase), pair.quadrature)
+    found = list(service.client.decode_pages([pair, dark, pair], correlation_id="mine"))
     assert isinstance(found[1], FrameError)
     for number in (0, 2):
         page = found[number]
@@ -106,38 +37,40 @@ def test_many_pairs_in_one_call(start: Start) -> None:
         assert (page.symbols == symbols).all()
 
 
-def test_pairs_that_fail_on_the_callers_side_end_the_call_with_their_error(start: Start) -> None:
+def test_pairs_that_fail_on_the_callers_side_end_the_call_with_their_error(service: Running) -> None:
     def pairs() -> Iterator[FramePair]:
         yield a_page()[1]
         raise KeyError("mine")
 
-    client = start().client
-    with pytest.raises(KeyError, match="mine"):
-        list(client.decode_pages(pairs()))
-    with pytest.raises(FrameError, match="float64"):
-        list(client.decode_pages([FramePair(np.zeros((2, 2)), np.zeros((2, 2)))]))  # type: ignore[arg-type]
+    with pytest.raises(KeyError):
+        list(service.client.decode_pages(pairs()))
+    good = a_page()[1]
+    for bad in (
+        FramePair(np.zeros((2, 2)), np.zeros((2, 2))),  # type: ignore[arg-type]
+        replace(good, quadrature=good.quadrature[1:]),
+        replace(good, quadrature=good.quadrature.astype(np.uint16)),
+        replace(good, in_phase=good.in_phase[0]),
+    ):
+        with pytest.raises(FrameError):
+            list(service.client.decode_pages([bad]))
 
 
 def test_many_pages_of_the_source_in_one_call(start: Start) -> None:
-    service = start(Limits(range_pages=9))
-    client, whole = service.client, service.source.shot
+    service = start()
 
-    def shot(timeout_s: float = 1.0, page: int | None = None) -> Shot:
-        if page == 5:
+    def lost(shot: Shot) -> Shot:
+        if shot.page_index == 5:
             raise LostShotError("page 5", "no frame", "one", Reason.MISSING_FRAME)
-        return whole(timeout_s, page)
+        return shot
 
-    service.source.shot = shot  # type: ignore[method-assign]
-    first, lost, last = client.read_pages([2, 5, 1], want_written=True)
-    assert isinstance(lost, LostShotError)
-    assert lost.reason is Reason.MISSING_FRAME
+    service.reading(lost)
+    first, gone, last = service.client.read_pages([2, 5, 1], want_written=True)
+    assert isinstance(gone, LostShotError)
+    assert gone.reason is Reason.MISSING_FRAME
     for page, number in ((first, 2), (last, 1)):
         assert isinstance(page, RemotePage)
-        assert page.page == number
-        assert page.written is not None
-    assert [one.page for one in client.read_pages(count=2) if isinstance(one, RemotePage)] == [0, 1]
-    with pytest.raises(LimitError, match="at most 9"):
-        list(client.read_pages(count=10))
+        assert (page.page, page.written is None) == (number, False)
+    assert [one.page for one in service.client.read_pages(count=2) if isinstance(one, RemotePage)] == [0, 1]
 
 
 @pytest.mark.parametrize(
@@ -154,7 +87,104 @@ def test_many_pages_of_the_source_in_one_call(start: Start) -> None:
         (lambda client: list(client.read_data(0, 2**40)), "pages"),
     ],
 )
-def test_what_no_message_can_hold_is_named(call: Any, field: str, start: Start) -> None:
+def test_what_no_message_can_hold_is_named(call: Any, field: str, service: Running) -> None:
     with pytest.raises(InvalidInputError) as error:
-        call(start().client)
+        call(service.client)
     assert error.value.subject == field
+
+
+Serve = Callable[..., tuple[Running, np.ndarray]]
+
+
+@pytest.fixture
+def serve(start: Start, tmp_path: Path) -> Serve:
+    """Starts a service whose source shows pages, some of them spoilt; returns it and the pages' symbols."""
+
+    def begin(spoilt: dict[int, coded.Spoil] | None = None, with_code: bool = True) -> tuple[Running, np.ndarray]:
+        bundle = coded.bundle(tmp_path / "toy.zip")
+        pages = coded.pages(bundle, tmp_path)
+        own = bundle if with_code else coded.bundle(tmp_path / "plain.zip", None)
+        return start(own, source=coded.ShownPages(pages, spoilt)), pages
+
+    return begin
+
+
+def test_a_page_carries_its_bytes_when_asked(serve: Serve) -> None:
+    service, pages = serve({2: coded.half_lost})
+    client, plane = service.client, service.plane
+    told = client.describe()
+    assert told.user_bytes_per_page == plane.registry.current.decoder.page_codec.user_bytes
+    assert "rate_per_mille = 500" in told.code_toml
+    pair = toy.ToyDevice(noise=8.0).page(pages[1], 32, 0.3)
+    size = told.user_bytes_per_page
+    for page in (client.decode(pair, 0, user_data=True), client.read_page(1, user_data=True)):
+        found = page.user_data
+        assert found is not None
+        assert found.data == coded.CONTENT[size : 2 * size]
+        assert found.header is not None
+        assert (found.header.volume, found.header.page, found.header.volume_bytes) == (9, 1, 1000)
+        assert (found.loss, page.levels) == (None, 32)
+        assert (found.file.data_pages, found.file.parity_pages) == (3, 2)
+        assert found.margin_bits > 0
+    assert client.decode(pair, 32).user_data is None
+    assert service.count("lightpage_margin_bits") > 0
+    lost = client.read_page(2, user_data=True).user_data  # it has symbols and no bytes
+    assert lost is not None
+    assert (lost.data, lost.loss, lost.margin_bits > 0) == (None, Loss.BODY, False)
+    assert service.count("lightpage_data_pages_total", loss="body") == 1
+    assert service.count("lightpage_data_pages_total", loss="none") == 2
+
+
+def test_what_cannot_be_asked_for_is_named(serve: Serve) -> None:
+    client = serve()[0].client
+    cases: list[tuple[Callable[[], object], type[LightpageError], str]] = [
+        (lambda: client.read_page(0, 16, user_data=True), InvalidInputError, "levels"),
+        (lambda: list(client.read_data(0, 0)), InvalidInputError, "pages"),
+        (lambda: list(client.read_data(0, 4097)), LimitError, "pages"),
+        (lambda: list(client.read_data((1 << 32) - 1, 2)), InvalidInputError, "first_page"),
+        (lambda: list(client.read_data(99, 1)), PageError, "page of toy:pages"),
+    ]
+    for call, kind, subject in cases:
+        with pytest.raises(kind) as error:
+            call()
+        assert error.value.subject == subject
+
+
+def test_a_model_without_a_code_says_so(serve: Serve) -> None:
+    client = serve(with_code=False)[0].client
+    assert (client.describe().code_toml, client.describe().user_bytes_per_page) == ("", 0)
+    for call in (lambda: client.read_page(0, user_data=True), lambda: list(client.read_data(0, 2))):
+        with pytest.raises(BundleError) as error:
+            call()
+        assert error.value.subject == "bundle plain.zip: code"
+
+
+def test_a_range_is_streamed_and_lost_pages_are_restored(serve: Serve) -> None:
+    service, pages = serve({0: coded.dark, 1: coded.half_lost, 6: coded.half_lost, 7: coded.dark, 8: coded.dark})
+    size = service.client.describe().user_bytes_per_page
+    found = list(service.client.read_data(0, 1000))  # the range ends with the source
+    assert [each.page for each in found if each.page is not None] == list(range(len(pages)))
+    assert found[0].user_data.loss == Loss.OPTICS
+    assert found[0].error
+    restored = {each.user_data.header.page: each.user_data.data for each in found if each.page is None}
+    assert restored == {0: coded.CONTENT[:size], 1: coded.CONTENT[size : 2 * size]}  # of group 1 too many are lost
+    assert found[-1].page is None  # restored pages follow at the end
+    read = {each.user_data.header.page: each.user_data.data for each in found if each.user_data.data is not None}
+    assert read[2] == coded.CONTENT[2 * size : 3 * size]
+
+
+def test_files_whose_pages_take_turns_are_restored(serve: Serve) -> None:
+    service, pages = serve()
+    plane = service.plane
+    folder = plane.registry.current.decoder.bundle.path.parent / "other"
+    folder.mkdir()
+    other = coded.pages(coded.bundle(folder / "toy.zip"), folder, b"y" * 400)
+    mixed = [page for pair in zip(pages[:5], other[:5], strict=True) for page in pair]
+    source = coded.ShownPages(mixed, {2: coded.half_lost, 3: coded.half_lost})
+    both = DataPlane(plane.registry, source)
+    found = list(read_data(both, 0, 10, Caller()))
+    restored = [(page.found.header.page, page.found.file.checksum) for page in found if page.source_page is None]
+    assert len(restored) == 2
+    assert {number for number, _ in restored} == {1}
+    assert len({checksum for _, checksum in restored}) == 2
+    assert all(page.model_version == "toy-1" for page in found)

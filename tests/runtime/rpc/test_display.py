@@ -2,32 +2,27 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
-import time
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import AsyncIterator, Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import grpc
 import numpy as np
 import pytest
 
-from lightpage.errors import InvalidInputError, LimitError, PageError
+from lightpage.errors import InvalidInputError, LightpageError, LimitError, PageError
 from runtime.acquisition.camera_source import CameraSource, Exposures
 from runtime.acquisition.page_store import PageStore
-from runtime.acquisition.source import FrameSource
-from runtime.bundle.bundle import Bundle
 from runtime.client.client import LightpageClient
-from runtime.decoding.decoder import Decoder
-from runtime.errors import LostShotError, Reason, SourceError
+from runtime.errors import NoSourceError
 from runtime.modulator.external import ExternalBeams, ExternalModulator
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
-from runtime.rpc.server import LightpageServer
-from runtime.service.dataplane import DataPlane
-from runtime.service.recalibrator import Recalibrator
-from runtime.service.registry import ModelRegistry
+from runtime.rpc.uploads import uploaded_pages
 from tests.runtime import toy
 from tests.runtime.acquisition.lab import PAIRING, Lab, LabModulator
+from tests.runtime.rpc.stage import Running, Start, refused, until_told
+from tests.waiting import eventually
 
 PAGES = np.stack([toy.symbols_of(16, number)[0] for number in (4, 9)])
 
@@ -50,175 +45,118 @@ def external(lab: Lab) -> tuple[CameraSource, LabModulator]:
     return source, stage
 
 
-class Serve:
-    def __init__(self, bundle: Path, source: FrameSource) -> None:
-        plane = DataPlane(ModelRegistry(Decoder(Bundle.open(bundle), threads=1)), source)
-        self.plane = plane
-        self.server = LightpageServer(plane, Recalibrator(plane, toy.fit_references)).start()
-        self.client = LightpageClient(self.server.target, timeout_s=20)
-
-
-@pytest.fixture
-def serve(toy_zip: Path) -> Iterator[type[Serve]]:
-    running: list[Serve] = []
-
-    class Started(Serve):
-        def __init__(self, source: FrameSource) -> None:
-            super().__init__(toy_zip, source)
-            running.append(self)
-
-    yield Started  # type: ignore[misc]
-    for service in running:
-        service.client.close()
-        service.server.stop(0.5)
-
-
-def test_a_controller_shows_what_it_has_uploaded(serve: type[Serve]) -> None:
-    lab = Lab()
-    source, stage = external(lab)
-    client = serve(source).client  # type: ignore[call-arg,arg-type]
+def test_a_controller_shows_what_it_has_uploaded_and_moves_beams(start: Start) -> None:
+    source, stage = external(Lab())
+    client = start(source=source).client
     assert client.upload_pages(PAGES[:1], 16) == 0
     assert client.upload_pages(PAGES[1], 16) == 1
-    seen: list[int] = []
 
-    def control() -> None:
+    def control() -> list[int]:
+        seen = []
         with LightpageClient(client.target, timeout_s=20) as mine:
-            for order in mine.display_orders(15.0):
+            for order in mine.display_orders(120.0):
+                if order.beams is not None:
+                    stage.let_through(signal=order.beams[0], reference=order.beams[1])
+                    mine.beams_set(signal=order.beams[0], reference=order.beams[1])
                 if order.page is not None:
                     seen.append(order.page)
                     stage.show(PAGES[order.page], 16, order.page, 1.0)
                     mine.page_shown(order.page)
                 if len(seen) == 2:
-                    return
+                    break
+        return seen
 
-    thread = threading.Thread(target=control)
-    thread.start()
-    for page in (1, 0):
-        reply = client.read_page(page, want_written=True)
-        assert (reply.symbols == PAGES[page]).all()
-        assert reply.written is not None
-        assert (reply.written == PAGES[page]).all()
-    thread.join(20)
-    assert seen == [1, 0]
+    with ThreadPoolExecutor(1) as pool:
+        controlling = pool.submit(control)
+        assert (source.references().in_phase == toy.ToyDevice().references().in_phase).all()
+        for page in (1, 0):
+            reply = client.read_page(page, want_written=True)
+            assert (reply.symbols == PAGES[page]).all()
+            assert (reply.written == PAGES[page]).all()
+        assert controlling.result(60) == [1, 0]
     client.page_shown(None)
 
 
-def test_an_upload_whose_caller_leaves_adds_no_page(serve: type[Serve]) -> None:
-    service = serve(external(Lab())[0])  # type: ignore[call-arg,arg-type]
-    sent, open_end = threading.Event(), threading.Event()
+def test_an_upload_whose_caller_leaves_adds_no_page(start: Start) -> None:
+    service, more = start(source=external(Lab())[0]), threading.Event()
+    messages = [pb.UploadPagesRequest(levels=16), pb.UploadPagesRequest(symbols=PAGES.tobytes())]
+    call = service.stub.UploadPages.future(until_told(messages, more), timeout=60)
+    eventually(lambda: service.count("lightpage_calls_in_flight") == 1)
+    call.cancel()
+    more.set()
+    eventually(lambda: service.count("lightpage_calls_in_flight") == 0)
 
-    def all_but_the_end() -> Iterator[pb.UploadPagesRequest]:
-        yield pb.UploadPagesRequest(levels=16)
-        yield pb.UploadPagesRequest(symbols=PAGES.tobytes())
-        sent.set()
-        open_end.wait(20)
+    def failing() -> Iterator[pb.UploadPagesRequest]:
+        yield from messages
+        raise ValueError
 
-    with grpc.insecure_channel(service.server.target) as channel:
-        stub = pb_grpc.LightpageStub(channel)  # type: ignore[no-untyped-call]
-        call = stub.UploadPages.future(all_but_the_end(), timeout=20)
-        assert sent.wait(10)
-        time.sleep(0.2)  # for the pages to arrive
-        call.cancel()
-        open_end.set()
-        with pytest.raises(grpc.FutureCancelledError):
-            call.result(10)
-
-        def failing() -> Iterator[pb.UploadPagesRequest]:
-            yield pb.UploadPagesRequest(levels=16)
-            yield pb.UploadPagesRequest(symbols=PAGES.tobytes())
-            time.sleep(0.2)
-            raise ValueError
-
-        with pytest.raises(grpc.RpcError):
-            stub.UploadPages(failing(), timeout=20)
-        assert service.client.upload_pages(PAGES[:1], 16) == 0
+    refused(lambda: service.stub.UploadPages(failing(), timeout=20))
+    assert service.client.upload_pages(PAGES[:1], 16) == 0
 
 
-def test_beams_are_moved_by_the_controller_too(serve: type[Serve]) -> None:
-    lab = Lab()
-    source, stage = external(lab)
-    client = serve(source).client  # type: ignore[call-arg,arg-type]
-
-    def control() -> None:
-        with LightpageClient(client.target, timeout_s=20) as mine:
-            moved = 0
-            for order in mine.display_orders(15.0):
-                if order.beams is not None:
-                    stage.let_through(signal=order.beams[0], reference=order.beams[1])
-                    mine.beams_set(signal=order.beams[0], reference=order.beams[1])
-                    moved += 1
-                if moved == 2:
-                    return
-
-    thread = threading.Thread(target=control)
-    thread.start()
-    references = source.references()
-    thread.join(20)
-    assert (references.in_phase == toy.ToyDevice().references().in_phase).all()
-
-
-def test_a_controller_that_says_nothing_costs_its_page(serve: type[Serve]) -> None:
+def test_what_cannot_be_uploaded_is_named(start: Start) -> None:
     source, _ = external(Lab())
-    service = serve(source)  # type: ignore[call-arg,arg-type]
+    service = start(source=source)
     service.client.upload_pages(PAGES, 16)
-    with (
-        LightpageClient(service.client.target, timeout_s=1.5) as hasty,
-        pytest.raises(Exception, match=r"on display|deadline") as raised,
-    ):
-        hasty.read_page(0)
-    if isinstance(raised.value, LostShotError):
-        assert raised.value.reason is Reason.NOT_ON_DISPLAY
-
-
-def test_what_cannot_be_uploaded_is_named(serve: type[Serve]) -> None:
-    source, _ = external(Lab())
-    client = serve(source).client  # type: ignore[call-arg,arg-type]
-    client.upload_pages(PAGES, 16)
-    with pytest.raises(InvalidInputError, match="16, as the pages before"):
-        client.upload_pages(PAGES % 4, 4)
-    with pytest.raises(PageError, match="whole pages"):
-        client.upload_pages(PAGES[:, :-1], 16)
-    with pytest.raises(PageError):
-        client.upload_pages(np.full_like(PAGES, 200), 16)
-    with pytest.raises(PageError, match="none"):
-        client.upload_pages(PAGES[:0], 16)
+    cases: list[tuple[np.ndarray, int, type[LightpageError]]] = [
+        (PAGES % 4, 4, InvalidInputError),  # other levels than those before
+        (PAGES[:, :-1], 16, PageError),
+        (np.full_like(PAGES, 200), 16, PageError),
+        (PAGES[:0], 16, PageError),
+    ]
+    for pages, levels, kind in cases:
+        with pytest.raises(kind):
+            service.client.upload_pages(pages, levels)
     source.pages.most_bytes = 2 * PAGES.nbytes - 1
     with pytest.raises(LimitError):
-        client.upload_pages(PAGES, 16)
+        service.client.upload_pages(PAGES, 16)
     assert len(source.pages) == 2
-    with grpc.insecure_channel(client.target) as channel:
-        stub = pb_grpc.LightpageStub(channel)
-        for messages in ([], [pb.UploadPagesRequest(symbols=b"a")], [pb.UploadPagesRequest(levels=4)] * 2):
-            with pytest.raises(grpc.RpcError) as raised:
-                stub.UploadPages(iter(messages), timeout=10)
-            assert raised.value.code() == grpc.StatusCode.INVALID_ARGUMENT
-        with pytest.raises(grpc.RpcError) as raised:
-            stub.ReportDisplay(pb.ReportDisplayRequest(), timeout=10)
-        assert raised.value.code() == grpc.StatusCode.INVALID_ARGUMENT
+    levels = pb.UploadPagesRequest(levels=4)
+    for messages in ([], [pb.UploadPagesRequest(symbols=b"a")], [levels] * 2, [levels, pb.UploadPagesRequest()]):
+        answer = refused(lambda sent=messages: service.stub.UploadPages(iter(sent), timeout=20))  # type: ignore[misc]
+        assert answer.reason == "MALFORMED"
+    answer = refused(lambda: service.stub.ReportDisplay(pb.ReportDisplayRequest(), timeout=20))
+    assert (answer.code, answer.reason) == (grpc.StatusCode.INVALID_ARGUMENT, "INVALID_VALUE")
 
 
-def test_a_source_that_does_all_by_itself_says_so(serve: type[Serve]) -> None:
-    client = serve(toy.ToySource(toy.ToyDevice())).client  # type: ignore[call-arg,arg-type]
-    with pytest.raises(SourceError, match="modulator"):
-        client.upload_pages(PAGES, 16)
-    with pytest.raises(SourceError, match="external"):
-        client.page_shown(0)
-    with pytest.raises(SourceError, match="external"):
-        client.beams_set(signal=True, reference=True)
-    with pytest.raises(SourceError, match="external"):
-        next(client.display_orders(5.0))
+def test_more_than_the_service_holds_is_refused_as_it_comes() -> None:
+    async def sent(*sizes: int, most: int = 8) -> tuple[int, np.ndarray]:
+        async def messages() -> AsyncIterator[pb.UploadPagesRequest]:
+            yield pb.UploadPagesRequest(levels=4)
+            for size in sizes:
+                yield pb.UploadPagesRequest(symbols=bytes(range(size)))
+
+        return await uploaded_pages(messages(), (1, 2), most)
+
+    levels, pages = asyncio.run(sent(2, 6))
+    assert levels == 4
+    np.testing.assert_array_equal(pages, [[[0, 1]], [[0, 1]], [[2, 3]], [[4, 5]]])
+    for sizes, kind in (((2, 6, 2), LimitError), ((3,), PageError), ((0,), PageError), ((), PageError)):
+        with pytest.raises(kind):
+            asyncio.run(sent(*sizes))
 
 
-def test_the_shots_of_a_source_are_in_the_metrics(serve: type[Serve]) -> None:
+def test_a_source_that_does_all_by_itself_says_so(service: Running) -> None:
+    calls: list[Callable[[], object]] = [
+        lambda: service.client.upload_pages(PAGES, 16),
+        lambda: service.client.page_shown(0),
+        lambda: service.client.beams_set(signal=True, reference=True),
+        lambda: next(service.client.display_orders(20.0)),
+    ]
+    for call in calls:
+        with pytest.raises(NoSourceError):
+            call()
+
+
+def test_the_shots_of_a_source_are_in_the_metrics(start: Start) -> None:
     lab = Lab()
     source, stage = external(lab)
     source.modulator = stage
-    service = serve(source)  # type: ignore[call-arg,arg-type]
+    service = start(source=source)
     service.client.upload_pages(PAGES, 16)
     service.client.read_page(0)
     lab.plan = lambda: lab.cameras[0].edge()
     service.client.read_page(1)
-    sample = service.plane.metrics.registry.get_sample_value
-    assert sample("lightpage_shots_total", {"outcome": "TAKEN"}) == 2
-    assert sample("lightpage_shots_total", {"outcome": "MISSING_FRAME"}) == 1
-    assert sample("lightpage_saturated_share", {"camera": "I"}) is not None
+    assert service.count("lightpage_shots_total", outcome="TAKEN") == 2
+    assert service.count("lightpage_shots_total", outcome="MISSING_FRAME") == 1
+    assert service.plane.metrics.registry.get_sample_value("lightpage_saturated_share", {"camera": "I"}) is not None

@@ -9,35 +9,39 @@ from typing import Any
 
 import grpc
 import pytest
+from google.protobuf.message import DecodeError
 
-from runtime.rpc import message_gate
+from lightpage.errors import LightpageError, LimitError
+from runtime.errors import MalformedError, OverloadedError, StalledError
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.rpc.message_gate import MessageGate
 from runtime.service.limits import Limits
+from runtime.wire.status import DETAIL_KEY, error_from, status_of
 
-LARGE = "/one.Service/Large"
-
-
-class Ended(Exception):
-    """A call was ended with a status."""
+LARGE, SMALL = "/one.Service/Large", "/one.Service/Small"
 
 
 class Context:
-    async def abort(self, code: grpc.StatusCode, text: str, trailers: object) -> None:
-        raise Ended(code, text)
+    """Ends a call by raising what the caller would."""
+
+    async def abort(self, code: grpc.StatusCode, text: str, trailers: Any) -> None:
+        error = error_from(pb.ErrorDetail.FromString(dict(trailers)[DETAIL_KEY]))
+        assert (code, f"{error.got}" in text) == (status_of(error), True)
+        raise error
 
 
 async def told(request: bytes, context: object) -> bytes:
     return request.upper()
 
 
-def handler_of(gate: MessageGate, method: str, handler: Any = None) -> Any:
+async def handler_of(gate: MessageGate, method: str, handler: Any = None) -> Any:
     """What the server calls for a method, by default one that takes a message and answers it."""
     handler = handler or grpc.unary_unary_rpc_method_handler(told)
 
     async def found(_: object) -> Any:
         return handler
 
-    return gate.intercept_service(found, SimpleNamespace(method=method))  # type: ignore[arg-type]
+    return await gate.intercept_service(found, SimpleNamespace(method=method))  # type: ignore[arg-type]
 
 
 async def messages(*sent: bytes, then: Coroutine[Any, Any, Any] | None = None) -> AsyncIterator[bytes]:
@@ -47,9 +51,19 @@ async def messages(*sent: bytes, then: Coroutine[Any, Any, Any] | None = None) -
         await then
 
 
-async def answer(gate: MessageGate, data: AsyncIterator[bytes], method: str = "/one.Service/Small") -> Any:
+async def answer(gate: MessageGate, data: AsyncIterator[bytes], method: str = SMALL) -> Any:
     handler = await handler_of(gate, method)
     return await handler.stream_unary(data, Context())
+
+
+async def refusal(gate: MessageGate, data: AsyncIterator[bytes], method: str = SMALL) -> LightpageError:
+    with pytest.raises(LightpageError) as error:
+        await answer(gate, data, method)
+    return error.value
+
+
+NARROW = Limits(message_bytes=4, receive_bytes=1, pair_bytes=1, stall_s=0.05, receive_s=60, concurrent_calls=1)
+"""With which there are eight places for messages, and twice as many for streams."""
 
 
 def test_there_are_places_for_what_fits_into_the_budget() -> None:
@@ -67,18 +81,18 @@ def test_each_method_has_its_limit() -> None:
     async def all_of_it() -> None:
         assert await answer(gate, messages(b"abcd")) == b"ABCD"
         assert await answer(gate, messages(b"abcdefghij"), LARGE) == b"ABCDEFGHIJ"
-        for method, sent, most in (("/one.Service/Small", b"abcde", 4), (LARGE, b"abcdefghijk", 10)):
+        for method, sent, most in ((SMALL, b"abcde", 4), (LARGE, b"abcdefghijk", 10)):
             data = messages(sent, b"never read")
-            with pytest.raises(Ended, match=f"RESOURCE_EXHAUSTED.*got {len(sent)} bytes, wanted at most {most}"):
-                await answer(gate, data, method)
+            error = await refusal(gate, data, method)
+            assert (type(error), error.got) == (LimitError, f"{len(sent)} bytes")
+            assert error.expected.endswith(f" {most}")
             assert await anext(data, None) is None  # closed: it keeps nothing
 
     asyncio.run(all_of_it())
 
 
-def test_no_more_are_on_their_way_than_there_are_places(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(message_gate, "_LEAST_PLACES", 2)
-    gate = MessageGate(Limits(message_bytes=4, receive_bytes=1, pair_bytes=1, stall_s=0.2), {LARGE: 10})
+def test_no_more_are_on_their_way_than_there_are_places() -> None:
+    gate = MessageGate(NARROW, {LARGE: 10})
 
     async def all_of_it() -> None:
         more, begun = asyncio.Event(), list[int]()
@@ -88,33 +102,32 @@ def test_no_more_are_on_their_way_than_there_are_places(monkeypatch: pytest.Monk
             await more.wait()
             yield b"late"
 
-        held = [asyncio.ensure_future(answer(gate, waiting(number), LARGE)) for number in range(2)]
-        while len(begun) < 2:
+        held = [asyncio.ensure_future(answer(gate, waiting(number), LARGE)) for number in range(gate.places)]
+        while len(begun) < gate.places:
             await asyncio.sleep(0)
-        with pytest.raises(Ended, match=r"RESOURCE_EXHAUSTED.*messages: got 2 on their way"):
-            await answer(gate, waiting(2), "/one.Service/Small")
-        assert begun == [0, 1]  # the third was not read at all
+        error = await refusal(gate, waiting(99))
+        assert (type(error), error.subject) == (OverloadedError, "messages")
+        assert begun == list(range(8))  # the ninth was not read at all
         assert await answer(gate, messages(b"ab"), "/another.Service/Small") == b"AB"
         late = asyncio.ensure_future(answer(gate, messages(b"abc")))
         await asyncio.sleep(0)
         more.set()
-        assert await asyncio.gather(*held, late) == [b"LATE", b"LATE", b"ABC"]
+        assert await asyncio.gather(*held, late) == [b"LATE"] * 8 + [b"ABC"]
 
     asyncio.run(all_of_it())
 
 
-def test_a_sender_that_pauses_is_ended_and_gives_its_place_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(message_gate, "_LEAST_PLACES", 1)
-    limits = Limits(message_bytes=4, receive_bytes=1, pair_bytes=1, stall_s=0.05, receive_s=20)
-    gate = MessageGate(limits, {LARGE: 10})
+def test_a_sender_that_pauses_is_ended_and_gives_its_place_back() -> None:
+    gate = MessageGate(NARROW, {LARGE: 10})
 
     async def all_of_it() -> None:
-        with pytest.raises(Ended, match=r"CANCELLED.*stream of Small: got nothing.*0\.05 s"):
-            await answer(gate, messages(then=asyncio.sleep(20)))
+        for _ in range(gate.places + 1):
+            error = await refusal(gate, messages(then=asyncio.Event().wait()))
+            assert (type(error), error.subject) == (StalledError, "stream of Small")
         assert await answer(gate, messages(b"ab")) == b"AB"
 
         async def slow() -> AsyncIterator[bytes]:
-            await asyncio.sleep(0.2)
+            await asyncio.sleep(0.1)
             yield b"slow"
 
         assert await answer(gate, slow(), LARGE) == b"SLOW"  # a large one may take longer
@@ -122,12 +135,28 @@ def test_a_sender_that_pauses_is_ended_and_gives_its_place_back(monkeypatch: pyt
     asyncio.run(all_of_it())
 
 
+def test_senders_who_pause_keep_no_short_call_waiting() -> None:
+    gate = MessageGate(NARROW, {LARGE: 10}, [LARGE])
+
+    async def both() -> None:
+        pauses = [messages(then=asyncio.Event().wait()) for _ in range(gate.stream_places)]
+        pausing = [asyncio.ensure_future(answer(gate, each, LARGE)) for each in pauses]
+        await asyncio.sleep(0)
+        assert await answer(gate, messages(b"abcd")) == b"ABCD"
+        assert type(await refusal(gate, messages(b"abcd"), LARGE)) is OverloadedError
+        for each in pausing:
+            each.cancel()
+        await asyncio.gather(*pausing, return_exceptions=True)
+
+    asyncio.run(both())
+
+
 def test_a_service_of_the_library_gets_its_messages_parsed() -> None:
     gate = MessageGate(Limits(), {})
 
     def parse(data: bytes) -> str:
         if data == b"\xff":
-            raise message_gate.DecodeError("garbage")
+            raise DecodeError("garbage")
         return data.decode()
 
     async def both(requests: AsyncIterator[str], context: object) -> AsyncIterator[str]:
@@ -135,27 +164,12 @@ def test_a_service_of_the_library_gets_its_messages_parsed() -> None:
             yield request * 2
 
     async def all_of_it() -> None:
-        made = grpc.stream_stream_rpc_method_handler(both, parse)  # type: ignore[arg-type]
+        made = grpc.stream_stream_rpc_method_handler(both, parse)
         handler = await handler_of(gate, "/one.Service/Both", made)
         assert [reply async for reply in handler.stream_stream(messages(b"a", b"b"), Context())] == ["aa", "bb"]
-        with pytest.raises(Ended, match=r"INVALID_ARGUMENT.*message of Both: got garbage"):
+        with pytest.raises(MalformedError) as error:
             _ = [reply async for reply in handler.stream_stream(messages(b"a", b"\xff"), Context())]
-        with pytest.raises(Ended, match=r"INVALID_ARGUMENT.*none"):
-            await answer(gate, messages())
+        assert (error.value.subject, error.value.got) == ("message of Both", "garbage")
+        assert type(await refusal(gate, messages())) is MalformedError
 
     asyncio.run(all_of_it())
-
-
-def test_senders_who_pause_keep_no_short_call_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(message_gate, "_LEAST_PLACES", 1)
-    monkeypatch.setattr(message_gate, "_STREAM_PLACES", 1)
-    gate = MessageGate(Limits(message_bytes=4, receive_bytes=1, pair_bytes=1, stall_s=5.0), {LARGE: 10}, [LARGE])
-
-    async def both() -> None:
-        never = asyncio.Event()
-        pausing = asyncio.ensure_future(answer(gate, messages(then=never.wait()), LARGE))
-        await asyncio.sleep(0)
-        assert await asyncio.wait_for(answer(gate, messages(b"abcd")), 1.0) == b"ABCD"
-        pausing.cancel()
-
-    asyncio.run(both())

@@ -5,92 +5,32 @@ from __future__ import annotations
 import errno
 import hashlib
 import shutil
-import time
+import threading
 from collections import namedtuple
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-import grpc
-import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from lightpage.errors import BundleError, CalibrationError, InvalidInputError, LightpageError, LimitError
-from runtime.bundle.bundle import Bundle, write_bundle
+from runtime.acquisition.source import Shot
+from runtime.bundle.bundle import write_bundle
 from runtime.bundle.manifest import DECODER
-from runtime.client.client import LightpageClient
 from runtime.commands.models import models as models_command
 from runtime.commands.recalibrate import rollback as rollback_command
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import NoTracker
 from runtime.errors import MalformedError, ModelExistsError, OtherModelError, SlotsTakenError, StalledError, StoreError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
-from runtime.rpc.server import LightpageServer
-from runtime.service.dataplane import DataPlane
 from runtime.service.limits import Limits
-from runtime.service.recalibrator import Recalibrator
-from runtime.service.registry import KEPT_MODELS, ModelRegistry, TrackerFactory, no_tracker
-from runtime.service.store import CURRENT, ModelStore
-from runtime.wire.status import error_of
+from runtime.service.registry import KEPT_MODELS
 from tests.runtime import toy
+from tests.runtime.rpc.stage import Running, Start, refused, until_told
+from tests.waiting import eventually
 
 Usage = namedtuple("Usage", "total used free")
-
-
-@dataclass
-class Running:
-    """A service with its parts in reach."""
-
-    plane: DataPlane
-    server: LightpageServer
-    source: toy.ToySource
-    client: LightpageClient
-
-    @property
-    def version(self) -> str:
-        return self.client.describe().model.version
-
-    @property
-    def store(self) -> ModelStore:
-        assert self.plane.store is not None
-        return self.plane.store
-
-    @property
-    def left_behind(self) -> list[str]:
-        """What lies in the store beside its note and its bundles."""
-        names = [path.name for path in self.store.folder.iterdir()]
-        return [name for name in names if name != CURRENT and (name[0] == "." or not name.endswith(".zip"))]
-
-    def end(self) -> None:
-        self.client.close()
-        self.server.stop(0.5)
-
-
-Start = Callable[..., Running]
-
-
-@pytest.fixture
-def start(toy_zip: Path, tmp_path: Path) -> Iterator[Start]:
-    """Starts services with a store, as `lightpage serve` does."""
-    running: list[Running] = []
-
-    def begin(
-        limits: Limits | None = None, store: Path | None = tmp_path / "store", tracker: TrackerFactory = no_tracker
-    ) -> Running:
-        source = toy.ToySource(toy.ToyDevice())
-        base = Decoder(Bundle.open(toy_zip), threads=1)
-        models = None if store is None else ModelStore(store, base.bundle)
-        plane = DataPlane(ModelRegistry(base, tracker), source, models, limits)
-        plane.models.resume()
-        server = LightpageServer(plane, Recalibrator(plane, toy.fit_references)).start()
-        running.append(Running(plane, server, source, LightpageClient(server.target, timeout_s=20)))
-        return running[-1]
-
-    yield begin
-    for service in running:
-        service.end()
 
 
 @pytest.fixture
@@ -99,28 +39,14 @@ def new(tmp_path: Path) -> Path:
     return toy.write_toy_bundle(tmp_path / "new.zip", version="toy-2")
 
 
-def wait_until(condition: Callable[[], bool], seconds: float = 10.0) -> bool:
-    until = time.monotonic() + seconds
-    while time.monotonic() < until:
-        if condition():
-            return True
-        time.sleep(0.01)
-    return condition()
+@pytest.fixture
+def stored(start: Start, tmp_path: Path) -> Start:
+    """Starts services with a store, the same one each time."""
+    return partial(start, store=tmp_path / "store")
 
 
-def sent(service: Running, *parts: pb.UploadModelRequest, pause_s: float = 0.0) -> pb.UploadModelReply:
-    """What comes of an upload in these messages, with a pause before each but the first."""
-
-    def messages() -> Iterator[pb.UploadModelRequest]:
-        for number, part in enumerate(parts):
-            time.sleep(pause_s if number else 0)
-            yield part
-
-    with grpc.insecure_channel(service.server.target) as channel:
-        try:
-            return pb_grpc.LightpageStub(channel).UploadModel(messages(), timeout=20)
-        except grpc.RpcError as error:
-            raise error_of(error, service.server.target) from None
+def sent(service: Running, *parts: pb.UploadModelRequest) -> pb.UploadModelReply:
+    return service.stub.UploadModel(iter(parts), timeout=20)  # type: ignore[no-any-return]
 
 
 def header(data: bytes, **changes: object) -> pb.UploadModelRequest:
@@ -131,22 +57,48 @@ def chunk(data: bytes) -> pb.UploadModelRequest:
     return pb.UploadModelRequest(chunk=data)
 
 
-def test_an_uploaded_model_is_kept_and_serves_once_it_is_put_in_service(start: Start, new: Path) -> None:
-    service = start()
-    model = service.client.upload_model(new)
+def test_an_uploaded_model_is_kept_put_in_service_and_rolled_back(stored: Start, new: Path, toy_zip: Path) -> None:
+    service = stored()
+    client = service.client
+    model = client.upload_model(new)
     assert (model.version, model.origin, model.current, model.loaded) == ("toy-2", "uploaded", False, False)
-    assert service.version == "toy-1"
     assert service.store.path_of("toy-2").read_bytes() == new.read_bytes()
-    assert [m.version for m in service.client.models()] == ["toy-1"]
-    assert [m.version for m in service.client.models(stored=True)] == ["toy-2", "toy-1"]
-    assert service.client.activate_model("toy-2", "toy-1") == ("toy-2", "toy-1")
-    assert service.client.read_page().model_version == "toy-2"
-    assert service.client.rollback() == ("toy-1", "toy-2")
-    assert service.left_behind == []
+    assert [m.version for m in client.models()] == ["toy-1"]
+    assert [m.version for m in client.models(stored=True)] == ["toy-2", "toy-1"]
+    for bundle in (new, toy_zip):  # a version that is there is not taken again
+        with pytest.raises(ModelExistsError):
+            client.upload_model(bundle)
+    assert client.activate_model("toy-2", "toy-1") == ("toy-2", "toy-1")
+    changes: list[Callable[[], object]] = [  # a call that is repeated steps once
+        lambda: client.activate_model("toy-2", "toy-1"),
+        lambda: client.rollback("toy-1"),
+        lambda: client.roll_forward("toy-1"),
+    ]
+    for change in changes:
+        with pytest.raises(OtherModelError) as error:
+            change()
+        assert error.value.got == "toy-2"
+    assert client.activate_model("toy-2") == ("toy-2", "toy-2")
+    assert client.read_page().model_version == "toy-2"
+    client.recalibrate(count=2)
+    assert client.rollback("toy-2+r1") == ("toy-2", "toy-2+r1")
+    assert client.pin_model("toy-2").pinned
+    service.end()
+    again = stored()
+    client = again.client
+    assert again.version == "toy-2"
+    assert [(model.origin, model.pinned) for model in client.models()] == [("given", False), ("uploaded", True)]
+    assert client.roll_forward("toy-2") == ("toy-2+r1", "toy-2")
+    assert not client.pin_model("toy-2", False).pinned
+    assert [client.rollback()[0] for _ in range(2)] == ["toy-2", "toy-1"]
+    for step in (client.rollback, lambda: client.activate_model("toy-9"), lambda: client.pin_model("../new")):
+        with pytest.raises(BundleError):
+            step()
+    assert again.left_behind == ["jobs.json"]
 
 
-def test_models_are_listed_with_what_is_known_of_them(start: Start, new: Path) -> None:
-    service = start()
+def test_models_are_listed_with_what_is_known_of_them(stored: Start, new: Path) -> None:
+    service = stored()
     service.client.upload_model(new)
     for number in range(1, KEPT_MODELS + 1):
         assert service.client.recalibrate(count=2).model_version == f"toy-1+r{number}"
@@ -160,71 +112,13 @@ def test_models_are_listed_with_what_is_known_of_them(start: Start, new: Path) -
     assert listed["toy-1+r1"].metrics["recalibration_pages"] == 2
 
 
-def test_rolling_back_and_forward_survives_a_restart(start: Start, new: Path) -> None:
-    service = start()
-    service.client.upload_model(new)
-    service.client.activate_model("toy-2")
-    service.client.recalibrate(count=2)
-    assert service.client.rollback("toy-2+r1") == ("toy-2", "toy-2+r1")
-    service.end()
-    again = start()
-    assert again.version == "toy-2"
-    assert again.client.roll_forward("toy-2") == ("toy-2+r1", "toy-2")
-    with pytest.raises(BundleError, match="wanted a later model"):
-        again.client.roll_forward()
-    assert [again.client.rollback()[0] for _ in range(2)] == ["toy-2", "toy-1"]
-    with pytest.raises(BundleError, match="wanted an earlier model"):
-        again.client.rollback()
-    assert [model.origin for model in again.client.models()] == ["given", "uploaded", "recalibrated"]
-
-
-def test_a_call_that_is_repeated_steps_once(start: Start, new: Path) -> None:
-    service = start()
-    service.client.upload_model(new)
-    service.client.activate_model("toy-2", "toy-1")
-    for change in (
-        lambda: service.client.activate_model("toy-2", "toy-1"),
-        lambda: service.client.rollback("toy-1"),
-        lambda: service.client.roll_forward("toy-1"),
-    ):
-        with pytest.raises(OtherModelError, match="toy-2"):
-            change()
-    assert service.client.activate_model("toy-2") == ("toy-2", "toy-2")
-    assert len(service.plane.registry.history.places) == 2
-
-
-def test_unknown_damaged_and_nonsensical_models_are_not_put_in_service(start: Start, new: Path) -> None:
-    service = start()
-    service.client.upload_model(new)
-    data = bytearray(new.read_bytes())
-    data[len(data) // 2] ^= 1
-    service.store.path_of("toy-2").write_bytes(data)
-    for version in ("toy-2", "toy-9", "../new", ""):
-        with pytest.raises(BundleError):
-            service.client.activate_model(version)
-    with pytest.raises(BundleError, match="toy-9"):
-        service.client.pin_model("toy-9")
-    assert service.version == "toy-1"
-
-
-def test_a_version_that_is_there_is_not_taken_again(start: Start, new: Path, toy_zip: Path) -> None:
-    service = start()
-    service.client.upload_model(new)
-    kept = service.store.path_of("toy-2").stat()
-    for bundle, version in ((new, "toy-2"), (toy_zip, "toy-1")):
-        with pytest.raises(ModelExistsError, match=version):
-            service.client.upload_model(bundle)
-    assert service.store.path_of("toy-2").stat() == kept
-    assert service.left_behind == []
-
-
-def test_bundles_that_could_not_serve_are_refused_and_leave_nothing(start: Start, tmp_path: Path) -> None:
+def test_bundles_that_could_not_serve_are_refused_and_leave_nothing(stored: Start, tmp_path: Path) -> None:
     def tracker(made: Decoder) -> NoTracker:
         if made.version == "toy-8":
             raise CalibrationError("calibration", "no table", "a calibration document")
         return NoTracker(made)
 
-    service = start(tracker=tracker)
+    service = stored(tracker=tracker)
     (tmp_path / "noise.zip").write_bytes(bytes(5000))
     files = toy.files()
     golden = write_bundle(
@@ -238,12 +132,12 @@ def test_bundles_that_could_not_serve_are_refused_and_leave_nothing(start: Start
             service.client.upload_model(bundle)
         assert ".upload-" not in str(error.value)
         assert service.left_behind == service.store.versions() == []
-    with pytest.raises(InvalidInputError, match="No such file"):
+    with pytest.raises(InvalidInputError):
         service.client.upload_model(tmp_path / "absent.zip")
 
 
-def test_an_upload_is_what_was_announced(start: Start, new: Path) -> None:
-    service, data = start(Limits(model_bytes=1 << 20)), new.read_bytes()
+def test_an_upload_is_what_was_announced(stored: Start, new: Path) -> None:
+    service, data = stored(limits=Limits(model_bytes=1 << 20)), new.read_bytes()
     half = len(data) // 2
     good, other = hashlib.sha256(data).digest(), hashlib.sha256(b"").digest()
     cases: list[tuple[list[pb.UploadModelRequest], type[LightpageError], str]] = [
@@ -252,93 +146,85 @@ def test_an_upload_is_what_was_announced(start: Start, new: Path) -> None:
         ([header(data), header(data)], MalformedError, "second header"),
         ([header(data), pb.UploadModelRequest()], MalformedError, "empty message"),
         ([header(data, bytes=0)], InvalidInputError, "header.bytes"),
-        ([header(data, bytes=(1 << 20) + 1)], LimitError, "at most 1048576"),
+        ([header(data, bytes=(1 << 20) + 1)], LimitError, "1048577"),
         ([header(data, sha256=b"123")], InvalidInputError, "sha256"),
         ([header(data, sha256=other), chunk(data)], BundleError, good.hex()),
-        ([header(data), chunk(data[:half])], InvalidInputError, "as announced"),
-        ([header(data), chunk(data), chunk(b"x")], InvalidInputError, "as announced"),
+        ([header(data), chunk(data[:half])], InvalidInputError, f"{half} bytes"),
+        ([header(data), chunk(data), chunk(b"x")], InvalidInputError, f"{len(data)}"),
     ]
     for parts, kind, named in cases:
-        with pytest.raises(kind, match=named):
-            sent(service, *parts)
+        answer = refused(lambda parts=parts: sent(service, *parts))  # type: ignore[misc]
+        assert type(answer.error) is kind
+        assert named in answer.text
         assert service.left_behind == service.store.versions() == []
     assert sent(service, header(data), chunk(data[:half]), chunk(data[half:])).model.version == "toy-2"
 
 
-def test_a_caller_who_stalls_or_is_slow_leaves_nothing(start: Start, new: Path) -> None:
-    data = new.read_bytes()
-    stalling = start(Limits(stall_s=0.2))
-    with pytest.raises(StalledError, match="next message"):
-        sent(stalling, header(data), chunk(data[:9]), chunk(data[9:]), pause_s=1.0)
-    assert wait_until(lambda: stalling.left_behind == [])
-    stalling.end()
-    slow = start(Limits(model_s=0.5))
-    with pytest.raises(StalledError, match="not all of it"):
-        sent(slow, header(data), *[chunk(b"x")] * 20, pause_s=0.1)
-    assert wait_until(lambda: slow.left_behind == [])
-    assert slow.store.versions() == []
-
-
-def test_a_caller_who_leaves_leaves_nothing_and_one_upload_is_taken_at_a_time(start: Start, new: Path) -> None:
-    service, data = start(), new.read_bytes()
+def test_a_caller_who_is_slow_leaves_nothing(stored: Start, new: Path) -> None:
+    service, data, over = stored(limits=Limits(model_s=0.2)), new.read_bytes(), threading.Event()
 
     def messages() -> Iterator[pb.UploadModelRequest]:
         yield header(data)
-        yield chunk(data[:9])
-        time.sleep(20)
+        while not over.wait(0.05):
+            yield chunk(b"x")
 
-    with grpc.insecure_channel(service.server.target) as channel:
-        call = pb_grpc.LightpageStub(channel).UploadModel.future(messages(), timeout=20)
-        assert wait_until(lambda: service.left_behind != [])
-        with pytest.raises(SlotsTakenError):
-            service.client.upload_model(new)
-        call.cancel()
-    assert wait_until(lambda: service.left_behind == [])
-    assert wait_until(lambda: service.plane.uploads.busy == 0)
+    answer = refused(lambda: service.stub.UploadModel(messages(), timeout=60))
+    over.set()
+    assert (type(answer.error), answer.subject) == (StalledError, "uploaded model")
+    eventually(lambda: service.left_behind == [])
+    assert service.store.versions() == []
+
+
+def test_a_caller_who_leaves_leaves_nothing_and_one_upload_is_taken_at_a_time(stored: Start, new: Path) -> None:
+    service, data, more = stored(), new.read_bytes(), threading.Event()
+    call = service.stub.UploadModel.future(until_told([header(data), chunk(data[:9])], more), timeout=60)
+    eventually(lambda: service.left_behind != [])
+    with pytest.raises(SlotsTakenError):
+        service.client.upload_model(new)
+    call.cancel()
+    more.set()
+    eventually(lambda: service.left_behind == [] and service.plane.uploads.busy == 0)
     assert service.client.upload_model(new).version == "toy-2"
 
 
 def test_a_caller_who_leaves_while_the_bundle_is_checked_leaves_nothing(
-    start: Start, new: Path, monkeypatch: pytest.MonkeyPatch
+    stored: Start, new: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    service, data = start(), new.read_bytes()
-    as_it_was, checking = service.plane.registry.check, []
+    service, data = stored(), new.read_bytes()
+    as_it_was, checking = service.plane.registry.check, threading.Event()
 
     def slow_check(decoder: Decoder) -> None:
-        checking.append(decoder)
-        wait_until(lambda: service.plane.uploads.busy == 0)
+        checking.set()
+        eventually(lambda: service.plane.uploads.busy == 0)
         as_it_was(decoder)
 
     monkeypatch.setattr(service.plane.registry, "check", slow_check)
-    with grpc.insecure_channel(service.server.target) as channel:
-        call = pb_grpc.LightpageStub(channel).UploadModel.future(iter([header(data), chunk(data)]), timeout=20)
-        assert wait_until(lambda: bool(checking))
-        call.cancel()
-    assert wait_until(lambda: service.left_behind == [])
+    call = service.stub.UploadModel.future(iter([header(data), chunk(data)]), timeout=60)
+    assert checking.wait(60)
+    call.cancel()
+    eventually(lambda: service.left_behind == [])
     assert service.store.versions() == []
 
 
-def test_without_a_store_there_is_nowhere_to_put_a_model(start: Start, new: Path) -> None:
-    service = start(store=None)
-    with pytest.raises(StoreError, match="--store"):
+def test_without_a_store_there_is_nowhere_to_put_a_model(stored: Start, new: Path) -> None:
+    service = stored(store=None)
+    with pytest.raises(StoreError):
         service.client.upload_model(new)
     assert service.client.pin_model("toy-1").pinned
     assert service.client.describe().model.pinned
 
 
 def test_a_full_disk_takes_no_upload_and_no_recalibration(
-    start: Start, new: Path, monkeypatch: pytest.MonkeyPatch
+    stored: Start, new: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    service = start()
-    shots: list[object] = []
-    as_it_was = service.source.shot
-    service.source.shot = lambda *given: (shots.append(given), as_it_was(*given))[1]  # type: ignore[method-assign]
+    service = stored()
+    shots: list[Shot] = []
+    service.reading(lambda shot: shots.append(shot) or shot)  # type: ignore[func-returns-value]
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, 1000))
-        with pytest.raises(StoreError, match="bytes free"):
-            service.client.upload_model(new)
-        with pytest.raises(StoreError, match="bytes free"):
-            service.client.recalibrate(count=2)
+        for change in (lambda: service.client.upload_model(new), lambda: service.client.recalibrate(count=2)):
+            with pytest.raises(StoreError):
+                change()
         assert shots == []
         assert "bytes free" in service.plane.store_trouble()
     assert service.store.versions() == []
@@ -347,37 +233,25 @@ def test_a_full_disk_takes_no_upload_and_no_recalibration(
     assert service.plane.store_trouble() == ""
 
 
-@pytest.mark.parametrize("failing", ["os.fsync", "os.link", "os.replace"])
+@pytest.mark.parametrize("failing", ["os.fsync", "os.link"])
 def test_a_disk_that_fails_during_an_upload_leaves_nothing(
-    failing: str, start: Start, new: Path, monkeypatch: pytest.MonkeyPatch
+    failing: str, stored: Start, new: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    service = start()
+    service = stored()
 
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
         patch.setattr(failing, full)
-        with pytest.raises(StoreError, match="No space left"):
+        with pytest.raises(StoreError):
             service.client.upload_model(new)
-        assert service.left_behind == service.store.versions() == []
-    assert "No space left" in service.plane.store_trouble()
+        eventually(lambda: service.left_behind == service.store.versions() == [])
     assert service.client.upload_model(new).version == "toy-2"
 
 
-def test_a_pinned_model_stays_when_it_is_let_go_of_it_does_not(start: Start) -> None:
-    service = start()
-    service.client.recalibrate(count=2)
-    assert service.client.pin_model("toy-1+r1").pinned
-    service.end()
-    again = start()
-    assert [model.pinned for model in again.client.models()] == [False, True]
-    assert not again.client.pin_model("toy-1+r1", False).pinned
-    assert again.store.note.pinned == frozenset()
-
-
-def test_the_command_line_does_all_of_it(start: Start, new: Path) -> None:
-    service = start()
+def test_the_command_line_does_all_of_it(stored: Start, new: Path) -> None:
+    service = stored()
 
     def told(*arguments: object) -> str:
         line = ["--target", service.server.target, *map(str, arguments)]
@@ -390,22 +264,8 @@ def test_the_command_line_does_all_of_it(start: Start, new: Path) -> None:
     assert "pinned" in told("pin", "toy-2")
     assert "pinned" not in told("unpin", "toy-2")
     arguments = ["--target", service.server.target, "--expect"]
-    with pytest.raises(OtherModelError, match="toy-2"):
+    with pytest.raises(OtherModelError):
         CliRunner().invoke(rollback_command, [*arguments, "toy-1"], standalone_mode=False, catch_exceptions=False)
     back = CliRunner().invoke(rollback_command, [*arguments, "toy-2"], standalone_mode=False, catch_exceptions=False)
     assert back.output == "toy-1 is in service again, toy-2 is not\n"
     assert told("forward") == "toy-2 is in service, toy-1 was\n"
-
-
-def test_a_damaged_store_is_said_after_a_restart(start: Start, new: Path) -> None:
-    service = start()
-    service.client.upload_model(new)
-    service.client.activate_model("toy-2")
-    service.end()
-    service.store.path_of("toy-2").write_bytes(b"damaged")
-    again = start()
-    assert again.version == "toy-1"
-    assert "toy-2.zip" in again.plane.store_trouble()
-    assert again.plane.metrics.registry.get_sample_value("lightpage_store_ok") == 0
-    symbols = toy.symbols_of(16, 3)[0]
-    assert np.mean(again.client.decode(toy.ToyDevice(seed=3).page(symbols, 16), 16).symbols == symbols) == 1

@@ -91,8 +91,3 @@ def test_pages_are_the_same_from_wherever_one_starts_and_states_differ(like: Mod
     np.testing.assert_array_equal(again.phases, all_pages[-1].phases)
     np.testing.assert_array_equal(all_pages[0].positions, all_pages[1].positions)
     assert np.abs(all_pages[0].positions - all_pages[-1].positions).max() > 1e-5
-
-
-def test_the_wave_localizer_has_synthetic_pages_too(like: ModelMatch, recorded: Recorded) -> None:
-    page = next(SyntheticPages(recorded.extractor.device, like, None, SEED).pages())
-    assert agreement(page) > 0.85

@@ -17,12 +17,14 @@ from lightpage.errors import InvalidInputError
 from lightpage.metrics.information import achievable_rate
 from train.fitting.concentration_scale import best_kappa_scale, decode_pages, most_likely_factor
 from train.fitting.fit import fit_network
-from train.fitting.fitted import CHECKPOINTS, FITTED, FITTED_WEIGHTS
+from train.fitting.fitted import CHECKPOINTS, FITTED, FITTED_WEIGHTS, Fitted
 from train.fitting.validation import held_out_air
 from train.models.hyperparameters import Hyperparameters
 
 PAGE = (8, 12)
 LEVELS = 256
+MASK = np.zeros(PAGE, dtype=bool)
+MASK[::4, ::4] = True
 CHOICES = Hyperparameters(channels=16, blocks=1, steps=120, batch=2, precision="32-true", learning_rate=5e-3)
 
 
@@ -43,25 +45,24 @@ def pages(count: int, seed: int, noise: float | np.ndarray = 0.2) -> TensorDatas
     return TensorDataset(light, torch.zeros(count, 2, *PAGE), torch.from_numpy(phases.astype(np.float32)))
 
 
-@pytest.fixture
-def mask() -> np.ndarray:
-    mask = np.zeros(PAGE, dtype=bool)
-    mask[::4, ::4] = True
-    return mask
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Fitted]:
+    """A training that has ended, and its folder."""
+    run = tmp_path_factory.mktemp("fit") / "run"
+    return run, fit_network(run, CHOICES, MASK, LEVELS, pages(12, 0), pages(3, 1))
 
 
-def test_it_learns_and_is_not_trained_twice(tmp_path: Path, mask: np.ndarray) -> None:
+def test_it_learns_and_is_not_trained_twice(trained: tuple[Path, Fitted], tmp_path: Path) -> None:
     training, validation = pages(12, 0), pages(3, 1)
-    run = tmp_path / "run"
-    first = fit_network(run, CHOICES, mask, LEVELS, training, validation)
+    run, first = Path(shutil.copytree(trained[0], tmp_path / "run")), trained[1]
     assert first.validation_air > 1.0
-    kept = fit_network(run, CHOICES, mask, LEVELS, training, validation)
+    kept = fit_network(run, CHOICES, MASK, LEVELS, training, validation)
     assert (kept.validation_air, kept.seconds, kept.curves) == (first.validation_air, first.seconds, first.curves)
     assert kept.curves["val_air"][-1][1] == pytest.approx(first.validation_air, abs=0.1)
     torch.testing.assert_close(kept.module.network.state_dict(), first.module.network.state_dict())
     (run / FITTED).unlink()  # interrupted after its last step, and moved
     run = run.rename(tmp_path / "moved")
-    again = fit_network(run, CHOICES, mask, LEVELS, training, validation)
+    again = fit_network(run, CHOICES, MASK, LEVELS, training, validation)
     assert again.validation_air == pytest.approx(first.validation_air, abs=1e-6)
     for one, other in zip(first.module.parameters(), again.module.parameters(), strict=True):
         torch.testing.assert_close(one, other)
@@ -70,17 +71,15 @@ def test_it_learns_and_is_not_trained_twice(tmp_path: Path, mask: np.ndarray) ->
     checkpoint = torch.load(run / "checkpoints" / "last.ckpt", map_location="cpu", weights_only=False)
     assert checkpoint["global_step"] == CHOICES.steps
     shutil.rmtree(run / CHECKPOINTS)
-    without = fit_network(run, CHOICES, mask, LEVELS, training, validation)
+    without = fit_network(run, CHOICES, MASK, LEVELS, training, validation)
     assert without.validation_air == again.validation_air
     assert not (run / CHECKPOINTS).exists()
 
 
-def test_further_processes_take_what_the_first_one_has_made(
-    tmp_path: Path, mask: np.ndarray, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_further_processes_take_what_the_first_one_has_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each would judge the pages by itself, and on another machine find another last digit."""
     choices, fitting = replace(CHOICES, steps=10), L.Trainer.fit
-    first = fit_network(tmp_path / "first", choices, mask, LEVELS, pages(2, 0), pages(1, 1))
+    first = fit_network(tmp_path / "first", choices, MASK, LEVELS, pages(2, 0), pages(1, 1))
 
     def then_the_first_ends(*args: object, **kwargs: object) -> None:
         fitting(*args, **kwargs)  # type: ignore[arg-type]
@@ -88,28 +87,26 @@ def test_further_processes_take_what_the_first_one_has_made(
 
     monkeypatch.setattr(L.Trainer, "fit", then_the_first_ends)
     monkeypatch.setattr("train.fitting.fit.is_first_process", lambda: False)
-    other = fit_network(tmp_path / "other", choices, mask, LEVELS, pages(2, 0), pages(1, 1))
+    other = fit_network(tmp_path / "other", choices, MASK, LEVELS, pages(2, 0), pages(1, 1))
     assert (other.validation_air, other.curves) == (1.25, first.curves)
     torch.testing.assert_close(other.module.network.state_dict(), first.module.network.state_dict())
 
 
 @pytest.mark.parametrize("damaged", [FITTED, FITTED_WEIGHTS])
-def test_what_a_finished_training_kept_is_named_when_it_is_damaged(
-    damaged: str, tmp_path: Path, mask: np.ndarray
-) -> None:
+def test_what_a_finished_training_kept_is_named_when_it_is_damaged(damaged: str, tmp_path: Path) -> None:
     choices = replace(CHOICES, steps=10)
-    fit_network(tmp_path, choices, mask, LEVELS, pages(2, 0), pages(1, 1))
+    fit_network(tmp_path, choices, MASK, LEVELS, pages(2, 0), pages(1, 1))
     with pytest.raises(InvalidInputError, match=FITTED_WEIGHTS):  # of another size
-        fit_network(tmp_path, replace(choices, channels=8), mask, LEVELS, pages(2, 0), pages(1, 1))
+        fit_network(tmp_path, replace(choices, channels=8), MASK, LEVELS, pages(2, 0), pages(1, 1))
     (tmp_path / damaged).write_bytes(b"")
     with pytest.raises(InvalidInputError, match=damaged):
-        fit_network(tmp_path, choices, mask, LEVELS, pages(2, 0), pages(1, 1))
+        fit_network(tmp_path, choices, MASK, LEVELS, pages(2, 0), pages(1, 1))
 
 
-def test_few_steps_teach_large_confidences_and_small_ones(tmp_path: Path, mask: np.ndarray) -> None:
+def test_few_steps_teach_large_confidences_and_small_ones(tmp_path: Path) -> None:
     noise = np.where(np.arange(PAGE[1]) < PAGE[1] // 2, 0.03, 0.6)
     training, validation = pages(12, 0, noise), pages(8, 1, noise)
-    module = fit_network(tmp_path, CHOICES, mask, LEVELS, training, validation).module
+    module = fit_network(tmp_path, CHOICES, MASK, LEVELS, training, validation).module
     p, phases = decode_pages(module, validation)
     mu, kappa = np.arctan2(p[:, 1], p[:, 0]), np.hypot(p[:, 0], p[:, 1])
     clear, noisy = np.split(kappa, 2, axis=2)
@@ -118,33 +115,32 @@ def test_few_steps_teach_large_confidences_and_small_ones(tmp_path: Path, mask: 
     assert achievable_rate(mu, kappa, level, LEVELS)[..., : PAGE[1] // 2].mean() > 3.6
 
 
-def test_a_claim_that_is_too_bold_is_scaled_down(tmp_path: Path, mask: np.ndarray) -> None:
-    training, validation = pages(12, 0), pages(3, 1)
-    choices = replace(CHOICES, steps=60)
-    module = fit_network(tmp_path, choices, mask, LEVELS, training, validation).module
-    calibrated = best_kappa_scale(module, validation, mask)
+def test_a_claim_that_is_too_bold_is_scaled_down(trained: tuple[Path, Fitted]) -> None:
+    validation = pages(3, 1)
+    module = fit_network(trained[0], CHOICES, MASK, LEVELS, pages(12, 0), validation).module
+    calibrated = best_kappa_scale(module, validation, MASK)
     with torch.no_grad():
         assert module.network.head.bias is not None
         for value in (module.network.head.weight, module.network.head.bias):
             value[:2] *= 3
-    assert best_kappa_scale(module, validation, mask) == pytest.approx(calibrated / 3, rel=0.02)
+    assert best_kappa_scale(module, validation, MASK) == pytest.approx(calibrated / 3, rel=0.02)
 
 
 def test_a_factor_at_the_end_of_the_search_is_said_to_be_there(caplog: pytest.LogCaptureFixture) -> None:
     assert most_likely_factor(lambda factor: (math.log(factor) - 1) ** 2) == pytest.approx(math.e, rel=1e-4)
     assert caplog.text == ""
     most_likely_factor(lambda factor: -factor)
-    assert "calibrated still better beyond the factor 20" in caplog.text
+    assert "factor 20" in caplog.text
 
 
-def test_air_does_not_see_the_piston_and_leaves_pilots_out(mask: np.ndarray) -> None:
+def test_air_does_not_see_the_piston_and_leaves_pilots_out() -> None:
     rng = np.random.default_rng(0)
     truth = rng.uniform(0, 2 * np.pi, (1, *PAGE)).astype(np.float32)
     p = 30 * np.stack([np.cos(truth + 1.0), np.sin(truth + 1.0)], axis=1).astype(np.float32)
-    exact = held_out_air(p, truth, mask, LEVELS)
+    exact = held_out_air(p, truth, MASK, LEVELS)
     wrong_data, wrong_pilots = truth.copy(), p.copy()
-    wrong_data[0][~mask] = rng.uniform(0, 2 * np.pi, int((~mask).sum()))
-    wrong_pilots[0, :, mask] *= 0.5
+    wrong_data[0][~MASK] = rng.uniform(0, 2 * np.pi, int((~MASK).sum()))
+    wrong_pilots[0, :, MASK] *= 0.5
     assert exact > 3.5
-    assert held_out_air(wrong_pilots, truth, mask, LEVELS) == pytest.approx(exact, abs=0.02)
-    assert held_out_air(p, wrong_data, mask, LEVELS) < 0
+    assert held_out_air(wrong_pilots, truth, MASK, LEVELS) == pytest.approx(exact, abs=0.02)
+    assert held_out_air(p, wrong_data, MASK, LEVELS) < 0

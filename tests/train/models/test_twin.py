@@ -161,31 +161,6 @@ class TestClosedForms:
             mirrored = points * (-1) ** cell
             np.testing.assert_allclose(rays.places[b], mirrored, rtol=0, atol=1e-15)
 
-    def test_reflections_keep_the_length_of_the_wave_vector(self) -> None:
-        profile, parameters = small_profile(), some_device(4, scale=1.0)
-        points = page_points(profile, 200)
-        rays = TorchTwin(RayTwin(profile)).trace(parameters, points)
-        from_axis = points + parameters[[NAMES.index("page_centre_x_m"), NAMES.index("page_centre_y_m")]]
-        expected = np.broadcast_to((from_axis**2).sum(-1), rays.phases.shape)
-        np.testing.assert_allclose((rays.places**2).sum(-1), expected, rtol=1e-12)
-
-    def test_without_shear_the_order_of_the_reflections_does_not_matter(self) -> None:
-        profile = small_profile()
-        rays = TorchTwin(RayTwin(profile)).trace(only(pipe_roll_rad=0.004), page_points(profile, 100))
-        xy, yx = BRANCHES.index("xy"), BRANCHES.index("yx")
-        np.testing.assert_allclose(rays.phases[xy], rays.phases[yx], atol=1e-9)
-        np.testing.assert_allclose(rays.places[xy], rays.places[yx], atol=1e-18)
-        sheared = TorchTwin(RayTwin(profile)).trace(only(pipe_angle_rad=-0.01), page_points(profile, 100))
-        assert np.abs(sheared.phases[xy] - sheared.phases[yx]).max() > 1
-
-    def test_the_nominal_angle_of_a_profile_counts_like_a_fitted_one(self) -> None:
-        profile = small_profile()
-        bent = profile.model_copy(update={"pipe": profile.pipe.model_copy(update={"angle_deg": -0.6})})
-        points = page_points(profile, 50)
-        built_in = TorchTwin(RayTwin(bent)).trace(nominal(), points)
-        fitted = TorchTwin(RayTwin(profile)).trace(only(pipe_angle_rad=np.deg2rad(-0.6)), points)
-        np.testing.assert_allclose(built_in.phases, fitted.phases, atol=1e-9)
-
     @pytest.mark.parametrize("name", ["bench", "paper"])
     def test_shipped_profiles_count_walls_enough_for_the_whole_capture_range(self, name: str) -> None:
         profile = load_profile(name)

@@ -35,24 +35,18 @@ def device(angle_rad: float, *, thick: bool = False, roll_rad: float | None = No
 
 @pytest.fixture(
     scope="module",
-    params=[
-        (0.0, True, False, 1),
-        (-0.01, True, False, 1),
-        (-0.01, False, False, 1),
-        (-0.01, True, True, 1),
-        (-0.01, True, True, 3),
-    ],
-    ids=["square", "sheared", "points", "real lenses", "tiles"],
+    params=[(0.0, True, False, 1), (-0.01, False, False, 1), (-0.01, True, True, 3)],
+    ids=["square", "points", "real lenses in tiles"],
 )
 def models(request: pytest.FixtureRequest) -> tuple[FittedWaves, Waves]:
     """The two models."""
     angle_rad, filled, thick, tiles = request.param
     profile, parameters = device(angle_rad, thick=thick)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(wave_lens, "_WAVES", wave_lens._WAVES / tiles**2)
-        patch.setattr(wave_pipe, "_BLOCK", 20 if tiles > 1 else wave_pipe._BLOCK)
+        patch.setattr(wave_lens, "WAVES_A_TILE", wave_lens.WAVES_A_TILE / tiles**2)
+        patch.setattr(wave_pipe, "MODES_A_BLOCK", 20 if tiles > 1 else wave_pipe.MODES_A_BLOCK)
         waves = Waves(profile, parameters, SAMPLES, FINE, filled=filled)
-    assert (len(waves._pipe.blocks) > 1) == (tiles > 1)
+    assert any(name.endswith("blocks.1") for name, _ in waves.named_modules()) == (tiles > 1)
     return FittedWaves(profile, parameters, SAMPLES, filled=filled), waves
 
 
@@ -87,8 +81,7 @@ def test_both_ways_are_adjoint(models: tuple[FittedWaves, Waves]) -> None:
     assert float((seen * field).sum()) == pytest.approx(float((page * back).sum()), rel=0.02)
 
 
-@pytest.mark.parametrize("roll_deg", [-0.4, 0.0, 0.4])
-@pytest.mark.parametrize(("fidelity", "at_most"), [(EXACT, 0.04), (ROUGH, 0.12)])
+@pytest.mark.parametrize(("fidelity", "at_most", "roll_deg"), [(EXACT, 0.04, 0.4), (ROUGH, 0.12, -0.4)])
 def test_light_is_followed_as_exactly_as_is_asked(fidelity: Fidelity, at_most: float, roll_deg: float) -> None:
     profile, parameters = device(-0.01, thick=True, roll_rad=float(np.deg2rad(roll_deg)))
     page = on_modulator(np.random.default_rng(2).uniform(0, 2 * np.pi, profile.page_shape), SAMPLES)

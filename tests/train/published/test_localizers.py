@@ -11,7 +11,7 @@ from lightpage.device.profile import Profile
 from lightpage.waves.channel import WaveChannel
 from lightpage.waves.geometry import WaveGeometry, cells_for
 from tests.lightpage.small import small_profile
-from train.published.decoder import over_reference, sample_pair
+from train.published.decoder import sample_pair
 from train.published.localizers import Localizer, ModeLocalizer, NoLocalizer, RayLocalizer, page_places
 
 SAMPLES = 4
@@ -64,15 +64,6 @@ def test_a_page_that_moved_is_looked_at_where_it_went() -> None:
     inside = slice(8, -8)
     assert torch.allclose(before[..., inside, inside], after[..., inside, inside], atol=1e-4)
     assert torch.equal(before, level)
-
-
-def test_light_is_over_the_reference_and_of_unit_strength() -> None:
-    level = torch.full((1, 2, 4, 4), 100.0)
-    bright = level + 20 * torch.randn(1, 2, 4, 4, generator=torch.Generator().manual_seed(1))
-    seen = over_reference(bright, level)
-    assert seen.square().mean() == pytest.approx(1)
-    torch.testing.assert_close(seen, over_reference(level + 2 * (bright - level), level))
-    assert torch.isfinite(over_reference(torch.zeros_like(level), torch.zeros_like(level))).all()
 
 
 def seen_by_cameras(profile: Profile, angle_deg: float) -> tuple[Complex, Complex]:
@@ -149,21 +140,7 @@ def test_rays_look_where_the_light_of_a_short_pipe_goes() -> None:
 
 def test_a_ray_that_the_pipe_loses_is_looked_for_outside_of_the_frames() -> None:
     profile = small_profile()
-    localizer = RayLocalizer(profile, 4)
-    traced = localizer.tracer(torch.zeros(1, 2, dtype=torch.float64), localizer.angle.double())
-    localizer.tracer.forward = lambda points, angle: replaced(points, angle)  # type: ignore[method-assign]
-
-    def replaced(points: torch.Tensor, angle: torch.Tensor) -> object:
-        return traced._replace(places=points, valid=torch.zeros(len(points), dtype=torch.bool))
-
-    assert float(localizer.grid().detach().abs().min()) > 5
-
-
-def test_the_mode_localizer_has_the_nominal_pipe() -> None:
-    profile = small_profile()
-    page, square = seen_by_cameras(profile, 0.0)
-    longer = profile.model_copy(
-        update={"pipe": profile.pipe.model_copy(update={"length_m": profile.pipe.length_m * 1.05})}
-    )
-    right, wrong = (alike(page, told(ModeLocalizer(p, SAMPLES), square)) for p in (profile, longer))
-    assert wrong < right - 0.1
+    air = profile.model_copy(update={"pipe": profile.pipe.model_copy(update={"refractive_index": 1.0005})})
+    reach = RayLocalizer(air, 4).grid().detach().abs().amax(-1)
+    assert (reach > 5).any()
+    assert (reach < 1).any()

@@ -8,13 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from lightpage.calibration.interfaces import BRANCHES
-from lightpage.calibration.parameters import nominal
 from lightpage.device.lenses import LENSES, LensPrescription
 from lightpage.device.profile import Profile, load_profile
 from lightpage.errors import InvalidInputError
 from tests.lightpage.small import small_profile
-from train.models.twin import RayTwin, TorchTwin
 from train.published.rays import RayTracer, Traced, _Rays, _through
 
 ACHROMAT = LENSES["AC508-080-A"]
@@ -167,28 +164,6 @@ class TestLenses:
         sphere = replace(lens, surfaces=(flat, replace(end, conic=0.0)))
         assert np.abs(self._landed_mm(sphere, [[5, -3]], [[0.0, 0.0]])).max() > 0.1
 
-    def test_steep_rays_meet_a_sphere_where_a_quadratic_says_or_are_lost(self) -> None:
-        radius, rng, count = 20e-3, np.random.default_rng(4), 2000
-        front = replace(ACHROMAT.surfaces[0], radius_m=radius, thickness_m=5e-3, index=1.5)
-        ball = replace(ACHROMAT, diameter_m=1.0, surfaces=(front, replace(ACHROMAT.surfaces[2], radius_m=np.inf)))
-        at = np.append(rng.uniform(-25e-3, 25e-3, (count, 2)), np.zeros((count, 1)), axis=1)
-        k = np.append(rng.uniform(-0.3, 0.3, (count, 2)), np.ones((count, 1)), axis=1)
-        k /= np.linalg.norm(k, axis=1, keepdims=True)
-        first = _through(ball, _Rays(torch.tensor(at), torch.tensor(k), torch.ones(count, dtype=torch.bool)))[0]
-        away = at - [0, 0, ball.front_focal_m + radius]
-        b = (k * away).sum(1)
-        under = b**2 - (away**2).sum(1) + radius**2
-        met = at + (-b - np.sqrt(np.maximum(under, 0)))[:, None] * k
-        # only the half towards the light is the surface
-        hit = (under > 0) & (met[:, 2] < ball.front_focal_m + radius)
-        assert 200 < hit.sum() < 1800
-        valid = first.valid.numpy()
-        assert hit[valid].all()
-        # close to the rim, further out than any lens reaches, Newton's steps may lose a ray
-        assert valid[hit & (np.hypot(met[:, 0], met[:, 1]) < 0.95 * radius)].all()
-        np.testing.assert_allclose(first.position.numpy()[valid], met[valid], rtol=0, atol=1e-12)
-        assert torch.isfinite(first.position).all()
-
     def test_the_image_of_the_axis_neighbourhood_is_the_page_itself(self) -> None:
         near = np.array([[10e-6, 0], [-7e-6, 4e-6]])
         places = trace(RayTracer(load_profile("paper"), ACHROMAT), near).places.numpy()
@@ -196,13 +171,12 @@ class TestLenses:
 
 
 class TestAgainstSingleRays:
-    @pytest.mark.parametrize("angle", [0.0, SLOPED, np.deg2rad(5)])
-    @pytest.mark.parametrize("lens", [None, ACHROMAT, ACHROMAT.reversed()], ids=["ideal", "thick", "reversed"])
+    @pytest.mark.parametrize(("lens", "angle"), [(None, np.deg2rad(5)), (ACHROMAT, 0.0), (ACHROMAT.reversed(), SLOPED)])
     def test_every_ray_goes_the_same_way(self, lens: LensPrescription | None, angle: float) -> None:
         # seven times as long: a dozen walls, by turns
         paper = load_profile("paper")
         profile = with_pipe(paper, length_m=7.3 * paper.pipe.length_m)
-        points = page_points(profile, 150, seed=1)
+        points = page_points(profile, 100, seed=1)
         tracer = RayTracer(profile, lens)
         traced, positions = trace(tracer, points, angle), path(tracer, points, angle)
         assert traced.valid.all()
@@ -214,13 +188,6 @@ class TestAgainstSingleRays:
             assert np.abs(traced.places[index].numpy() + ray.at[:2]).max() < 1e-12
             walls = max(walls, len(ray.met))
         assert walls >= 10
-
-    def test_without_a_single_wall_the_ray_lands_at_its_own_point(self) -> None:
-        profile = load_profile("bench")
-        points = page_points(profile, 500) / 4
-        traced = trace(RayTracer(profile), points, SLOPED)
-        assert not traced.reflections.any()
-        np.testing.assert_allclose(traced.places.numpy(), points, rtol=0, atol=1e-17)
 
 
 class TestClosedForms:
@@ -240,48 +207,8 @@ class TestClosedForms:
         np.testing.assert_allclose(path(tracer, points)[-3, :, :2], triangle, rtol=0, atol=1e-15)
         np.testing.assert_allclose(traced.places.numpy(), (-1) ** cells * points, rtol=0, atol=1e-15)
 
-    def test_places_are_those_of_the_ray_twin(self) -> None:
-        profile = with_pipe(load_profile("bench"), angle_deg=-0.6)
-        points = page_points(profile, 2000)
-        traced = trace(RayTracer(profile), points, SLOPED)
-        twin = TorchTwin(RayTwin(profile)).trace(nominal(), points)
-        met = traced.reflections.numpy()
-        assert met.max() == 1
-        # which of two walls comes first is all that the single ray knows beyond its cell
-        x_first = np.abs(points[:, 0]) > np.abs(points @ [np.sin(SLOPED), np.cos(SLOPED)])
-        names = np.where(
-            met.all(1), np.where(x_first, "xy", "yx"), np.where(met[:, 0], "x", np.where(met[:, 1], "y", "direct"))
-        )
-        branch = np.array([BRANCHES.index(name) for name in names])
-        assert min(np.bincount(branch, minlength=len(BRANCHES))) > 50
-        expected = twin.places[branch, np.arange(len(points))]
-        np.testing.assert_allclose(traced.places.numpy(), expected, rtol=0, atol=1e-15)
-        # the twin counts by its unfolded cell: the same walls, but for a shear's width along the cells' edges
-        cells = np.abs(np.round(twin.positions))
-        edge = np.abs(np.abs(twin.positions) - 0.5)
-        assert (cells == met).mean() > 0.98
-        assert edge[cells != met].max() < 2 * abs(SLOPED)
-
 
 class TestLostRays:
-    def test_walls_met_below_the_critical_angle_lose_the_ray(self) -> None:
-        profile = with_pipe(small_profile(), refractive_index=1.0008)
-        points = page_points(profile, 2000)
-        tracer, index = RayTracer(profile), profile.pipe.refractive_index
-        sines = points / profile.lens.focal_length_m
-        slopes = sines / np.sqrt(index**2 - (sines**2).sum(1, keepdims=True))
-        meets = np.abs(slopes) * profile.pipe.length_m > profile.pipe.width_m / 2
-        steep = np.abs(sines) > np.sqrt(index**2 - 1)
-        lost = (meets & steep).any(1)
-        traced = trace(tracer, points)
-        assert (meets.any(1) & ~lost).sum() > 100
-        assert (meets & steep)[:, 1].sum() > 100
-        np.testing.assert_array_equal(traced.valid.numpy(), ~lost)
-        assert torch.isfinite(traced.places).all()
-        drawn = np.isfinite(path(tracer, points)).all(-1)
-        np.testing.assert_array_equal(drawn[-1], ~lost)
-        assert drawn[:3].all()
-
     def test_it_is_the_critical_angle_to_nine_digits(self) -> None:
         profile = with_pipe(small_profile(), refractive_index=1.0008)
         critical = profile.lens.focal_length_m * np.sqrt(1.0008**2 - 1)
@@ -312,43 +239,6 @@ class TestLostRays:
         assert traced.valid.tolist() == [True, False, False, False]
         assert torch.isfinite(traced.places).all()
 
-    def test_a_ray_beside_the_entrance(self) -> None:
-        # the achromat the wrong way round: of wide beams it makes a wide focus
-        profile, points = small_profile(), np.array([[0, 12e-3], [0, 1e-3]])
-        positions = path(RayTracer(profile, ACHROMAT.reversed()), points)
-        entrance = positions[4]
-        assert abs(entrance[0, 1]) > profile.pipe.width_m / 2 > abs(entrance[1, 1])
-        assert np.isfinite(positions[5:]).all((0, 2)).tolist() == [False, True]
-        assert np.isnan(positions[5:, 0]).all()
-
-
-class TestPath:
-    @pytest.mark.parametrize("lens", [None, ACHROMAT], ids=["ideal", "thick"])
-    def test_it_runs_from_modulator_to_camera(self, lens: LensPrescription | None) -> None:
-        profile = load_profile("paper")
-        points, tracer = page_points(profile, 100), RayTracer(profile, lens)
-        positions, traced = path(tracer, points, SLOPED), trace(tracer, points, SLOPED)
-        np.testing.assert_array_equal(positions[0], np.pad(points, ((0, 0), (0, 1))))
-        np.testing.assert_array_equal(positions[-1, :, :2], -traced.places.numpy())
-        assert (np.diff(positions[:, :, 2], axis=0) >= 0).all()
-        surfaces = 1 if lens is None else 3
-        total = 4 * profile.lens.focal_length_m + profile.pipe.length_m
-        if lens is not None:
-            total = 2 * (lens.front_focal_m + lens.back_focal_m + 18e-3) + profile.pipe.length_m
-        np.testing.assert_allclose(positions[-1, :, 2], total, rtol=1e-14)
-        entrance, walls, leaving = positions[1 + surfaces], positions[2 + surfaces : -2 - surfaces], -2 - surfaces
-        np.testing.assert_allclose(positions[leaving, :, 2] - entrance[:, 2], profile.pipe.length_m, rtol=1e-12)
-        # each wall is touched, and whoever met fewer waits where it is
-        assert len(walls) == traced.reflections.sum(1).max()
-        before = entrance
-        for row, at in enumerate(walls):
-            sheared = at[:, 0] * np.sin(SLOPED) + at[:, 1] * np.cos(SLOPED)
-            on_wall = np.abs(np.abs(np.stack([at[:, 0], sheared])) - profile.pipe.width_m / 2).min(0) < 1e-15
-            moves = traced.reflections.sum(1).numpy() > row
-            np.testing.assert_array_equal(on_wall[moves], True)
-            np.testing.assert_array_equal(at[~moves], before[~moves])
-            before = at
-
 
 class TestDerivatives:
     @pytest.mark.parametrize("lens", [None, ACHROMAT], ids=["ideal", "thick"])
@@ -369,38 +259,25 @@ class TestDerivatives:
         (slope,) = torch.autograd.grad(places(angle, at).abs().sum(), angle)
         assert abs(float(slope)) > 0.1
 
-    @pytest.mark.parametrize("lens", [None, ACHROMAT], ids=["ideal", "thick"])
-    def test_lost_and_axial_rays_have_finite_ones(self, lens: LensPrescription | None) -> None:
-        tracer = RayTracer(with_pipe(load_profile("paper"), refractive_index=1.001), lens)
-        # on the axis, direct, below the critical angle, beside the lens or beyond what it can bend
-        points = torch.tensor([[0, 0], [1e-3, 0], [0, 6e-3], [0.5, 0]], dtype=torch.float64, requires_grad=True)
-        angle = scalar(0.0).requires_grad_(True)
-        traced: Traced = tracer(points, angle)
-        assert traced.valid.tolist() == [True, True, False, False]
-        slopes = torch.autograd.grad(traced.places.sum(), (points, angle))
-        assert all(torch.isfinite(slope).all() for slope in slopes)
-
 
 class TestInput:
     @pytest.mark.parametrize(
         ("points", "angle", "got"),
         [
-            (torch.zeros(3, 3, dtype=torch.float64), scalar(0), r"shape \(3, 3\)"),
-            (torch.zeros(2, dtype=torch.float64), scalar(0), r"shape \(2,\)"),
+            (torch.zeros(3, 3, dtype=torch.float64), scalar(0), r"\(3, 3\)"),
             (torch.zeros(3, 2), scalar(0), "float32"),
             (torch.full((3, 2), torch.nan, dtype=torch.float64), scalar(0), "NaN"),
-            (torch.zeros(3, 2, dtype=torch.float64), torch.zeros(1, dtype=torch.float64), r"shape \(1,\)"),
+            (torch.zeros(3, 2, dtype=torch.float64), torch.zeros(1, dtype=torch.float64), r"\(1,\)"),
             (torch.zeros(3, 2, dtype=torch.float64), torch.zeros(()), "float32"),
-            (torch.zeros(3, 2, dtype=torch.float64), scalar(-0.6), "-0.6 rad"),
+            (torch.zeros(3, 2, dtype=torch.float64), scalar(-0.6), r"-0\.6 rad"),
             (torch.zeros(3, 2, dtype=torch.float64), scalar(np.nan), "nan rad"),
         ],
     )
     def test_what_cannot_be_traced_is_refused(self, points: torch.Tensor, angle: torch.Tensor, got: str) -> None:
         tracer = RayTracer(small_profile())
-        with pytest.raises(InvalidInputError, match=got):
-            tracer(points, angle)
-        with pytest.raises(InvalidInputError, match=got):
-            tracer.path(points, angle)
+        for trace in (tracer, tracer.path):
+            with pytest.raises(InvalidInputError, match=got):
+                trace(points, angle)
 
     def test_no_points_are_no_rays(self) -> None:
         traced = trace(RayTracer(small_profile(), ACHROMAT), np.zeros((0, 2)))

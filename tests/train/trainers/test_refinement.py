@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner
 from scipy import special
 
 from lightpage.calibration.calibrate import KnownPage
@@ -19,13 +17,10 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import perfectly_calibrated
 from tests.lightpage.small import small_profile
-from train.commands.train import train
 from train.data.features import FeatureExtractor
 from train.data.known_light import explained
-from train.models.hyperparameters import Hyperparameters
 from train.models.parts import turned
 from train.models.prediction import Prediction, expected_phasors
-from train.runs import load_decoder, load_run
 from train.trainers.refinement import fit_prediction
 
 PROFILE = small_profile()
@@ -89,18 +84,3 @@ def test_illumination_and_floor_are_those_of_the_device(dim: Known) -> None:
     assert corner / by_term[0] == pytest.approx(1 - Device().slm.falloff_relative, abs=0.04)
     bright = known_page(sensor=Sensor(full_well_e=100, read_noise_e=0.1))
     assert bright.prediction.floor < 0.6 * dim.prediction.floor
-
-
-def test_a_run_with_refinements_decodes_better_than_its_first_look(small_device: list[str], tmp_path: Path) -> None:
-    size = ["--channels", "24", "--blocks", "1", "--steps", "160", "--synthetic-pages", "0"]
-
-    def trained(refinements: int) -> float:
-        out = tmp_path / f"run{refinements}"
-        options = [*small_device, *size, "--refinements", str(refinements), "--out", str(out)]
-        CliRunner().invoke(train, options, standalone_mode=False, catch_exceptions=False)
-        return load_run(out).validation_air
-
-    assert trained(2) > trained(0) + 0.2
-    run = load_run(tmp_path / "run2")
-    assert run.hyperparameters == Hyperparameters(channels=24, blocks=1, steps=160, refinements=2)
-    assert len(load_decoder(tmp_path / "run2", run).refiners) == 2

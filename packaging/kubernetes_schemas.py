@@ -1,8 +1,8 @@
-"""Writes kubernetes.json and servicemonitor.json from packages that have them, in an environment of its own.
+"""Writes the schemas of tests/deploy/schemas from packages that have them, in an environment of its own.
 
     python3.11 -m venv build/schemas
     build/schemas/bin/pip install kubernetes-validate==1.37.0 cloudcoil-models-prometheus-operator==0.80.1.0
-    build/schemas/bin/python tests/deploy/schemas/collect.py
+    build/schemas/bin/python packaging/kubernetes_schemas.py
 
 Only the kinds of deploy/kubernetes are taken, with what they refer to, and without descriptions.
 """
@@ -29,7 +29,7 @@ KINDS = {
 METADATA = "io.k8s.apimachinery.pkg.apis.meta.v1.ObjectMeta"
 SAID_ONLY = ("description", "title", "default", "$comment")
 DRAFT = "https://json-schema.org/draft/2020-12/schema"
-HERE = Path(__file__).parent
+SCHEMAS = Path(__file__).resolve().parents[1] / "tests" / "deploy" / "schemas"
 
 
 def stripped(schema: Any) -> Any:
@@ -91,7 +91,7 @@ def kubernetes() -> dict[str, Any]:
 
 def service_monitor() -> dict[str, Any]:
     """The same of Prometheus operator's ServiceMonitor, whose metadata are Kubernetes' own."""
-    from cloudcoil.models.prometheus_operator.v1 import ServiceMonitor
+    from cloudcoil.models.prometheus_operator.v1 import ServiceMonitor  # type: ignore[import-not-found]
 
     schema = strict(stripped(ServiceMonitor.model_json_schema(by_alias=True)))
     definitions = schema.pop("$defs")
@@ -107,4 +107,4 @@ def service_monitor() -> dict[str, Any]:
 
 if __name__ == "__main__":
     for name, found in {"kubernetes": kubernetes(), "servicemonitor": service_monitor()}.items():
-        (HERE / f"{name}.json").write_text(json.dumps(found, indent=1) + "\n")
+        (SCHEMAS / f"{name}.json").write_text(json.dumps(found, indent=1) + "\n")

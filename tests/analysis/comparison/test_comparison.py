@@ -1,0 +1,148 @@
+"""Comparisons of decoders: what each command writes, and what it takes up from earlier runs."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from analysis.comparison import calibration, decoders
+from analysis.comparison.outcome import symbols_by_walls
+from analysis.comparison.weight_store import CALIBRATION, TRAINED, WeightStore
+from lightpage.calibration.calibrate import Registered
+from lightpage.calibration.document import Calibration
+from lightpage.calibration.parameters import NAMES
+from lightpage.device.state import Device, ideal_device
+from lightpage.errors import InvalidInputError
+from lightpage.page.symbols import pilot_mask
+from lightpage.simulator.true_optics import true_parameters
+from tests.lightpage.small import small_profile
+from train.models.presets import FAST, PRESETS
+from train.runs import BEGUN, check_begun
+
+PROFILE = small_profile()
+DEVICE = Device().with_settings(["geometry.pipe_angle_deg=-0.6", "sensor.full_well_e=32"])
+
+
+def calibration_of(device: Device) -> Calibration:
+    """A calibration that is right: the small page has too few patches to find a device from nominal."""
+    turn = device.homodyne.turn_rad
+    perfect = Registered(true_parameters(PROFILE, device), np.ones(len(NAMES)), turn, 0.0, 0.5, 1.0, 0.5)
+    return Calibration.from_registered(perfect, PROFILE, ["0" * 64])
+
+
+def prepared(out: Path, device: Device, name: str) -> list[str]:
+    """Options of a comparison on the small device, whose calibration is there."""
+    (out / name).mkdir(parents=True)
+    calibration_of(device).save(out / name / "calibration.toml")
+    (out / "small.toml").write_text(PROFILE.to_toml())
+    return ["--profile", str(out / "small.toml"), "--pages", "12", "--out", str(out)]
+
+
+def test_symbols_are_told_apart_by_the_walls_that_their_light_meets() -> None:
+    zones = symbols_by_walls(PROFILE, calibration_of(ideal_device()))
+    rows, columns = PROFILE.page_shape
+    # a symbol's light leaves x f/L n off the axis, and meets a wall where that is over half of the width
+    reach = PROFILE.pipe.width_m / 2 * PROFILE.lens.focal_length_m * PROFILE.pipe.refractive_index
+    reach /= PROFILE.pipe.length_m * PROFILE.symbol_pitch_m
+    across, down = (np.abs(np.arange(count) - (count - 1) / 2) > reach for count in (columns, rows))
+    assert (zones["no wall"] == ~across & ~down[:, None]).mean() > 0.98
+    assert (zones["x"] == across & ~down[:, None]).mean() > 0.98
+    assert sum(zone.astype(int) for zone in zones.values()).tolist() == np.ones((rows, columns)).tolist()
+
+
+def test_the_command_compares_methods_and_says_what_the_device_is(tmp_path: Path) -> None:
+    words = prepared(tmp_path, ideal_device(), "-0.3deg-32e-4px-ideal")
+    words += ["--ideal", "--angle", "-0.3", "--method", "none", "--published-channels", "4", "--published-steps", "10"]
+    done = CliRunner().invoke(decoders.main, [*words, "--trained", str(tmp_path / "kept")], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    begun = json.loads((tmp_path / "-0.3deg-32e-4px-ideal" / BEGUN).read_text())
+    ideal = ideal_device().with_settings(["geometry.pipe_angle_deg=-0.3", "sensor.full_well_e=32"])
+    assert Device.model_validate(begun["device"]) == ideal
+    (found,) = json.loads((tmp_path / "figures.json").read_text())["lights"]
+    (none,) = found["outcomes"]
+    assert (none["arm"], none["size"], none["steps"]) == ("none", "4/8", 10)
+    assert len(none["validation_curve"]) > 0
+    data = ~pilot_mask(PROFILE)
+    assert none["own_mi_kB"] == pytest.approx(none["own_mi"] * data.sum() / 8000)
+    assert (tmp_path / "figure.png").stat().st_size > 10_000
+
+
+@pytest.mark.long  # trains six decoders
+def test_the_command_keeps_what_it_trained_and_takes_it_up(tmp_path: Path) -> None:
+    out, kept = tmp_path / "out", tmp_path / "kept"
+    words = prepared(out, Device(), "-0.6deg-32e-4px")
+    words += [word for name in ("coherent", "refined", "oracle", "fast", "none") for word in ("--method", name)]
+    words += [
+        "--arm",
+        "wave-refined",
+        "--steps",
+        "20",
+        "--size",
+        "8x1x0",
+        "--published-channels",
+        "4",
+        "--published-steps",
+        "12",
+    ]
+    words += ["--levels", "16", "--trained", str(kept), "--keep"]
+    first = CliRunner().invoke(decoders.main, words, catch_exceptions=False)
+    assert first.exit_code == 0, first.output
+    figures = json.loads((out / "figures.json").read_text())
+    elsewhere = tmp_path / "elsewhere"
+    words[words.index(str(out))] = str(elsewhere)
+    again = CliRunner().invoke(decoders.main, words, catch_exceptions=False)
+    assert again.exit_code == 0, again.output
+    assert not list(elsewhere.rglob("checkpoints"))  # nothing was trained
+    outcomes = json.loads((elsewhere / "figures.json").read_text())["lights"][0]["outcomes"]
+    for one, other in zip(outcomes, figures["lights"][0]["outcomes"], strict=True):
+        assert one["air"] == pytest.approx(other["air"], abs=0.01)  # large tensors are kept in half precision
+        assert one["validation_curve"] == other["validation_curve"]
+
+
+def test_weights_that_were_kept_are_taken_up_for_their_options_alone(tmp_path: Path) -> None:
+    kept = TRAINED / "bench" / "-0.6deg-32e-4px"
+    for name in (BEGUN, CALIBRATION):
+        shutil.copyfile(kept / name, tmp_path / name)
+    run = tmp_path / "fast" / "48x2x0-6000"
+    options = asdict(replace(PRESETS[FAST].choices, steps=6000, seed=5000))
+    store = WeightStore(tmp_path, kept)
+    assert not store.bring(run, options | {"depth": 1})
+    assert store.bring(run, options)
+    assert check_begun(run, options)
+    assert not store.bring(run, options)  # it is there
+    shutil.rmtree(run)
+    (tmp_path / BEGUN).write_text("{}")
+    assert not store.bring(run, options)  # of another data set
+
+
+def test_calibrations_that_are_done_are_not_done_again_and_what_failed_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = list[int]()
+
+    def outcome(bench: calibration.Bench, seed: int) -> calibration.Outcome:
+        drawn.append(seed)
+        failure = "not found" if drawn.count(6) == 1 and seed == 6 else None
+        error = None if failure else 0.001 * seed
+        return calibration.Outcome(seed, -0.6, angle_error_deg=error, seconds=2.0, failure=failure)
+
+    def run(*words: str) -> None:
+        CliRunner().invoke(calibration.main, words, standalone_mode=False, catch_exceptions=False)
+
+    monkeypatch.setattr(calibration.Bench, "own", outcome)
+    path = tmp_path / "F.json"
+    for devices, calibrated in (("2", 1), ("3", 3)):
+        run("--symbol-size", "2", "--first-seed", "5", "--json", str(path), "--devices", devices)
+        found = json.loads(path.read_text())["summary"]
+        assert (found["devices"], found["calibrated"]) == (int(devices), calibrated)
+    assert drawn == [5, 6, 6, 7]
+    assert found["angle_error_deg_worst"] == pytest.approx(0.007)
+    assert found["angle_error_deg_median"] == pytest.approx(0.006)
+    with pytest.raises(InvalidInputError, match="a new name"):
+        run("--first-seed", "5", "--json", str(path))
