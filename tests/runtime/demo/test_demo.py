@@ -22,8 +22,7 @@ from runtime.wire.pages import RemotePage, RemoteTimings
 from tests.runtime import toy
 from tests.runtime.recalibration.toy_worker import known, quiet
 
-ROWS = 28
-"""Of the picture: what two pages hold."""
+ROWS = 28  # of the picture: what two pages hold
 TIMINGS = RemoteTimings(0.0, 0.2, 0.1, 0.3)
 
 

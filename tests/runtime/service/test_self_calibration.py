@@ -1,7 +1,4 @@
-"""The monitor says by many pages that a recalibration is due, and the service then recalibrates itself, seldom.
-
-Signs belong to whose pages show them: a caller's frames say nothing of the service's own device.
-"""
+"""The monitor says by many pages that a recalibration is due, and the service then recalibrates itself, seldom."""
 
 from __future__ import annotations
 

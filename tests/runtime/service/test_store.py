@@ -95,15 +95,9 @@ def test_a_note_of_an_earlier_program_is_read_and_one_of_this_names_what_that_re
     plane = a_plane(decoder, store)
     assert plane.registry.current.version == "toy-1+r1"
     assert plane.rollback()[0].version == "toy-1"
-    written = {
-        "base": base,
-        "bundle": None,
-        "history": [None, "toy-1+r1.zip"],
-        "cursor": 0,
-        "pinned": [],
-        "origins": {},
-    }
-    assert json.loads((store.folder / CURRENT).read_text()) == written
+    written = json.loads((store.folder / CURRENT).read_text())
+    kept = [written[name] for name in ("base", "bundle", "history", "cursor")]
+    assert kept == [base, None, [None, "toy-1+r1.zip"], 0]
     (store.folder / CURRENT).write_text(json.dumps({"base": base, "bundle": None}))
     assert store.read() == Note()
 
