@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -27,6 +28,7 @@ from runtime.acquisition.sources import open_source
 from runtime.errors import OtherModelError, SourceError, StoppingError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.recalibration.outcome import RefitResult
+from runtime.service.audit import AuditLog
 from runtime.service.registry import KEPT_MODELS
 from tests.runtime import toy
 from tests.runtime.rpc.stage import Running, Start, a_page, refused
@@ -224,3 +226,9 @@ def test_a_model_that_changes_meanwhile_makes_its_result_out_of_date(start: Star
     with pytest.raises(OtherModelError):
         service.client.recalibrate(count=2, expected_version="toy-1+r2")
     assert service.version == "toy-1"
+
+
+def test_who_asked_for_a_change_is_written_down(start: Start, tmp_path: Path) -> None:
+    file = tmp_path / "audit.jsonl"
+    start(audit=AuditLog(file)).client.recalibrate(count=2)
+    assert json.loads(file.read_text("utf-8"))["who"].startswith("ipv4:127.0.0.1:")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import hashlib
 import json
 import shutil
 from pathlib import Path
@@ -9,8 +11,9 @@ from typing import Any
 
 import pytest
 
-from lightpage.errors import InvalidInputError
-from runtime.scaling.job import Choices, found_recordings, of_fleet, of_recordings
+from lightpage.errors import InvalidInputError, StorageError
+from runtime.errors import BundleError
+from runtime.scaling.job import Choices, bundle_sha256, found_recordings, of_fleet, of_recordings
 from runtime.scaling.task import FineTuning, NamedBundle, Operation
 from tests.runtime import toy
 from tests.runtime.scaling.jobs import BUNDLE, NEWER, PASSES, STAYS, job, source
@@ -134,3 +137,17 @@ def test_what_a_run_knows_is_not_opened_again(toy_zip: Path, tmp_path: Path) -> 
     (lost,) = of_recordings(choices, [str(tmp_path / "a.h5")], str(bundle), None).sources
     assert (lost.pages, lost.stamp) == (0, None)
     assert lost.problem is not None
+
+
+def test_a_bundle_that_cannot_be_read_is_told_from_one_that_is_another(
+    toy_zip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(BundleError, match="gone"):
+        bundle_sha256(tmp_path / "gone.zip")
+
+    def fails(*_: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(hashlib, "file_digest", fails)
+    with pytest.raises(StorageError, match="bundle"):
+        bundle_sha256(toy_zip)

@@ -202,3 +202,15 @@ def test_what_others_reach_needs_certificates(tmp_path: Path, key: str, table: s
 def test_this_machine_alone_needs_none(tmp_path: Path) -> None:
     for address in ("127.0.0.1:0", "localhost:50051", "[::1]:50051", "127.3.2.1:50051", "unix:/run/a"):
         assert of_file(tmp_path, f"[service]\naddress = '{address}'\n").settings.service.address == address
+
+
+@pytest.mark.parametrize(
+    ("most", "more"),
+    [
+        ("service.source = 'simulator:bench'\nlimits.recalibration_pages = 2\nself_calibration.pages = [1, 2]", ", 3]"),
+        ("[limits]\nreply_bytes = 2147483647", "8"),
+    ],
+)
+def test_a_limit_itself_is_taken_and_one_more_is_not(most: str, more: str, tmp_path: Path) -> None:
+    of_file(tmp_path, most)
+    refused(tmp_path, most[:-1] + more)

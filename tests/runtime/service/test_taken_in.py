@@ -8,12 +8,15 @@ import os
 from pathlib import Path
 
 import pytest
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
 
 from lightpage.errors import BundleError
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.signature import BundleKey
 from runtime.bundle.signature_file import signature_path
 from runtime.decoding.decoder import Decoder
+from runtime.errors import ModelExistsError, StoreError
 from runtime.service.dataplane import DataPlane
 from runtime.service.incoming import Incoming
 from runtime.service.registry import ModelRegistry
@@ -21,7 +24,6 @@ from runtime.service.store import ModelStore
 from tests.clock import HandClock
 from tests.lightpage.full_disk import full_disk
 from tests.runtime import toy
-from tests.runtime.bundle.test_signature import Signer
 from tests.waiting import eventually
 
 
@@ -99,6 +101,22 @@ def test_the_folder_is_looked_at_while_the_service_runs(
         assert versions(plane) == ["toy-1"]
         eventually(lambda: clock.advance(5.0) or "as toy-2" in caplog.text)
     assert versions(plane) == ["toy-2", "toy-1"]
+
+
+class Signer:
+    """A private key, and the public one in a file."""
+
+    def __init__(self, folder: Path, name: str = "signing") -> None:
+        self._key = ec.generate_private_key(ec.SECP256R1())
+        self.path = folder / f"{name}.pem"
+        form = serialization.PublicFormat.SubjectPublicKeyInfo
+        self.path.write_bytes(self._key.public_key().public_bytes(serialization.Encoding.PEM, form))
+
+    def signature(self, bundle: Path) -> bytes:
+        return self._key.sign(bundle.read_bytes(), ec.ECDSA(hashes.SHA256()))
+
+    def sign(self, bundle: Path) -> None:
+        signature_path(bundle).write_bytes(self.signature(bundle))
 
 
 def begin(folder: Path, signer: Signer | None) -> DataPlane:
@@ -231,3 +249,20 @@ def test_pruning_takes_signatures_along(service: Signed) -> None:
     store.note = service.plane.store.note  # type: ignore[union-attr]
     store.prune(())
     assert sorted(path.name for path in service.store.glob("toy-*")) == ["toy-3.zip", "toy-3.zip.sig"]
+
+
+def test_a_bundle_of_the_same_version_that_came_meanwhile_stays(service: Signed) -> None:
+    path, signature = service.bundle("toy-2")
+    with pytest.raises(ModelExistsError, match="new bundle: version"):
+        service.models.take_in(path, (service.store / "toy-2.zip").touch, signature)
+    assert (service.store / "toy-2.zip").read_bytes() == b""
+
+
+def test_a_bundle_that_cannot_be_noted_is_not_taken(service: Signed, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise StoreError("model store", "no room", "room")
+
+    monkeypatch.setattr(service.plane.store, "change", full)
+    with pytest.raises(StoreError, match="model store"):
+        service.take_in("toy-2")
+    assert not list(service.store.glob("toy-2*"))

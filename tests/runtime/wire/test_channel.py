@@ -168,3 +168,11 @@ def test_a_watch_goes_on_after_a_lost_connection_but_not_beyond_its_time() -> No
         with pytest.raises(LightpageError):
             list(nobody.watch_job("a", 20))
         assert clock.now() == 1011.25  # who was never heard is not waited for
+
+
+def test_a_proxy_of_the_environment_is_passed_by(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("no_proxy", "NO_PROXY", "no_grpc_proxy"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("grpc_proxy", "http://127.0.0.1:1")
+    with served(Failing()) as port, LightpageClient(f"localhost:{port}", timeout_s=20) as client:
+        client.models()
