@@ -82,7 +82,7 @@ def scene(shape: tuple[int, int] = SENSOR, more_bytes: int = 0, **settings: Any)
 
 
 def gone(act: Callable[[], object]) -> None:
-    assert reason_of(act) is Reason.CAMERA_GONE
+    assert reason_of(act, "in-phase camera") is Reason.CAMERA_GONE
 
 
 @pytest.mark.parametrize("pixel_format", ["Mono8", "Mono10Packed", "Mono12p", "Mono16"])
