@@ -72,6 +72,7 @@ lint: $(STAMP)  ## ruff, layers of imports, mypy --strict, hadolint
 	$(BIN)/lint-imports --no-cache --no-logo
 	$(BIN)/mypy
 	$(BIN)/mypy packaging/*.py
+	$(BIN)/python -m tests.rules
 	$(BIN)/hadolint Dockerfile
 
 format: $(STAMP)  ## let ruff put the code in order

@@ -10,12 +10,7 @@ from lightpage.device.profile import Profile
 
 
 class FlatTwin:
-    """Places are the points themselves, phases a ramp, pixels the places over the camera's pitch.
-
-    Args:
-        profile: page and cameras.
-        ramp: phase gradient along (x, y), rad/m, the same for every branch.
-    """
+    """Places are the points themselves, phases a ramp (rad/m), pixels the places over the camera's pitch."""
 
     def __init__(self, profile: Profile, ramp: tuple[float, float] = (0.0, 0.0)) -> None:
         self._pitch = profile.camera.pitch_m
@@ -34,15 +29,7 @@ class FlatTwin:
 
 
 class Picture:
-    """A page as light on the camera plane: symbols as soft squares, shifted, with a phase ramp.
-
-    Args:
-        profile: page layout.
-        symbols: phasors [ny, nx].
-        shift_m: how far (x, y) the picture lies from the page.
-        ramp: phase gradient along the page's (x, y), rad/m, on top of the symbols.
-        piston: phase, radians.
-    """
+    """A page's phasors [ny, nx] as light on the camera plane: soft squares, shifted, with a phase ramp (rad/m)."""
 
     _FINE = 8
 

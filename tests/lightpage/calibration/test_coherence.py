@@ -65,18 +65,6 @@ def test_the_true_geometry_explains_waves_and_every_deviation_less(light: FieldS
             assert page_coherence(light, TWIN, wrong, PROFILE, SYMBOLS) < best - 0.01, name
 
 
-def test_a_turn_of_all_symbols_and_the_strength_of_the_light_do_not_matter(light: FieldSampler) -> None:
-    plain = page_coherence(light, TWIN, TRUTH, PROFILE, SYMBOLS)
-    assert page_coherence(light, TWIN, TRUTH, PROFILE, SYMBOLS * np.exp(2j)) == pytest.approx(plain, rel=1e-6)
-    brighter = page_coherence(lambda places: 7 * light(places), TWIN, TRUTH, PROFILE, SYMBOLS)
-    assert brighter == pytest.approx(plain, rel=1e-5)
-
-
-def test_no_light_has_no_coherence() -> None:
-    dark = page_coherence(lambda places: np.zeros(places.shape[:-1]), TWIN, TRUTH, PROFILE, SYMBOLS)
-    assert dark == 0
-
-
 def test_the_branches_share_all_of_the_light() -> None:
     positions = np.random.default_rng(0).uniform(-3, 3, (200, 2))
     np.testing.assert_allclose(branch_shares(positions, BRANCHES).sum(axis=0), 1)

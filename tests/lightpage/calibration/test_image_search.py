@@ -63,13 +63,6 @@ def test_the_image_is_found_wherever_it_lies(
         assert found.needed < 20 < found.significance
 
 
-def test_the_piston_need_not_be_known(fields: dict[tuple[float, float, bool], NDArray[np.complexfloating]]) -> None:
-    field = fields[-2.6, 1.6, False]
-    one, other = SEARCH.find(field, known()), SEARCH.find(field * np.exp(2j), known())
-    np.testing.assert_allclose(other.shift_px, one.shift_px, atol=1e-4)
-    assert other.significance == pytest.approx(one.significance, rel=1e-4)
-
-
 def test_beyond_reach_it_is_not_found_unless_it_is_looked_for_there(
     fields: dict[tuple[float, float, bool], NDArray[np.complexfloating]],
 ) -> None:

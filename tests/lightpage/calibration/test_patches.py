@@ -85,14 +85,6 @@ class TestCutting:
         assert len(middle) >= min(5, len(everywhere))
         assert np.abs(np.mean([patch.centre_m for patch in middle], axis=0)).max() < 0.5 * profile.symbol_pitch_m
 
-    def test_the_window_is_a_square_lattice_about_nothing_that_reaches_far_enough(self) -> None:
-        window = search_window(10e-6, 3e-6)
-        assert window.shape == (81, 2)
-        assert np.abs(window).max(0) == pytest.approx([12e-6, 12e-6])
-        assert np.abs(window.mean(0)).max() < 1e-18
-        assert len(np.unique(window.round(9), axis=0)) == 81
-        np.testing.assert_allclose(window[1] - window[0], [3e-6, 0])
-
 
 class TestFinding:
     @pytest.mark.parametrize("shift_px", [(0.0, 0.0), (-7.9, 9.4)])
@@ -110,21 +102,6 @@ class TestFinding:
         # the peak over slopes is read by a parabola, which on slopes 0.3 rad a symbol apart errs by up to 0.02
         assert found.slope * PITCH == pytest.approx(slope, abs=0.025)
         assert found.significance > 0.85 * found.symbols
-
-    def test_of_small_symbols_too(self) -> None:
-        """A ramp that the page's centre or a length makes is as steep on the page, whatever its symbols' size."""
-        steep = (-1.6 / PITCH, 1.1 / PITCH)
-        picture, patch = Picture(FINE, FINE_SYMBOLS, (4 * PIXEL, -5 * PIXEL), steep), patches(FINE)[5]
-        found = look(picture, patch, FINE_SYMBOLS, ramp=(0.0, 0.0), profile=FINE)
-        assert (found.pixels - found.read_at)[0] == pytest.approx([4, -5], abs=0.3)
-        assert found.slope * PITCH == pytest.approx([-1.6, 1.1], abs=0.03)
-        # two samples a symbol see the soft squares less evenly than four
-        assert found.significance > 0.8 * found.symbols > 300
-
-    @pytest.mark.parametrize("piston", [2.0, -1.3])
-    def test_the_phase_is_that_of_the_light_against_the_symbols(self, piston: float) -> None:
-        found = look(Picture(PROFILE, SYMBOLS, piston=piston))
-        assert np.exp(1j * found.phase) == pytest.approx(np.exp(1j * piston), abs=0.02)
 
     def test_what_the_twin_already_says_is_added_back(self) -> None:
         ramp = (0.9 / PITCH, -0.6 / PITCH)
@@ -176,11 +153,6 @@ class TestSignificance:
         own, other = Picture(PROFILE, SYMBOLS), Picture(PROFILE, np.exp(1j * random_phases(PROFILE, 9)))
         mixed = look(lambda places: own(places) + other(places))
         assert 0.3 * mixed.symbols < mixed.significance < 0.7 * mixed.symbols
-
-    def test_darkness_is_not_significant(self) -> None:
-        found = look(lambda places: np.zeros(places.shape[:-1], complex))
-        assert found.significance < 1
-        assert np.isfinite([*found.pixels.ravel(), found.phase, *found.slope, *found.carrier]).all()
 
     @staticmethod
     def _unrelated(reach_px: float, pages: int, samples: int = 4, profile: Profile = PROFILE) -> list[float]:

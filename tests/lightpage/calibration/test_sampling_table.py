@@ -30,15 +30,6 @@ def some_device() -> np.ndarray:
     return vector
 
 
-def test_centres_run_row_by_row_about_the_pages_centre() -> None:
-    profile = small_profile()
-    rows, columns = profile.page_shape
-    centres = symbol_centres(profile).reshape(rows, columns, 2)
-    assert np.abs(centres.mean((0, 1))).max() < 1e-15
-    np.testing.assert_allclose(centres[0, 1] - centres[0, 0], [profile.symbol_pitch_m, 0], atol=1e-15)
-    np.testing.assert_allclose(centres[1, 0] - centres[0, 0], [0, profile.symbol_pitch_m], atol=1e-15)
-
-
 @pytest.mark.parametrize("profile", [small_profile(), load_profile("bench")], ids=lambda p: p.name)
 def test_four_by_four_samples_rebuilt_from_it_are_those_that_the_twin_traces(profile: Profile) -> None:
     twin, parameters, grid = TorchTwin(RayTwin(profile)), some_device(), field_grid(profile)
@@ -60,9 +51,10 @@ def test_four_by_four_samples_rebuilt_from_it_are_those_that_the_twin_traces(pro
             assert np.abs(turned).max() < 2e-3
 
 
-def test_its_maps_have_the_names_and_shapes_that_a_decoder_takes() -> None:
+def test_its_maps_have_the_names_and_shapes_that_a_decoder_takes_and_no_digits_that_nobody_needs() -> None:
     profile = small_profile()
-    table = sampling_table(TorchTwin(RayTwin(profile)), some_device(), TURN, profile)
+    twin, parameters = TorchTwin(RayTwin(profile)), some_device()
+    table = sampling_table(twin, parameters, TURN, profile)
     branches, page = len(BRANCHES), profile.page_shape
     assert tuple(table) == SAMPLING_TABLE
     assert {name: array.shape for name, array in table.items()} == {
@@ -77,15 +69,16 @@ def test_its_maps_have_the_names_and_shapes_that_a_decoder_takes() -> None:
     assert {array.dtype for array in table.values()} == {np.dtype(np.float32)}
     np.testing.assert_allclose(table["homodyne"], [np.cos(TURN), np.sin(TURN)], rtol=1e-6)
     assert np.abs(table["phases"][:, 0]).max() <= np.pi + 1e-6
-
-
-def test_positions_are_the_exit_centroids_of_the_symbols() -> None:
-    profile = small_profile()
-    twin, parameters = TorchTwin(RayTwin(profile)), some_device()
-    positions = sampling_table(twin, parameters, TURN, profile)["positions"]
-    expected = twin.trace(parameters, symbol_centres(profile)).positions
-    np.testing.assert_allclose(positions[0], expected[:, 0].reshape(profile.page_shape), atol=1e-6)
-    np.testing.assert_allclose(positions[1], expected[:, 1].reshape(profile.page_shape), atol=1e-6)
+    positions = twin.trace(parameters, symbol_centres(profile)).positions
+    np.testing.assert_allclose(table["positions"].reshape(2, -1).T, positions, atol=1e-6)
+    for name, bits in (("places", 14), ("place_gradients", 14), ("phases", 16)):
+        scaled = table[name].astype(np.float64) * 2.0**bits
+        np.testing.assert_array_equal(scaled, np.rint(scaled), err_msg=name)
+    positions = twin.trace(parameters, symbol_centres(profile)).positions
+    np.testing.assert_allclose(table["positions"].reshape(2, -1).T, positions, atol=1e-6)
+    for name, bits in (("places", 14), ("place_gradients", 14), ("phases", 16)):
+        scaled = table[name].astype(np.float64) * 2.0**bits
+        np.testing.assert_array_equal(scaled, np.rint(scaled), err_msg=name)
 
 
 def test_a_cubic_holds_the_pixels_of_the_whole_grid() -> None:
@@ -98,11 +91,3 @@ def test_a_cubic_holds_the_pixels_of_the_whole_grid() -> None:
     terms = np.stack([u**i * v**j for i, j in monomial_powers()])
     rebuilt = np.moveaxis(coefficients @ terms, 1, -1)
     assert np.abs(rebuilt - twin.pixels(parameters, places)).max() < 1e-3
-
-
-def test_what_it_holds_of_symbols_has_no_digits_that_nobody_needs() -> None:
-    profile = small_profile()
-    table = sampling_table(TorchTwin(RayTwin(profile)), some_device(), TURN, profile)
-    for name, bits in (("places", 14), ("place_gradients", 14), ("phases", 16)):
-        scaled = table[name].astype(np.float64) * 2.0**bits
-        np.testing.assert_array_equal(scaled, np.rint(scaled), err_msg=name)

@@ -18,7 +18,7 @@ def random_word(data: int, corrections: int, seed: int) -> np.ndarray:
     return np.concatenate([symbols, parity(symbols, corrections)], axis=1)[0]
 
 
-@pytest.mark.parametrize(("data", "corrections"), [(1, 1), (2, 32), (100, 7), (1000, 2)])
+@pytest.mark.parametrize(("data", "corrections"), [(1, 1), (2, 32), (100, 7), (LONGEST_WORD - 8, 4)])
 def test_parity_is_the_librarys(data: int, corrections: int) -> None:
     rng = np.random.default_rng([data, corrections])
     symbols = rng.integers(0, 4096, (3, data))
@@ -28,17 +28,6 @@ def test_parity_is_the_librarys(data: int, corrections: int) -> None:
     assert got.shape == (3, 2 * corrections)
     for row, ends in zip(symbols, got, strict=True):
         assert list(library(corrections).encode(row.tolist())) == [*row, *ends]
-
-
-def test_the_longest_word_has_the_librarys_parity_and_is_mended() -> None:
-    word = random_word(LONGEST_WORD - 8, 4, 0)
-    assert list(library(4).encode(word[:-8].tolist())) == word.tolist()
-    spoilt = word.copy()
-    spoilt[[0, 2000, 4086, 4094]] ^= [1, 4095, 77, 2048]  # data and parity, first and last
-    found = repair(spoilt, 4)
-    assert found is not None
-    assert np.array_equal(found[0], word[:-8])
-    assert found[1] == 4
 
 
 def spoil(word: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:

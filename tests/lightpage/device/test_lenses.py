@@ -1,13 +1,65 @@
-"""Claims about lens prescriptions: focal distances against known figures, closed forms and themselves turned round."""
+"""Lenses: a real one's path, and prescriptions against known figures, closed forms and themselves turned round."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 
+from lightpage.device.lens_path import SeidelTerms
 from lightpage.device.lenses import LENSES, LensPrescription, Surface
+from lightpage.device.profile import load_profile, parse_profile
+from lightpage.errors import ProfileError
 from tests.lightpage.refused import refused
+from tests.lightpage.small import THICK, small_profile
+
+TERMS = SeidelTerms(1.1, -0.7, 0.5, 0.9, -1.3, 0.4)
+
+
+def test_slope_and_bend_are_the_derivatives() -> None:
+    x, y, across, up = np.random.default_rng(0).uniform(-1, 1, (4, 50))
+    step = 1e-4
+
+    def path(across: np.ndarray, up: np.ndarray) -> np.ndarray:
+        return np.asarray(TERMS.of_both(x, y, across, up))
+
+    for axis, (dx, dy) in enumerate(((step, 0.0), (0.0, step))):
+        plus, minus = path(across + dx, up + dy), path(across - dx, up - dy)
+        np.testing.assert_allclose(TERMS.slope(x, y, across, up)[axis], (plus - minus) / (2 * step), atol=1e-6)
+        bend = (plus - 2 * path(across, up) + minus) / step**2
+        np.testing.assert_allclose(TERMS.bend(x, y, across, up)[axis], bend, atol=1e-5)
+        by_field = [
+            TERMS.of_field(x + side * dx, y + side * dy) + TERMS.of_both(x + side * dx, y + side * dy, across, up)
+            for side in (1, -1)
+        ]
+        expected = (by_field[0] - by_field[1]) / (2 * step)
+        np.testing.assert_allclose(TERMS.slope_on_field(x, y, across, up)[axis], expected, atol=1e-6)
+
+
+def test_the_mirror_image_sends_the_same_path_from_the_point_opposite() -> None:
+    x, y, across, up = np.random.default_rng(1).uniform(-1, 1, (4, 50))
+    mirrored = TERMS.mirrored()
+    # seen from the camera, whose coordinates are turned by half a turn, and conjugate
+    np.testing.assert_allclose(-mirrored.of_both(x, y, across, up), TERMS.of_both(-x, -y, across, up), atol=1e-12)
+    np.testing.assert_allclose(-mirrored.of_field(x, y), TERMS.of_field(-x, -y), atol=1e-12)
+
+
+def test_a_profile_keeps_it_through_toml_and_ideal_lenses_go_without() -> None:
+    thick = small_profile().model_copy(update={"lens_path": THICK})
+    assert parse_profile(thick.to_toml()) == thick
+    assert not thick.ideal_lenses
+    assert "lens_path" not in small_profile().to_toml()
+    with refused(got="lens_path.coma_rad", kind=ProfileError):
+        parse_profile(thick.to_toml().replace("coma_rad = -1.4", "coma_rad = -4000.0"))
+
+
+def test_the_same_lenses_are_stated_for_the_corner_of_a_page_cut_for_larger_symbols() -> None:
+    paper = load_profile("paper")
+    cut = paper.with_symbols_of(64)
+    assert cut.corner_m < 0.98 * paper.corner_m
+    np.testing.assert_allclose(cut.seidel_terms(), paper.seidel_terms(), rtol=1e-12)
+
 
 ACHROMAT = LENSES["AC508-080-A"]
 
@@ -29,24 +81,13 @@ def test_a_thick_lens_obeys_the_lensmaker() -> None:
     assert focal_distances_m(lens) == pytest.approx(expected, rel=1e-12)
 
 
-def test_a_flat_side_is_one_of_infinite_radius() -> None:
-    lens = LensPrescription("flat in front", (Surface(math.inf, 4e-3, 1.5), Surface(-25e-3, 0, 1)), 20e-3)
-    assert focal_distances_m(lens) == pytest.approx((50e-3, 50e-3, 50e-3 - 4e-3 / 1.5), rel=1e-12)
-
-
-def test_reversed_it_has_its_focal_planes_swapped() -> None:
-    turned = ACHROMAT.reversed()
-    assert [surface.radius_m for surface in turned.surfaces] == [247.2e-3, 46.4e-3, -54.9e-3]
-    assert [surface.index for surface in turned.surfaces] == [1.815674, 1.674748, 1]
-    assert [surface.thickness_m for surface in turned.surfaces] == [2e-3, 16e-3, 0]
-    effective, back, front = focal_distances_m(ACHROMAT)
-    assert focal_distances_m(turned) == pytest.approx((effective, front, back), rel=1e-12)
-    assert turned.reversed() == ACHROMAT
-
-
-def test_each_surface_keeps_its_conic_when_reversed() -> None:
+def test_reversed_it_has_its_focal_planes_swapped_and_keeps_its_conics() -> None:
     lens = LensPrescription("asphere", (Surface(30e-3, 9e-3, 1.7, conic=-0.6), Surface(-70e-3, 0, 1)), 20e-3)
-    assert [surface.conic for surface in lens.reversed().surfaces] == [0, -0.6]
+    turned = lens.reversed()
+    effective, back, front = focal_distances_m(lens)
+    assert focal_distances_m(turned) == pytest.approx((effective, front, back), rel=1e-12)
+    assert [surface.conic for surface in turned.surfaces] == [0, -0.6]
+    assert ACHROMAT.reversed().reversed() == ACHROMAT
 
 
 @pytest.mark.parametrize(

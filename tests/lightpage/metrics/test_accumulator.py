@@ -57,18 +57,6 @@ def test_bins_of_equal_count_hold_the_symbols_in_order_of_concentration() -> Non
     assert [b.count for b in accumulator.concentration_bins(bins=31)] == [1] * 30
 
 
-def test_calibrated_concentrations_keep_their_promise_in_every_bin_and_doubled_ones_do_not() -> None:
-    rng = np.random.default_rng(6)
-    kappa = rng.gamma(2.0, 5.0, 40_000)
-    symbols, errors = rng.integers(64, size=kappa.size), rng.vonmises(0, kappa)
-    calibrated, doubled = Accumulator(64, np.ones((100, 400), bool), 1), Accumulator(64, np.ones((100, 400), bool), 1)
-    calibrated.add(symbols * 2 * np.pi / 64 + errors, kappa, symbols)
-    doubled.add(symbols * 2 * np.pi / 64 + errors, 2 * kappa, symbols)
-    assert len(calibrated.concentration_bins()) == 10
-    assert max(abs(b.observed - b.promised) for b in calibrated.concentration_bins()) < 0.02
-    assert max(b.promised - b.observed for b in doubled.concentration_bins()) > 0.1
-
-
 def test_no_page_has_no_figures() -> None:
     with refused("pages to measure", kind=PageError):
         Accumulator(16, np.ones((2, 3), bool), pages=4).figures()

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 from scipy.special import logsumexp, softmax
 from scipy.stats import entropy
 
+from lightpage import von_mises
 from lightpage.errors import PageError
 from lightpage.metrics import information, measures, reliability
 from tests.lightpage.refused import refused
@@ -26,11 +28,6 @@ def test_own_information_is_what_the_posterior_leaves_unknown(levels: int) -> No
     logits = kappa[:, None] * (np.cos(np.arange(levels) * 2 * np.pi / levels - mu[:, None]) - 1)
     expected = np.log2(levels) - entropy(softmax(logits, axis=1), base=2, axis=1)
     np.testing.assert_allclose(information.own_information(mu, kappa, levels), expected, atol=1e-8)
-
-
-def test_own_information_is_nothing_without_concentration_and_never_more_than_the_levels_hold() -> None:
-    bits = information.own_information(np.zeros(3), np.array([0.0, 1e4, 1e30]), levels=16)
-    np.testing.assert_allclose(bits, [0, 4, 4], atol=1e-12)
 
 
 @pytest.mark.parametrize("levels", [2, 3, 16, 25, 26, 256])
@@ -133,13 +130,6 @@ def test_maps_average_to_the_figures_of_the_page() -> None:
         measures.symbol_maps(mu[:, 1:], kappa[:, 1:], symbols[:, 1:], 64, data)
 
 
-def test_confidence_lies_between_a_guess_and_certainty() -> None:
-    _, confidence = information.decide_with_confidence(np.zeros(3), np.array([0.0, 3.0, 1e12]), 4)
-    assert confidence.dtype == np.float32
-    assert confidence[0] == pytest.approx(0.25)
-    assert confidence[0] < confidence[1] < confidence[2] == 1
-
-
 @pytest.mark.parametrize(
     ("mu", "kappa", "symbols", "levels", "named"),
     [
@@ -156,3 +146,20 @@ def test_nonsense_is_named(mu: np.ndarray, kappa: np.ndarray, symbols: np.ndarra
     with pytest.raises(PageError) as caught:
         information.log_posterior(mu, kappa, symbols, levels)
     assert named in str(caught.value)
+
+
+@pytest.mark.parametrize("kappa", [0.0, 0.3, 4.0, 60.0])
+def test_promises_are_integrals_of_the_density(kappa: float) -> None:
+    def weight(angle: float) -> float:
+        return float(np.exp(kappa * (np.cos(angle) - 1)))
+
+    total, _ = quad(weight, -np.pi, np.pi)
+    cosine, _ = quad(lambda angle: weight(angle) * np.cos(angle), -np.pi, np.pi)
+    told, _ = quad(lambda angle: weight(angle) / total * np.log(2 * np.pi * weight(angle) / total), -np.pi, np.pi)
+    assert von_mises.mean_resultant(np.array([kappa]))[0] == pytest.approx(cosine / total, abs=1e-9)
+    assert von_mises.information(np.array([kappa]))[0] == pytest.approx(told, abs=1e-9)
+
+
+def test_a_narrow_density_tells_as_a_normal_one_does() -> None:
+    expected = np.log(2 * np.pi) - np.log(2 * np.pi * np.e / 5000) / 2
+    assert von_mises.information(np.array([5000.0]))[0] == pytest.approx(expected, abs=1e-3)

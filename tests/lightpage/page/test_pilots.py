@@ -83,15 +83,6 @@ class TestTrust:
         assert np.median(found) == pytest.approx(expected, rel=0.1)
         assert max(found) <= 1
 
-    def test_pilots_that_are_better_than_claimed_change_nothing(self) -> None:
-        p, pilots = noisy(4000, 40, 0)
-        assert estimate_trust(p, pilots, estimate_piston(p, pilots).angle_rad) == 1
-
-    def test_wrong_pilots_leave_no_trust(self) -> None:
-        p, pilots = noisy(400, 400, 0)
-        wrong = Pilots(pilots.mask, np.roll(pilots.phases, 1))
-        assert estimate_trust(p, wrong, estimate_piston(p, wrong).angle_rad) < 0.01
-
     @pytest.mark.parametrize(("kappa", "outliers", "off_rad"), [(100, 1, 1.5), (1000, 2, np.pi), (4000, 2, 1.5)])
     def test_few_dead_places_cost_nothing(self, kappa: float, outliers: int, off_rad: float) -> None:
         p, pilots = noisy(kappa, kappa, 0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Callable
 from io import FileIO
 from pathlib import Path
 
@@ -63,15 +62,6 @@ def write(path: Path, pages: int = 4) -> None:
             recording.append(SYMBOLS[page], random_frames(page))
 
 
-def begin(path: Path) -> Callable[[], int]:
-    """Write two pages and be interrupted; tells the pages that a command would find."""
-    with pytest.raises(KeyboardInterrupt), writer(path) as recording:  # noqa: PT012
-        for page in range(2):
-            recording.append(SYMBOLS[page], random_frames(page))
-        raise KeyboardInterrupt
-    return lambda: pages_there(path, PROFILE, LEVELS, 12)
-
-
 def check(path: Path, pages: int = 4) -> None:
     with Recording.open(path) as recording:
         assert recording.pages == pages
@@ -113,7 +103,10 @@ def test_wherever_writing_fails_the_pages_before_stay(
 
 def test_a_failure_to_read_does_not_begin_the_pages_anew(tmp_path: Path, disk: type[Disk]) -> None:
     path = tmp_path / "r.h5"
-    found = begin(path)
+    with pytest.raises(KeyboardInterrupt), writer(path) as recording:  # noqa: PT012
+        for page in range(2):
+            recording.append(SYMBOLS[page], random_frames(page))
+        raise KeyboardInterrupt
     content = partial_path(path).read_bytes()
     for good in range(6):
         reads = [0]
@@ -129,7 +122,7 @@ def test_a_failure_to_read_does_not_begin_the_pages_anew(tmp_path: Path, disk: t
             with pytest.raises(StorageError):
                 writer(path)
         assert partial_path(path).read_bytes() == content
-    assert found() == 2
+    assert pages_there(path, PROFILE, LEVELS, 12) == 2
     disk.bad_reads = 2
     write(path)
     check(path)

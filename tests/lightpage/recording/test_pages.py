@@ -14,7 +14,7 @@ from lightpage.device.profile import parse_profile
 from lightpage.errors import PageError, RecordingError
 from lightpage.page.symbols import random_symbols
 from lightpage.recording.pages import Pages, PagesWriter
-from tests.lightpage.recording.test_recording import small_profile
+from tests.lightpage.recording.test_recording import array, attribute, small_profile
 from tests.lightpage.refused import refused
 
 LEVELS = 16
@@ -52,22 +52,12 @@ class TestWriting:
             assert parse_profile(str(file.attrs["profile"])) == PROFILE
             assert (file["symbols"].dtype, file["symbols"].chunks) == (np.uint8, (1, *PROFILE.page_shape))
 
-    def test_nothing_has_the_final_name_until_all_is_there(self, tmp_path: Path) -> None:
-        path = tmp_path / "p.h5"
-        path.write_bytes(b"earlier")
-        with PagesWriter(path, PROFILE, LEVELS, CODE) as writer:
-            writer.append(SYMBOLS[0])
-            writer.append(SYMBOLS[1:])
-            assert path.read_bytes() == b"earlier"
-        assert [entry.name for entry in tmp_path.iterdir()] == ["p.h5"]
-        with Pages.open(path) as pages:
-            assert np.array_equal(list(pages), SYMBOLS)
-
     def test_an_interruption_leaves_the_earlier_file(self, tmp_path: Path) -> None:
         path = write(tmp_path / "p.h5")
         before = path.read_bytes()
         with pytest.raises(KeyboardInterrupt), PagesWriter(path, PROFILE, LEVELS, CODE) as writer:  # noqa: PT012
-            writer.append(SYMBOLS[:2])
+            writer.append(SYMBOLS[0])
+            assert path.read_bytes() == before
             raise KeyboardInterrupt
         assert [entry.name for entry in tmp_path.iterdir()] == ["p.h5"]
         assert path.read_bytes() == before
@@ -88,67 +78,18 @@ class TestWriting:
             write(tmp_path / "p.h5", symbols)
         assert list(tmp_path.iterdir()) == []
 
-    def test_levels_out_of_range_and_a_folder_that_is_not_there_are_refused(self, tmp_path: Path) -> None:
-        for levels in (1, 257):
-            with refused("levels", levels, PageError):
-                PagesWriter(tmp_path / "p.h5", PROFILE, levels, CODE)
-        with refused("p.h5.partial", kind=RecordingError):
-            PagesWriter(tmp_path / "no" / "p.h5", PROFILE, LEVELS, CODE)
-        assert list(tmp_path.iterdir()) == []
-
-    def test_pages_that_are_being_written_are_not_destroyed(self, tmp_path: Path) -> None:
-        path = tmp_path / "p.h5"
-        with PagesWriter(path, PROFILE, LEVELS, CODE) as writer:
-            writer.append(SYMBOLS[:3])
-            with refused("p.h5.partial", kind=RecordingError):
-                PagesWriter(path, PROFILE, LEVELS, CODE)
-            writer.append(SYMBOLS[3:])
-        with Pages.open(path) as pages:
-            assert np.array_equal(list(pages), SYMBOLS)
-
-    def test_what_an_earlier_program_left_is_written_over(self, tmp_path: Path) -> None:
-        (tmp_path / "p.h5.partial").write_bytes(b"left" * 100_000)
-        path = write(tmp_path / "p.h5")
-        assert path.stat().st_size < 100_000
-        with Pages.open(path) as pages:
-            assert np.array_equal(list(pages), SYMBOLS)
-
-
-def set_attribute(name: str, value: object) -> Callable[[h5py.File], None]:
-    return lambda file: file.attrs.__setitem__(name, value)
-
-
-def set_symbols(symbols: np.ndarray) -> Callable[[h5py.File], None]:
-    def change(file: h5py.File) -> None:
-        del file["symbols"]
-        file["symbols"] = symbols
-
-    return change
-
 
 class TestReading:
-    def test_a_truncated_file_other_files_and_none_are_refused(self, tmp_path: Path) -> None:
-        path = tmp_path / "p.h5"
-        whole = write(tmp_path / "whole.h5").read_bytes()
-        for content in (None, b"anything" * 1000, *(whole[: int(share * len(whole))] for share in (0, 0.1, 0.99))):
-            if content is not None:
-                path.write_bytes(content)
-            with refused("p.h5", kind=RecordingError):
-                Pages.open(path)
-
     @pytest.mark.parametrize(
         ("change", "subject", "got"),
         [
-            (set_attribute("format", "lightpage-recording"), "'format'", "lightpage-recording"),
-            (lambda file: file.attrs.__delitem__("format"), "'format'", None),
-            (set_attribute("version", 2), "'version'", 2),
-            (set_attribute("levels", 1), "'levels'", 1),
-            (set_attribute("levels", 16.5), "'levels'", 16.5),
-            (lambda file: file.attrs.__delitem__("levels"), "'levels'", None),
+            (attribute("format", "lightpage-recording"), "'format'", "lightpage-recording"),
+            (attribute("version", 2), "'version'", 2),
+            (attribute("levels", 1), "'levels'", 1),
             (lambda file: file.__delitem__("symbols"), "'symbols'", "none"),
-            (set_symbols(np.zeros((7, 6, 9), np.uint16)), "'symbols'", "uint16"),
-            (set_symbols(np.zeros((6, 9), np.uint8)), "'symbols'", (6, 9)),
-            (set_symbols(np.zeros((0, 6, 9), np.uint8)), "'symbols'", (0, 6, 9)),
+            (array("symbols", lambda d: d.astype(np.uint16)), "'symbols'", "uint16"),
+            (array("symbols", lambda d: d[0]), "'symbols'", (6, 9)),
+            (array("symbols", lambda d: d[:0]), "'symbols'", (0, 6, 9)),
         ],
     )
     def test_a_foreign_file_is_refused_by_name(
@@ -178,6 +119,4 @@ class TestReading:
         with Pages.open(path) as pages:
             assert np.array_equal(pages[2], SYMBOLS[2])
             with refused("p.h5: page 3", 16, RecordingError):
-                pages[3]
-            with refused("page 3", kind=RecordingError):
                 list(pages)

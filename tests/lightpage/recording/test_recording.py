@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 
 from lightpage.device.profile import Profile, load_profile, parse_profile
-from lightpage.errors import PageError, RecordingError, SaturatedFrameError
+from lightpage.errors import PageError, RecordingError
 from lightpage.page.symbols import pilot_mask, random_symbols
-from lightpage.recording.exposure import check_light
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording, RecordingWriter, hash_frames
 from tests.lightpage.refused import refused
@@ -109,27 +109,6 @@ class TestReading:
             assert pilots.dtype == np.bool_
             assert np.array_equal(pilots, mask)
 
-    @pytest.mark.parametrize(
-        ("number", "text"),
-        [
-            (float, str),
-            (np.uint16, str.encode),
-            (np.float32, lambda value: np.array([value.encode()])),
-            (lambda value: np.array([value], np.float64), str),
-        ],
-    )
-    def test_whole_numbers_may_come_as_floats_and_texts_as_arrays_of_bytes(
-        self, foreign: Path, number: Callable[[int], object], text: Callable[[str], object]
-    ) -> None:
-        with h5py.File(foreign, "r+") as file:
-            for name, value in {"version": 1, "camera_bit_depth": 12, "levels": LEVELS, "black_level": 7}.items():
-                file.attrs[name] = number(value)
-            file.attrs["format"], file.attrs["profile"] = text("lightpage-recording"), text("name = 'µ'")
-        with Recording.open(foreign) as recording:
-            assert (recording.levels, recording.bit_depth, recording.black_level) == (LEVELS, 12, 7)
-            assert all(type(n) is int for n in (recording.levels, recording.bit_depth, recording.black_level))
-            assert recording.profile_text == "name = 'µ'"
-
     def test_8_bit_counts_may_come_in_16_bit_words(self, foreign: Path) -> None:
         with h5py.File(foreign, "r+") as file:
             file.attrs["camera_bit_depth"] = 8
@@ -139,22 +118,15 @@ class TestReading:
             assert int(recording.frames(0).in_phase.max()) <= 255
 
     def test_counts_of_the_other_byte_order_come_back_in_this_machines(self, foreign: Path) -> None:
-        names = ("in_phase", "quadrature", "reference_in_phase", "reference_quadrature")
         with Recording.open(foreign) as recording:
-            before, references = recording.frames(1), recording.references()
-            page_hash = recording.page_hash(1)
+            before, page_hash = recording.frames(1).in_phase, recording.page_hash(1)
         with h5py.File(foreign, "r+") as file:
-            other = np.dtype(np.uint16).newbyteorder("S")
-            for name in names:
-                data = file[name][()]
-                del file[name]
-                file.create_dataset(name, data=data, dtype=other)
-            assert not file["in_phase"].dtype.isnative
+            data = file["in_phase"][()]
+            del file["in_phase"]
+            file.create_dataset("in_phase", data=data, dtype=data.dtype.newbyteorder("S"))
         with Recording.open(foreign) as recording:
-            for got, expected in ((recording.frames(1), before), (recording.references(), references)):
-                for name in ("in_phase", "quadrature"):
-                    assert getattr(got, name).dtype.isnative
-                    assert np.array_equal(getattr(got, name), getattr(expected, name))
+            assert recording.frames(1).in_phase.dtype.isnative
+            assert np.array_equal(recording.frames(1).in_phase, before)
             assert recording.page_hash(1) == page_hash
 
     @pytest.mark.parametrize("black", [0, 200, 4094])
@@ -169,28 +141,14 @@ class TestReading:
                     assert getattr(got, name).dtype == np.uint16
                     assert np.array_equal(getattr(got, name), np.clip(counts - black, 0, None))
 
-    def test_a_clipped_count_stays_at_full_scale_where_the_black_level_is_taken_off(self, foreign: Path) -> None:
-        with h5py.File(foreign, "r+") as file:
-            file.attrs["black_level"] = 200
-            file["in_phase"][1, 3:9] = 4095
+    def test_the_hash_of_a_page_is_that_of_the_frames_that_a_decoder_is_given(self, foreign: Path) -> None:
+        stored = "57c2f4abdcaafa11965f6992bf7c1820bab85ff13fb5cb69c75309ec5f375f3c"
         with Recording.open(foreign) as recording:
-            frame = recording.frames(1).in_phase
-            assert np.all(frame[3:9] == 4095)
-            with pytest.raises(SaturatedFrameError):
-                check_light("in-phase frame", frame, recording.bit_depth)
-
-    def test_a_recording_without_a_black_level_keeps_its_counts_and_its_hashes(self, foreign: Path) -> None:
-        with Recording.open(foreign) as recording, h5py.File(foreign) as file:
-            assert recording.black_level == 0
-            stored = FramePair(file["in_phase"][0], file["quadrature"][0])
-            assert np.array_equal(recording.frames(0).in_phase, stored.in_phase)
-            assert recording.page_hash(0) == hash_frames(stored)
-            assert recording.page_hash(0) == ("57c2f4abdcaafa11965f6992bf7c1820bab85ff13fb5cb69c75309ec5f375f3c")
+            assert recording.page_hash(0) == hash_frames(recording.frames(0)) == stored
         with h5py.File(foreign, "r+") as file:
             file.attrs["black_level"] = 100
         with Recording.open(foreign) as recording:
-            # the identity of what a decoder is given
-            assert recording.page_hash(0) == hash_frames(recording.frames(0)) != hash_frames(stored)
+            assert recording.page_hash(0) == hash_frames(recording.frames(0)) != stored
 
     def test_it_tells_where_its_own_profile_says_otherwise(self, foreign: Path) -> None:
         profile = load_profile("bench")
@@ -205,19 +163,21 @@ class TestReading:
             with Recording.open(foreign) as recording:
                 assert recording.differences(profile) == expected
 
+    def test_left_aligned_counts_are_told_of_once(self, foreign: Path, caplog: pytest.LogCaptureFixture) -> None:
+        with h5py.File(foreign, "r+") as file:
+            file.attrs["camera_bit_depth"] = 16
+            for name in ("in_phase", "quadrature", "reference_in_phase", "reference_quadrature"):
+                file[name][...] = file[name][...] << 4
+        with Recording.open(foreign) as recording:
+            recording.references()
+            recording.frames(0)
+        assert [record.message.count("multiples of 16") for record in caplog.records] == [1]
+
     def test_a_page_that_is_not_there_is_refused(self, foreign: Path) -> None:
         with Recording.open(foreign) as recording:
             for page in (-1, PAGES):
                 with refused("page", page, RecordingError):
                     recording.frames(page)
-
-    def test_page_hash_tells_pages_and_the_places_of_frames_apart(self, foreign: Path) -> None:
-        with Recording.open(foreign) as recording:
-            hashes = {recording.page_hash(page) for page in range(PAGES)}
-        with h5py.File(foreign, "r+") as file:
-            file["in_phase"][0], file["quadrature"][0] = file["quadrature"][0], file["in_phase"][0]
-        with Recording.open(foreign) as recording:
-            assert len(hashes | {recording.page_hash(0)}) == PAGES + 1
 
     def test_a_profile_of_another_camera_or_page_is_refused(self, foreign: Path) -> None:
         profile = small_profile()
@@ -231,21 +191,15 @@ class TestReading:
                 recording.check_against(profile.model_copy(update={"page": page}))
 
 
-def replace(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[h5py.File], None]:
+def attribute(name: str, value: object) -> Callable[[h5py.File], None]:
+    return lambda file: file.attrs.__setitem__(name, value)
+
+
+def array(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[h5py.File], None]:
     def edit(file: h5py.File) -> None:
         data = change(file[name][()])
         del file[name]
         file[name] = data
-
-    return edit
-
-
-def attribute(name: str, value: object) -> Callable[[h5py.File], None]:
-    def edit(file: h5py.File) -> None:
-        if value is None:
-            del file.attrs[name]
-        else:
-            file.attrs[name] = value
 
     return edit
 
@@ -255,76 +209,45 @@ def group_instead(file: h5py.File) -> None:
     file.create_group("quadrature")
 
 
-def without(name: str) -> Callable[[h5py.File], None]:
-    def edit(file: h5py.File) -> None:
-        del file[name]
-
-    return edit
-
-
-BAD = {
-    "no format": (attribute("format", None), "attribute 'format'", "none"),
-    "another format": (attribute("format", "other"), "attribute 'format'", "'other'"),
-    "no version": (attribute("version", None), "attribute 'version'", "none"),
-    "newer version": (attribute("version", 2), "attribute 'version'", "2"),
-    "version of text": (attribute("version", "1"), "attribute 'version'", "'1'"),
-    "no bit depth": (attribute("camera_bit_depth", None), "attribute 'camera_bit_depth'", "none"),
-    "a black level below zero": (attribute("black_level", -1), "attribute 'black_level'", "-1"),
-    "a black level at full scale": (attribute("black_level", 4095), "attribute 'black_level'", "4095"),
-    "a black level between counts": (attribute("black_level", 12.5), "attribute 'black_level'", "12.5"),
-    "7 bits": (attribute("camera_bit_depth", 7), "attribute 'camera_bit_depth'", "7"),
-    "17 bits": (attribute("camera_bit_depth", 17), "attribute 'camera_bit_depth'", "17"),
-    "1 level": (attribute("levels", 1), "attribute 'levels'", "1"),
-    "257 levels": (attribute("levels", 257), "attribute 'levels'", "257"),
-    "levels below the symbols": (attribute("levels", 8), "dataset 'symbols'", "15"),
-    "profile as a number": (attribute("profile", 3), "attribute 'profile'", "int"),
-    "no in-phase": (without("in_phase"), "dataset 'in_phase'", "none"),
-    "no quadrature": (without("quadrature"), "dataset 'quadrature'", "none"),
-    "no reference": (without("reference_quadrature"), "dataset 'reference_quadrature'", "none"),
-    "a group": (group_instead, "dataset 'quadrature'", "group"),
-    "32-bit frames": (replace("in_phase", lambda d: d.astype(np.uint32)), "dataset 'in_phase'", "uint32"),
-    "12 bits in a byte": (replace("in_phase", lambda d: d.astype(np.uint8)), "dataset 'in_phase'", "uint8"),
-    "fewer quadrature pages": (replace("quadrature", lambda d: d[:2]), "dataset 'quadrature'", (2, 14, 20)),
-    "narrower quadrature": (replace("quadrature", lambda d: d[:, :, :19]), "dataset 'quadrature'", (3, 14, 19)),
-    "flat frames": (replace("in_phase", lambda d: d[0]), "dataset 'in_phase'", (14, 20)),
-    "reference per page": (
-        replace("reference_in_phase", lambda d: d[None]),
-        "dataset 'reference_in_phase'",
-        (1, 14, 20),
-    ),
-    "reference of another size": (
-        replace("reference_in_phase", lambda d: d.T),
-        "dataset 'reference_in_phase'",
-        (20, 14),
-    ),
-    "no pixels": (replace("in_phase", lambda d: d[:, :0]), "dataset 'in_phase'", (3, 0, 20)),
-    "16-bit symbols": (replace("symbols", lambda d: d.astype(np.uint16)), "dataset 'symbols'", "uint16"),
-    "fewer symbol pages": (replace("symbols", lambda d: d[:2]), "dataset 'symbols'", (2, 6, 9)),
-    "flat symbols": (replace("symbols", lambda d: d[0]), "dataset 'symbols'", (6, 9)),
-    "pilots of another page": (replace("pilots", lambda d: d.T), "dataset 'pilots'", (9, 6)),
-    "no pilots": (replace("pilots", np.zeros_like), "dataset 'pilots'", "0 pilots"),
-    "nothing but pilots": (replace("pilots", np.ones_like), "dataset 'pilots'", "54 pilots"),
-    "no pages": (replace("in_phase", lambda d: d[:0]), "dataset 'in_phase'", (0, 14, 20)),
-    "float pilots": (replace("pilots", lambda d: d.astype(np.float64)), "dataset 'pilots'", "float64"),
-}
+BAD = [
+    (attribute("format", "other"), "attribute 'format'", "'other'"),
+    (attribute("version", 2), "attribute 'version'", "2"),
+    (lambda file: file.attrs.__delitem__("camera_bit_depth"), "attribute 'camera_bit_depth'", "none"),
+    (attribute("black_level", -1), "attribute 'black_level'", "-1"),
+    (attribute("black_level", 4095), "attribute 'black_level'", "4095"),
+    (attribute("camera_bit_depth", 7), "attribute 'camera_bit_depth'", "7"),
+    (attribute("camera_bit_depth", 17), "attribute 'camera_bit_depth'", "17"),
+    (attribute("levels", 1), "attribute 'levels'", "1"),
+    (attribute("levels", 257), "attribute 'levels'", "257"),
+    (attribute("levels", 15), "dataset 'symbols'", "15"),
+    (attribute("profile", 3), "attribute 'profile'", "int"),
+    (lambda file: file.__delitem__("quadrature"), "dataset 'quadrature'", "none"),
+    (group_instead, "dataset 'quadrature'", "group"),
+    (array("in_phase", lambda d: d.astype(np.uint32)), "dataset 'in_phase'", "uint32"),
+    (array("in_phase", lambda d: d.astype(np.uint8)), "dataset 'in_phase'", "uint8"),
+    (array("quadrature", lambda d: d[:2]), "dataset 'quadrature'", (2, 14, 20)),
+    (array("in_phase", lambda d: d[0]), "dataset 'in_phase'", (14, 20)),
+    (array("reference_in_phase", lambda d: d[None]), "dataset 'reference_in_phase'", (1, 14, 20)),
+    (array("reference_in_phase", lambda d: d.T), "dataset 'reference_in_phase'", (20, 14)),
+    (array("in_phase", lambda d: d[:, :0]), "dataset 'in_phase'", (3, 0, 20)),
+    (array("symbols", lambda d: d.astype(np.uint16)), "dataset 'symbols'", "uint16"),
+    (array("symbols", lambda d: d[:2]), "dataset 'symbols'", (2, 6, 9)),
+    (array("pilots", lambda d: d.T), "dataset 'pilots'", (9, 6)),
+    (array("pilots", np.zeros_like), "dataset 'pilots'", "0 pilots"),
+    (array("pilots", np.ones_like), "dataset 'pilots'", "54 pilots"),
+    (array("pilots", lambda d: d.astype(np.float64)), "dataset 'pilots'", "float64"),
+    (array("in_phase", lambda d: d[:0]), "dataset 'in_phase'", (0, 14, 20)),
+]
 
 
 class TestBadFiles:
-    @pytest.mark.parametrize("case", BAD)
+    @pytest.mark.parametrize(("edit", "subject", "got"), BAD)
     def test_an_inconsistent_recording_is_refused_with_what_is_wrong_and_what_came(
-        self, foreign: Path, case: str
+        self, foreign: Path, edit: Callable[[h5py.File], None], subject: str, got: object
     ) -> None:
-        edit, subject, got = BAD[case]
         with h5py.File(foreign, "r+") as file:
             edit(file)
         with refused(f"foreign.h5: {subject}", got, RecordingError):
-            Recording.open(foreign)
-
-    @pytest.mark.parametrize("keep", [0.0, 0.1, 0.95])
-    def test_a_truncated_file_is_refused(self, foreign: Path, keep: float) -> None:
-        content = foreign.read_bytes()
-        foreign.write_bytes(content[: int(len(content) * keep)])
-        with refused("foreign.h5", kind=RecordingError):
             Recording.open(foreign)
 
     def test_a_text_a_missing_file_and_a_folder_are_refused(self, tmp_path: Path) -> None:
@@ -341,18 +264,6 @@ class TestBadFiles:
             recording.frames(0)
             with refused("'quadrature' page 1", 4096, RecordingError):
                 recording.frames(1)
-
-    def test_opening_reads_no_frames(self, foreign: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        read: list[str] = []
-        original = h5py.Dataset.__getitem__
-
-        def spy(dataset: h5py.Dataset, *args: object, **kwargs: object) -> object:
-            read.append(str(dataset.name))
-            return original(dataset, *args, **kwargs)
-
-        monkeypatch.setattr(h5py.Dataset, "__getitem__", spy)
-        with Recording.open(foreign):
-            assert read == ["/pilots", "/symbols"]
 
 
 class TestWriting:
@@ -402,9 +313,6 @@ class TestWriting:
         path = tmp_path / "own.h5"
         write_own(path)
         before = path.read_bytes()
-        with pytest.raises(KeyboardInterrupt):
-            interrupted(path, 1)
-        assert path.read_bytes() == before
         with RecordingWriter(path, small_profile(), LEVELS, 12, random_frames(9)) as writer:
             writer.append(None, random_frames(0))
             assert path.read_bytes() == before
@@ -447,28 +355,26 @@ class TestWriting:
         path, profile, references = tmp_path / "own.h5", small_profile(), random_frames(9)
         with refused("bit depth", 17, RecordingError):
             RecordingWriter(path, profile, LEVELS, 17, references)
-        with refused("levels", 1, PageError):
-            RecordingWriter(path, profile, 1, 12, references)
         with refused("pilots", (9, 6), RecordingError):
             RecordingWriter(path, profile, LEVELS, 12, references, np.zeros((9, 6), np.bool_))
         with refused("reference_in_phase", kind=RecordingError):
             RecordingWriter(path, load_profile("bench"), LEVELS, 12, references)
-        with refused("own.h5", kind=RecordingError):
-            RecordingWriter(tmp_path / "no" / "own.h5", profile, LEVELS, 12, references)
         assert list(tmp_path.iterdir()) == []
+
+
+ARGUMENTS = small_profile(), LEVELS, 12, random_frames(100), pilot_mask(small_profile())
 
 
 def interrupted(path: Path, pages: int) -> None:
     """Record `pages` pages, then press Ctrl-C."""
-    profile = small_profile()
-    with RecordingWriter(path, profile, LEVELS, 12, random_frames(100), pilot_mask(profile)) as writer:
+    with RecordingWriter(path, *ARGUMENTS) as writer:
         for page in range(pages):
             writer.append(np.full((6, 9), page, np.uint8), random_frames(page))
         raise KeyboardInterrupt
 
 
 def resumed(path: Path) -> RecordingWriter:
-    return RecordingWriter.resume(path, small_profile(), LEVELS, 12, random_frames(100), pilot_mask(small_profile()))
+    return RecordingWriter.resume(path, *ARGUMENTS)
 
 
 class TestInterruption:
@@ -494,26 +400,24 @@ class TestInterruption:
                 assert (recording.symbols(page) == page).all()
                 assert np.array_equal(recording.frames(page).in_phase, random_frames(page).in_phase)
 
-    @pytest.mark.parametrize("change", ["levels", "bit_depth", "references", "pilots", "profile"])
-    def test_a_partial_file_of_other_arguments_is_not_gone_on_with(self, tmp_path: Path, change: str) -> None:
-        path, profile = tmp_path / "own.h5", small_profile()
+    @pytest.mark.parametrize(
+        ("place", "other"),
+        [
+            (0, small_profile().model_copy(update={"name": "other"})),
+            (1, 8),
+            (2, 16),
+            (3, random_frames(101)),
+            (4, None),
+        ],
+    )
+    def test_a_partial_file_of_other_arguments_is_not_gone_on_with(
+        self, tmp_path: Path, place: int, other: object
+    ) -> None:
+        path, arguments = tmp_path / "own.h5", list[Any](ARGUMENTS)
         with pytest.raises(KeyboardInterrupt):
             interrupted(path, 2)
-        arguments = {
-            "profile": profile,
-            "levels": LEVELS,
-            "bit_depth": 12,
-            "references": random_frames(100),
-            "pilots": pilot_mask(profile),
-        }
-        arguments[change] = {
-            "levels": 8,
-            "bit_depth": 16,
-            "references": random_frames(101),
-            "pilots": None,
-            "profile": profile.model_copy(update={"name": "other"}),
-        }[change]
-        with RecordingWriter.resume(path, **arguments) as writer:  # type: ignore[arg-type]
+        arguments[place] = other
+        with RecordingWriter.resume(path, *arguments) as writer:
             assert writer.pages == 0
 
     @pytest.mark.parametrize("damaged", [False, True])

@@ -1,27 +1,104 @@
-"""A service with a bundle key takes signed bundles only, whichever way they come; its own models need no signature."""
+"""Bundles that come from a folder or as uploads: what is whole, good and signed goes to the store, all else is said."""
 
 from __future__ import annotations
 
-import hashlib
 import json
+import logging
 import os
 from pathlib import Path
 
 import pytest
-from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_public_key
 
 from lightpage.errors import BundleError
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.signature import BundleKey
 from runtime.bundle.signature_file import signature_path
 from runtime.decoding.decoder import Decoder
-from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.incoming import Incoming
 from runtime.service.registry import ModelRegistry
 from runtime.service.store import ModelStore
+from tests.clock import HandClock
+from tests.lightpage.full_disk import full_disk
 from tests.runtime import toy
 from tests.runtime.bundle.test_signature import Signer
+from tests.waiting import eventually
+
+
+@pytest.fixture
+def plane(decoder: Decoder, tmp_path: Path) -> DataPlane:
+    made = DataPlane(ModelRegistry(decoder), store=ModelStore(tmp_path / "store", decoder.bundle))
+    made.models.resume()
+    return made
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (made := tmp_path / "incoming").mkdir()
+    return made
+
+
+def versions(plane: DataPlane) -> list[str]:
+    return [entry.manifest.version for entry in plane.models.entries(stored=True)]
+
+
+def test_a_bundle_is_moved_to_the_store_once_it_is_whole(plane: DataPlane, folder: Path) -> None:
+    incoming, path = Incoming(plane, folder), folder / "new.zip"
+    whole = toy.write_toy_bundle(folder / "new.part", version="toy-2")
+    data = toy.write_toy_bundle(folder.parent / "toy-2.zip", version="toy-2").read_bytes()
+    path.write_bytes(data[:100])
+    incoming.look()
+    path.write_bytes(data)
+    incoming.look()  # it has changed
+    assert versions(plane) == ["toy-1"]
+    incoming.look()
+    assert versions(plane) == ["toy-2", "toy-1"]
+    assert [file.name for file in folder.iterdir()] == [whole.name]
+    assert plane.registry.current.version == "toy-1"
+
+
+def test_what_is_refused_is_said_once_and_stays(
+    plane: DataPlane, folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    incoming, path = Incoming(plane, folder), folder / "bad.zip"
+    path.write_bytes(b"no zip")
+    (folder / "link.zip").symlink_to(toy.write_toy_bundle(folder.parent / "elsewhere.zip", version="toy-3"))
+    for _ in range(4):
+        incoming.look()
+    assert sum("bad.zip" in record.getMessage() for record in caplog.records) == 1
+    assert path.exists()
+    path.unlink()
+    toy.write_toy_bundle(path, version="toy-2")
+    incoming.look()
+    incoming.look()
+    assert versions(plane) == ["toy-2", "toy-1"]
+
+
+def test_what_the_store_cannot_take_is_tried_again(
+    plane: DataPlane, folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    incoming = Incoming(plane, folder)
+    toy.write_toy_bundle(folder / "new.zip", version="toy-2")
+    incoming.look()
+    with full_disk(10):
+        incoming.look()
+        incoming.look()
+    assert sum("new.zip" in record.getMessage() for record in caplog.records) == 1
+    incoming.look()
+    assert versions(plane) == ["toy-2", "toy-1"]
+
+
+def test_the_folder_is_looked_at_while_the_service_runs(
+    plane: DataPlane, folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    clock = HandClock()
+    toy.write_toy_bundle(folder / "new.zip", version="toy-2")
+    with Incoming(plane, folder, 5.0, clock):
+        clock.until_somebody_waits()
+        assert versions(plane) == ["toy-1"]
+        eventually(lambda: clock.advance(5.0) or "as toy-2" in caplog.text)
+    assert versions(plane) == ["toy-2", "toy-1"]
 
 
 def begin(folder: Path, signer: Signer | None) -> DataPlane:
@@ -39,8 +116,6 @@ def begin(folder: Path, signer: Signer | None) -> DataPlane:
 
 
 class Signed:
-    """A service that wants signatures, and whoever can make them."""
-
     def __init__(self, folder: Path) -> None:
         self.signer, self.folder, self.store = Signer(folder), folder, folder / "store"
         self.plane = begin(folder, self.signer)
@@ -49,7 +124,6 @@ class Signed:
         self.incoming.mkdir()
 
     def bundle(self, version: str) -> tuple[Path, bytes]:
-        """A new bundle, and what would sign it."""
         path = toy.write_toy_bundle(self.folder / f"{version}.zip", version=version)
         return path, self.signer.signature(path)
 
@@ -58,7 +132,6 @@ class Signed:
         self.models.take_in(path, signature=signature)
 
     def looked(self) -> set[str]:
-        """Versions that there are once the folder of incoming bundles was looked at."""
         taking = Incoming(self.plane, self.incoming)
         taking.look()
         taking.look()
@@ -70,27 +143,15 @@ def service(tmp_path: Path) -> Signed:
     return Signed(tmp_path)
 
 
-def uploaded(service: Signed, path: Path, signature: bytes) -> str:
-    """Send a bundle to the service; returns the version that it then has."""
-    content = path.read_bytes()
-    upload = service.models.upload(len(content), hashlib.sha256(content).digest(), Caller(), signature)
-    try:
-        upload.begin()
-        upload.add(content)
-        return upload.finish().manifest.version
-    finally:
-        upload.drop()
-
-
-def test_an_upload_needs_a_signature(service: Signed) -> None:
+def test_a_new_bundle_needs_a_signature(service: Signed) -> None:
     (good, signature), (bad, _) = service.bundle("toy-2"), service.bundle("toy-3")
     for wrong in (b"", signature):
         with pytest.raises(BundleError, match="new bundle: signature"):
-            uploaded(service, bad, wrong)
-    assert uploaded(service, good, signature) == "toy-2"
+            service.models.take_in(bad, signature=wrong)
+    service.models.take_in(good, signature=signature)
     assert service.models.activate("toy-2")[0].version == "toy-2"
     assert signature_path(service.store / "toy-2.zip").read_bytes() == signature
-    assert not [path for path in service.store.iterdir() if "toy-3" in path.name or "upload" in path.name]
+    assert not list(service.store.glob("*toy-3*"))
 
 
 def test_incoming_bundles_need_one(service: Signed) -> None:
@@ -104,11 +165,11 @@ def test_incoming_bundles_need_one(service: Signed) -> None:
     assert not list(service.incoming.iterdir())
 
 
-@pytest.mark.parametrize("kind", ["link", "pipe", "folder"])
+@pytest.mark.parametrize("kind", ["link", "pipe"])
 def test_a_signature_that_is_no_plain_file_is_refused(service: Signed, kind: str) -> None:
     (secret := service.folder / "secret").write_bytes(b"a private key")
     path = toy.write_toy_bundle(service.incoming / "toy-2.zip", version="toy-2")
-    make = {"link": lambda at: at.symlink_to(secret), "pipe": os.mkfifo, "folder": Path.mkdir}
+    make = {"link": lambda at: at.symlink_to(secret), "pipe": os.mkfifo}
     make[kind](signature_path(path))
     assert service.looked() == {"toy-1"}
     assert not list(service.store.glob("*.sig"))
@@ -125,19 +186,6 @@ def test_a_stored_bundle_without_its_own_signature_is_refused(service: Signed) -
     for version in ("toy-2", "toy-3", "toy-7", "toy-1+r9"):
         with pytest.raises(BundleError, match="signature"):
             service.models.activate(version)
-
-
-def test_a_signature_may_be_put_beside_a_bundle_that_was_taken_in_without_one(tmp_path: Path) -> None:
-    signer, new = Signer(tmp_path), toy.write_toy_bundle(tmp_path / "new.zip", version="toy-2")
-    signature = signer.signature(new)
-    begin(tmp_path, None).models.take_in(new, signature=b"without a key none is kept")
-    assert sorted(path.name for path in (tmp_path / "store").glob("*toy*")) == ["toy-2.zip"]
-    plane = begin(tmp_path, signer)
-    with pytest.raises(BundleError, match="signature"):
-        plane.models.activate("toy-2")
-    signature_path(tmp_path / "store" / "toy-2.zip").write_bytes(signature)
-    assert plane.models.activate("toy-2")[0].version == "toy-2"
-    assert begin(tmp_path, signer).registry.current.version == "toy-2"
 
 
 def recalibrated(plane: DataPlane, folder: Path, version: str) -> Path:
@@ -168,10 +216,12 @@ def test_its_own_models_need_none_and_the_note_names_their_key(service: Signed) 
     recalibrated(service.plane, service.folder, "toy-1+r1")
     service.take_in("toy-2")
     assert begin(service.folder, service.signer).registry.current.version == "toy-1+r1"
-    told = json.loads((service.store / "current.json").read_text())["keys"]
-    key = load_pem_public_key(service.signer.path.read_bytes())
-    der = key.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
-    assert told == {"toy-1+r1": hashlib.sha256(der).hexdigest()}
+    assert json.loads((service.store / "current.json").read_text())["keys"].keys() == {"toy-1+r1"}
+
+
+def test_without_a_key_no_signature_is_kept(tmp_path: Path) -> None:
+    begin(tmp_path, None).models.take_in(toy.write_toy_bundle(tmp_path / "new.zip", version="toy-2"), signature=b"some")
+    assert [path.name for path in (tmp_path / "store").glob("*toy*")] == ["toy-2.zip"]
 
 
 def test_pruning_takes_signatures_along(service: Signed) -> None:

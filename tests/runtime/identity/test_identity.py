@@ -1,4 +1,4 @@
-"""Certificates: files that are no good are named, and new ones count without a restart."""
+"""Certificates count anew without a restart, and are named where they are no good; what they say of who calls."""
 
 from __future__ import annotations
 
@@ -13,11 +13,13 @@ import pytest
 
 from analysis.service.identity import commands_of, documented
 from lightpage.errors import InvalidInputError
+from runtime.errors import NotAllowedError
 from runtime.identity.certificates import Certificates
-from runtime.identity.roles import identity_of
+from runtime.identity.roles import LOCAL, NEEDED, Identity, Role, identity_of
+from runtime.rpc.call import SERVICE
+from runtime.rpc.inference_calls import INFERENCE, PREFIX
 from runtime.wire.tls import TlsFiles
 from tests.runtime.identity.authority import Authority
-from tests.waiting import eventually
 
 
 @pytest.fixture
@@ -25,23 +27,11 @@ def authority(tmp_path: Path) -> Authority:
     return Authority(tmp_path)
 
 
-def test_files_are_read(authority: Authority) -> None:
-    files = authority.service()
-    pem = files.read()
-    assert (pem.ca, pem.key) == (files.ca.read_bytes(), files.key.read_bytes())
-    bash(f"openssl verify -x509_strict -purpose sslserver -CAfile {files.ca} {files.certificate}", authority.folder)
-
-
-@pytest.mark.parametrize("name", ["ca", "certificate", "key"])
-def test_a_missing_file_is_named(authority: Authority, name: str) -> None:
-    files = authority.service()
-    getattr(files, name).unlink()
-    with pytest.raises(InvalidInputError, match=f"^{name} "):
-        files.read()
-
-
-def test_files_that_are_something_else_are_named(authority: Authority) -> None:
+def test_files_that_are_missing_or_something_else_are_named(authority: Authority, tmp_path: Path) -> None:
     files, other = authority.service(), authority.service("other")
+    for name in ("ca", "certificate", "key"):
+        with pytest.raises(InvalidInputError, match=f"^{name} "):
+            TlsFiles(**{**vars(files), name: tmp_path / "none"}).read()
     with pytest.raises(InvalidInputError, match=r"service\.key: got"):
         TlsFiles(files.key, files.certificate, files.key).read()
     for certificate, key in ((files.key, files.key), (files.certificate, other.key)):
@@ -50,33 +40,6 @@ def test_files_that_are_something_else_are_named(authority: Authority) -> None:
     bash(f"openssl ec -in {files.key} -aes128 -passout pass:secret -out {files.key}.locked", authority.folder)
     with pytest.raises(InvalidInputError, match="without a password"):  # which is not asked for
         TlsFiles(files.ca, files.certificate, Path(f"{files.key}.locked")).read()
-
-
-def _mounted(folder: Path, files: TlsFiles, version: str) -> TlsFiles:
-    """Have a folder hold files as kubelet mounts a Secret: names that never change, behind one link that is swapped."""
-    names = {"ca": "ca.crt", "certificate": "tls.crt", "key": "tls.key"}
-    (folder / f"..{version}").mkdir(parents=True)
-    for kind, name in names.items():
-        shutil.copy(getattr(files, kind), folder / f"..{version}" / name)
-        if not (folder / name).is_symlink():
-            (folder / name).symlink_to(f"..data/{name}")
-    earlier = (folder / "..data").readlink() if (folder / "..data").is_symlink() else None
-    (folder / "..data_tmp").symlink_to(f"..{version}")
-    os.replace(folder / "..data_tmp", folder / "..data")
-    if earlier is not None:
-        shutil.rmtree(folder / earlier)
-    return TlsFiles(**{kind: folder / name for kind, name in names.items()})
-
-
-def test_new_files_of_a_mounted_secret_count(authority: Authority, tmp_path: Path) -> None:
-    mounted = _mounted(tmp_path / "mount", authority.service(), "2026_01_01")
-    certificates = Certificates(mounted)
-    before, context = certificates.pem(), certificates.context()
-    assert certificates.pem() is before
-    newer = authority.service("newer")
-    assert _mounted(tmp_path / "mount", newer, "2026_02_01") == mounted
-    assert certificates.pem().certificate == newer.certificate.read_bytes() != before.certificate
-    assert certificates.context() is not context
 
 
 def test_earlier_files_that_are_put_back_count(tmp_path: Path) -> None:
@@ -93,31 +56,11 @@ def test_earlier_files_that_are_put_back_count(tmp_path: Path) -> None:
         assert certificates.context().get_ca_certs(binary_form=True) == [_der(folder / "ca.pem")]
 
 
-def test_files_that_are_overwritten_with_their_times_kept_count(authority: Authority, tmp_path: Path) -> None:
-    """As by `cp -p`; one that is made readable for the service changes no more than this either."""
-    files, other = authority.service(), Authority(tmp_path / "other").folder / "ca.pem"
-    texts = [path.read_text() for path in (files.ca, other)]
-    size = max(map(len, texts))
-    files.ca.write_text(texts[0].ljust(size, "\n"))
-    certificates, before = Certificates(files), files.ca.stat()
-    files.ca.write_text(texts[1].ljust(size, "\n"))
-    times = before.st_atime_ns, before.st_mtime_ns
-
-    def changed() -> bool:  # its clock is coarse
-        os.utime(files.ca, ns=times)
-        return files.ca.stat().st_ctime_ns != before.st_ctime_ns
-
-    eventually(changed)
-    after = files.ca.stat()
-    assert (after.st_ino, after.st_size, after.st_mtime_ns) == (before.st_ino, before.st_size, before.st_mtime_ns)
-    assert certificates.context().get_ca_certs(binary_form=True) == [_der(other)]
-
-
 def _der(path: Path) -> bytes:
     return ssl.PEM_cert_to_DER_cert(path.read_text())
 
 
-def test_half_replaced_files_leave_the_earlier_ones(authority: Authority, caplog: pytest.LogCaptureFixture) -> None:
+def test_half_replaced_files_leave_the_earlier_ones(authority: Authority) -> None:
     files, newer = authority.service(), authority.service("newer")
     certificates = Certificates(files)
     before, context = certificates.pem(), certificates.context()  # of the service, and of the console
@@ -125,18 +68,9 @@ def test_half_replaced_files_leave_the_earlier_ones(authority: Authority, caplog
     for _ in range(2):
         assert certificates.pem() is before
         assert certificates.context() is context
-    assert [record.levelname for record in caplog.records] == ["WARNING"]
     os.replace(newer.key, files.key)
     assert certificates.pem() is not before
     assert certificates.context() is not context
-
-
-def test_authorities_may_have_comments_of_any_letters(authority: Authority) -> None:
-    files = authority.service()
-    files.ca.write_bytes("Autorité de l’appareil, 設備\n".encode() + files.ca.read_bytes())
-    certificates = Certificates(files)
-    assert certificates.context().get_ca_certs()
-    assert files.client_context().get_ca_certs()
 
 
 def test_the_commands_for_operators_make_good_certificates_and_renew_them(tmp_path: Path) -> None:
@@ -171,17 +105,13 @@ def _replace(files: TlsFiles, newer: TlsFiles) -> None:
     shutil.copy(newer.key, files.key)
 
 
-def test_new_certificates_that_no_caller_takes_do_not_count(
-    authority: Authority, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_new_certificates_that_no_caller_takes_do_not_count(authority: Authority) -> None:
     files = authority.service()
     certificates = Certificates(files)
     good = certificates.pem()
     for wrong in (authority.service("late", timedelta(days=-1)), authority.caller("other", ["admin"])):
-        caplog.clear()
         _replace(files, wrong)
         assert certificates.pem() is good
-        assert str(files.certificate) in caplog.text
     newer = authority.service("newer")
     _replace(files, newer)
     assert certificates.pem().certificate == newer.certificate.read_bytes()
@@ -203,17 +133,52 @@ def test_the_first_end_is_told(authority: Authority, tmp_path: Path) -> None:
     certificates = Certificates(files)
     assert certificates.ends_s() == until(files.ca) < until(files.certificate)
     longer = Authority(tmp_path / "longer", valid_for=timedelta(days=400))
-    for days in (30, 90):
-        newer = longer.service(valid_for=timedelta(days=days))
-        for source, target in zip(vars(newer).values(), vars(files).values(), strict=True):
-            shutil.copy(source, target)
-        assert certificates.ends_s() == until(newer.certificate), "nobody has connected meanwhile"
+    newer = longer.service(valid_for=timedelta(days=30))
+    shutil.copy(newer.ca, files.ca)
+    _replace(files, newer)
+    assert certificates.ends_s() == until(newer.certificate), "nobody has connected meanwhile"
     between = longer.service("between", valid_for=timedelta(days=7))
     with files.certificate.open("ab") as chain:
         chain.write(between.certificate.read_bytes())
     assert certificates.ends_s() == until(between.certificate), "of a chain"
 
 
-def test_a_certificate_for_callers_is_warned_of(authority: Authority, caplog: pytest.LogCaptureFixture) -> None:
-    Certificates(authority.caller("caller", ["read"], timedelta(days=90)))
-    assert "serverAuth" in caplog.text
+def test_a_certificate_says_who_and_what(tmp_path: Path) -> None:
+    files = Authority(tmp_path).caller("controller 1", ["decode", "recalibrate", "king"])
+    identity = identity_of(files.certificate.read_bytes())
+    assert (identity.name, identity.roles) == ("controller 1", {Role.DECODE, Role.RECALIBRATE})
+
+
+def test_a_role_is_itself_and_may_look() -> None:
+    for role in Role:
+        allowed = {other for other in Role if Identity("one", frozenset([role])).may(other)}
+        assert allowed == (set(Role) if role is Role.ADMIN else {Role.READ, role})
+    assert all(LOCAL.may(role) for role in Role)
+    with pytest.raises(NotAllowedError, match="call X"):
+        Identity("nobody", frozenset()).check(Role.READ, "call X", 0.0)
+
+
+def test_a_certificate_that_ends_while_connected_is_refused(tmp_path: Path) -> None:
+    files = Authority(tmp_path).caller("one", ["admin"], timedelta(hours=1))
+    identity = identity_of(files.certificate.read_bytes())
+    identity.check(Role.READ, "call X", identity.until - 1)
+    with pytest.raises(NotAllowedError, match="expired"):
+        identity.check(Role.READ, "call X", identity.until)
+
+
+def test_a_name_cannot_make_a_line_of_its_own(tmp_path: Path) -> None:
+    authority = Authority(tmp_path)
+    authority.caller("a\nFAKE\x1b[31m", ["read"]).certificate.rename(tmp_path / "odd.pem")
+    assert identity_of((tmp_path / "odd.pem").read_bytes()).name == "a\\nFAKE\\x1b[31m"
+
+
+def test_what_is_no_certificate_is_refused() -> None:
+    for data in (b"-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n", b"\x30\x03abc"):
+        with pytest.raises(NotAllowedError, match="certificate"):
+            identity_of(data)
+
+
+def test_every_call_needs_a_role_and_the_page_for_operators_says_the_same() -> None:
+    own, other = ({method.name for method in service.methods} for service in (SERVICE, INFERENCE))
+    assert own | {PREFIX + name for name in other} == NEEDED.keys()
+    assert documented()[1] == NEEDED
