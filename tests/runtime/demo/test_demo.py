@@ -92,5 +92,3 @@ def test_a_picture_is_lost_by_drift_and_won_back_with_the_shipped_bundle(
     read = (tmp_path / "recalibrated.pgm").read_bytes()
     assert read == (tmp_path / "as-calibrated.pgm").read_bytes() == pgm(small)
     assert (tmp_path / "after-drift.pgm").read_bytes() != read
-
-
