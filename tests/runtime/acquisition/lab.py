@@ -190,8 +190,9 @@ def source_of(
     return CameraSource(toy.PROFILE, cameras, lab, modulator, modulator, *given), modulator
 
 
-def reason_of(take: Callable[[], object]) -> Reason:
-    """Why a shot is lost."""
+def reason_of(take: Callable[[], object], subject: str = "") -> Reason:
+    """Why a shot is lost; what is said of it begins with the subject."""
     with pytest.raises(LostShotError) as raised:
         take()
+    assert raised.value.subject.startswith(subject)
     return raised.value.reason

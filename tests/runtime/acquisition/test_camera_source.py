@@ -416,11 +416,11 @@ def test_whoever_waits_for_others_waits_no_longer_than_it_wants_and_hears_of_the
         other = threading.Thread(target=reason_of, args=(source.references,))
         other.start()
         assert moves.acquire(timeout=60)
-        assert reason_of(lambda: source.shot(0.01, page=0)) is Reason.MISSING_FRAME
+        assert reason_of(lambda: source.shot(0.01, page=0), source.name) is Reason.MISSING_FRAME
         leave.release(2)
         other.join(60)
         lab.clock.until_somebody_waits()
         lab.clock.advance(0.5)
         assert all(moves.acquire(timeout=60) for _ in range(2))
-        assert reason_of(lambda: source.shot(0.01, page=0)) is Reason.BEAM_CONTROL_FAILED
+        assert reason_of(lambda: source.shot(0.01, page=0), source.name) is Reason.BEAM_CONTROL_FAILED
         leave.release(100)

@@ -82,7 +82,7 @@ def scene(shape: tuple[int, int] = SENSOR, more_bytes: int = 0, **settings: Any)
 
 
 def gone(act: Callable[[], object]) -> None:
-    assert reason_of(act) is Reason.CAMERA_GONE
+    assert reason_of(act, "in-phase camera") is Reason.CAMERA_GONE
 
 
 @pytest.mark.parametrize("pixel_format", ["Mono8", "Mono10Packed", "Mono12p", "Mono16"])
@@ -221,10 +221,8 @@ def test_a_camera_that_another_program_controls_is_named() -> None:
     ("given", "shape", "setting", "got", "expected"),
     [
         ({"pixel_format": "Mono14"}, SENSOR, "pixel_format", "Mono14", "Mono8"),
-        ({"trigger_activation": "FallingEdge"}, SENSOR, "trigger_activation", "FallingEdge", "RisingEdge"),
         ({"exposure_us": 1e9}, SENSOR, "exposure_us", "1000000000.0", "10000000"),
         ({"gain_db": 2.5}, SENSOR, "gain_db", "2.0", "0 to 10"),
-        ({"black_level_counts": 4}, SENSOR, "black_level_counts", "4", ""),
         ({}, (97, 128), "region", "128 x 97", "128 x 96"),
     ],
 )

@@ -82,7 +82,7 @@ class Lab:
         self.screen.show(SYMBOLS, LEVELS, 1, timeout_s)
 
     def lost(self, timeout_s: float = 10.0) -> None:
-        assert reason_of(lambda: self.show(timeout_s)) is Reason.NOT_ON_DISPLAY
+        assert reason_of(lambda: self.show(timeout_s), "page 1 ") is Reason.NOT_ON_DISPLAY
         assert not self.screen.shows()
 
 
@@ -252,7 +252,8 @@ def test_beams_are_waited_for_in_the_same_way(start: Start) -> None:
 
 def test_beams_that_nobody_hears_of_are_named_and_open() -> None:
     beams = ExternalBeams(0.0)
-    assert reason_of(lambda: beams.let_through(signal=False, reference=True)) is Reason.BEAM_CONTROL_FAILED
+    lost = reason_of(lambda: beams.let_through(signal=False, reference=True), beams.name)
+    assert lost is Reason.BEAM_CONTROL_FAILED
     beams.close()
     assert beams.wanted() is None
     beams.let_through(signal=True, reference=True)

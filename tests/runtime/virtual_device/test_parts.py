@@ -110,7 +110,7 @@ def test_pages_and_shutters_over_the_socket(tmp_path: Path) -> None:
         assert set(np.unique(light.pair().in_phase)) == {4, 255}
         driver.let_through(signal=True, reference=True)
         assert (light.pair().in_phase == seen.in_phase).all()
-        assert reason_of(lambda: driver.show(symbols[:-1], 16, 6, 30.0)) is Reason.NOT_ON_DISPLAY
+        assert reason_of(lambda: driver.show(symbols[:-1], 16, 6, 30.0), driver.name) is Reason.NOT_ON_DISPLAY
         driver.show(symbols, 16, 7, 30.0)
     driver.close()
 
