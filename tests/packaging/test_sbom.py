@@ -206,8 +206,9 @@ def test_links_of_the_image_end_in_the_image(root: Path, tmp_path: Path) -> None
     library.symlink_to("hop")
     (library.parent / "hop").symlink_to(tmp_path / "outside")
     assert subjects(inventory.take(root).faults) == ["libgood1: lib/libgood.so.1"]
-    relinked(library.parent / "hop", f"{20 * '../'}{tmp_path}/outside")
-    assert subjects(inventory.take(root).faults) == ["libgood1: lib/libgood.so.1"]
+    for target in (f"{20 * '../'}{tmp_path}/outside", "libgood.so.1"):  # the second: in a circle
+        relinked(library.parent / "hop", target)
+        assert subjects(inventory.take(root).faults) == ["libgood1: lib/libgood.so.1"]
 
 
 @pytest.mark.parametrize("name", PLANTED)
