@@ -16,7 +16,7 @@ export PYTHONDONTWRITEBYTECODE =
 export ORT_DISABLE_TELEMETRY = 1
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMEXPR_NUM_THREADS=1
 
-.PHONY: help setup demo demo-hardware test pytest test-long test-lowest messages bench bench-speed bench-service bench-other-servers bench-scaling dashboard soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image sbom check-image check-camera-image lock licences audit proto lint format clean
+.PHONY: help setup demo demo-hardware test pytest test-long planted test-lowest messages bench bench-speed bench-service bench-other-servers bench-scaling dashboard soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image sbom check-image check-camera-image lock licences audit proto lint format clean
 .DELETE_ON_ERROR:
 
 help:  ## list the targets
@@ -51,6 +51,10 @@ pytest: $(STAMP)
 test-long: $(STAMP)  ## tests that take minutes and prove little more
 	$(PYTEST) -m long $(PYTEST_ARGS)
 
+PLANTED_ARGS ?=
+planted: $(STAMP)  ## plant 60 faults, one at a time, and print which of them the tests find; PLANTED_ARGS="--out FOLDER" resumes
+	$(ONE_THREAD) $(BIN)/python -m tests.planted.plant $(PLANTED_ARGS)
+
 messages: $(STAMP)  ## write anew what the command line says in the failures that people meet most: tests/messages
 	$(PYTEST) tests/messages --snapshot-update
 
@@ -68,6 +72,7 @@ lint: $(STAMP)  ## ruff, layers of imports, mypy --strict, hadolint
 	$(BIN)/lint-imports --no-cache --no-logo
 	$(BIN)/mypy
 	$(BIN)/mypy packaging/*.py
+	$(BIN)/python -m tests.rules
 	$(BIN)/hadolint Dockerfile
 
 format: $(STAMP)  ## let ruff put the code in order

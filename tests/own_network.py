@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -55,8 +54,6 @@ def pytest_runtest_logreport(report: pytest.TestReport) -> None:
 
 def _run(first: pytest.Function) -> dict[str, tuple[str, str]]:
     """Run the marked tests of a file."""
-    if shutil.which("unshare") is None:
-        pytest.skip("no unshare: util-linux is not installed")
     if namespace.available() is not None:
         pytest.skip(NO_NETWORKS)
     try:

@@ -16,17 +16,14 @@ class Told:
     """See `lightpage.progress.Reporter`.
 
     Attributes:
-        loops: what was tracked, with its unit.
         notes: what was told.
     """
 
-    loops: list[tuple[str, str]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     def track(
         self, items: Iterable[T], what: str, unit: str, total: int | None, done: int, state: State
     ) -> Iterable[T]:
-        self.loops.append((what, unit))
         return items
 
     def note(self, what: str) -> None:

@@ -27,9 +27,7 @@ SILENCE_S = 3.0
 """A service that says nothing for so long has stopped."""
 
 
-async def serve(
-    address: str, link: socket.socket, tls: TlsFiles | None = None, silence_s: float = SILENCE_S
-) -> None:
+async def serve(address: str, link: socket.socket, tls: TlsFiles | None = None, silence_s: float = SILENCE_S) -> None:
     """Answer health checks at an address until the link is closed; says first at which port, or why not.
 
     Args:

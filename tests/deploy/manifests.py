@@ -11,8 +11,7 @@ import yaml
 from jsonschema import Draft202012Validator
 from referencing import Registry, Resource
 
-from tests.deploy.promql import DEPLOY
-
+DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 FOLDER = DEPLOY / "kubernetes"
 SCHEMAS = Path(__file__).parent / "schemas"
 KUSTOMIZATION = "kustomization.yaml"

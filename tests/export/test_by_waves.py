@@ -1,15 +1,12 @@
-"""Decoders that know waves as bundles: they follow a device that drifts, and the image."""
+"""A decoder of two passes as a bundle: it follows a device that drifts, and the image."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
-import pytest
-from click.testing import CliRunner
 from scipy import ndimage
 
-from export.command import export_run
 from lightpage.calibration.sampling_table import sampling_table
 from lightpage.device.state import Device
 from lightpage.metrics.measures import measure
@@ -24,28 +21,13 @@ from runtime.decoding.image_drift import SHIFT, DriftModel
 from runtime.decoding.image_tracker import WIDEST, ImageTracker, tracker_for
 from runtime.execution.twin import OnnxTwin
 from tests.lightpage.small import small_profile
-from train.commands.train import train
 from train.models.twin import RayTwin, TorchTwin
 
 DEVICE = Device()
 
 
-@pytest.fixture(scope="module", params=[pytest.param("wave", marks=pytest.mark.long), "coherent, two passes"])
-def bundle(request: pytest.FixtureRequest, small_device: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A decoder by waves alone is exported for it; the other is everybody's."""
-    if request.param != "wave":
-        return Path(request.getfixturevalue("small_bundle"))
-    folder = tmp_path_factory.mktemp("by-waves")
-    size = "--localizer wave --refinements 0 --channels 12 --blocks 1 --steps 120 --synthetic-pages 0"
-    options = [*small_device, *size.split(), "--out", str(folder / "run")]
-    CliRunner().invoke(train, options, standalone_mode=False, catch_exceptions=False)
-    _, error = export_run(folder / "run", folder / "bundle.zip")
-    assert error <= 1e-3
-    return folder / "bundle.zip"
-
-
-def test_with_the_drifted_devices_table_it_decodes_the_drifted_device(bundle: Path) -> None:
-    profile, decoder = small_profile(), Decoder.load(bundle)
+def test_with_the_drifted_devices_table_it_decodes_the_drifted_device(small_bundle: Path) -> None:
+    profile, decoder = small_profile(), Decoder.load(small_bundle)
     drifted = DEVICE.with_settings([f"geometry.pipe_angle_deg={DEVICE.geometry.pipe_angle_deg + 0.12}"])
     symbols = random_symbols(profile, 256, 1, np.random.default_rng(9))[0]
     pair = Simulator(profile, drifted, seed=9).page(symbols)
@@ -61,8 +43,8 @@ def test_with_the_drifted_devices_table_it_decodes_the_drifted_device(bundle: Pa
     assert air(decoder.with_table(own)) > air(decoder) + 0.5
 
 
-def test_the_image_is_followed(bundle: Path, small_device: list[str]) -> None:
-    decoder = Decoder.load(bundle)
+def test_the_image_is_followed(small_bundle: Path, small_device: list[str]) -> None:
+    decoder = Decoder.load(small_bundle)
     assert isinstance(tracker_for(decoder), ImageTracker)
     with Recording.open(small_device[3]) as recording:
         pair, symbols = recording.frames(0), recording.symbols(0)

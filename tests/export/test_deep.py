@@ -44,13 +44,11 @@ def test_a_device_without_what_it_needs_is_told(tmp_path: Path) -> None:
     own = Bundle.open(bundle).manifest.profile
     good, other = made_run(tmp_path / "good", own), made_run(tmp_path / "other", small_profile().to_toml())
     DEEP.check(bundle, good, 8)
-    (made_run(tmp_path / "bare", own) / WEIGHTS).unlink()
     stranger = toy.write_toy_bundle(tmp_path / "stranger.zip")
     for model, run, pages, told in (
         (bundle, None, 40, "^run"),
         (bundle, good, 7, "known pages"),
         (bundle, tmp_path / "none", 40, "none"),
-        (bundle, tmp_path / "bare", 40, WEIGHTS),
         (bundle, other, 40, "profile small"),
         (stranger, good, 40, r"stranger\.zip"),
     ):

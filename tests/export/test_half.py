@@ -1,13 +1,16 @@
-"""A graph in half precision: what is halved, what stays, and rounding that a CPU shows too."""
+"""Graphs as files: a large constant is kept once; what is halved, what stays, and rounding that a CPU shows too."""
 
 from __future__ import annotations
 
 import numpy as np
 import onnx
 import pytest
-from onnx import TensorProto, parser
+import torch
+from onnx import TensorProto, numpy_helper, parser
+from torch import nn
 
 from export.half import check_deviation, in_half, rounded
+from export.onnx_files import _export
 from lightpage.errors import BundleError, InvalidInputError
 from runtime.execution.session import open_session
 
@@ -71,3 +74,28 @@ def test_a_graph_without_a_network_is_refused() -> None:
         node.name = node.name.replace("decoder/network", "decoder/net")
     with pytest.raises(InvalidInputError, match=r"^decoder\.onnx"):
         in_half(model.SerializeToString(), ())
+
+
+class TwoWays(nn.Module):
+    """Products with three matrices, two of which are alike."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        rng = torch.Generator().manual_seed(0)
+        large, other = torch.rand(40, 40, generator=rng), torch.rand(40, 40, generator=rng)
+        for name, value in (("there", large), ("back", large.clone()), ("other", other)):
+            self.register_buffer(name, value)
+
+    def forward(self, light: torch.Tensor) -> torch.Tensor:
+        return light @ self.there @ self.other @ self.back
+
+
+def test_a_large_constant_is_kept_once_and_the_answer_is_the_same() -> None:
+    module, light = TwoWays(), torch.eye(40)
+    model = _export(module, (light,), ("light",), ("seen",), None)
+    onnx.checker.check_model(model)
+    held = [numpy_helper.to_array(one) for one in model.graph.initializer if np.prod(one.dims) == 1600]
+    assert len(held) == 2
+    assert not np.array_equal(*held)
+    (seen,) = open_session(model.SerializeToString(), "two ways", 1).run(["seen"], {"light": light.numpy()})
+    np.testing.assert_allclose(seen, module(light).numpy(), rtol=1e-5)

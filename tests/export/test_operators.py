@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,27 +49,18 @@ def small(body: str, header: str = SMALL, opset: int = OPSET) -> bytes:
     return bytes(parser.parse_model(text).SerializeToString())
 
 
-def test_no_node_of_a_fast_decoder_leaves_the_provider(fast: bytes) -> None:
-    for provider in PROVIDERS:
-        assert fallbacks(fast, provider) == [], provider
-    assert shape_computations(fast) == []
-    assert repeated_products(fast) == []
-
-
-def test_nor_does_one_of_a_decoder_of_two_passes(small_bundle: Path) -> None:
-    """It holds the operators of one pass, by beams or by waves, too."""
-    part = page_part(Bundle.open(small_bundle).files[DECODER])
-    for provider in PROVIDERS:
-        assert fallbacks(part, provider) == [], provider
-    assert shape_computations(part) == []
-    assert repeated_products(part) == []
+@pytest.mark.parametrize("decoder", ["fast", "of two passes"])
+def test_no_node_of_a_decoder_leaves_the_provider(decoder: str, fast: bytes, small_bundle: Path) -> None:
+    """That of two passes holds the operators of one pass, by beams or by waves, too."""
+    part = fast if decoder == "fast" else page_part(Bundle.open(small_bundle).files[DECODER])
+    assert [fallbacks(part, provider) for provider in PROVIDERS] == [[]] * len(PROVIDERS)
+    assert (shape_computations(part), repeated_products(part)) == ([], [])
 
 
 @pytest.mark.parametrize(
     ("left", "right", "repeated"),
     [
         ("2, 1, 3, 4", "1, 2, 4, 5", True),
-        ("2, 3, 4", "2, 1, 4, 5", True),
         ("2, 1, 3, 4", "2, 2, 4, 5", False),
         ("3, 4", "2, 2, 4, 5", False),
     ],
@@ -101,8 +91,6 @@ def test_a_cast_planted_before_the_sampling_is_found_and_named(fast: bytes) -> N
     found = fallbacks(model.SerializeToString(), "cuda")
     (new,) = set(found) - set(fallbacks(fast, "cuda"))
     assert (new.node, new.operator, new.version) == (sampler.name, "GridSample", 20)
-    assert new.got == "planted of float16, half of float16"
-    assert new.expected.startswith("one of float32")
     assert fallbacks(model.SerializeToString(), "tensorrt") == fallbacks(fast, "tensorrt")  # that samples in halves too
 
 
@@ -117,7 +105,6 @@ SLICED = "agraph (float[4, 4] a, int64[1] b) => (float[n, m] y)"
         ("cuda", small("y = MatMul (a, a)", "agraph (int64[4, 4] a) => (int64[4, 4] y)"), "MatMul", "of int64"),
         ("tensorrt", small("y = Add (a, a)", "agraph (double[4] a) => (double[4] y)"), "Add", "of float64"),
         ("cuda", small("y = Det (a)", "agraph (float[4, 4] a) => (float y)"), "Det", "operator Det"),
-        ("cuda", small("y = com.microsoft.Unheard (a)", SHAPED), "com.microsoft:Unheard", "com.microsoft:Unheard"),
         ("tensorrt", small("y = Slice (a, b, b, b)", SLICED), "Slice", "is computed"),
         ("tensorrt", small("y = GridSample (x, grid)", SAMPLED), "GridSample", "x of 5 axes"),
         ("tensorrt", small("y = Neg (a)", SHAPED, opset=21), "Neg", "opset 21"),
@@ -148,16 +135,6 @@ def test_computations_of_shapes_are_told_apart() -> None:
     assert fallbacks(model, "cuda") == []
 
 
-def test_the_committed_lists_say_where_they_are_from() -> None:
-    for provider in PROVIDERS:
-        listed = OperatorList.load(provider)
-        assert re.fullmatch(r"[\w-]+/[\w-]+ docs/\w+\.md at [0-9a-f]{40} \(.+\)", listed.origin)
-        assert {domain for domain, _ in listed.operators} <= {"", "com.microsoft"}
-        assert len(listed.operators) > 100
-    with pytest.raises(InvalidInputError, match="'abacus'"):
-        OperatorList.load("abacus")
-
-
 def made(document: str, provider: str, folder: Path) -> OperatorList:
     """The list of a document, by way of the command and its file."""
     (folder / "D.md").write_text(document)
@@ -179,8 +156,6 @@ KERNELS = """
 |||[1, 10]|**T** = tensor(float)|
 |GridSample|*in* X:**T1**<br> *in* grid:**T2**|16+|**T1** = tensor(float)<br/> **T2** = tensor(float)|
 | |
-|**Operator Domain:** *ai.onnx.ml*||||
-|Scaler|*in* X:**T**<br> *out* Y:**T**|1+|**T** = tensor(float)|
 |**Operator Domain:** *com.microsoft*||||
 |Fused|*in* X:**T**<br> *in* W:**T1**<br> *out* Y:**T**<br><br>or<br><br>*in* X:**T**|1+|**T** = tensor(float)|
 <a name="dmlexecutionprovider"/>

@@ -13,14 +13,15 @@ from string import Template
 import numpy as np
 import onnx
 import onnx.parser
+import pytest
 from onnx import numpy_helper
 
-from lightpage.device.profile import Profile, parse_profile
+from lightpage.device.profile import Camera, PageLayout, Profile, load_profile
 from lightpage.errors import CalibrationError
 from lightpage.page.symbols import random_symbols, symbol_phases
 from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.reader import RecordingWriter
+from lightpage.recording.reader import Recording, RecordingWriter
 from runtime.acquisition.source import SHOT_S, FrameSource, Shot
 from runtime.bundle.bundle import Bundle, npz, write_bundle
 from runtime.bundle.manifest import DECODER, GOLDEN, PILOTS, TWIN, Manifest
@@ -28,30 +29,14 @@ from runtime.decoding.decoder import Decoder
 from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.outcome import RefitReport, RefitResult
 
-PROFILE_TOML = """
-schema_version = 1
-name = "toy"
-[light]
-wavelength_m = 532e-9
-[lens]
-focal_length_m = 20e-3
-[pipe]
-length_m = 18.75e-3
-width_m = 0.9e-3
-refractive_index = 1.46
-[slm]
-pitch_m = 9.2e-6
-[page]
-columns = 24
-rows = 16
-symbol_size_px = 4
-pilot_fraction = 0.05
-[camera]
-columns_px = 96
-rows_px = 64
-pitch_m = 2.4e-6
-"""
-PROFILE: Profile = parse_profile(PROFILE_TOML)
+PROFILE: Profile = load_profile("bench").model_copy(
+    update={
+        "name": "toy",
+        "page": PageLayout(columns=24, rows=16, symbol_size_px=4, pilot_fraction=0.05),
+        "camera": Camera(columns_px=96, rows_px=64, pitch_m=2.4e-6),
+    }
+)
+PROFILE_TOML = PROFILE.to_toml()
 SHAPE = PROFILE.frame_shape
 PAGE = PROFILE.page_shape
 OFFSETS = (128.0, 80.0)
@@ -227,6 +212,18 @@ def write_toy_recording(
         for index, page in enumerate(symbols):
             writer.append(page, device.page(page, levels, piston * index))
     return symbols
+
+
+def frames_fail(monkeypatch: pytest.MonkeyPatch, error: Exception, *pages: int, of: str = "") -> None:
+    """Have the frames of some pages of recordings, of one name or all, not be read."""
+    frames = Recording.frames
+
+    def read(recording: Recording, page: int) -> FramePair:
+        if page in pages and recording.path.name.startswith(of):
+            raise error
+        return frames(recording, page)
+
+    monkeypatch.setattr(Recording, "frames", read)
 
 
 def fit_references(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decoder) -> RefitResult:

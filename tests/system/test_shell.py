@@ -10,7 +10,6 @@ import re
 import shutil
 import subprocess
 import sys
-import sysconfig
 import tomllib
 from collections.abc import Sequence
 from contextlib import redirect_stdout
@@ -24,17 +23,11 @@ from tests.packaging.scripts import script
 ROOT = Path(__file__).resolve().parents[2]
 SETTINGS: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PROJECT, DATA = SETTINGS["project"], SETTINGS["tool"]["setuptools"]["package-data"]
-COMMANDS: dict[str, str] = {**PROJECT["scripts"], **PROJECT["entry-points"]["lightpage.commands"]}
-PLUG_INS: dict[str, str] = {
-    **PROJECT["entry-points"]["lightpage.sources"],
-    **PROJECT["entry-points"]["lightpage.recalibrations"],
-}
-EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
+NAMED: list[dict[str, str]] = [PROJECT["scripts"], *PROJECT["entry-points"].values()]
 LOCKS = ROOT / "packaging" / "locks"
 # What a wheel is made of, and what the image build is given beside that.
 PACKAGES = ("lightpage", "train", "export", "runtime", "analysis")
 SOURCES = ("pyproject.toml", "LICENSE", "README.md", *PACKAGES)
-PACKAGING = ("packaging",)
 TYPED = ("lightpage", "train", "export", "runtime")
 
 
@@ -49,45 +42,11 @@ def run(command: Sequence[str | Path], *, cwd: Path = ROOT, timeout_s: float = 6
     )
 
 
-def normal(name: str) -> str:
-    """A distribution's name as pip compares it."""
-    return re.sub(r"[-_.]+", "-", re.split(r"[\s\[<>=!~;]", name, maxsplit=1)[0]).lower()
-
-
-def pins() -> dict[str, str]:
-    lines = (ROOT / "constraints.txt").read_text().splitlines()
-    return {normal(name): version for name, _, version in (line.partition("==") for line in lines if line[:1] != "#")}
-
-
-# ---- make and continuous integration ------------------------------------------------------------------------------
-
-
-def test_make_knows_what_to_do_and_its_first_target_only_tells() -> None:
-    targets = ["setup", "demo", "test", "bench", "image", "sbom", "lock", "proto", "lint"]
-    planned = run(["make", "--dry-run", *targets])
-    assert planned.returncode == 0, planned.stderr
+def test_scripts_parse() -> None:
     assert run(["make", "--dry-run"]).stdout == run(["make", "--dry-run", "help"]).stdout
-
-
-def test_scripts_are_executable_and_parse() -> None:
-    scripts = [ROOT / ".ci/run", *ROOT.glob("packaging/*.sh")]
-    assert [path for path in scripts if not os.access(path, os.X_OK)] == []
-    assert [run(["bash", "-n", path]).stderr for path in scripts] == [""] * len(scripts)
-    assert scripts[0].read_text().splitlines()[-1] == "make test"  # continuous integration does no more
-
-
-# ---- versions -----------------------------------------------------------------------------------------------------
-
-
-def test_requirements_are_pinned() -> None:
-    for line in (ROOT / "constraints.txt").read_text().splitlines():
-        assert line.startswith("#") or re.fullmatch(r"[\w.-]+==[\w.]+", line), line  # no URL, no path, no local tag
-
-    expected = [*PROJECT["dependencies"], *EXTRAS["train"], *EXTRAS["dev"]]
-    assert {normal(requirement) for requirement in expected} <= pins().keys()
-
-    assert f"torch=={pins()['torch']}" in EXTRAS["train"]
-    assert not any(normal(requirement) == "torch" for requirement in PROJECT["dependencies"])
+    for path in (ROOT / ".ci/run", *ROOT.glob("packaging/*.sh")):
+        assert os.access(path, os.X_OK)
+        assert run(["bash", "-n", path]).stderr == ""
 
 
 # ---- commands -----------------------------------------------------------------------------------------------------
@@ -104,7 +63,7 @@ def defined(module: str) -> set[str]:
 
 
 def test_every_command_and_plug_in_is_there() -> None:
-    for name, value in [*COMMANDS.items(), *PLUG_INS.items()]:
+    for name, value in (item for names in NAMED for item in names.items()):
         module, _, attribute = value.partition(":")
         assert attribute in defined(module), name
 
@@ -121,50 +80,25 @@ def test_data_files_of_the_packages_travel_with_the_wheel() -> None:
 # ---- image --------------------------------------------------------------------------------------------------------
 
 
-def test_the_dockerfile_passes_hadolint() -> None:
-    hadolint = Path(sysconfig.get_path("scripts")) / "hadolint"
-    linted = run([hadolint, "--config", ROOT / ".hadolint.yaml", ROOT / "Dockerfile"])
-    assert linted.returncode == 0, linted.stdout
-
-
 def stages() -> dict[str, str]:
     """The Dockerfile's named stages: name to text."""
     pattern = re.compile(r"^FROM \S+ AS (?P<name>\S+)\n(?P<text>.*?)(?=^FROM |\Z)", re.MULTILINE | re.DOTALL)
     return {found["name"]: found["text"] for found in pattern.finditer((ROOT / "Dockerfile").read_text())}
 
 
-def test_the_image_is_not_root_quiet_and_checked_and_installs_its_own_lock() -> None:
-    for line in (
-        "USER 10001:10001",
-        "ORT_DISABLE_TELEMETRY=1",
-        "PYTHONDONTWRITEBYTECODE=1",
-        'CMD ["python", "-m", "runtime.commands.healthcheck"]',
-        'ENTRYPOINT ["lightpage", "serve"]',
-    ):
+def test_the_image_is_not_root_quiet_and_checked() -> None:
+    for line in ("USER 10001:10001", "ORT_DISABLE_TELEMETRY=1", 'CMD ["python", "-m", "runtime.commands.healthcheck"]'):
         assert line in stages()["service"]
     for name in ("runtime", "camera", "deep", "gpu"):  # whatever is installed, it is run alike
         assert f"FROM service AS {name}" in (ROOT / "Dockerfile").read_text()
-        installed = re.findall(r"packaging/install_locked.sh (\S+) (\S+)$", stages()[f"build-{name}"], re.MULTILINE)
-        assert installed == [(f"packaging/locks/{name}.txt", "/opt/lightpage")]
         assert re.findall(r"--from=(\S+)", stages()[name]) == [f"build-{name}"]
-
-
-def test_only_the_deep_image_has_torch_and_none_has_both_runtimes() -> None:
-    named = {
-        path.stem: set(re.findall(r"^([\w.-]+)==", path.read_text(), re.MULTILINE)) for path in LOCKS.glob("*.txt")
-    }
-    assert [name for name, some in named.items() if "torch" in some] == ["deep"]
-    runtimes = {name: sorted(some & {"onnxruntime", "onnxruntime-gpu"}) for name, some in named.items()}
-    assert runtimes.pop("build") == []
-    assert runtimes.pop("gpu") == ["onnxruntime-gpu"]
-    assert set(map(tuple, runtimes.values())) == {("onnxruntime",)}
 
 
 def test_the_image_is_built_of_what_the_wheel_is_built_of() -> None:
     copied = re.findall(r"^COPY (?!--)(.*) \S+$", stages()["build"], re.MULTILINE)
-    assert sorted(" ".join(copied).split()) == sorted((*SOURCES, *PACKAGING))
+    assert sorted(" ".join(copied).split()) == sorted((*SOURCES, "packaging"))
     let_through = [line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")]
-    assert sorted(let_through) == sorted((*SOURCES, *PACKAGING))
+    assert sorted(let_through) == sorted((*SOURCES, "packaging"))
 
 
 # ---- what the image build is lent ---------------------------------------------------------------------------------
@@ -181,9 +115,6 @@ def lend(listing: str, out: Path) -> tuple[str, list[str]]:
 
 
 def test_settings_of_pip_are_lent_to_the_build_of_an_image(tmp_path: Path) -> None:
-    assert lend("", tmp_path) == ("[global]\n", [])
-    assert not (tmp_path / "ca_bundle").exists()
-
     out, index, wheels, cert = (tmp_path / name for name in ("out", "index", "wheels", "my.pem"))
     for folder in (out, index / "simple", wheels):
         folder.mkdir(parents=True)
@@ -199,15 +130,9 @@ def test_settings_of_pip_are_lent_to_the_build_of_an_image(tmp_path: Path) -> No
         "cert = /run/secrets/ca_bundle",
     ]
     assert (out / "ca_bundle").read_text() == "certificates\n"
-    assert str(tmp_path) not in settings
-
-    listing = [
-        ":env:.index-url='https://two.example/simple'",
-        "WARNING: chatter",
-        "global.index-url='https://one.example/simple'",
-    ]
-    for order in (listing, listing[::-1]):
-        assert lend("\n".join(order), tmp_path)[0] == "[global]\nindex-url = https://two.example/simple\n"
+    listing = [f"{where}.index-url='https://{host}.example/simple'" for where, host in ((":env:", 1), ("global", 2))]
+    for order in ([*listing, "WARNING: chatter"], listing[::-1]):
+        assert lend("\n".join(order), tmp_path)[0] == "[global]\nindex-url = https://1.example/simple\n"
 
 
 # ---- an environment without torch ---------------------------------------------------------------------------------
@@ -252,8 +177,7 @@ def does_its_work(said: str) -> None:
     assert told["decoded"] == [[56, 87], True]
     assert told["profiles"] == ["bench", "paper"]
     assert (told["torch"], len(told["typed"])) == (False, 4)
-    for name in ("serve", "decode", "evaluate", "recalibrate"):
-        assert re.search(rf"^  {name} ", told["help"], re.MULTILINE), told["help"]
+    assert re.search(r"^  serve ", told["help"], re.MULTILINE), told["help"]
 
 
 def test_the_runtime_needs_nothing_but_what_its_image_has() -> None:
@@ -296,5 +220,3 @@ def test_it_installs_from_its_lock_and_does_its_work(tmp_path: Path) -> None:
     said = run([scripts / "python", "-I", "-c", IN_THE_IMAGE], cwd=scripts, timeout_s=120)
     assert said.returncode == 0, said.stderr
     does_its_work(said.stdout)
-    helped = run([scripts / "lightpage", "--help"], cwd=scripts)
-    assert helped.returncode == 0, helped.stderr

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +11,6 @@ from click.testing import CliRunner
 
 from analysis.comparison import calibration, decoders
 from analysis.comparison.outcome import symbols_by_walls
-from analysis.comparison.weight_store import CALIBRATION, TRAINED, WeightStore
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.document import Calibration
 from lightpage.calibration.parameters import NAMES
@@ -22,11 +19,9 @@ from lightpage.errors import InvalidInputError
 from lightpage.page.symbols import pilot_mask
 from lightpage.simulator.true_optics import true_parameters
 from tests.lightpage.small import small_profile
-from train.models.presets import FAST, PRESETS
-from train.runs import BEGUN, check_begun
+from train.runs import BEGUN
 
 PROFILE = small_profile()
-DEVICE = Device().with_settings(["geometry.pipe_angle_deg=-0.6", "sensor.full_well_e=32"])
 
 
 def calibration_of(device: Device) -> Calibration:
@@ -34,14 +29,6 @@ def calibration_of(device: Device) -> Calibration:
     turn = device.homodyne.turn_rad
     perfect = Registered(true_parameters(PROFILE, device), np.ones(len(NAMES)), turn, 0.0, 0.5, 1.0, 0.5)
     return Calibration.from_registered(perfect, PROFILE, ["0" * 64])
-
-
-def prepared(out: Path, device: Device, name: str) -> list[str]:
-    """Options of a comparison on the small device, whose calibration is there."""
-    (out / name).mkdir(parents=True)
-    calibration_of(device).save(out / name / "calibration.toml")
-    (out / "small.toml").write_text(PROFILE.to_toml())
-    return ["--profile", str(out / "small.toml"), "--pages", "12", "--out", str(out)]
 
 
 def test_symbols_are_told_apart_by_the_walls_that_their_light_meets() -> None:
@@ -57,11 +44,14 @@ def test_symbols_are_told_apart_by_the_walls_that_their_light_meets() -> None:
 
 
 def test_the_command_compares_methods_and_says_what_the_device_is(tmp_path: Path) -> None:
-    words = prepared(tmp_path, ideal_device(), "-0.3deg-32e-4px-ideal")
+    (folder := tmp_path / "-0.3deg-32e-4px-ideal").mkdir()
+    calibration_of(ideal_device()).save(folder / "calibration.toml")
+    (tmp_path / "small.toml").write_text(PROFILE.to_toml())
+    words = ["--profile", str(tmp_path / "small.toml"), "--pages", "12", "--out", str(tmp_path)]
     words += ["--ideal", "--angle", "-0.3", "--method", "none", "--published-channels", "4", "--published-steps", "10"]
     done = CliRunner().invoke(decoders.main, [*words, "--trained", str(tmp_path / "kept")], catch_exceptions=False)
     assert done.exit_code == 0, done.output
-    begun = json.loads((tmp_path / "-0.3deg-32e-4px-ideal" / BEGUN).read_text())
+    begun = json.loads((folder / BEGUN).read_text())
     ideal = ideal_device().with_settings(["geometry.pipe_angle_deg=-0.3", "sensor.full_well_e=32"])
     assert Device.model_validate(begun["device"]) == ideal
     (found,) = json.loads((tmp_path / "figures.json").read_text())["lights"]
@@ -71,54 +61,6 @@ def test_the_command_compares_methods_and_says_what_the_device_is(tmp_path: Path
     data = ~pilot_mask(PROFILE)
     assert none["own_mi_kB"] == pytest.approx(none["own_mi"] * data.sum() / 8000)
     assert (tmp_path / "figure.png").stat().st_size > 10_000
-
-
-@pytest.mark.long  # trains six decoders
-def test_the_command_keeps_what_it_trained_and_takes_it_up(tmp_path: Path) -> None:
-    out, kept = tmp_path / "out", tmp_path / "kept"
-    words = prepared(out, Device(), "-0.6deg-32e-4px")
-    words += [word for name in ("coherent", "refined", "oracle", "fast", "none") for word in ("--method", name)]
-    words += [
-        "--arm",
-        "wave-refined",
-        "--steps",
-        "20",
-        "--size",
-        "8x1x0",
-        "--published-channels",
-        "4",
-        "--published-steps",
-        "12",
-    ]
-    words += ["--levels", "16", "--trained", str(kept), "--keep"]
-    first = CliRunner().invoke(decoders.main, words, catch_exceptions=False)
-    assert first.exit_code == 0, first.output
-    figures = json.loads((out / "figures.json").read_text())
-    elsewhere = tmp_path / "elsewhere"
-    words[words.index(str(out))] = str(elsewhere)
-    again = CliRunner().invoke(decoders.main, words, catch_exceptions=False)
-    assert again.exit_code == 0, again.output
-    assert not list(elsewhere.rglob("checkpoints"))  # nothing was trained
-    outcomes = json.loads((elsewhere / "figures.json").read_text())["lights"][0]["outcomes"]
-    for one, other in zip(outcomes, figures["lights"][0]["outcomes"], strict=True):
-        assert one["air"] == pytest.approx(other["air"], abs=0.01)  # large tensors are kept in half precision
-        assert one["validation_curve"] == other["validation_curve"]
-
-
-def test_weights_that_were_kept_are_taken_up_for_their_options_alone(tmp_path: Path) -> None:
-    kept = TRAINED / "bench" / "-0.6deg-32e-4px"
-    for name in (BEGUN, CALIBRATION):
-        shutil.copyfile(kept / name, tmp_path / name)
-    run = tmp_path / "fast" / "48x2x0-6000"
-    options = asdict(replace(PRESETS[FAST].choices, steps=6000, seed=5000))
-    store = WeightStore(tmp_path, kept)
-    assert not store.bring(run, options | {"depth": 1})
-    assert store.bring(run, options)
-    assert check_begun(run, options)
-    assert not store.bring(run, options)  # it is there
-    shutil.rmtree(run)
-    (tmp_path / BEGUN).write_text("{}")
-    assert not store.bring(run, options)  # of another data set
 
 
 def test_calibrations_that_are_done_are_not_done_again_and_what_failed_is(

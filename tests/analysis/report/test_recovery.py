@@ -50,6 +50,7 @@ WHOLE = Recovery(
     blocks_per_page=BLOCKS,
 )
 NOTHING = replace(WHOLE, volume=None, pages=tuple(LOST), restored=(), missing=(), foreign={}, repeated=0)
+BODY = NOTHING.to_json()["page_results"][1]
 
 
 def written(recovery: Recovery, path: Path, **changes: Any) -> Path:
@@ -72,56 +73,37 @@ def test_a_recovery(tmp_path: Path) -> None:
     margin, failed = seen.pictures["pages"]
     assert {"read (5)", "optics (1)", "body (2)"} <= labels(margin)
     assert {"page lost (2)", "page read all the same (0)", "not decoded (1)"} <= labels(failed)
-    assert "at least 0.200 bit/symbol where a page was read" in text
-    assert f"did not converge: 4 of {BLOCKS * 7}, {BLOCKS} a page" in text
-    assert "All 5,500 bytes of the file came back, 1 data page of it from parity pages." in text
     for page in LOST:
         assert html.escape(page.reason) in text
-    assert "<td>5</td><td>5</td>\n<td>7</td><td>body</td>" in text
-    assert "<td>4</td><td>unknown</td>\n<td>unknown</td><td>optics</td>" in text
 
 
-def test_the_facts_of_a_recovery(tmp_path: Path) -> None:
-    figures = WHOLE.to_json()
-    assert facts_of(WHOLE, tmp_path) == {
-        "Code": CODE.describe(),
-        "Volume": "7: 10 pages in groups of 4 data and 2 parity pages",
-        "File size": "5,500 bytes",
-        "Recorded pages": "8",
-        "Unread": "3 of the recorded pages",
-        "Repeated": "1 of the recorded pages",
+def test_the_facts_of_a_recovery_and_its_losses_by_cause(tmp_path: Path) -> None:
+    figures, facts = WHOLE.to_json(), facts_of(WHOLE, tmp_path)
+    told = {
+        "Volume": "10 pages in groups of 4 data and 2 parity",
+        "Unread": "3",
         "Pages of other volumes": "1 of volume 9",
-        "Missing": "3 pages of the volume, parity included: 3, 5-6",
-        "Restored": "1 data page: 3",
-        "Lost": "none",
-        "User bytes a page": "1,000",
+        "Missing": "3, 5-6",
+        "Restored": "3",
         "AIR bytes a page": "880",  # 3.2 bits of 2200 symbols
         "Share of the AIR": "1.136",
-        "Q, q": "3.478 user bits a symbol, 0.870 of the raw bits",
-        "Page failure rate": f"0.3750, with 95% confidence at most {figures['page_failure_rate_bound_95']:.4f}",
-        "Margin of pages that were read": "0.200 bit a symbol in the mean, 0.200 bit a symbol at least",
-        "Corrected": "10 symbols by Reed-Solomon",
-        "Iterations": "5.0 a codeword, mean of pages that were read",
-        "Time": "0.520 s a page, code alone 0.020 s; medians",
+        "Q, q": "3.478",
+        "Page failure rate": f"{figures['page_failure_rate_bound_95']:.4f}",
+        "Margin of pages that were read": "0.200",
+        "Corrected": "10",
+        "Time": "0.520",
     }
-
-
-def test_losses_are_counted_by_cause(tmp_path: Path) -> None:
-    data = report_of_recovery(JsonFile.read(written(WHOLE, tmp_path / "r.json")))
+    assert {name: value for name, value in told.items() if value not in facts[name]} == {}
+    data = report_of_recovery(JsonFile.read(tmp_path / "r.json"))
     found = [(cause, count, share) for cause, _, count, share in data.causes]
     assert found == [("optics", 1, 1 / 8), ("body", 2, 0.25)]
     assert set(LOSSES) == set(Loss)
 
 
-def test_a_file_of_which_pages_or_all_are_lost(tmp_path: Path) -> None:
-    text, _ = page_of(written(replace(WHOLE, lost=(1, 2, 4), restored=()), tmp_path / "r.json"), tmp_path / "r.html")
-    assert "3 data pages: 1-2, 4" in text
-    assert "came back" not in text
+def test_a_recovery_of_nothing(tmp_path: Path) -> None:
     _, seen = page_of(written(NOTHING, tmp_path / "r.json"), tmp_path / "r.html")
     assert {"read (0)", "optics (1)"} <= labels(seen.pictures["pages"][0])
-    facts = facts_of(NOTHING, tmp_path)
-    assert facts["Volume"] == facts["File size"]
-    assert facts["Page failure rate"].startswith("1.0000")
+    assert facts_of(NOTHING, tmp_path)["Page failure rate"].startswith("1.0000")
     none = {"page_results": [], "pages": 0, "pages_unread": 0, "page_failure_rate": None, "seconds_per_page": None}
     text, seen = page_of(written(NOTHING, tmp_path / "r.json", **none), tmp_path / "r.html")
     check_whole(text, seen, SECTIONS)
@@ -134,34 +116,20 @@ def test_long_lists_end_and_text_is_escaped(tmp_path: Path) -> None:
     many = replace(WHOLE, pages=lost, missing=tuple(range(0, 5000, 2)))
     text, seen = page_of(written(many, tmp_path / "r.json"), tmp_path / "r.html")
     assert text.count("<td>body</td>") == 200 + 1  # one of them counts the cause
-    assert "2,300 more" in text
-    assert "2,480 more" in text
     assert all(picture.startswith("data:image/png") for picture in seen.pictures["pages"])
-    assert len(text) < 500_000
     assert "script" not in seen.tags
     assert html.escape(evil).replace("&quot;", "&#34;") in text
-
-
-def one(**changes: Any) -> dict[str, Any]:
-    """Results of one page, which is not as it should be."""
-    page = NOTHING.to_json()["page_results"][1] | changes
-    return {"page_results": [page], "pages": 1, "pages_unread": 1}
 
 
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
         ({"user_bytes_per_page": "1000"}, "user_bytes_per_page"),
-        ({"q": 2.0}, "q"),
         ({"air_bytes_per_page": float("inf")}, "air_bytes_per_page"),
-        ({"lost": [-1]}, r"lost\.0"),
         ({"code": CODE.model_dump() | {"levels": 17}}, "code"),
-        ({"volume": VOLUME.to_json() | {"data_pages": 0}}, "volume"),
-        ({"page_results": None}, "page_results"),
+        ({"page_results": [BODY | {"loss": "<b>"}], "pages": 1, "pages_unread": 1}, r"page_results\.0\.loss"),
+        ({"page_results": [BODY | {"failed_blocks": BLOCKS + 1}], "pages": 1, "pages_unread": 1}, "file"),
         ({"pages": 9}, "file"),
-        (one(loss="<b>"), r"page_results\.0\.loss"),
-        (one(page=1 << 70), r"page_results\.0\.page"),
-        (one(failed_blocks=BLOCKS + 1), "file"),
     ],
 )
 def test_figures_that_cannot_be_are_refused(changes: dict[str, Any], named: str, tmp_path: Path) -> None:
@@ -176,12 +144,8 @@ def test_figures_that_cannot_be_are_refused(changes: dict[str, Any], named: str,
     ("content", "named"),
     [
         (json.dumps({"target": "127.0.0.1:50051", "levels": 256, "pages": [], "refused_pages": []}), "decode"),
-        (json.dumps({"pages": 3, "\x1b[2J": 1}), r"'\\x1b\[2J'"),
-        (json.dumps({str(number): 0 for number in range(9)}), "4 more"),
-        ("{}", "without keys"),
         ("[1, 2]", "no object"),
         ("[" * 100_000, "no JSON"),
-        ("", "no JSON"),
     ],
 )
 def test_other_json_is_named(content: str, named: str, tmp_path: Path) -> None:

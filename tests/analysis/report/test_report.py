@@ -15,7 +15,6 @@ import torch
 
 from analysis.report.command import report
 from analysis.report.data import exit_centroids
-from analysis.report.figures import training
 from analysis.report.from_evaluation import report_of_evaluation
 from analysis.report.from_run import levels_of, report_of_run
 from analysis.report.json_file import JsonFile
@@ -60,7 +59,6 @@ def test_a_run_of_two_passes(small_run: Path, tmp_path: Path) -> None:
     assert f"{learnt:,} parameters" in facts["Network"]
     best = max(value for _, value in data.curves[1]["val_air"])
     assert best == pytest.approx(described.validation_air, abs=0.02)  # looked at in bfloat16 while it trains
-    assert f"{best:.3f} bit/symbol" in training(data.curves)[1].caption
 
 
 def test_a_run_by_rays_shows_the_angle_that_it_was_trained_to(
@@ -98,28 +96,18 @@ def test_zones_add_up_and_the_pipe_angle_is_told_in_degrees(small_run: Path) -> 
     assert np.nanmean(data.maps.own_mi) == pytest.approx(data.measures.own_mi_bits_per_symbol, abs=1e-9)
     assert all(zone.worst_air < zone.air for zone in found)
     assert {zone.reflections for zone in found} == {(0, 0), (0, 1), (1, 0), (1, 1)}
-    groups = dict(geometry(data))
-    angle = groups["Pipe angle"][0]
-    assert angle.unit == "degree"
+    (angle,) = dict(geometry(data))["Pipe angle"]
     assert float(angle.value.replace("−", "-")) == pytest.approx(data.calibration.angle_deg(data.profile), abs=0.5)
-    assert sum(len(rows) for rows in groups.values()) == len(data.calibration.parameters)
 
 
 def test_an_evaluation_and_its_maps(evaluation: Path, tmp_path: Path) -> None:
     text, seen = page_of(evaluation, tmp_path / "E.html")
     check_whole(text, seen, SECTIONS)
-    assert set(seen.pictures) == {"maps", "reliability", "page", "rays"}
-    assert "small-1" in text
     found = json.loads(evaluation.read_text())
     maps = {name: np.array(rows, dtype=float) for name, rows in found["maps"].items()}
     assert np.array_equal(np.isnan(maps["air"]), pilot_mask(small_profile()))
     for name in ("air", "own_mi"):
         assert np.nanmean(maps[name]) == pytest.approx(found[f"{name}_bits_per_symbol"], abs=ROUNDING)
-    bins = found["confidence_bins"]
-    count = sum(part["count"] for part in bins)
-    assert count == found["pages"] * found["symbols_per_page"]
-    missed = sum(part["count"] * abs(part["accuracy"] - part["confidence"]) for part in bins)
-    assert missed / count == pytest.approx(found["ece"])
 
 
 def test_a_golden_page_comes_from_the_bundle_that_was_evaluated_or_not_at_all(
@@ -141,15 +129,6 @@ def test_a_golden_page_comes_from_the_bundle_that_was_evaluated_or_not_at_all(
     assert isinstance(report_of_evaluation(JsonFile.read(moved)).golden, str)
 
 
-def test_curves_come_from_what_the_finished_training_kept(small_run: Path, tmp_path: Path) -> None:
-    folder = shutil.copytree(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("tensorboard"))
-    assert "training" in page_of(folder, tmp_path / "R.html")[1].pictures
-    (folder / "fitted.json").unlink()
-    _, seen = page_of(folder, tmp_path / "R.html")
-    assert seen.sections == SECTIONS
-    assert "training" not in seen.pictures
-
-
 def test_levels_are_read_off_phases() -> None:
     for levels in (2, 16, 100, 256):
         drawn = np.random.default_rng(levels).integers(levels, size=2000)
@@ -161,7 +140,6 @@ def test_levels_are_read_off_phases() -> None:
 def test_what_is_no_source_is_refused(
     small_run: Path, ray_run: Path, evaluation: Path, small_device: list[str], tmp_path: Path
 ) -> None:
-    (tmp_path / "unfinished").mkdir()
     (tmp_path / "notes.txt").write_text("AIR was fine")
     (tmp_path / "other.json").write_text(json.dumps({"bundle_version": "1", "pages": 3}))
     (tmp_path / "none.json").write_text(json.dumps({"pages": 0, "pages_left_out": 0, "refused_pages": [{"page": 0}]}))
@@ -171,7 +149,7 @@ def test_what_is_no_source_is_refused(
     bad |= {"maps": maps | {"air": maps["air"][:-1]}}
     recording: tuple[object, ...] = ("--recording", small_device[3])
     for source, options, named in (
-        *((tmp_path / name, (), name) for name in ("unfinished", "notes.txt", "other.json", "none.json")),
+        *((tmp_path / name, (), name) for name in ("notes.txt", "other.json", "none.json")),
         *((changed(evaluation, tmp_path / f"{n}.json", **{n: value}), (), n) for n, value in bad.items()),
         (ray_run, (), "--recording"),
         (evaluation, recording, "--recording"),

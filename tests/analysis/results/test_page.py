@@ -2,14 +2,13 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
 
-from analysis.results.measurements import COMPARISONS, Measurement, collected, kept_measurements
+from analysis.results.measurements import Measurement, collected, kept_measurements
 from analysis.results.page import PAGE, ROOT, Results, main, render
 from lightpage.errors import InvalidInputError
 from runtime.bundle.bundle import Bundle
@@ -86,14 +85,6 @@ def test_the_ledger_is_that_of_the_shipped_code() -> None:
     assert kept_measurements()["ledger"].figures["bright"]["code"] == shipped.model_dump()
 
 
-def test_no_kept_figures_are_long_or_of_an_unknown_source() -> None:
-    kept = kept_measurements()
-    assert set(COMPARISONS) <= set(kept)
-    known = re.compile(r"measured \d{4}-\d\d-\d\d on commit [0-9a-f]{7}|laboratory notebook, commit [0-9a-f]{7}")
-    assert [name for name, measurement in kept.items() if not known.fullmatch(measurement.source)] == []
-    assert [name for name, of in kept.items() if len(json.dumps(of.figures)) > 20_000] == []
-
-
 # ---- collecting -----------------------------------------------------------------------------------------------------
 
 
@@ -113,26 +104,11 @@ def test_figures_are_collected_without_their_curves_and_what_lacks_is_left_out(t
         del one["training_curve"], one["validation_curve"]
     assert kept["sheared"].figures == figures
     assert (tmp_path / "images" / "decoders.png").read_bytes() == b"picture"
-    page = (tmp_path / "page.md").read_text()
-    assert "| published, ray localizer | 2.34 | 1.17 |" in page
-    assert "mode localizer |" not in page
-    told = done.output.splitlines()
-    assert any("square/figures.json" in line for line in told)
-    for lacking in ("sheared, -0.6 degree, mode", "full-size", "evaluation", "demo"):
-        assert any(line.endswith(lacking) for line in told), lacking
+    assert "| published, ray localizer | 2.34 | 1.17 |" in (tmp_path / "page.md").read_text()
     # a comparison that is not finished replaces nothing
     written(path, toy(outcome("ray", 3.0)))
-    done = command(tmp_path, "--from", tmp_path / "runs", "--commit", "0123456")
-    assert "unfinished" in done.output
+    command(tmp_path, "--from", tmp_path / "runs", "--commit", "0123456")
     assert kept_measurements(tmp_path / "kept")["sheared"].figures == figures
-
-
-def test_a_page_of_nothing_has_no_figures(tmp_path: Path) -> None:
-    assert command(tmp_path).exit_code == 0
-    page = (tmp_path / "page.md").read_text()
-    rows = [line for line in page.splitlines() if line.startswith("|") and "---" not in line]
-    assert len(rows) == 3  # the heads of tables
-    assert not any(re.search(r"\d\.\d", row) for row in rows)
 
 
 @pytest.mark.parametrize(("name", "figures"), [("dim", {"pages": 3}), ("demo", {}), ("speed-bench", {}), ("dim", [])])

@@ -5,20 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lightpage.calibration.calibrate import KnownPage, calibrate
+from lightpage.calibration.calibrate import KnownPage, calibrate, refine
 from lightpage.device.profile import PageLayout, load_profile
 from lightpage.device.state import Device
 from lightpage.errors import CalibrationError
 from lightpage.page.symbols import symbol_phases
 from lightpage.progress import Progress
 from lightpage.simulator.simulator import Simulator
+from lightpage.simulator.true_optics import true_parameters
 from tests.lightpage.refused import refused
 from train.models.field import FieldRecovery, TorchFieldSolver
 from train.models.twin import RayTwin, TorchTwin
 
 
-def begin(progress: Progress) -> None:
-    """Calibrate on a page that hardly meets the walls."""
+def begin(progress: Progress, again: bool = False) -> None:
+    """Calibrate on a page that hardly meets the walls, from nominal or again from what the device is."""
     bench = load_profile("bench")
     profile = bench.model_copy(
         update={
@@ -30,7 +31,11 @@ def begin(progress: Progress) -> None:
     symbols = np.random.default_rng(0).integers(16, size=profile.page_shape).astype(np.uint8)
     page = KnownPage(simulator.page(symbols), np.exp(1j * symbol_phases(symbols, 16)))
     twin, solver = TorchTwin(RayTwin(profile)), TorchFieldSolver(FieldRecovery(profile))
-    calibrate(twin, solver, profile, simulator.references(), [page], progress)
+    if again:
+        start = true_parameters(profile, Device())
+        refine(twin, solver, profile, simulator.references(), [page], start, -np.pi / 2, progress)
+    else:
+        calibrate(twin, solver, profile, simulator.references(), [page], progress)
 
 
 def test_a_page_that_hardly_meets_the_walls_is_found_directly_and_then_named_as_too_narrow() -> None:
@@ -55,3 +60,20 @@ def test_a_calibration_ends_where_it_is_stopped_at_any_patch() -> None:
     with pytest.raises(Stopped):
         begin(stop_at_the_third_patch)
     assert set(told) == {"find the direct image"}
+
+
+def test_a_re_fit_tells_which_share_is_behind() -> None:
+    class Stopped(Exception):
+        pass
+
+    shares = list[float]()
+
+    def stop_in_the_second_stage(stage: str, share: float) -> None:
+        shares.append(share)
+        if len(shares) > 1 and share > shares[0] + 0.2:
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        begin(stop_in_the_second_stage, again=True)
+    assert shares == sorted(shares)
+    assert 0 <= shares[0] < shares[-1] < 1

@@ -1,7 +1,8 @@
-"""The command as a process among others: its streams, signals, help and completion."""
+"""The command as a process among others: its streams, signals, help, completion, progress and lack of resources."""
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -10,10 +11,14 @@ from pathlib import Path
 
 import click
 import pytest
+import tqdm.std
 from click.shell_completion import ShellComplete
 
-from lightpage.cli import main
-from lightpage.cli.main import COMPLETE, THREADS, lightpage, run
+from lightpage.cli import progress_bar
+from lightpage.cli.main import COMPLETE, EXIT_ERROR, lightpage, run
+from lightpage.errors import RecordingError, SurroundingsError
+from lightpage.failures import os_failure, understood
+from tests.clock import HandClock
 from tests.lightpage.small import small_profile
 
 
@@ -33,12 +38,9 @@ def shell(script: str, folder: Path, **variables: str) -> subprocess.CompletedPr
     ("script", "status"),
     [
         ("lightpage --help | true; exit ${PIPESTATUS[0]}", 0),
-        ("lightpage --help >&-", 0),
-        ("lightpage --help 2>&-", 0),
         ("lightpage --help <&- >&- 2>&-", 0),
         ("lightpage --help > /dev/full", 2),
         ("lightpage nonsense 2> /dev/full", 2),
-        ("lightpage nonsense 2>&-", 2),
     ],
 )
 def test_streams_that_are_closed_full_or_absent(script: str, status: int, tmp_path: Path) -> None:
@@ -63,29 +65,6 @@ def test_what_an_encoding_cannot_say_is_escaped(encoding: str) -> None:
     name = os.fsdecode(b"a\xff.h5")
     done = subprocess.run([sys.executable, "-c", code, name], env=there, capture_output=True, timeout=60)
     assert (done.returncode, done.stdout) == (0, b"a\\udcff.h5\n")
-
-
-WAITS = """
-import signal, sys
-import click
-from lightpage.cli import main
-
-@click.command()
-def waits() -> None:
-    print("ready", flush=True)
-    signal.pause()
-
-sys.exit(main.run(waits, []))
-"""
-
-
-def test_a_signal_ends_a_command_that_says_how_to_go_on() -> None:
-    with subprocess.Popen([sys.executable, "-c", WAITS], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == b"ready\n"
-        process.send_signal(signal.SIGINT)
-        _, told = process.communicate(timeout=30)
-    assert (process.returncode, b"run the same command" in told) == (130, True)
 
 
 @pytest.mark.parametrize(
@@ -142,39 +121,67 @@ def test_every_command_shows_its_help_without_extras_and_required_options() -> N
     assert {"train", "calibrate", "export", "models list", "bulk recover"} <= set(done.stdout.splitlines())
 
 
-def test_shells_complete_commands_and_options(tmp_path: Path) -> None:
+def test_shells_complete_commands_and_options() -> None:
     complete = ShellComplete(lightpage, {}, "lightpage", COMPLETE)
     assert [item.value for item in complete.get_completions([], "sim")] == ["simulate"]
     assert "--holes" in [item.value for item in complete.get_completions(["bulk", "recover"], "--ho")]
-    asked = {"COMP_WORDS": "lightpage sim", "COMP_CWORD": "1", COMPLETE: "bash_complete"}
-    assert shell("lightpage", tmp_path, **asked).stdout == "plain,simulate\n"
 
 
-def test_libraries_of_linear_algebra_do_not_spin_unless_they_are_told_to(monkeypatch: pytest.MonkeyPatch) -> None:
-    for stream in ("stdin", "stdout", "stderr"):
-        monkeypatch.setattr(sys, stream, getattr(sys, stream))
-    monkeypatch.setattr(main, "run", lambda _: 0)
-    for own, seen in ((None, THREADS["OPENBLAS_NUM_THREADS"]), ("3", None)):
-        for name in (*THREADS, "OMP_NUM_THREADS", "OMP_WAIT_POLICY"):
-            monkeypatch.setenv(name, "")  # so that it is set back
-            monkeypatch.delenv(name)
-        if own is not None:
-            monkeypatch.setenv("OMP_NUM_THREADS", own)
-        with pytest.raises(SystemExit):
-            main.main()
-        assert os.environ.get("OPENBLAS_NUM_THREADS") == seen
+def test_a_name_that_is_too_long_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(lightpage, ["bulk", "decode", "n" * 300, "--recordings", "R.h5"]) == 2
+    assert capsys.readouterr().err.startswith("lightpage: error: ")
 
 
 @pytest.mark.parametrize(
-    "asked",
+    ("error", "named"),
     [
-        "evaluate --recording R.h5 --json {long}",
-        "bulk decode {long} --recordings R.h5",
+        (MemoryError("Unable to allocate 3 MiB"), "memory"),
+        (RuntimeError("can't start new thread"), "ulimit -u"),
+        (OSError(errno.EMFILE, os.strerror(errno.EMFILE)), "ulimit -n"),
+        (ImportError("libx.so: failed to map segment from shared object"), "memory"),
     ],
 )
-def test_names_that_are_too_long_are_named(
-    asked: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_a_short_resource_is_one_line(error: Exception, named: str, capsys: pytest.CaptureFixture[str]) -> None:
+    @click.command()
+    def command() -> None:
+        raise error
+
+    assert run(command, []) == EXIT_ERROR
+    told = capsys.readouterr().err
+    assert told.startswith("lightpage: error: ")
+    assert told.count("\n") == 1
+    assert named in told
+
+
+def test_words_of_a_library_name_a_resource_where_it_has_no_number() -> None:
+    error = OSError("Unable to open file (memory allocation failed)")
+    assert isinstance(os_failure("recording R", error, "a file", RecordingError), SurroundingsError)
+    assert isinstance(understood("B", MemoryError()), SurroundingsError)
+    assert understood("bundle B", ValueError("bad magic")) is None
+
+
+def test_progress_is_plain_lines_now_and_then_where_stderr_is_no_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert run(lightpage, asked.format(long="n" * 300).split()) == 2
-    assert capsys.readouterr().err.startswith("lightpage: error: ")
+    clock = HandClock()
+    monkeypatch.setattr(tqdm.std, "time", clock.now)
+    with progress_bar.percent_bar() as progress:
+        for step in range(4):
+            clock.advance(progress_bar.LINE_S)
+            progress("fit", step / 4)
+    for _ in progress_bar.Bars().track(range(30), "pages", "page", None, 0, lambda: "AIR 5"):
+        clock.advance(progress_bar.LINE_S / 10 + 1e-3)
+    told = capsys.readouterr()
+    assert told.out == ""
+    lines = [line for line in told.err.splitlines() if line]
+    assert lines[0].startswith("lightpage: fit: ")
+    assert any(line.startswith("lightpage: done: 100% after 02:00") for line in lines)
+    pages = [line for line in lines if line.startswith("lightpage: pages: ")]
+    assert 2 <= len(pages) <= 4
+    assert pages[0].endswith(", AIR 5")
+    assert "\r" not in told.err
+
+
+def test_short_work_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    assert list(progress_bar.Bars().track(range(3), "pages", "page", None, 0, lambda: "")) == [0, 1, 2]
+    assert capsys.readouterr().err.strip() == ""

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
 
-from lightpage.codec.choose import Choice, DrawnPage, choose
+from lightpage.codec.choose import Choice, DrawnPage, choose, needed_information
 from lightpage.codec.page_codec import PageCodec
 from lightpage.page.symbols import symbol_phases
 from tests.lightpage.codec.light import header_of, pilot_mask, written
@@ -61,3 +62,15 @@ def test_pages_that_nothing_carries_are_refused_with_what_they_were() -> None:
 def test_two_pages_are_too_few() -> None:
     with refused(got=2):
         choose_by(2, KAPPA, 0.0, 4.0)
+
+
+def test_few_codes_of_the_chosen_levels_are_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = list[int]()
+
+    def counted(*arguments: Any) -> float:
+        tried.append(arguments[2])
+        return needed_information(*arguments)
+
+    monkeypatch.setattr("lightpage.codec.choose.needed_information", counted)
+    chosen, _ = choose_by(3, KAPPA, 0.0, 4.2)
+    assert tried.count(chosen.code.levels) <= 3

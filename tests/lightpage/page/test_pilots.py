@@ -101,6 +101,14 @@ class TestTrust:
         kept = [len(without_outliers(*noisy(kappa, claim, seed)).phases) for seed in range(40)]
         assert np.mean(kept) > 53.9
 
+    @pytest.mark.parametrize(("wrong", "left"), [(2, 38), (3, 40)])
+    def test_one_in_twenty_may_be_dead(self, wrong: int, left: int) -> None:
+        p, pilots = noisy(4000, 4000, 0)
+        mask, phases = pilots.mask.copy(), pilots.phases[:40].copy()
+        mask[mask] = np.arange(54) < 40
+        phases[:wrong] += np.pi
+        assert len(without_outliers(p, Pilots(mask, phases)).phases) == left
+
     def test_a_device_that_changed_in_part_is_not_excused(self) -> None:
         p, pilots = noisy(400, 400, 0)
         phases = pilots.phases.copy()

@@ -22,7 +22,25 @@ from tests.runtime import toy
 PAIRING = PairingSettings(tolerance_s=0.012, frame_s=0.15, quiet_s=0.04, spacing_s=0.032)
 
 
-class LabCamera:
+class LabDevice:
+    """Answers until it is gone."""
+
+    name: str
+    gone, lost = False, Reason.CAMERA_GONE
+
+    def must_answer(self) -> None:
+        if self.gone:
+            raise LostShotError(self.name, "no answer", "one", self.lost)
+
+    arm = must_answer
+
+    def close(self) -> None:
+        pass
+
+    disarm = close
+
+
+class LabCamera(LabDevice):
     """Frames become due some time after their trigger; each shows what is on display when it is exposed."""
 
     bit_depth, frame_numbers, frame_shape = 8, 65535, (4, 4)
@@ -30,7 +48,6 @@ class LabCamera:
     def __init__(self, name: str, scene: Callable[[], np.ndarray], clock: HandClock) -> None:
         self.name, self.scene, self.clock = name, scene, clock
         self.opened = 0
-        self.gone = False
         self.id = 65529
         self.follows: Callable[[int], int] = lambda number: number % 65535 + 1
         self.clock_s, self.pace = 1e6, 1.00005
@@ -39,7 +56,7 @@ class LabCamera:
         self._count = 0
 
     def arm(self) -> None:
-        self._must_answer()
+        self.must_answer()
         self.opened = max(1, self.opened)
 
     def restart(self) -> None:
@@ -65,11 +82,11 @@ class LabCamera:
             heapq.heappush(self.queue, (at + delivery_s, self._count, frame))
 
     def fire(self) -> None:
-        self._must_answer()
+        self.must_answer()
         self.edge()
 
     def frame(self, timeout_s: float) -> Frame | None:
-        self._must_answer()
+        self.must_answer()
         end = self.clock.now() + timeout_s
         while True:
             self.poll()
@@ -81,29 +98,15 @@ class LabCamera:
             coming = [first[0][0] for first in (self.queue, self.exposures) if first]
             self.clock.advance(min([end, *coming]) - now)
 
-    def close(self) -> None:
-        pass
 
-    disarm = close
+class Lab(LabDevice):
+    """Both cameras behind one trigger; `plan` says what becomes of the next edge, `fired` when there were any."""
 
-    def _must_answer(self) -> None:
-        if self.gone:
-            raise LostShotError(self.name, "no answer", "a camera", Reason.CAMERA_GONE)
-
-
-class Lab:
-    """Both cameras behind one trigger; `plan` says what becomes of the next edge.
-
-    Attributes:
-        fired: when the trigger fired.
-    """
-
-    name = "lab trigger"
+    name, lost = "lab trigger", Reason.TRIGGER_GONE
 
     def __init__(self) -> None:
         self.clock = HandClock()
         self.page = 0
-        self.gone = False
         self.cameras = [
             LabCamera(name, lambda: np.full((4, 4), self.page % 251, np.uint8), self.clock) for name in ("I", "Q")
         ]
@@ -119,11 +122,8 @@ class Lab:
         self.poll()
         self.page += 1
 
-    def arm(self) -> None:
-        self._must_answer()
-
     def fire(self) -> float:
-        self._must_answer()
+        self.must_answer()
         self.fired.append(self.clock.now())
         plan, self.plan = self.plan, None
         if plan is not None:
@@ -133,17 +133,8 @@ class Lab:
                 camera.edge()
         return self.fired[-1]
 
-    def close(self) -> None:
-        pass
 
-    disarm = close
-
-    def _must_answer(self) -> None:
-        if self.gone:
-            raise LostShotError(self.name, "no answer", "a trigger", Reason.TRIGGER_GONE)
-
-
-class LabModulator:
+class LabModulator(LabDevice):
     """Shows pages and blocks beams in the lab."""
 
     name = "lab modulator"
@@ -179,9 +170,6 @@ class LabModulator:
             dark = np.full(toy.SHAPE, 3, np.uint8)
             dark[2, 3] = 200
             self.pair = type(self.pair)(dark, dark.copy())
-
-    def close(self) -> None:
-        pass
 
 
 def pages_of(folder: Path, count: int = 3) -> PageStore:

@@ -1,12 +1,19 @@
-"""What is read while the caller works: each page in its place, one ahead, its error with it."""
+"""What is read while the caller works: each page in its place, one ahead, its error with it; pages that were seen."""
 
 from __future__ import annotations
 
 import threading
+from pathlib import Path
 
+import numpy as np
 import pytest
 
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import hash_frames
+from runtime.bulk.evaluation import was_seen
 from runtime.bulk.read_ahead import read_ahead
+from runtime.decoding.decoder import Decoder
+from tests.runtime import toy
 from tests.waiting import LIMIT_S
 
 
@@ -50,6 +57,12 @@ def test_whoever_stops_early_waits_for_no_page_that_has_not_begun() -> None:
     assert read == [0]
 
 
-def test_no_pages_are_none() -> None:
-    with pytest.raises(StopIteration):
-        next(read_ahead(lambda index: index, 0))
+@pytest.mark.parametrize(("trained", "saved"), [(("u1", "u1"), (">u2", "u1")), (("u1", "u2"), ("u2", "u2"))])
+def test_a_page_is_known_again_in_whichever_type_its_counts_are_stored(
+    trained: tuple[str, str], saved: tuple[str, str], tmp_path: Path
+) -> None:
+    counts = np.random.default_rng(0).integers(0, 256, (2, *toy.SHAPE))
+    then, now = (FramePair(counts[0].astype(a), counts[1].astype(b)) for a, b in (trained, saved))
+    decoder = Decoder.load(toy.write_toy_bundle(tmp_path / "t.zip", trained_pages=[hash_frames(then)]), threads=1)
+    assert was_seen(decoder, now)
+    assert not was_seen(decoder, FramePair(now.quadrature, now.in_phase))

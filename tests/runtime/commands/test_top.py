@@ -9,33 +9,25 @@ import select
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from threading import Thread
-from wsgiref.simple_server import make_server
 
 import pytest
 
 from lightpage.cli import main as cli_main
 from lightpage.cli.main import EXIT_ERROR, lightpage
-from lightpage.errors import LightpageError
 from runtime.commands.top import top
 from runtime.console.scrapes import Change, Scrape, Scrapes, scrape
 from runtime.console.server import ConsoleServer
 from runtime.decoding.decoder import Decoder
-from tests.runtime.commands.test_commands import ROOT
 from tests.runtime.console.stage import Stage, stage
-from tests.runtime.identity.authority import Authority
 from tests.waiting import eventually
+
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def address(running: Stage) -> str:
     return running.url.removeprefix("http://").replace("localhost", "127.0.0.1")
-
-
-def a_scrape(at: float, values: Mapping[str, float], started: float = 1.0) -> Scrape:
-    samples = {("process_start_time_seconds", frozenset[tuple[str, str]]()): started}
-    return Scrape(at, samples | {(name, frozenset()): value for name, value in values.items()})
 
 
 def test_one_text_says_what_the_service_does(decoder: Decoder, capsys: pytest.CaptureFixture[str]) -> None:
@@ -55,43 +47,28 @@ def test_one_text_says_what_the_service_does(decoder: Decoder, capsys: pytest.Ca
         assert change.mean("lightpage_decode_seconds") * 8 == pytest.approx(change.rise("lightpage_decode_seconds_sum"))
 
 
-def test_a_wrong_address_is_named_with_what_to_do(decoder: Decoder, capsys: pytest.CaptureFixture[str]) -> None:
-    with stage(decoder) as running:
-        gone = address(running)
-    assert cli_main.run(top, ["--address", gone, "--once"]) == EXIT_ERROR
-    assert gone in capsys.readouterr().err
+@pytest.mark.parametrize(
+    "text", [b"up 1\n", b"<html>a page</html>\n", b"\x00\x00\x06\x04\x00\x00\x00\x00\x00\x00\x05\x00\x00\x40\x00", None]
+)
+def test_what_is_no_service_is_named_in_a_line(text: bytes | None, capsys: pytest.CaptureFixture[str]) -> None:
+    """Other metrics, another page, what a gRPC server says, and nobody."""
+    said = text or b""
 
-    for text, told in ((b"up 1\n", "something else"), (b"<html>a page</html>\n", "no metrics")):
-
-        def other(_: object, start_response: Callable[..., object], text: bytes = text) -> list[bytes]:
-            start_response("200 OK", [])
-            return [text]
-
-        with make_server("127.0.0.1", 0, other) as server:
-            Thread(target=server.handle_request, daemon=True).start()
-            with pytest.raises(LightpageError, match=told):
-                scrape(f"127.0.0.1:{server.server_port}")
-
-
-@pytest.mark.parametrize("arguments", [["top", "--once"], ["console", "--no-browser"]])
-def test_what_is_no_http_and_no_port_is_named_in_a_line(
-    arguments: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
     def answer(listener: socket.socket) -> None:
         connection, _ = listener.accept()
         with connection:
             connection.recv(1000)
-            connection.sendall(b"\x00\x00\x06\x04\x00\x00\x00\x00\x00\x00\x05\x00\x00\x40\x00")  # as a gRPC server
+            connection.sendall(said if said.startswith(b"\0") else b"HTTP/1.0 200 OK\r\n\r\n" + said)
 
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        listener.settimeout(10)
-        Thread(target=answer, args=(listener,), daemon=True).start()
-        other = f"127.0.0.1:{listener.getsockname()[1]}"
-        for place, got in ((other, "not HTTP"), ("127.0.0.1:x", "'x'")):
-            assert cli_main.run(lightpage, [*arguments, "--address", place]) == EXIT_ERROR
-            (told,) = capsys.readouterr().err.splitlines()
-            assert place in told
-            assert got in told
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        if text is not None:
+            listener.listen()
+            Thread(target=answer, args=(listener,), daemon=True).start()
+        place = f"127.0.0.1:{listener.getsockname()[1]}"
+        assert cli_main.run(lightpage, ["top", "--once", "--address", place]) == EXIT_ERROR
+    (told,) = capsys.readouterr().err.splitlines()
+    assert place in told
 
 
 def test_quantiles_are_those_of_what_came_between() -> None:
@@ -109,86 +86,54 @@ def test_quantiles_are_those_of_what_came_between() -> None:
 
 
 def test_a_restart_ends_what_was_counted_before() -> None:
+    def counted(at: float, calls: float, **started: float) -> Change:
+        samples = {"lightpage_calls_total": calls, **started}
+        scrapes.add(Scrape(at, {(name, frozenset()): value for name, value in samples.items()}))
+        assert scrapes.change is not None
+        return scrapes.change
+
     scrapes = Scrapes(window_s=10.0)
     for at in range(20):
-        scrapes.add(a_scrape(float(at), {"lightpage_calls_total": 100.0 + 2 * at}))
-    change = scrapes.change
-    assert change is not None
+        change = counted(float(at), 100.0 + 2 * at, process_start_time_seconds=1.0)
     assert (change.seconds, change.rate("lightpage_calls_total")) == (10.0, 2.0)
-    scrapes.add(a_scrape(20.0, {"lightpage_calls_total": 500.0}, started=2.0))
-    scrapes.add(a_scrape(21.0, {"lightpage_calls_total": 503.0}, started=2.0))
-    change = scrapes.change
-    assert change is not None
+    counted(20.0, 500.0, process_start_time_seconds=2.0)
+    change = counted(21.0, 503.0, process_start_time_seconds=2.0)
     assert (scrapes.restarts, change.seconds, change.rate("lightpage_calls_total")) == (1, 1.0, 3.0)
-    scrapes.add(Scrape(22.0, {("lightpage_calls_total", frozenset()): 4.0}))  # of a system that tells no start
+    counted(22.0, 4.0)  # of a system that tells no start
     assert scrapes.restarts == 2
 
 
-class Terminal:
-    """`lightpage top` in a terminal of its own."""
-
-    def __init__(self, address: str) -> None:
-        self._own, other = pty.openpty()
-        command = [sys.executable, "-c", "from runtime.commands.top import top; top()", "--address", address]
-        environment = {**os.environ, "TERM": "xterm", "COLUMNS": "120", "LINES": "50", "PYTHONPATH": str(ROOT)}
-        self.process = subprocess.Popen(
-            [*command, "--interval", "0.1"], stdin=other, stdout=other, stderr=other, env=environment, close_fds=True
-        )
-        os.close(other)
-
-    def shows(self, text: str) -> bool:
-        """Wait until it shows a text."""
+def test_in_a_terminal_it_outlives_the_service_and_ends_with_q(decoder: Decoder) -> None:
+    def shows(text: str) -> bool:
         seen = bytearray()
 
         def found() -> bool:
-            if select.select([self._own], [], [], 0.1)[0]:
-                seen.extend(os.read(self._own, 65536))
+            if select.select([screen], [], [], 0.1)[0]:
+                seen.extend(os.read(screen, 65536))
             return text.encode() in seen
 
         return eventually(found)
 
-    def press(self, key: str) -> None:
-        os.write(self._own, key.encode())
-
-    def close(self) -> None:
-        self.process.kill()
-        self.process.wait()
-        os.close(self._own)
-
-
-def test_in_a_terminal_it_outlives_the_service_and_ends_with_q(decoder: Decoder) -> None:
+    screen, own = pty.openpty()
     with stage(decoder) as running:
         running.read(3)
         port = running.server.port
-        terminal = Terminal(address(running))
+        command = [sys.executable, "-c", "from runtime.commands.top import top; top()", "--address", address(running)]
+        environment = {**os.environ, "TERM": "xterm", "COLUMNS": "120", "LINES": "50", "PYTHONPATH": str(ROOT)}
+        process = subprocess.Popen([*command, "--interval", "0.1"], stdin=own, stdout=own, stderr=own, env=environment)
+        os.close(own)
         try:
-            assert terminal.shows("toy-1")
+            assert shows("toy-1")
             running.server.close()
-            assert terminal.shows("no answer")
+            assert shows("no answer")
             running.plane.metrics.in_service("toy-2")
             with ConsoleServer(running.console, port):
-                assert terminal.shows("toy-2")
-                terminal.press("x")
-                terminal.press("q")
-                assert terminal.shows("\x1b[?1049l")  # the screen is as it was
-                assert terminal.process.wait(60) == 0
+                assert shows("toy-2")
+                os.write(screen, b"x")
+                os.write(screen, b"q")
+                assert shows("\x1b[?1049l")  # the screen is as it was
+                assert process.wait(60) == 0
         finally:
-            terminal.close()
-
-
-def test_a_service_with_tls_is_scraped_with_a_certificate(
-    decoder: Decoder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    authority = Authority(tmp_path)
-    with stage(decoder, authority.service()) as running:
-        own = authority.caller("watcher", ["read"])
-        files = [word for name, path in vars(own).items() for word in (f"--{name}", str(path))]
-        place = ["--address", f"localhost:{running.server.port}", "--interval", "0.1", "--once"]
-        assert cli_main.run(top, [*place, *files]) == 0
-        assert "model toy-1" in capsys.readouterr().out
-        assert cli_main.run(top, place) == EXIT_ERROR
-        assert "--certificate" in capsys.readouterr().err
-        nobody = authority.caller("nobody")
-        files = [word for name, path in vars(nobody).items() for word in (f"--{name}", str(path))]
-        assert cli_main.run(top, [*place, *files]) == EXIT_ERROR
-        assert "403 Forbidden" in capsys.readouterr().err
+            process.kill()
+            process.wait()
+            os.close(screen)

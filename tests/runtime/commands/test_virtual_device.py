@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -10,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from lightpage.cli import main as cli_main
+from lightpage.cli.main import EXIT_ERROR, lightpage
 from lightpage.errors import InvalidInputError
 from runtime.commands import virtual_device
 from tests.lightpage.small import small_profile
-
-pytestmark = pytest.mark.own_network
 
 
 def started(folder: Path, *command: str) -> subprocess.Popen[str]:
@@ -29,6 +28,7 @@ def started(folder: Path, *command: str) -> subprocess.Popen[str]:
     )
 
 
+@pytest.mark.own_network
 def test_its_status_is_that_of_the_command(tmp_path: Path) -> None:
     running = started(tmp_path, "sh", "-c", f"test -S {tmp_path}/device/modulator.sock && exit 7")
     out, err = running.communicate(timeout=300)
@@ -36,6 +36,7 @@ def test_its_status_is_that_of_the_command(tmp_path: Path) -> None:
     assert f"camera:{tmp_path}/device/device.toml" in err
 
 
+@pytest.mark.own_network
 def test_sigterm_ends_the_command_too(tmp_path: Path) -> None:
     mark = tmp_path / "mark"
     # `read` waits for an end of input that does not come.
@@ -55,24 +56,9 @@ def test_a_command_that_is_not_there_is_named() -> None:
     assert (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)) == before
 
 
-def test_a_signal_that_comes_while_the_command_is_started_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    made: list[subprocess.Popen[bytes]] = []
-    popen = subprocess.Popen
-
-    def interrupted(command: list[str]) -> subprocess.Popen[bytes]:
-        made.append(popen(command, stdin=subprocess.PIPE))
-        os.kill(os.getpid(), signal.SIGTERM)
-        return made[0]
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(subprocess, "Popen", interrupted)
-    before = signal.signal(signal.SIGTERM, interrupt)  # as the program does
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            virtual_device.run_to_its_end(["cat"])
-    finally:
-        signal.signal(signal.SIGTERM, before)
-    assert made[0].returncode == -signal.SIGTERM
-    made[0].communicate()
+def test_a_folder_that_cannot_be_written_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(virtual_device, "go_on_inside", lambda name: pytest.fail("started"))
+    assert cli_main.run(lightpage, ["virtual-device", "--out", "/proc/self", "--", "true"]) == EXIT_ERROR
+    assert "error: --out /proc/self:" in capsys.readouterr().err

@@ -36,14 +36,9 @@ class Losing(toy.ToySource):
 @dataclass
 class Stage:
     plane: DataPlane
-    history: History
     console: Console
     server: ConsoleServer
-    secured: bool = False
-
-    @property
-    def url(self) -> str:
-        return f"{'https' if self.secured else 'http'}://localhost:{self.server.port}"
+    url: str
 
     def read(self, pages: int) -> None:
         for _ in range(pages):
@@ -59,4 +54,4 @@ def stage(decoder: Decoder, tls: TlsFiles | None = None) -> Iterator[Stage]:
     recalibrator = Recalibrator(plane, toy.fit_references)
     console = Console(metrics, history, registry, monitor, "toy:device", Actions(plane, recalibrator))
     with ConsoleServer(console, 0, certificates=None if tls is None else Certificates(tls)) as server:
-        yield Stage(plane, history, console, server, tls is not None)
+        yield Stage(plane, console, server, f"http{'s' if tls else ''}://localhost:{server.port}")

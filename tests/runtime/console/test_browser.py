@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, expect, sync_playwright
 
 from runtime.decoding.decoder import Decoder
 from runtime.wire.tls import TlsFiles
@@ -30,18 +30,7 @@ def browser() -> Iterator[Browser]:
         running.close()
 
 
-def loaded(page: Page, name: str) -> bool:
-    """Whether a picture comes; the page's own rules forbid playwright to wait for it there."""
-    for _ in range(600):
-        if page.locator(f"#{name}").evaluate("image => image.complete && image.naturalWidth > 0"):
-            return True
-        page.wait_for_timeout(100)
-    return False
-
-
 class Visitor:
-    """Somebody with a certificate who looks at the console."""
-
     def __init__(self, browser: Browser, url: str, certificate: TlsFiles) -> None:
         own = {"origin": url, "certPath": str(certificate.certificate), "keyPath": str(certificate.key)}
         self.context = browser.new_context(
@@ -73,7 +62,7 @@ def test_a_browser_shows_pages_and_losses_acts_for_administrators_and_says_when_
         watcher.sees("models", "toy-2 (in service)")
         expect(watcher.page.locator("#actions")).to_be_hidden()
         for name in ("in_phase", "quadrature", "confidence"):
-            assert loaded(watcher.page, name)
+            expect(watcher.page.locator(f"#{name}")).not_to_have_js_property("naturalWidth", 0, timeout=_WAIT_MS)
         assert watcher.page.locator(".chart path.line").count() >= 5
         running.read(3)
         watcher.sees("facts", "10 pages")

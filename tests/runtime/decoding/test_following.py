@@ -1,4 +1,4 @@
-"""The Python call that the package advertises."""
+"""The Python call that the package advertises, and the shipped bundle: its name, and that it follows its device."""
 
 from __future__ import annotations
 
@@ -10,12 +10,18 @@ import pytest
 import runtime
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device
+from lightpage.metrics.measures import measure
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols
 from lightpage.simulator.simulator import Simulator
+from runtime.bundle.shipped import DEFAULT, bundle_path
 from runtime.decoding.decoder import Decoder
+from runtime.decoding.drift_tables import BundleTables
+from runtime.decoding.image_drift import SHIFT, TILT
+from runtime.decoding.image_tracker import RETRACE_RAD, ImageTracker, tracker_for
 from runtime.decoding.tracking import NoTracker
 from runtime.errors import UnconfirmedPageError
+from runtime.execution.twin import OnnxTwin
 from tests.runtime import toy
 
 
@@ -40,3 +46,39 @@ def test_an_image_that_has_moved_is_read_unless_it_is_not_followed() -> None:
     assert (decoder.decode(pair).symbols != symbols)[data].mean() < 0.55
     with pytest.raises(UnconfirmedPageError):
         NoTracker(Decoder(decoder.bundle, 1, decoder.graph)).decode(pair, 256)
+
+
+def test_a_name_is_the_shipped_bundle_even_beside_a_folder_of_that_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / DEFAULT).mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert bundle_path(DEFAULT).name == f"{DEFAULT}.zip"
+    assert bundle_path(DEFAULT).is_file()
+    for given in (f"./{DEFAULT}", "nothing-of-that-name"):
+        assert bundle_path(given) == Path(given)
+
+
+@pytest.mark.long
+def test_the_shipped_decoder_follows_an_image_that_moves_over_its_reference() -> None:
+    """Which tilts it; so far off, the table is traced again, and holds the tilt from then on."""
+    decoder = Decoder.load(bundle_path(DEFAULT))
+    profile, levels, by = decoder.bundle.profile, 256, np.array([6.0, -4.0])
+    simulator = Simulator(profile, Device().with_settings(["drift.shift_px=0.0"]), levels, 8, reference_stays=True)
+    written = np.asarray(random_symbols(profile, levels, 1, np.random.default_rng(8))[0])
+    tracker = tracker_for(decoder)
+    assert isinstance(tracker, ImageTracker)
+    rates = []
+    for _ in range(3):
+        page = tracker.decode(simulator.page(written), levels)
+        rates.append(measure(page.phase, page.concentration, written, levels).air_bits_per_symbol)
+        if len(rates) == 1:
+            simulator.knock((float(by[0]), float(by[1])))
+    state = tracker.state
+    expected = BundleTables(decoder, OnnxTwin(decoder.bundle, 1)).tilt_of(by)
+    np.testing.assert_allclose(state.drift[SHIFT], by, atol=0.03)
+    # the reference's ripple, of which other parts lie under the image now, adds a tilt of its own
+    assert np.linalg.norm(state.drift[TILT] - expected) < 0.5 * np.linalg.norm(expected)
+    assert np.abs(state.untraced[TILT]).max() < RETRACE_RAD
+    assert state.decoder is not decoder
+    assert rates[2] > 0.97 * rates[0]

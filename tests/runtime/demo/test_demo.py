@@ -17,13 +17,12 @@ from runtime.commands.demo import demo
 from runtime.decoding.decoder import Decoder
 from runtime.demo.demo import drifted, pgm, run_demo, summarise
 from runtime.demo.picture import picture
-from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.refit import refit
 from runtime.wire.pages import RemotePage, RemoteTimings
 from tests.runtime import toy
+from tests.runtime.recalibration.toy_worker import known, quiet
 
-ROWS = 28
-"""Of the picture: what two pages hold."""
+ROWS = 28  # of the picture: what two pages hold
 TIMINGS = RemoteTimings(0.0, 0.2, 0.1, 0.3)
 
 
@@ -63,20 +62,14 @@ def test_drift_leaves_what_cannot_drift() -> None:
 def test_a_bundle_without_code_field_or_calibration_is_no_demo(decoder: Decoder, tmp_path: Path) -> None:
     with pytest.raises(BundleError, match="code: got none"):
         run_demo(decoder.bundle.path, tmp_path, 0)
-    device = toy.ToyDevice()
-    symbols = toy.symbols_of(16, 1)[0]
-    pair = device.page(symbols, 16)
     with pytest.raises(CalibrationError, match="calibration"):
-        refit(decoder.bundle, KnownPages((pair,), (symbols,), 16, device.references()), lambda *_: None, decoder)
-    with pytest.raises(BundleError, match="bundle"):
-        decoder.field_solver(pair, pair, np.zeros((2, 2, 10), np.float32), np.ones(2, np.float32))
+        refit(decoder.bundle, known(count=1), quiet, decoder)
 
 
 @pytest.mark.timeout(1800)  # its recalibration takes only what time others leave
 def test_a_picture_is_lost_by_drift_and_won_back_with_the_shipped_bundle(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of three pages, instead of twenty."""
     small = picture()[:ROWS]
     for name, value in {"picture": lambda: small, "DRIFT_STEPS": (0.3,), "GROUPS": 1, "PARITY_PAGES": 1}.items():
         monkeypatch.setattr(f"runtime.demo.demo.{name}", value)
@@ -99,13 +92,3 @@ def test_a_picture_is_lost_by_drift_and_won_back_with_the_shipped_bundle(
     read = (tmp_path / "recalibrated.pgm").read_bytes()
     assert read == (tmp_path / "as-calibrated.pgm").read_bytes() == pgm(small)
     assert (tmp_path / "after-drift.pgm").read_bytes() != read
-
-
-# Ten times the pages, read by the same code.
-@pytest.mark.long
-def test_the_whole_demo(tmp_path: Path) -> None:
-    result = CliRunner().invoke(demo, ["--out", str(tmp_path)], standalone_mode=False, catch_exceptions=False)
-    assert result.exception is None
-    figures = json.loads((tmp_path / "demo.json").read_text())
-    assert figures["pages"] >= 20
-    assert [phase["picture_exact"] for phase in figures["phases"]] == [True, False, True]

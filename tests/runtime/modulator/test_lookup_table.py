@@ -5,8 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lightpage.device.profile import PageLayout
 from lightpage.errors import InvalidInputError, PageError
 from runtime.modulator.lookup_table import LookupTable
+from runtime.modulator.raster import Raster
+from runtime.modulator.settings import RasterSettings
+from tests.lightpage.small import small_profile
 
 
 def table(tmp_path: Path, text: str, levels: int) -> list[int]:
@@ -23,46 +27,29 @@ def test_without_a_file_the_levels_lie_evenly_on_one_wave() -> None:
         LookupTable.linear(1)
 
 
-@pytest.mark.parametrize("text", ["0 60 130 200", "0,60,130,200\n", "# mine\ngrey\n0\n60 # second\n\n130;200"])
-def test_a_file_of_grey_values_is_taken_as_it_is(text: str, tmp_path: Path) -> None:
-    assert table(tmp_path, text, 4) == [0, 60, 130, 200]
-
-
-def test_a_calibration_gives_the_grey_values_whose_phases_are_the_levels(tmp_path: Path) -> None:
-    """A modulator whose phase is not linear: 2.2 waves x^1.5 over its grey values, stated every 5th, wrapped."""
-
-    def phase(grey: np.ndarray) -> np.ndarray:
-        return 2.2 * 2 * np.pi * (grey / 255) ** 1.5 + 0.4
-
-    greys = np.arange(0, 256, 5)
-    text = "phase_rad grey\n" + "".join(
-        f"{p % (2 * np.pi):.6f}, {g}\n" for p, g in zip(phase(greys), greys, strict=True)
-    )
-    found = np.array(table(tmp_path, text, 16))
-    slope = np.abs(np.gradient(phase(np.arange(256.0)))).max()  # half a grey value of rounding, and the interpolation
-    assert np.abs(phase(found) - phase(np.zeros(1)) - 2 * np.pi * np.arange(16) / 16).max() < 0.6 * slope
-
-
-def test_a_phase_that_falls_with_the_grey_value_counts_from_its_lowest(tmp_path: Path) -> None:
-    assert table(tmp_path, "phase_rad grey\n5 0\n2.5 100\n0 200\n", 4) == [200, 137, 74, 12]
+@pytest.mark.parametrize(
+    ("text", "greys"),
+    [
+        ("0,60,130,200\n", [0, 60, 130, 200]),
+        ("# mine\ngrey\n0\n60 # second\n\n130;200", [0, 60, 130, 200]),
+        ("phase_rad grey\n5 0\n2.5 100\n0 200\n", [200, 137, 74, 12]),  # counts from its lowest phase
+        (f"phase_rad grey\n0 0\n{3 * np.pi / 4} 128\n{3 * np.pi / 2} 255\n", [0, 85, 170, 255]),  # just enough
+        ("phase_rad, grey\n1, 0\n3, 50\n4.4, 100\n1.2, 200\n", [0, 39, 91, 143]),  # wrapped, and not linear
+    ],
+)
+def test_a_file_states_grey_values_or_the_phases_of_some(text: str, greys: list[int], tmp_path: Path) -> None:
+    assert table(tmp_path, text, 4) == greys
 
 
 @pytest.mark.parametrize(
     ("text", "levels", "line", "got"),
     [
         ("", 4, "", "0 grey values"),
-        ("0 1 2", 4, "", "3 grey values"),
         ("0 1\n2 x", 4, "line 2", "'x'"),
-        ("0 nan", 2, "line 1", "'nan'"),
         ("0 256", 2, "line 1", "256"),
-        ("-1 2", 2, "line 1", "-1"),
         ("0 2.5", 2, "line 1", "2.5"),
         ("0 9 7 9", 4, "", "9 for levels 1 and 3"),
-        ("phase_rad grey\n", 4, "", "0 grey values"),
-        ("phase_rad grey\n0 0", 4, "", "1 grey values"),
         ("phase_rad grey\n0 0\n1", 4, "line 3", "1"),
-        ("phase_rad grey\n0 0\n1 300", 4, "line 3", "300"),
-        ("phase_rad grey\n0 0\n1 0", 4, "line 3", "0"),
         ("phase_rad grey\n0 0\n2 100\n1.5 200\n", 4, "", "100 and 200"),
         ("phase_rad grey\n0 0\n2 100\n4 200\n", 4, "", "4 rad"),
         ("phase_rad grey\n0 0\n3 1\n6 2\n", 4, "", "levels 1 and 2"),
@@ -73,18 +60,8 @@ def test_a_wrong_file_is_told_by_its_line(text: str, levels: int, line: str, got
         table(tmp_path, text, levels)
     assert raised.value.subject == f"lookup table {tmp_path / 'table.csv'}" + (f", {line}" if line else "")
     assert got in raised.value.got
-
-
-def test_a_calibration_that_spans_just_enough_is_taken(tmp_path: Path) -> None:
-    assert table(tmp_path, f"phase_rad grey\n0 0\n{3 * np.pi / 4} 128\n{3 * np.pi / 2} 255\n", 4) == [0, 85, 170, 255]
-
-
-def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
-    (tmp_path / "binary").write_bytes(b"\xff\xfe\x00")
-    for name in ("nowhere.csv", "binary"):
-        with pytest.raises(InvalidInputError) as raised:
-            LookupTable.from_file(tmp_path / name, 4)
-        assert raised.value.subject == f"lookup table {tmp_path / name}"
+    with pytest.raises(InvalidInputError, match=r"^lookup table .*nowhere"):
+        LookupTable.from_file(tmp_path / "nowhere.csv", 4)
 
 
 def test_symbols_become_grey_values_of_their_own_table_alone() -> None:
@@ -98,3 +75,39 @@ def test_symbols_become_grey_values_of_their_own_table_alone() -> None:
         linear.greys_of(np.array([[0, 4]]), 4)
     with pytest.raises(PageError, match="float64"):
         linear.greys_of(np.array([[0.5]]), 4)
+
+
+TINY = small_profile().model_copy(update={"page": PageLayout(columns=3, rows=2, symbol_size_px=2)})
+PAGE = np.array([[10, 20, 30], [40, 50, 60]], np.uint8)
+
+
+def image(**settings: object) -> np.ndarray:
+    values = {"rows_px": 8, "columns_px": 11, "background_grey": 1, **settings}
+    return Raster(TINY, RasterSettings.model_validate(values)).image(PAGE)
+
+
+def test_each_symbol_is_a_square_and_the_page_lies_in_the_middle() -> None:
+    shown = image()
+    assert shown.dtype == np.uint8
+    assert shown.shape == (8, 11)
+    assert shown[2:6, 2:8].tolist() == 2 * [[10, 10, 20, 20, 30, 30]] + 2 * [[40, 40, 50, 50, 60, 60]]
+    shown[2:6, 2:8] = 1
+    assert (shown == 1).all()
+    with pytest.raises(PageError):
+        Raster(TINY, RasterSettings(rows_px=8, columns_px=10)).image(PAGE.T)
+
+
+def test_an_offset_moves_the_page_right_and_down_and_a_flip_mirrors_it_where_it_is() -> None:
+    np.testing.assert_array_equal(image(offset_x_px=3, offset_y_px=-2), np.roll(image(), (-2, 3), (0, 1)))
+    moved = {"columns_px": 10, "offset_x_px": 1}
+    np.testing.assert_array_equal(image(flip_x=True, **moved)[:, 3:9], image(**moved)[:, 8:2:-1])
+    np.testing.assert_array_equal(image(flip_y=True), image()[::-1])
+
+
+@pytest.mark.parametrize(
+    ("settings", "ends"),
+    [({"columns_px": 5}, "-1"), ({"offset_y_px": 3}, "5"), ({"offset_x_px": -3}, "-1")],
+)
+def test_a_page_that_leaves_the_modulator_is_refused(settings: dict[str, int], ends: str) -> None:
+    with pytest.raises(InvalidInputError, match=f"pixels {ends} to"):
+        image(**settings)

@@ -1,10 +1,12 @@
-"""A worker that fits the toy device: `... toy_worker FOLDER`."""
+"""Known pages of a toy device that has drifted, and a worker that fits it: `... toy_worker FOLDER`."""
 
 from __future__ import annotations
 
 import os
 import sys
 from pathlib import Path
+
+import numpy as np
 
 from lightpage.progress import Progress
 from runtime.bundle.bundle import Bundle
@@ -14,6 +16,28 @@ from runtime.recalibration.outcome import RefitResult
 from runtime.recalibration.work import WorkFolder
 from runtime.recalibration.worker import end_with_parent, work, yield_to_reads
 from tests.runtime import toy
+
+DRIFTED = (150.0, 62.0)
+
+
+def known(offsets: tuple[float, float] = DRIFTED, count: int = 3, levels: int = 16) -> KnownPages:
+    device = toy.ToyDevice(offsets)
+    symbols = toy.symbols_of(levels, 11, count)
+    pairs = tuple(device.page(page, levels, 0.3) for page in symbols)
+    return KnownPages(pairs, tuple(symbols), levels, device.references())
+
+
+def shuffled(pages: KnownPages, which: slice) -> KnownPages:
+    """The pages, some of them with symbols that are not theirs."""
+    symbols = list(pages.symbols)
+    rng = np.random.default_rng(2)
+    for index in range(*which.indices(len(symbols))):
+        symbols[index] = rng.integers(16, size=toy.PAGE).astype(np.uint8)
+    return KnownPages(pages.pairs, tuple(symbols), pages.levels, pages.references)
+
+
+def quiet(step: str, share: float) -> None:
+    """No progress."""
 
 
 def fit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decoder) -> RefitResult:

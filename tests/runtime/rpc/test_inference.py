@@ -11,7 +11,6 @@ import grpc
 import numpy as np
 import pytest
 from google.protobuf.descriptor_pool import DescriptorPool
-from google.protobuf.message_factory import GetMessageClass
 from grpc_reflection.v1alpha.proto_reflection_descriptor_database import ProtoReflectionDescriptorDatabase
 
 from lightpage.errors import FrameError
@@ -73,9 +72,8 @@ def stub_of(service: Running) -> oip_grpc.GRPCInferenceServiceStub:
 
 
 def infer(service: Running, request: oip.ModelInferRequest) -> oip.ModelInferResponse:
-    answer: oip.ModelInferResponse = oip_grpc.GRPCInferenceServiceStub(
-        service.channels[0] if service.channels else service.channel()
-    ).ModelInfer(request, timeout=20)
+    channel = service.channels[0] if service.channels else service.channel()
+    answer: oip.ModelInferResponse = oip_grpc.GRPCInferenceServiceStub(channel).ModelInfer(request, timeout=20)
     return answer
 
 
@@ -133,26 +131,21 @@ def test_user_bytes_come_when_asked_for(start: Start, service: Running, tmp_path
     size = with_code.client.describe().user_bytes_per_page
     metadata = stub_of(with_code).ModelMetadata(oip.ModelMetadataRequest(name="lightpage"), timeout=20)
     assert metadata.properties["user_bytes_per_page"] == str(size)
-    for pair, content, loss in (
-        (shown, coded.CONTENT[size : 2 * size], ""),
-        (coded.half_lost(shown), b"", "BODY"),
-    ):
+    for pair, content, loss in ((shown, coded.CONTENT[size : 2 * size], ""), (coded.half_lost(shown), b"", "BODY")):
         response = infer(with_code, asking_for_bytes(pair))
         assert arrays(response)["user_data"].tobytes() == content
         told = values(response)
         assert (told["levels"], told["user_data.loss"]) == (32, loss)
         assert ("user_data.header.page" in told) == (not loss)
     assert fails(with_code, asking_for_bytes(levels=8)).reason == "INVALID_VALUE"
-    answer = fails(service, asking_for_bytes())
-    assert (answer.code, answer.reason) == (grpc.StatusCode.FAILED_PRECONDITION, "NO_CODE")
+    assert fails(service, asking_for_bytes()).reason == "NO_CODE"
 
 
 def test_the_service_and_its_model_describe_themselves(service: Running) -> None:
     stub = stub_of(service)
     assert stub.ServerLive(oip.ServerLiveRequest(), timeout=20).live
     assert stub.ServerReady(oip.ServerReadyRequest(), timeout=20).ready
-    server = stub.ServerMetadata(oip.ServerMetadataRequest(), timeout=20)
-    assert (server.name, list(server.extensions)) == ("lightpage", [])
+    assert stub.ServerMetadata(oip.ServerMetadataRequest(), timeout=20).name == "lightpage"
     metadata = stub.ModelMetadata(oip.ModelMetadataRequest(name="lightpage"), timeout=20)
     assert (metadata.name, list(metadata.versions)) == ("lightpage", ["toy-1"])
     frames = [("in_phase", "UINT8", list(toy.SHAPE)), ("quadrature", "UINT8", list(toy.SHAPE))]
@@ -171,7 +164,6 @@ def test_a_service_in_trouble_is_not_ready(start: Start, monkeypatch: pytest.Mon
     stub = stub_of(service)
     assert not stub.ServerReady(oip.ServerReadyRequest(), timeout=20).ready
     assert not stub.ModelReady(oip.ModelReadyRequest(name="lightpage"), timeout=20).ready
-    assert stub.ServerLive(oip.ServerLiveRequest(), timeout=20).live
 
 
 def test_only_the_version_in_service_decodes(start: Start, tmp_path: Path) -> None:
@@ -180,9 +172,8 @@ def test_only_the_version_in_service_decodes(start: Start, tmp_path: Path) -> No
     request, stub = request_of(levels=16), stub_of(service)
     metadata = stub.ModelMetadata(oip.ModelMetadataRequest(name="lightpage", version="toy-1"), timeout=20)
     assert list(metadata.versions) == ["toy-1", "toy-2"]
-    for version in ("", "toy-2"):
-        request.model_version = version
-        assert infer(service, request).model_version == "toy-2"
+    request.model_version = "toy-2"
+    assert infer(service, request).model_version == "toy-2"
     request.model_version = "toy-1"
     with service.plane.decodes.held(Caller()):  # it does not wait for its turn
         answer = fails(service, request)
@@ -190,8 +181,7 @@ def test_only_the_version_in_service_decodes(start: Start, tmp_path: Path) -> No
     request.model_version = "toy-3"
     asked = oip.ModelMetadataRequest(name="lightpage", version="toy-3")
     for answer in (fails(service, request), refused(lambda: stub.ModelMetadata(asked, timeout=20))):
-        assert (answer.code, answer.reason) == (grpc.StatusCode.NOT_FOUND, "MODEL")
-        assert (answer.subject, answer.error.got) == ("model version", "'toy-3'")
+        assert (answer.code, answer.subject) == (grpc.StatusCode.NOT_FOUND, "model version")
     request.model_name = "bench"
     assert fails(service, request).subject == "model name"
     with pytest.raises(OtherModelError):  # where the model changes while a pair waits for its turn
@@ -210,20 +200,16 @@ def test_a_page_that_is_not_believed_is_no_answer(service: Running) -> None:
     assert (arrays(infer(service, known(symbols)))["symbols"] == symbols).all()
     answer = fails(service, known(other))
     assert (answer.code, answer.reason) == (grpc.StatusCode.DATA_LOSS, "PAGE_NOT_BELIEVED")
-    assert answer.told["ErrorInfo"].metadata["loss_reason"] == "PILOTS_DISAGREE"
 
 
 def test_sessions_are_those_of_the_own_contract(start: Start) -> None:
     service = start(tracker=Remembering)
-    one, other = stub_of(service), stub_of(service)
 
-    def piston(stub: Any, **parameters: Any) -> float:
-        return float(values(stub.ModelInfer(request_of(levels=16, **parameters), timeout=20))["piston_rad"])
+    def piston(**parameters: Any) -> float:
+        return float(values(infer(service, request_of(levels=16, **parameters)))["piston_rad"])
 
-    assert [piston(one, session="mine"), piston(other, session="mine")] == [1, 2]
-    assert service.client.decode(PAIR, 16, session="mine").piston_rad == 3
-    assert [piston(one), piston(one), piston(other)] == [1, 2, 1]  # each connection's own
-    assert [piston(one, stateless=True) for _ in range(2)] == [1, 1]
+    assert service.client.decode(PAIR, 16, session="mine").piston_rad == 1
+    assert [piston(session="mine"), piston(), piston(), piston(stateless=True)] == [2, 1, 2, 1]
 
 
 # ---- refusals -----------------------------------------------------------------------------------------------------
@@ -235,9 +221,8 @@ def with_pilots(request: oip.ModelInferRequest, mask: np.ndarray, symbols: np.nd
         add(request, "pilot_symbols", symbols)
 
 
-def without(request: oip.ModelInferRequest) -> None:
-    request.ClearField("inputs")
-    request.ClearField("raw_input_contents")
+def with_text(parameter: oip.InferParameter) -> None:
+    parameter.string_param = "16"
 
 
 def one_less(request: oip.ModelInferRequest) -> None:
@@ -258,11 +243,6 @@ def with_a_typed(value: int) -> Callable[[oip.ModelInferRequest], None]:
     return change
 
 
-def with_few_typed(request: oip.ModelInferRequest) -> None:
-    request.CopyFrom(request_of(typed=True))
-    request.inputs[1].contents.uint_contents.pop()
-
-
 def with_mixed(request: oip.ModelInferRequest) -> None:
     request.CopyFrom(request_of(typed=True))
     request.inputs[0].contents.int_contents.append(1)
@@ -270,42 +250,30 @@ def with_mixed(request: oip.ModelInferRequest) -> None:
 
 Change = Callable[[oip.ModelInferRequest], object]
 NO_PILOTS, A_PAGE = np.zeros(toy.PAGE, bool), np.zeros(toy.PAGE, np.uint8)
-# fmt: off
 WRONG: list[tuple[Change, str, str]] = [
-    (without, "inputs.in_phase", "INVALID_VALUE"),
     (one_less, "inputs.quadrature", "INVALID_VALUE"),
     (lambda r: add(r, "image", A_PAGE), "inputs", "INVALID_VALUE"),
     (lambda r: add(r, "in_phase", np.zeros(toy.SHAPE, np.uint8)), "inputs.in_phase", "INVALID_VALUE"),
     (lambda r: setattr(r.inputs[0], "datatype", "UINT16"), "inputs.in_phase", "FRAME_FORMAT"),
     (lambda r: r.inputs[1].shape.reverse(), "inputs.quadrature", "FRAME_FORMAT"),
-    (lambda r: r.inputs[1].shape.insert(0, 1), "inputs.quadrature", "FRAME_FORMAT"),
     (lambda r: r.inputs[1].shape.extend([1] * 100_000), "inputs.quadrature", "FRAME_FORMAT"),
-    (lambda r: r.inputs[1].shape.__setitem__(0, -64), "inputs.quadrature", "FRAME_FORMAT"),
     (lambda r: r.raw_input_contents.__setitem__(0, b"1"), "inputs.in_phase", "FRAME_FORMAT"),
     (lambda r: r.raw_input_contents.pop(), "raw_input_contents", "INVALID_VALUE"),
     (lambda r: r.inputs[0].contents.uint_contents.append(1), "inputs.in_phase.contents", "INVALID_VALUE"),
     (lambda r: r.ClearField("raw_input_contents"), "inputs.in_phase.contents.uint_contents", "FRAME_FORMAT"),
-    (with_few_typed, "inputs.quadrature.contents.uint_contents", "FRAME_FORMAT"),
     (with_a_typed(256), "inputs.in_phase.contents.uint_contents", "FRAME_FORMAT"),
     (with_mixed, "inputs.in_phase.contents", "FRAME_FORMAT"),
-    (lambda r: setattr(r.inputs[0].parameters["shared_memory_region"], "string_param", "x"), "inputs.in_phase.parameters", "INVALID_VALUE"),  # noqa: E501
+    (lambda r: with_text(r.inputs[0].parameters["region"]), "inputs.in_phase.parameters", "INVALID_VALUE"),
     (lambda r: r.outputs.add(name="logits"), "outputs", "INVALID_VALUE"),
     (lambda r: [r.outputs.add(name="phase") for _ in range(2)], "outputs.phase", "INVALID_VALUE"),
-    (lambda r: setattr(r.outputs.add(name="phase").parameters["top"], "int64_param", 3), "outputs.phase.parameters", "INVALID_VALUE"),  # noqa: E501
-    (lambda r: setattr(r.parameters["level"], "int64_param", 3), "parameters", "INVALID_VALUE"),
-    (lambda r: setattr(r.parameters["levels"], "string_param", "16"), "parameters.levels", "INVALID_VALUE"),
-    (lambda r: r.parameters["levels"].Clear(), "parameters.levels", "INVALID_VALUE"),
+    (lambda r: with_text(r.outputs.add(name="phase").parameters["top"]), "outputs.phase.parameters", "INVALID_VALUE"),
+    (lambda r: with_text(r.parameters["level"]), "parameters", "INVALID_VALUE"),
+    (lambda r: with_text(r.parameters["levels"]), "parameters.levels", "INVALID_VALUE"),
     (lambda r: setattr(r.parameters["levels"], "int64_param", -1), "parameters.levels", "INVALID_VALUE"),
-    (lambda r: setattr(r.parameters["levels"], "int64_param", 999), "levels", "INVALID_VALUE"),
-    (lambda r: setattr(r.parameters["black_level"], "int64_param", 255), "black_level", "INVALID_VALUE"),
     (lambda r: with_pilots(r, NO_PILOTS, None), "inputs.pilot_mask", "INVALID_VALUE"),
-    (lambda r: add(r, "pilot_symbols", A_PAGE), "inputs.pilot_symbols", "INVALID_VALUE"),
-    (lambda r: with_pilots(r, NO_PILOTS[1:], A_PAGE), "inputs.pilot_mask", "INVALID_VALUE"),
     (with_a_flag_of_2, "inputs.pilot_mask", "INVALID_VALUE"),
-    (lambda r: with_pilots(r, ~NO_PILOTS, A_PAGE + 16), "pilots", "INVALID_VALUE"),
     (lambda r: [r.outputs.add(name="phase") for _ in range(300)], "", "TOO_LARGE"),
 ]
-# fmt: on
 """What is changed, the field that the error names, and its reason."""
 
 
@@ -318,7 +286,6 @@ def test_what_is_wrong_with_a_request_is_named(service: Running) -> None:
         if field:
             assert answer.told["BadRequest"].field_violations[0].field == field, number
         assert len(answer.text) < 1000
-    assert infer(service, request_of(levels=16)).outputs
     assert service.plane.received.used == 0
     last = request_of(typed=True)
     last.inputs[0].contents.uint_contents[6143] = 255
@@ -345,13 +312,9 @@ def test_a_whole_pair_passes_where_no_message_of_ones_own_may_be_so_large(start:
         request = request_of(PAIR, typed, levels=16)
         assert request.ByteSize() > 12_000
         assert infer(service, request).outputs
-    # Their own messages have their own limit, and say so; beyond the largest message of all, gRPC does.
-    for size, reason in ((5000, "TOO_LARGE"), (10**6, "")):
+    for size, reason in ((5000, "TOO_LARGE"), (10**6, "")):  # beyond the largest message of all, gRPC refuses it
         answer = refused(lambda size=size: service.stub.GetJob(pb.GetJobRequest(id="a" * size), timeout=20))  # type: ignore[misc]
         assert (answer.code, answer.reason) == (EXHAUSTED, reason)
-        assert ("4096" in answer.text) == (size == 5000)
-    large = pb.DecodeFramesRequest(chunk=bytes(5000))
-    assert refused(lambda: service.stub.DecodeFrames(iter([large]), timeout=20)).reason == "TOO_LARGE"
 
 
 @pytest.mark.parametrize(
@@ -401,8 +364,6 @@ def test_calls_beyond_the_protocol_are_told_so_and_counted_under_one_name(start:
         answer = refused(lambda call=call: call(b"", timeout=20))  # type: ignore[misc]
         assert (answer.code, method in answer.text) == (grpc.StatusCode.UNIMPLEMENTED, True)
     assert service.count("lightpage_calls_total", method="inference/other", code="UNIMPLEMENTED") == 3
-    stub_of(service).ServerLive(oip.ServerLiveRequest(), timeout=20)
-    assert service.count("lightpage_calls_total", method="inference/ServerLive", code="OK") == 1
 
 
 def test_a_service_without_the_protocol_does_not_know_it(start: Start) -> None:
@@ -410,19 +371,10 @@ def test_a_service_without_the_protocol_does_not_know_it(start: Start) -> None:
     answer = refused(lambda: stub_of(service).ServerLive(oip.ServerLiveRequest(), timeout=20))
     assert answer.code is grpc.StatusCode.UNIMPLEMENTED
     assert INFERENCE.full_name not in service.server.health()
-    assert service.client.decode(PAIR, 16).levels == 16
 
 
-def test_a_stranger_finds_and_calls_the_protocol_by_reflection_alone(service: Running) -> None:
-    channel = service.channel()
-    database = ProtoReflectionDescriptorDatabase(channel)
-    assert {SERVICE.full_name, "grpc.health.v1.Health"} <= set(database.get_services())
-    (name,) = (one for one in database.get_services() if one.startswith("inference."))
-    method = DescriptorPool(database).FindServiceByName(name).methods_by_name["ModelInfer"]
-    asked = GetMessageClass(method.input_type)
-    assert asked is not oip.ModelInferRequest
-    request = asked.FromString(request_of(levels=16).SerializeToString())
-    read = GetMessageClass(method.output_type).FromString
-    response = channel.unary_unary(f"/{name}/ModelInfer", asked.SerializeToString, read)(request, timeout=20)
-    assert response.outputs[0].name == "symbols"
-    assert response.raw_output_contents[0] == a_page()[0].tobytes()
+def test_a_stranger_finds_the_protocol_by_reflection_alone(service: Running) -> None:
+    database = ProtoReflectionDescriptorDatabase(service.channel())
+    assert {SERVICE.full_name, INFERENCE.full_name, "grpc.health.v1.Health"} <= set(database.get_services())
+    method = DescriptorPool(database).FindServiceByName(INFERENCE.full_name).methods_by_name["ModelInfer"]
+    assert method.input_type.full_name == oip.ModelInferRequest.DESCRIPTOR.full_name

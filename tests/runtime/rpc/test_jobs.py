@@ -15,7 +15,6 @@ import pytest
 
 from lightpage.errors import (
     BlackFrameError,
-    BusyError,
     FrameError,
     InvalidInputError,
     LightpageError,
@@ -47,7 +46,8 @@ from tests.runtime.slow_fit import SlowFit
 from tests.waiting import eventually
 
 DRIFTED = (150.0, 62.0)
-Parts = Sequence[pb.RecalibrateFramesRequest]
+Part = pb.RecalibrateFramesRequest
+Parts = Sequence[Part]
 
 
 def known(count: int = 3, levels: int = 16, offsets: tuple[float, float] = DRIFTED) -> KnownPages:
@@ -63,34 +63,17 @@ def send(client: LightpageClient, pages: KnownPages, **options: object) -> JobIn
     return client.recalibrate_frames(pages.pairs, pages.symbols, pages.references, **given)  # type: ignore[arg-type]
 
 
-def bytes_of(pair: FramePair) -> bytes:
-    return pair.in_phase.tobytes() + pair.quadrature.tobytes()
-
-
-def header(**changes: object) -> pb.RecalibrateFramesRequest:
+def header(**changes: object) -> Part:
     usual = {"rows_px": 64, "columns_px": 96, "pixel_type": pb.PIXEL_TYPE_UINT8, "bit_depth": 8}
-    return pb.RecalibrateFramesRequest(
-        header=pb.RecalibrateFramesHeader(**{**usual, "levels": 16, "pages": 2, **changes})  # type: ignore[arg-type]
-    )
-
-
-def reference(data: bytes) -> pb.RecalibrateFramesRequest:
-    return pb.RecalibrateFramesRequest(reference=data)
-
-
-def symbols(data: bytes) -> pb.RecalibrateFramesRequest:
-    return pb.RecalibrateFramesRequest(symbols=data)
-
-
-def chunk(data: bytes) -> pb.RecalibrateFramesRequest:
-    return pb.RecalibrateFramesRequest(chunk=data)
+    given = {**usual, "levels": 16, "pages": 2, **changes}
+    return Part(header=pb.RecalibrateFramesHeader(**given))  # type: ignore[arg-type]
 
 
 PAGES = known(2)
 assert PAGES.references is not None
-REFERENCE = reference(bytes_of(PAGES.references))
-SYMBOLS = [symbols(page.tobytes()) for page in PAGES.symbols]
-FRAMES = [chunk(bytes_of(pair)) for pair in PAGES.pairs]
+REFERENCE = Part(reference=PAGES.references.in_phase.tobytes() + PAGES.references.quadrature.tobytes())
+SYMBOLS = [Part(symbols=page.tobytes()) for page in PAGES.symbols]
+FRAMES = [Part(chunk=pair.in_phase.tobytes() + pair.quadrature.tobytes()) for pair in PAGES.pairs]
 ALL = [header(), REFERENCE, SYMBOLS[0], FRAMES[0], SYMBOLS[1], FRAMES[1]]
 PAIR_BYTES = 2 * 64 * 96
 ALL_BYTES = 3 * PAIR_BYTES + 2 * 16 * 24
@@ -106,23 +89,18 @@ def test_a_job_survives_its_caller_and_is_kept_over_a_restart(start: Start, tmp_
         job = caller.start_recalibration(count=2, correlation_id="night shift")
     assert fit.entered.wait(60)
     assert (job.state, job.pages_of, job.correlation_id) == (JobState.RUNNING, "source", "night shift")
-    assert (job.ended_s, job.result, job.error) == (None, None, None)
-    assert job.created_s > 1.7e9  # seconds of the epoch
     fit.go.set()
     done = service.last(job)
     assert (done.id, done.state, done.error, done.correlation_id) == (job.id, JobState.DONE, None, "night shift")
     assert done.result is not None
     assert (done.result.model_version, done.result.pages_used) == ("toy-1+r1", 2)
     assert done.ended_s is not None
+    assert done.ended_s >= job.created_s > 1.7e9  # seconds of the epoch
     assert service.version == "toy-1+r1"
-    assert service.client.jobs() == [done]
-    assert list(service.client.watch_job(done.id, 20)) == [done]
-    second = service.last(service.client.start_recalibration(pages=[1, 2, 3]))
     service.end()
     again = start(store=tmp_path / "store")
-    assert [job.id for job in again.client.jobs()] == [second.id, done.id]
-    assert again.client.job(done.id) == done
-    assert again.version == service.version
+    assert again.client.jobs() == list(again.client.watch_job(done.id, 20)) == [done]
+    assert again.version == "toy-1+r1"
 
 
 def test_a_watch_tells_each_change_and_holds_no_thread(start: Start) -> None:
@@ -153,8 +131,7 @@ def test_a_cancelled_job_changes_nothing_and_makes_room(start: Start) -> None:
     assert cancelled.state is JobState.CANCELLED
     assert isinstance(cancelled.error, JobCancelledError)
     assert service.version == "toy-1"
-    again = service.client.cancel_job(job.id)
-    assert (again.state, again.ended_s) == (JobState.CANCELLED, cancelled.ended_s)
+    assert service.client.cancel_job(job.id).ended_s == cancelled.ended_s
     fit.go.set()
     done = service.last(service.client.start_recalibration(count=2))
     assert done.state is JobState.DONE
@@ -162,9 +139,7 @@ def test_a_cancelled_job_changes_nothing_and_makes_room(start: Start) -> None:
     for call in (service.client.job, service.client.cancel_job, lambda name: list(service.client.watch_job(name, 20))):
         with pytest.raises(NoSuchJobError):
             call("no-such-job")
-    assert refused(lambda: service.stub.GetJob(pb.GetJobRequest(), timeout=20)).code is grpc.StatusCode.NOT_FOUND
     assert service.version == "toy-1+r1"
-    assert service.count("lightpage_recalibrations_total", result="dropped") == 1
 
 
 def test_a_job_that_does_not_hear_of_its_end_is_told_as_it_runs() -> None:
@@ -177,64 +152,26 @@ def test_a_job_that_does_not_hear_of_its_end_is_told_as_it_runs() -> None:
     assert next(times, None) is None
 
 
-def test_a_second_one_is_told_which_runs_whoever_began_it(start: Start) -> None:
-    fit = SlowFit()
-    service = start(fit=fit)
-    call = service.stub.Recalibrate(pb.RecalibrateRequest(source=pb.SourcePages(count=2)), timeout=60)
-    assert next(call).progress.step
-    assert fit.entered.wait(60)
-    (running,) = service.client.jobs()
-    assert (running.state, running.pages_of) == (JobState.RUNNING, "source")
-    seconds: list[Callable[[], object]] = [
-        lambda: service.client.start_recalibration(count=2),
-        lambda: service.client.recalibrate(count=2),
-        lambda: send(service.client, PAGES),
-    ]
-    for second in seconds:
-        with pytest.raises(BusyError) as caught:
-            second()
-        assert caught.value.job == running.id
-    asked = pb.StartRecalibrationRequest(source=pb.SourcePages(count=2))
-    answer = refused(lambda: service.stub.StartRecalibration(asked, timeout=20))
-    assert (answer.code, answer.reason) == (grpc.StatusCode.ABORTED, "RECALIBRATION_RUNS")
-    assert dict(answer.told["ErrorInfo"].metadata) == {"job": running.id}
-    assert len(service.client.jobs()) == 1
-    service.client.cancel_job(running.id)  # also one with a caller, who hears why it ended
-    assert isinstance(refused(lambda: call).error, JobCancelledError)
-
-
 def test_a_job_that_ends_badly_says_why_as_a_call_would(start: Start, tmp_path: Path) -> None:
     service = start()
-    end = service.last(service.client.start_recalibration(pages=[1]))
-    assert (end.state, type(end.error)) == (JobState.FAILED, InvalidInputError)
     toy.write_toy_recording(tmp_path / "short.h5", toy.ToyDevice(), 16, 2)
     end = service.last(service.client.start_recalibration(recording="short.h5", count=3))
     assert (end.state, end.pages_of) == (JobState.FAILED, "recording short.h5")
     assert isinstance(end.error, InvalidInputError)
-    toy.write_toy_recording(tmp_path / "other.h5", toy.ToyDevice(), 16, 3)
-    with Recording.open(tmp_path / "other.h5") as recording:
-        pages = read_recorded(recording, range(3))
+    pages = known(3)
     wrong = KnownPages(pages.pairs, tuple(15 - page for page in pages.symbols), 16, pages.references)
     end = service.last(send(service.client, wrong))
     assert (end.state, type(end.error)) == (JobState.REFUSED, RecalibrationRefusedError)
     message = service.stub.GetJob(pb.GetJobRequest(id=end.id), timeout=20)
     assert message.refusal.code == grpc.StatusCode.FAILED_PRECONDITION.value[0]
     assert message.refusal.reason == pb.ERROR_REASON_RECALIBRATION_REFUSED
-    for result, count in (("refused", 1), ("failed", 2)):
-        assert service.count("lightpage_recalibrations_total", result=result) == count
-    assert service.version == "toy-1"
     # what is known at once fails the call
-    service.recalibrator.check_count(16)
-    for options, kind in (
-        ({"count": 17}, LimitError),
-        ({"recording": "absent.h5"}, InvalidInputError),
-        ({"recording": "../short.h5"}, InvalidInputError),
-    ):
+    for options, kind in (({"count": 17}, LimitError), ({"recording": "absent.h5"}, InvalidInputError)):
         with pytest.raises(kind):
             service.client.start_recalibration(**options)
     answer = refused(lambda: service.stub.StartRecalibration(pb.StartRecalibrationRequest(), timeout=20))
     assert (answer.code, answer.subject) == (grpc.StatusCode.INVALID_ARGUMENT, "pages")
-    assert len(service.client.jobs()) == 3
+    assert len(service.client.jobs()) == 2
 
 
 def test_the_model_in_service_must_be_the_one_expected(start: Start) -> None:
@@ -249,24 +186,19 @@ def test_the_model_in_service_must_be_the_one_expected(start: Start) -> None:
             call("toy-0")
         assert caught.value.got == "toy-1"
     assert service.client.jobs() == []
-    assert service.client.recalibrate(count=2, expected_version="toy-1").model_version == "toy-1+r1"
-    assert service.last(send(service.client, PAGES, expected_version="toy-1+r1")).state is JobState.DONE
+    assert service.last(send(service.client, PAGES, expected_version="toy-1")).state is JobState.DONE
 
 
 # ---- frames that are sent -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("own_mask", [False, True])
-def test_frames_that_are_sent_give_what_the_same_pages_of_a_recording_give(
-    own_mask: bool, start: Start, tmp_path: Path
-) -> None:
+def test_frames_that_are_sent_give_what_the_same_pages_of_a_recording_give(start: Start, tmp_path: Path) -> None:
     toy.write_toy_recording(tmp_path / "known.h5", toy.ToyDevice(DRIFTED), 16, 4)
     one, other = start(), start(source=None)
     recorded = one.last(one.client.start_recalibration(recording="known.h5"))
     with Recording.open(tmp_path / "known.h5") as recording:
         pages = read_recorded(recording, range(4))
-    mask = pilot_mask(toy.PROFILE) if own_mask else None
-    sent = other.last(send(other.client, pages, pilot_mask=mask, correlation_id="sent"))
+    sent = other.last(send(other.client, pages, pilot_mask=pilot_mask(toy.PROFILE), correlation_id="sent"))
     assert (sent.pages_of, sent.correlation_id, recorded.pages_of) == ("frames", "sent", "recording known.h5")
     assert sent.result is not None
     assert recorded.result is not None
@@ -303,76 +235,53 @@ def test_dark_frames_are_left_out_and_too_many_are_the_callers_fault(start: Star
     done = service.last(send(service.client, one_dark)).result
     assert done is not None
     assert done.pages_used == 3
-    cases: list[tuple[KnownPages, type[LightpageError], str]] = [
-        (KnownPages((pages.pairs[0], dark, dark), pages.symbols[:3], 16, pages.references), BlackFrameError, "page 2"),
-        (KnownPages(pages.pairs, pages.symbols, 16, dark), BlackFrameError, "reference"),
-        (KnownPages(2 * pages.pairs[:1], pages.symbols[:2], 16, pages.references), InvalidInputError, "page 1"),
-    ]
-    for bad, kind, named in cases:
-        with pytest.raises(kind) as error:
+    twice_dark = KnownPages((pages.pairs[0], dark, dark), pages.symbols[:3], 16, pages.references)
+    for bad, named in ((twice_dark, "page 2"), (KnownPages(pages.pairs, pages.symbols, 16, dark), "reference")):
+        with pytest.raises(BlackFrameError) as error:
             send(service.client, bad)
         assert named in error.value.subject
     assert len(service.client.jobs()) == 1
     assert service.plane.received.used == 0
 
 
-def flags(*values: int) -> bytes:
-    mask = pilot_mask(toy.PROFILE).astype(np.uint8).reshape(-1)
-    mask[: len(values)] = values
-    return mask.tobytes()
-
-
+FLAGS = pilot_mask(toy.PROFILE).astype(np.uint8).tobytes()
 WRONG: dict[str, tuple[Parts, type[LightpageError]]] = {
     "nothing": ([], MalformedError),
     "no header": (ALL[1:], MalformedError),
-    "two headers": ([ALL[0], *ALL], MalformedError),
-    "an empty message": ([*ALL[:2], pb.RecalibrateFramesRequest(), *ALL[2:]], MalformedError),
+    "an empty message": ([*ALL[:2], Part(), *ALL[2:]], MalformedError),
     "a header later": ([*ALL[:4], ALL[0], *ALL[4:]], MalformedError),
     "no reference": ([ALL[0], *ALL[2:]], MalformedError),
     "frames before symbols": ([*ALL[:2], FRAMES[0], SYMBOLS[0], *ALL[4:]], MalformedError),
-    "symbols twice": ([*ALL[:3], *ALL[2:]], MalformedError),
     "reference again": ([*ALL[:4], REFERENCE, *ALL[4:]], MalformedError),
     "a page less": (ALL[:4], MalformedError),
-    "no page": (ALL[:2], MalformedError),
     "a page more": ([*ALL, SYMBOLS[0], FRAMES[0]], MalformedError),
-    "symbols without frames": (ALL[:5], FrameError),
-    "half a reference": ([ALL[0], reference(REFERENCE.reference[:-1]), *ALL[2:]], FrameError),
-    "half a page in the middle": ([*ALL[:3], chunk(FRAMES[0].chunk[:-1]), *ALL[4:]], FrameError),
-    "half a page at the end": ([*ALL[:-1], chunk(FRAMES[1].chunk[:-1])], FrameError),
-    "a byte more": ([*ALL, chunk(b"x")], FrameError),
-    "a byte more in a chunk": ([*ALL[:3], chunk(FRAMES[0].chunk + b"x"), *ALL[4:]], FrameError),
-    "a reference too long": ([*ALL[:2], reference(b"x"), *ALL[2:]], FrameError),
+    "half a reference": ([ALL[0], Part(reference=REFERENCE.reference[:-1]), *ALL[2:]], FrameError),
+    "half a page in the middle": ([*ALL[:3], Part(chunk=FRAMES[0].chunk[:-1]), *ALL[4:]], FrameError),
+    "a byte more": ([*ALL, Part(chunk=b"x")], FrameError),
     "other columns": ([header(columns_px=95)], FrameError),
-    "other rows": ([header(rows_px=0)], FrameError),
-    "other type": ([header(pixel_type=pb.PIXEL_TYPE_UINT16)], FrameError),
     "other depth": ([header(bit_depth=10)], FrameError),
     "no type": ([header(pixel_type=0)], InvalidInputError),
     "black beyond": ([header(black_level=256)], InvalidInputError),
-    "no levels": ([header(levels=0)], PageError),
     "one level": ([header(levels=1)], PageError),
-    "too many levels": ([header(levels=257)], PageError),
     "one page": ([header(pages=1)], InvalidInputError),
-    "no pages": ([header(pages=0)], InvalidInputError),
     "too many pages": ([header(pages=17)], LimitError),
     "as many as may be, but fewer come": ([header(pages=16), *ALL[1:]], MalformedError),
-    "huge frames": ([header(rows_px=1 << 20, columns_px=1 << 20)], LimitError),
-    "few flags": ([header(pilot_mask=flags()[:-1])], PageError),
-    "a flag of 2": ([header(pilot_mask=flags(2))], PageError),
+    "few flags": ([header(pilot_mask=FLAGS[:-1])], PageError),
+    "a flag of 2": ([header(pilot_mask=b"\2" + FLAGS[1:])], PageError),
     "no pilots": ([header(pilot_mask=bytes(16 * 24))], PageError),
     "only pilots": ([header(pilot_mask=b"\1" * (16 * 24))], PageError),
-    "few symbols": ([*ALL[:2], symbols(SYMBOLS[0].symbols[:-1]), *ALL[3:]], PageError),
-    "no symbols": ([*ALL[:2], symbols(b""), *ALL[3:]], PageError),
+    "few symbols": ([*ALL[:2], Part(symbols=SYMBOLS[0].symbols[:-1]), *ALL[3:]], PageError),
     "a symbol beyond the levels": ([header(levels=15), *ALL[1:]], PageError),
-    "too large a chunk": ([ALL[0], reference(bytes((1 << 20) + 1))], LimitError),
+    "too large a chunk": ([ALL[0], Part(reference=bytes((1 << 20) + 1))], LimitError),
 }
 
 
-def halves(part: pb.RecalibrateFramesRequest) -> Parts:
+def halves(part: Part) -> Parts:
     kind = part.WhichOneof("part")
     if kind not in ("reference", "chunk"):
         return [part]
     data = getattr(part, kind)
-    return [pb.RecalibrateFramesRequest(**{kind: piece}) for piece in (data[:1], b"", data[1:9000], data[9000:])]
+    return [Part(**{kind: piece}) for piece in (data[:1], b"", data[1:9000], data[9000:])]
 
 
 def test_bad_input_is_named_and_leaves_nothing_and_good_input_comes_in_any_chunks(start: Start) -> None:
@@ -406,22 +315,18 @@ def test_what_comes_counts_against_the_memory_until_the_job_has_ended(start: Sta
     assert error.value.subject == "frames to recalibrate with"
 
 
-@pytest.mark.parametrize("way", ["leaves half way", "cancels", "hangs up", "runs out of time"])
+@pytest.mark.parametrize("way", ["cancels", "hangs up", "runs out of time"])
 def test_a_caller_who_has_not_closed_its_stream_and_leaves_starts_nothing(way: str, start: Start) -> None:
     """Only a stream that its caller has closed counts: the library ends that of one who has gone too."""
     service, more = start(), threading.Event()
-    messages, size = (ALL[:4], 2 * PAIR_BYTES + 16 * 24) if way == "leaves half way" else (ALL, ALL_BYTES)
-    used = service.plane.received
-    channel = service.channel()
+    used, channel = service.plane.received, service.channel()
     call = service.stub.RecalibrateFrames.future(
-        until_told(messages, more), timeout=0.5 if way == "runs out of time" else 60
+        until_told(ALL, more), timeout=0.5 if way == "runs out of time" else 60
     )
     if way != "runs out of time":
-        eventually(lambda: used.used == size)
-    if way == "hangs up":
-        channel.close()
-    elif way != "runs out of time":
-        call.cancel()
+        eventually(lambda: used.used == ALL_BYTES)
+        leave = call.cancel if way == "cancels" else channel.close
+        leave()
     eventually(lambda: call.done() and used.used == 0)
     eventually(lambda: service.count("lightpage_calls_in_flight") == 0)
     more.set()
@@ -429,12 +334,11 @@ def test_a_caller_who_has_not_closed_its_stream_and_leaves_starts_nothing(way: s
 
 
 def test_the_client_refuses_what_it_cannot_send(service: Running) -> None:
-    wide, second = FramePair(*2 * (np.zeros((64, 97), np.uint8),)), PAGES.symbols[1]
+    wide = FramePair(*2 * (np.zeros((64, 97), np.uint8),))
     for pairs, symbols_, kind in (
         (PAGES.pairs, PAGES.symbols[:1], InvalidInputError),
         ((PAGES.pairs[0], wide), PAGES.symbols, FrameError),
-        (PAGES.pairs, (PAGES.symbols[0], second + np.uint16(300)), PageError),
-        (PAGES.pairs, (PAGES.symbols[0], second * 1.0), PageError),
+        (PAGES.pairs, (PAGES.symbols[0], PAGES.symbols[1] + np.uint16(300)), PageError),
     ):
         with pytest.raises(kind):
-            send(service.client, KnownPages(pairs, symbols_, 16, PAGES.references))  # type: ignore[arg-type]
+            send(service.client, KnownPages(pairs, symbols_, 16, PAGES.references))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -13,7 +14,6 @@ import h5py
 import numpy as np
 import pytest
 
-from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.errors import (
     BundleError,
     InvalidInputError,
@@ -25,12 +25,10 @@ from lightpage.errors import (
 from lightpage.metrics.measures import measure
 from runtime.acquisition.source import Shot
 from runtime.acquisition.sources import open_source
-from runtime.client.client import LightpageClient
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.tracking import NoTracker
-from runtime.errors import NoSourceError, OtherModelError, SourceError, StoppingError
+from runtime.errors import OtherModelError, SourceError, StoppingError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.recalibration.outcome import RefitResult
+from runtime.service.audit import AuditLog
 from runtime.service.registry import KEPT_MODELS
 from tests.runtime import toy
 from tests.runtime.rpc.stage import Running, Start, a_page, refused
@@ -74,11 +72,9 @@ def test_it_recovers_what_drift_cost_and_rollback_undoes_it(start: Start) -> Non
     assert shares == sorted(shares)
     assert (shares[0], shares[-1]) == (0, 1)
     assert ("fit", pytest.approx(2 / 25 + 23 / 25 * 11 / 23)) in steps  # half of the fit, two pages read
-    assert len({share for name, share in steps if name == "read the pages"}) >= 2
     assert air_of(service) > 0.98 * before
     assert [(m.version, m.current) for m in service.client.models()] == [("toy-1", False), ("toy-1+r1", True)]
     assert service.client.describe().calibration_toml == "angle_deg = 0.5\n"
-    assert [model.decoder.threads for model in service.plane.registry.models] == [1, 1]
     assert service.client.rollback() == ("toy-1", "toy-1+r1")
     assert air_of(service) < before - 0.8
     with pytest.raises(BundleError):
@@ -98,31 +94,6 @@ def test_without_a_store_it_goes_on_after_a_rollback_and_keeps_only_the_models_h
 
 
 # ---- refused ------------------------------------------------------------------------------------------------------
-
-
-class DriftTracker(NoTracker):
-    """Has learnt where the drifted device's offsets are."""
-
-    def __init__(self, decoder: Decoder) -> None:
-        references = toy.ToyDevice(DRIFTED).references()
-        table: SamplingTable = {
-            "reference_in_phase": references.in_phase.astype(np.float32),
-            "reference_quadrature": references.quadrature.astype(np.float32),
-        }
-        super().__init__(decoder.with_table(table))
-
-
-def test_a_re_fit_is_judged_against_what_the_tracker_makes_of_the_old_model(start: Start) -> None:
-    def half_way(*arguments: object) -> RefitResult:
-        good = toy.fit_references(*arguments)  # type: ignore[arg-type]
-        table = {name: values - 8 for name, values in good.table.items()}
-        return RefitResult(table, good.calibration_toml, good.report)
-
-    service = start(fit=half_way, tracker=DriftTracker)
-    service.device.offsets = DRIFTED
-    with pytest.raises(RecalibrationRefusedError):
-        service.client.recalibrate(count=2)
-    assert service.version == "toy-1"
 
 
 def test_a_re_fit_is_not_judged_by_the_page_that_it_was_fitted_on(start: Start, tmp_path: Path) -> None:
@@ -158,10 +129,9 @@ def test_recordings_on_the_server(start: Start, tmp_path: Path) -> None:
 
     recorded(tmp_path / "known.h5", 4, in_phase=lambda data: data * (np.arange(4) != 1)[:, None, None].astype(np.uint8))
     assert service.client.recalibrate(recording="known.h5").pages_used == 3  # but for the dark one
-    for name in ("absent.h5", "../known.h5", str(tmp_path / "known.h5"), "", "x" * 300):
-        assert fails(InvalidInputError, name).subject == "recording to recalibrate with"
     (tmp_path / "link.h5").symlink_to(tmp_path / "known.h5")
-    fails(InvalidInputError, "link.h5")
+    for name in ("absent.h5", "../known.h5", str(tmp_path / "known.h5"), "", "x" * 300, "link.h5"):
+        assert fails(InvalidInputError, name).subject == "recording to recalibrate with"
 
     def wrong_behind_three(symbols: np.ndarray) -> np.ndarray:
         return np.concatenate([symbols[:3], 15 - symbols[3:]])
@@ -175,11 +145,8 @@ def test_recordings_on_the_server(start: Start, tmp_path: Path) -> None:
     frames = ("in_phase", "quadrature", "reference_in_phase", "reference_quadrature")
     recorded(tmp_path / "narrow.h5", 2, **dict.fromkeys(frames, lambda data: data[..., :90]))
     assert "64 x 90" in fails(RecordingError, "narrow.h5").got
-    path = tmp_path / "damaged.h5"
-    toy.write_toy_recording(path, toy.ToyDevice(), 16, 2)
-    path.write_bytes(path.read_bytes()[:-2000])
+    (tmp_path / "damaged.h5").write_bytes((tmp_path / "known.h5").read_bytes()[:-2000])
     assert fails(SourceError, "damaged.h5").subject.startswith("recording damaged.h5")
-    assert not isinstance(fails(SourceError, "damaged.h5"), NoSourceError)
 
 
 # ---- beside other things ------------------------------------------------------------------------------------------
@@ -196,24 +163,8 @@ def test_one_runs_at_a_time_beside_decoding_and_the_end_of_the_service_cuts_it_o
         with pytest.raises(StoppingError):
             first.result(60)
     assert fit.ended.is_set()
-    assert service.count("lightpage_recalibrations_total", result="dropped") == 1
     with pytest.raises(StoppingError):
         service.recalibrator.check_start()
-
-
-def test_one_that_is_stopped_reads_no_more_pages(start: Start) -> None:
-    service, read = start(), list[int]()
-
-    def leaving(shot: Shot) -> Shot:
-        read.append(len(read))
-        if len(read) == 2:
-            service.recalibrator.close(0.0)
-        return shot
-
-    service.reading(leaving)
-    with pytest.raises(StoppingError):
-        service.client.recalibrate(count=5)
-    assert read == [0, 1]
 
 
 def test_the_service_ends_beside_one_that_does_not_stop_and_it_changes_nothing_any_more(start: Start) -> None:
@@ -277,29 +228,7 @@ def test_a_model_that_changes_meanwhile_makes_its_result_out_of_date(start: Star
     assert service.version == "toy-1"
 
 
-def test_a_swap_under_load_loses_no_request(start: Start) -> None:
-    service, stop = start(), threading.Event()
-    answers, errors = list[Any](), list[LightpageError]()
-    symbols, pair = a_page()
-
-    def load() -> None:
-        with LightpageClient(service.server.target) as client:
-            while not stop.is_set():
-                try:
-                    answers.append(client.decode(pair, 16))
-                except LightpageError as error:
-                    errors.append(error)
-
-    with ThreadPoolExecutor(2) as pool:
-        try:
-            for _ in range(2):
-                pool.submit(load)
-            for version in ("toy-1+r1", "toy-1+r2"):
-                assert service.client.recalibrate(count=2).model_version == version
-                eventually(lambda version=version: answers[-1:] and answers[-1].model_version == version)  # type: ignore[misc]
-            service.client.rollback()
-            eventually(lambda: answers[-1].model_version == "toy-1+r1")
-        finally:
-            stop.set()
-    assert errors == []
-    assert all((answer.symbols == symbols).all() for answer in answers)
+def test_who_asked_for_a_change_is_written_down(start: Start, tmp_path: Path) -> None:
+    file = tmp_path / "audit.jsonl"
+    start(audit=AuditLog(file)).client.recalibrate(count=2)
+    assert json.loads(file.read_text("utf-8"))["who"].startswith("ipv4:127.0.0.1:")

@@ -25,13 +25,7 @@ PAGES, RANGE = 7, 3
 
 
 class Archive:
-    """Recordings `a.h5` and `b.h5`, of seven pages each, and a bundle.
-
-    Attributes:
-        tasks: that the last run did.
-        before_each: called with every task before it is done.
-        clock: of the pauses between tries.
-    """
+    """Recordings `a.h5` and `b.h5`, of seven pages each, and a bundle; `tasks` are those that the last run did."""
 
     def __init__(self, folder: Path, bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.folder, self.out, self.json = folder, folder / "out", folder / "J.json"

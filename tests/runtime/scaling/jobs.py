@@ -50,11 +50,7 @@ def write(shard: Path, *pages: PageRecord, model: NamedBundle = BUNDLE) -> None:
 
 
 class Works:
-    """An engine that reads every range at once, unless it is told of a failure.
-
-    Args:
-        fails: given a task and how often it came before, says what became of it; None where it is read.
-    """
+    """An engine that reads every range at once; `fails` may say what becomes of a task, that came so often before."""
 
     def __init__(self, fails: Callable[[Task, int], Outcome | None] = lambda task, before: None) -> None:
         self.restarts, self.in_flight, self.workers_alive = 0, 0, 1

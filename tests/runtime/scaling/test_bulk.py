@@ -18,12 +18,10 @@ from runtime.bulk.evaluation import evaluate
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import NoTracker
-from runtime.recalibration.known_pages import read_recorded
-from runtime.recalibration.recalibration import recalibrate
 from runtime.scaling.driver import AGAIN_S
 from runtime.scaling.ledger import Ledger
 from tests.runtime import coded, toy
-from tests.runtime.scaling.archive import PAGES, RANGE, Archive, spoil_page
+from tests.runtime.scaling.archive import PAGES, RANGE, Archive
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -41,9 +39,8 @@ def test_every_page_is_read_once_and_a_second_run_does_what_is_missing(archive: 
     before = archive.records()
     assert {record.worker.rpartition(":")[2] for record in before.values()} == {str(os.getpid())}
     (archive.out / "shards/000001/00000003.json").unlink()
-    (left := archive.out / "shards/000000/.00000003.h5-abc").write_bytes(b"of a worker that was killed")
     status, figures = archive.run("decode")
-    assert (status, archive.firsts(), left.exists()) == (0, [("b", 3)], False)
+    assert (status, archive.firsts()) == (0, [("b", 3)])
     assert figures["this_run"]["pages"] == RANGE
     status, figures = archive.run("decode", asked=False)  # it knows what was asked
     assert (status, archive.tasks, figures["this_run"]["pages"], figures["pages_read"]) == (0, [], 0, 14)
@@ -83,19 +80,13 @@ def test_another_question_or_a_second_run_in_the_same_folder_is_refused(archive:
     with Ledger(archive.out):
         assert archive.run("decode")[0] == 75
         assert archive.run("decode", "--part", "0/2")[0] == 75
-    assert archive.run("decode", "--part", "2/2")[0] == 2
-    assert archive.run("decode", "--address", "auto")[0] == 2
     assert archive.run("decode", "--provider", "gpu")[0] == 2
     assert not archive.records()
     assert archive.run("decode", asked=False)[0] == 2
     assert archive.run("decode")[0] == 0
     toy.write_toy_bundle(archive.folder / "other.zip", version="toy-2")
-    for question in (
-        ("decode", "--range-pages", "4"),
-        ("evaluate",),
-        ("decode", "--bundle", str(archive.folder / "other.zip")),
-        ("decode", "--part", "0/2"),
-    ):
+    other = ("decode", "--bundle", str(archive.folder / "other.zip"))
+    for question in (("evaluate",), other, ("decode", "--part", "0/2")):
         assert archive.run(*question, asked=False) == (2, {})
         assert archive.tasks == []
 
@@ -117,11 +108,11 @@ def test_each_part_does_its_recordings_and_the_whole_is_added_up_without_parts(a
 def test_a_recording_that_opens_at_the_second_try_costs_a_second(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tries, opened = iter([True]), Recording.open
+    tries, opened = iter([StorageError("recording", "Input/output error", "data")]), Recording.open
 
     def hiccup(path: Path) -> Recording:
-        if next(tries, False):
-            raise StorageError(f"recording {path}", "Input/output error", "data")
+        if (error := next(tries, None)) is not None:
+            raise error
         return opened(path)
 
     monkeypatch.setattr(Recording, "open", hiccup)
@@ -129,44 +120,16 @@ def test_a_recording_that_opens_at_the_second_try_costs_a_second(
     assert archive.clock.now() == AGAIN_S[0]
 
 
-def test_a_lost_page_is_named_once_and_its_neighbours_are_read(
-    archive: Archive, capsys: pytest.CaptureFixture[str]
-) -> None:
-    spoil_page(archive.folder / "a.h5", 4)
-    (archive.folder / "b.h5").rename(archive.folder / "b.gone")
-    (archive.folder / "b.h5").touch()
-    for read in (PAGES - 1, 0):
-        status, figures = archive.run("decode")  # something is missing, whatever is lost
-        assert (status, figures["this_run"]["failed"], figures["this_run"]["pages"]) == (75, 1, read + bool(read))
-    (archive.folder / "b.gone").rename(archive.folder / "b.h5")
-    status, figures = archive.run("decode")
-    assert (status, figures["pages_read"], figures["lost"]) == (2, 13, {"BlackFrameError": 1})
-    assert figures["recordings"][0]["lost_pages"] == {"BlackFrameError": "4"}
-    assert "page 4" in capsys.readouterr().err
-    assert archive.run("decode")[0] == 2  # it stays lost, and is not tried again
-    assert archive.tasks == []
-
-
-def test_a_newer_model_reads_only_what_was_not_read_well_and_the_difference_is_told(archive: Archive) -> None:
-    device = toy.ToyDevice(offsets=(158.0, 110.0), seed=3)
-    toy.write_toy_recording(archive.folder / "b.h5", device, 16, PAGES, 5)
+def test_a_newer_model_reads_only_what_was_not_read_well(archive: Archive) -> None:
+    toy.write_toy_recording(archive.folder / "b.h5", toy.ToyDevice((158.0, 110.0), seed=3), 16, PAGES, 5)
     status, figures = archive.run("evaluate")
-    lost, due = figures["pages_lost"], figures["pages_recalibration_due"]
-    assert (status, lost + due, figures["recordings"][0]["pages_read"]) == (2, PAGES, PAGES)
-    toy.write_toy_recording(archive.folder / "known", device, 16, 2, 6)
-    with Recording.open(archive.folder / "known") as file:
-        known = read_recorded(file, range(2))
-    decoder, better = Decoder(Bundle.open(archive.bundle), threads=1), archive.folder / "new.zip"
-    recalibrate(decoder, known, better, "toy-1+r1", toy.fit_references, lambda *_: None)
-    status, figures = archive.run("evaluate", "--again-with", str(better), asked=False)
+    assert (status, figures["pages_lost"] + figures["pages_recalibration_due"]) == (2, PAGES)
+    newer = toy.write_toy_bundle(archive.folder / "newer.zip", version="toy-2")
+    status, figures = archive.run("evaluate", "--again-with", str(newer), asked=False)
     assert {name for name, _ in archive.firsts()} == {"b"}
-    assert sum(len(task.pages) for task in archive.tasks) == PAGES
-    told = figures["rounds"][0]
-    assert (told["pages"], told["pages_won"] + told["pages_better"]) == (PAGES, figures["models"]["toy-1+r1"])
-    assert told["air_after"] > told["air_before"]
-    assert (status, figures["pages_read"], told["pages_lost_still"]) == (0, 2 * PAGES, 0)
-    moved = better.rename(archive.folder / "moved.zip")  # is the same round
-    assert archive.run("evaluate", "--again-with", str(moved), asked=False)[0] == 0
+    assert (status, sum(len(task.pages) for task in archive.tasks), figures["rounds"][0]["pages"]) == (2, PAGES, PAGES)
+    moved = newer.rename(archive.folder / "moved.zip")  # is the same round
+    archive.run("evaluate", "--again-with", str(moved), asked=False)
     assert (archive.tasks, len(json.loads((archive.out / "job.json").read_text())["rounds"])) == ([], 1)
 
 
@@ -178,16 +141,12 @@ def test_files_come_back_from_pages_in_several_recordings(archive: Archive) -> N
     file = Path(told["file"])
     assert (file.read_bytes(), told["restored"]) == (coded.CONTENT, [2])
     made = file.stat().st_mtime_ns
-    left = file.with_name(f"{file.name}.0.partial")  # of a run that was killed
-    left.touch()
     assert archive.run("recover", asked=False)[0] == 0
-    assert (file.stat().st_mtime_ns, left.exists()) == (made, False)
+    assert file.stat().st_mtime_ns == made
     (note := archive.out / "files.json").write_text(json.dumps([{**told, "volume": 3}, told]))
     file.unlink()
-    (holes := file.with_name(f"{file.name}.holes")).write_bytes(b"from before the last page came")
     assert archive.run("recover", "--volume", "9", asked=False)[0] == 0
     assert [each["volume"] for each in json.loads(note.read_text())] == [3, 9]
-    assert (file.read_bytes(), holes.exists()) == (coded.CONTENT, False)
     shutil.rmtree(archive.out)
     coded.CODE.save(archive.folder / "code.toml")
     asked = ("--no-tracking", "--code", str(archive.folder / "code.toml"))  # a bundle without one
@@ -199,7 +158,7 @@ def test_files_come_back_from_pages_in_several_recordings(archive: Archive) -> N
 
 
 def test_a_file_whose_pages_do_not_suffice_is_written_with_holes_on_request_under_a_name_of_its_own(
-    archive: Archive, capsys: pytest.CaptureFixture[str]
+    archive: Archive,
 ) -> None:
     pages, options = archive.shows_a_file(dict.fromkeys(range(3), coded.dark))
     status, figures = archive.run("recover", *options)
@@ -211,22 +170,8 @@ def test_a_file_whose_pages_do_not_suffice_is_written_with_holes_on_request_unde
         holes = Path(told["file_with_holes"])
         assert (status, told["file"], told["lost"]) == (3, None, [0, 1, 2])
         found, lost = holes.read_bytes(), 3 * len(coded.CONTENT) // (len(pages) - 1)
-        assert len(found) == len(coded.CONTENT)
-        assert not any(found[: lost // 2])
-        assert found[-100:] == coded.CONTENT[-100:]
+        assert (len(found), any(found[: lost // 2]), found[-9:]) == (1000, False, coded.CONTENT[-9:])
         assert [path.name for path in (archive.out / "files").iterdir()] == [holes.name]
-    assert str(holes) in capsys.readouterr().out
     (told,) = archive.run("recover", *options, "--volume", "9")[1]["files"]
     assert told["file_with_holes"] == str(holes)  # it is there still
     assert archive.run("recover", *options, "--volume", "8:12")[0] == 2
-
-
-def test_pages_without_any_bytes_are_lost_data(archive: Archive) -> None:
-    options = ("--no-tracking", "--bundle", str(coded.bundle(archive.folder / "coded.zip")))
-    status, figures = archive.run("recover", *options)
-    assert (status, figures["files"], figures["pages_missing"]) == (75, [], 14)  # of other levels than the code
-    for name in "ab":
-        toy.write_toy_recording(archive.folder / f"{name}.h5", toy.ToyDevice(), coded.CODE.levels, 2)
-    shutil.rmtree(archive.out)
-    status, figures = archive.run("recover", *options)
-    assert (status, figures["files"], figures["pages_lost"]) == (3, [], 4)

@@ -103,10 +103,8 @@ MISFILED = "recording a.h5: dataset 'in_phase': got Can't read data (errno = 5),
 @pytest.mark.parametrize(
     ("page_1", "every_loss", "doubted"),
     [
-        (lost(1, "UnreadableError", MISFILED), False, True),
         (lost(1, "optics", MISFILED), False, True),
         (lost(1, "BlackFrameError", MISFILED), False, False),
-        (lost(1), False, False),
         (lost(1), True, True),
         (page(1), True, False),
     ],
@@ -129,7 +127,6 @@ def test_losses_that_version_0_1_0_took_storage_for_are_doubted_and_others_on_re
         ([[page(0, 1.0)], [page(0, 1.0)]], 1.0),
         ([[page(0, 1.0)], [page(0, 1.1)]], 1.1),
         ([[page(0, 1.0)], [lost(0)]], 1.0),
-        ([[lost(0)], [page(0, 0.1)]], 0.1),
         ([[lost(0)], [lost(0)]], None),
     ],
 )

@@ -38,11 +38,7 @@ LIMIT_S = 60
 
 
 class Workers:
-    """Workers that are no processes.
-
-    Args:
-        hang, die: first pages of ranges at which so many workers hang, or die by signal 9.
-    """
+    """Workers that are no processes: at first pages of ranges, so many `hang`, or `die` by signal 9."""
 
     def __init__(self, hang: dict[int, int] | None = None, die: dict[int, int] | None = None) -> None:
         self.clock = HandClock()
@@ -101,8 +97,8 @@ class Link:
         self._other.close()
 
 
-def outcomes(workers: Workers, tasks: Iterable[Task], count: int = 1) -> tuple[LocalEngine, list[Outcome], Told]:
-    engine = LocalEngine(count, 2, "module", workers.start, workers.clock.now)
+def outcomes(workers: Workers, tasks: Iterable[Task]) -> tuple[LocalEngine, list[Outcome], Told]:
+    engine = LocalEngine(1, 2, "module", workers.start, workers.clock.now)
     told = Told()
     with reporting(told):
         return engine, list(engine.run(tasks)), told
@@ -120,15 +116,9 @@ def test_workers_do_each_range_once_and_tell_of_it_in_lines_that_may_come_togeth
     assert told.notes == [f"device a: {first}, {number}" for first in (0, 3, 6) for number in range(2)]
     assert (workers.started, workers.ended) == ([("module", 2)], [0.0])
     assert (engine.restarts, engine.in_flight, engine.workers_alive) == (0, 0, 0)
-    _, found, _ = outcomes(more := Workers(), ranges, count=2)
-    assert (len(found), len(more.started)) == (3, 2)
-
-
-def test_workers_are_counted_while_they_work(ranges: list[Task]) -> None:
-    workers = Workers()
-    engine = LocalEngine(2, 1, "module", workers.start, workers.clock.now)
+    engine = LocalEngine(2, 1, "module", (workers := Workers()).start, workers.clock.now)
     seen = [(engine.in_flight, engine.workers_alive) for _ in engine.run(ranges)]
-    assert seen == [(1, 2), (0, 2), (0, 2)]
+    assert (seen, len(workers.started)) == ([(1, 2), (0, 2), (0, 2)], 2)
 
 
 @pytest.mark.parametrize("kind", ["hang", "die"])

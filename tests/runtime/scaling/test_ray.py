@@ -6,7 +6,6 @@ import math
 import os
 import signal
 import sys
-import tempfile
 import uuid
 from collections import Counter
 from collections.abc import Callable
@@ -17,9 +16,6 @@ from typing import Any
 
 import pytest
 
-from lightpage.cli.main import run as run_command
-from lightpage.errors import LightpageError
-from runtime.commands import bulk as command
 from runtime.errors import WorkerError
 from runtime.scaling import ray_engine
 from runtime.scaling.driver import run
@@ -36,16 +32,6 @@ from tests.runtime.scaling.test_local import pages
 PAGES, RANGE = 60, 5
 
 
-def test_without_ray_the_extra_is_named(
-    toy_zip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    toy.write_toy_recording(tmp_path / "a.h5", toy.ToyDevice(), 16, 2)
-    monkeypatch.setitem(sys.modules, "ray", None)  # as if it were not there
-    words = ["decode", str(tmp_path / "out"), "--recordings", str(tmp_path / "a.h5"), "--bundle", str(toy_zip)]
-    assert run_command(command.bulk, [*words, "--engine", "ray"]) == 2
-    assert "pip install 'lightpage[cluster]'" in capsys.readouterr().err
-
-
 READS_S, HANGS_S = 100.0, 5000.0
 """Of a range of one page, which may take 660."""
 
@@ -53,9 +39,7 @@ READS_S, HANGS_S = 100.0, 5000.0
 class FakeRay:
     """What the engine needs of Ray, by a clock that runs while somebody waits.
 
-    Args:
-        cpus: how many tasks are at work at once, in the order in which they came; the others wait.
-        takes: seconds of a task, called when it begins. It is ready then, also if it was cancelled before.
+    So many tasks are at work at once, in the order in which they came. One is ready in time also if it was cancelled.
     """
 
     exceptions = SimpleNamespace(RayError=RuntimeError)
@@ -199,8 +183,6 @@ def test_a_worker_and_a_node_die_and_nothing_is_missing_twice_or_different(
                     cluster.add_node(num_cpus=1)
                 if len(done) >= 4 and worker is None and (at_work := working(mark)):  # ranges are short
                     worker = at_work[0]
-                    # what it was started with: the C library looks at no later word
-                    assert b"MALLOC_ARENA_MAX=2" in Path(f"/proc/{worker}/environ").read_bytes().split(b"\0")
                     os.kill(worker, signal.SIGKILL)
         assert sorted(done) == [tuple(range(first, first + RANGE)) for first in range(0, PAGES, RANGE)]
         assert pages(tmp_path / "killed") == pages(tmp_path / "single")
@@ -223,44 +205,15 @@ def working(mark: str) -> list[int]:
     return found
 
 
-class UnstartedRay:
-    """Takes note of how a cluster is started, or fails to start it."""
-
-    def __init__(self, error: Exception | None = None) -> None:
-        self.error = error
-        self.settings: dict[str, Any] = {}
-
-    def is_initialized(self) -> bool:
-        return False
-
-    def init(self, **settings: Any) -> None:
-        self.settings = settings
-        if self.error is not None:
-            raise self.error
-
-    def shutdown(self) -> None:
-        pass
-
-
-def test_a_cluster_of_this_machine_is_started_whatever_the_surroundings_say(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (long := tmp_path / ("x" * 100)).mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(long))
+def test_a_cluster_of_this_machine_is_started_whatever_the_surroundings_say(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
-    monkeypatch.setitem(sys.modules, "ray", ray := UnstartedRay())
+    settings: dict[str, Any] = {}
+    ray = SimpleNamespace(is_initialized=bool, init=lambda **told: settings.update(told), shutdown=lambda: None)
+    monkeypatch.setitem(sys.modules, "ray", ray)
     with ray_engine.connected(None):
-        assert ray.settings["address"] == "local"
-        folder = Path(ray.settings["_temp_dir"])
+        assert settings["address"] == "local"
+        folder = Path(settings["_temp_dir"])
         assert folder.is_dir()
-        assert len(f"{folder}/session_2026-01-01_00-00-00_123456_1234567/sockets/plasma_store") <= 107
     assert not folder.exists()
     with ray_engine.connected("auto"):
-        assert ray.settings["address"] == "auto"
-
-
-def test_a_cluster_that_does_not_start_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
-    for error, said in ((FileNotFoundError(2, "no home"), "HOME"), (OSError(24, "Too many open files"), "ulimit -n")):
-        monkeypatch.setitem(sys.modules, "ray", UnstartedRay(error))
-        with pytest.raises(LightpageError, match=said), ray_engine.connected(None):
-            pass
+        assert settings["address"] == "auto"

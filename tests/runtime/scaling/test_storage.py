@@ -10,64 +10,27 @@ import sys
 import pytest
 
 from lightpage.errors import StorageError
-from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.reader import Recording
 from runtime.scaling.driver import AGAIN_S
+from tests.runtime import toy
 from tests.runtime.scaling.archive import PAGES, RANGE, Archive
 from tests.storage_fault import StorageFault
 
 BAD_PAGE = 4
 
 
-class Disk:
-    """Storage that does not give a page of `a.h5` for so many tries."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.failures = 0
-        frames = Recording.frames
-
-        def read(recording: Recording, page: int) -> FramePair:
-            if recording.path.name == "a.h5" and page == BAD_PAGE and self.failures > 0:
-                self.failures -= 1
-                raise StorageError(f"recording {recording.path}: page {page}", "Input/output error", "data")
-            return frames(recording, page)
-
-        monkeypatch.setattr(Recording, "frames", read)
-
-
-@pytest.fixture
-def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
-    return Disk(monkeypatch)
-
-
-def test_a_hiccup_costs_a_pause_and_a_fault_the_range_until_it_is_over(archive: Archive, disk: Disk) -> None:
-    disk.failures = 1
-    status, figures = archive.run("evaluate")
-    assert (status, figures["pages_lost"], figures["pages_missing"]) == (0, 0, 0)
-    assert archive.firsts() == [(name, first) for name in "ab" for first in (0, 3, 6)] + [("a", RANGE)]
-    assert archive.clock.now() == AGAIN_S[0]
-    (archive.out / f"shards/000000/{RANGE:08d}.json").unlink()
-    disk.failures = 99
-    status, figures = archive.run("evaluate")
-    assert (status, figures["pages_lost"], figures["pages_missing"]) == (75, 0, RANGE)
-    assert archive.clock.now() == AGAIN_S[0] + sum(AGAIN_S)
-    disk.failures = 0
-    assert archive.run("evaluate")[0] == 0
-    assert archive.firsts() == [("a", RANGE)]
-
-
-@pytest.mark.parametrize(("operation", "cause"), [("decode", "StorageError"), ("recover", "storage")])
 def test_pages_are_given_up_on_request_alone_and_read_again_on_another(
-    operation: str, cause: str, archive: Archive, disk: Disk
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    options = archive.shows_a_file()[1] if operation == "recover" else ()
-    disk.failures = 99
-    status, figures = archive.run(operation, *options, "--give-up")
-    assert (figures["lost"], figures["pages_missing"]) == ({cause: 1}, 0)
-    assert status == (0 if operation == "recover" else 2)  # parity completes the file
-    disk.failures = 0
-    assert archive.run(operation, *options)[1]["lost"] == {cause: 1}
-    status, figures = archive.run(operation, *options, "--retry-lost")
+    _, options = archive.shows_a_file()
+    with monkeypatch.context() as patch:
+        toy.frames_fail(patch, StorageError("page", "Input/output error", "data"), BAD_PAGE, of="a.h5")
+        status, figures = archive.run("recover", *options)
+        assert (status, figures["pages_lost"], figures["pages_missing"]) == (75, 0, RANGE)
+        assert archive.clock.now() == sum(AGAIN_S)
+        status, figures = archive.run("recover", *options, "--give-up")
+        assert (status, figures["lost"], figures["pages_missing"]) == (0, {"storage": 1}, 0)  # parity completes it
+    assert archive.run("recover", *options)[1]["lost"] == {"storage": 1}
+    status, figures = archive.run("recover", *options, "--retry-lost")
     assert (status, figures["lost"], archive.firsts()) == (0, {}, [("a", RANGE)])
 
 

@@ -6,21 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from lightpage.metrics.reliability import ConfidenceBin
 from runtime.scaling.ledger import Ledger
 from runtime.scaling.part import Part
 from runtime.scaling.shard import PageRecord, PageState, ShardRecord
 from runtime.scaling.task import Operation
-from runtime.scaling.totals import AIR, TOLD, Mean, Totals, totals
+from runtime.scaling.totals import AIR, totals
 from tests.runtime.scaling.jobs import BUNDLE, NEWER, PAGES, STAYS, job, lost, page, source, write
-
-
-def test_a_mean_holds_its_least_and_nothing_of_no_values() -> None:
-    mean = Mean()
-    assert (mean.value, mean.least) == (None, None)
-    for value in (3.0, None, 1.0, 5.0):
-        mean.add(value)
-    assert (mean.value, mean.least) == (3.0, 1.0)
 
 
 def test_pages_are_counted_by_what_became_of_them(tmp_path: Path) -> None:
@@ -54,13 +45,6 @@ def test_pages_are_counted_by_what_became_of_them(tmp_path: Path) -> None:
     assert (part.tally.pages, part.tally.lost.total(), len(part.recordings)) == (PAGES, 3, 1)
 
 
-def test_the_first_lost_pages_are_told(tmp_path: Path) -> None:
-    ledger = Ledger(tmp_path)
-    for first in (0, 3):
-        write(ledger.shard(0, first), *map(lost, range(first, first + 3)))
-    assert len(totals(ledger, job()).lost) == TOLD == 5
-
-
 def test_a_round_says_what_it_has_brought(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path)
     write(ledger.shard(0, 0), lost(0), lost(1), page(2, 1.0, True, **{AIR: 1.0}))
@@ -79,19 +63,6 @@ def test_a_round_says_what_it_has_brought(tmp_path: Path) -> None:
     }
     assert (found.tally.read, found.tally.models) == (3, {"toy-2": 2, "toy-1": 2})
     assert [reading.pages for reading in found.readings] == [3, 3, 3, 1]
-
-
-def test_bins_of_confidence_are_added_up(tmp_path: Path) -> None:
-    ledger = Ledger(tmp_path)
-    assert Totals().ece is None
-    for first, count, confidence, accuracy in ((0, 10, 0.8, 0.9), (3, 30, 0.9, 0.6)):
-        bins = (ConfidenceBin(0.5, 1.0, count, confidence, accuracy),)
-        shard = ledger.shard(0, first)
-        write(shard, page(first))
-        ShardRecord.read(shard).model_copy(update={"confidence_bins": bins}).write(shard)
-    found = totals(ledger, job(source("a"), operation=Operation.EVALUATE))
-    assert found.ece == pytest.approx((0.1 * -10 + 0.3 * 30) / 40)
-    assert found.to_json()["figures"]["ece"] == found.ece
 
 
 def test_devices_have_a_row_each_that_says_why(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from lightpage.errors import BundleError, CalibrationError
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import NoTracker
 from runtime.errors import ModelExistsError, OtherModelError
-from runtime.service.registry import HISTORY, History, Model, ModelRegistry, Place, no_note
+from runtime.service.registry import HISTORY, History, Model, ModelRegistry, Place
 from tests.runtime import toy
 
 
@@ -20,7 +20,6 @@ def a_place(folder: Path, version: str) -> Place:
 
 
 def a_registry(decoder: Decoder, folder: Path, *versions: str, kept: int = 4) -> ModelRegistry:
-    """A registry into which models of these versions came, one after another."""
     registry = ModelRegistry(decoder, kept=kept)
     for version in versions:
         registry.swap(Decoder.load(a_place(folder, version).path, threads=1))
@@ -148,14 +147,3 @@ def test_other_devices_and_bundles_that_cannot_be_tracked_are_refused(decoder: D
     with pytest.raises(BundleError, match="got 10 bits"):
         ModelRegistry(decoder).check(deep)
     ModelRegistry(decoder).check(same)
-
-
-def test_a_history_is_taken_over_after_a_restart(decoder: Decoder, tmp_path: Path) -> None:
-    first = a_registry(decoder, tmp_path, "toy-2", "toy-3")
-    first.rollback("", no_note)
-    again = ModelRegistry(decoder)
-    again.resume(first.history)
-    assert (again.current.version, loaded(again)) == ("toy-2", ["toy-1", "toy-2"])
-    assert again.step(1)[0].version == "toy-3"
-    assert again.rollback()[0].version == "toy-2"
-    assert again.rollback()[0].version == "toy-1"

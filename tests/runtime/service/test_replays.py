@@ -1,90 +1,29 @@
-"""Answers by request id are bounded, whatever callers send."""
+"""What callers send again or leave behind is bounded: answers by request id, and the memory of pairs."""
 
 from __future__ import annotations
 
-import gc
 import threading
-import weakref
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 
 import grpc
 import numpy as np
 import pytest
 
 from lightpage.errors import LightpageError, StorageError
-from lightpage.page.pilots import Pilots
-from lightpage.recording.frame_pair import FramePair
-from runtime.acquisition.source import Shot
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.page import DecodedPage
-from runtime.decoding.tracking import NoTracker
 from runtime.errors import (
     CallerLeft,
     LostShotError,
     Reason,
     RequestIdError,
     SlotsTakenError,
-    SourceError,
     UnconfirmedPageError,
 )
-from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.rpc.call import Call
-from runtime.rpc.page_calls import PageCalls
 from runtime.service.caller import Caller
-from runtime.service.dataplane import DataPlane
-from runtime.service.monitor import Monitor
-from runtime.service.registry import ModelRegistry
+from runtime.service.receiver import PairReceiver, ReceiveBudget
 from runtime.service.replays import Replays
 from runtime.wire.status import status_of
 from tests.clock import HandClock
-from tests.runtime import toy
-
-
-class Losing(NoTracker):
-    """Believes no page."""
-
-    def decode(self, pair: FramePair, levels: int, pilots: Pilots | None = None) -> DecodedPage:
-        raise UnconfirmedPageError("pilots", "none", "some", Reason.PILOTS_DISAGREE).of(
-            super().decode(pair, levels, pilots)
-        )
-
-
-class Watching(toy.ToySource):
-    """Remembers its frames for as long as somebody else does."""
-
-    def __init__(self) -> None:
-        super().__init__(toy.ToyDevice())
-        self.frames: list[weakref.ref[np.ndarray]] = []
-
-    def shot(self, timeout_s: float = 1.0, page: int | None = None) -> Shot:
-        shot = super().shot(timeout_s, page)
-        self.frames += [weakref.ref(shot.pair.in_phase), weakref.ref(shot.pair.quadrature)]
-        return shot
-
-
-@pytest.fixture
-def collected_by_nobody() -> Iterator[None]:
-    """What a cycle of frames and their errors holds stays: seconds pass before it is looked for."""
-    gc.collect()
-    gc.disable()
-    yield
-    gc.enable()
-
-
-@pytest.mark.usefixtures("collected_by_nobody")
-@pytest.mark.parametrize("request_id", ["", "shift-1"])
-def test_nothing_holds_the_frames_of_a_lost_page(request_id: str, decoder: Decoder) -> None:
-    source = Watching()
-    plane = DataPlane(ModelRegistry(decoder, Losing), source, monitor=Monitor())
-    calls, request = PageCalls(plane), pb.ReadPageRequest(request_id=request_id)
-    for _ in range(3 if request_id else 1):
-        with suppress(UnconfirmedPageError):  # `pytest.raises` would keep it
-            calls.ReadPage(request, Call("ReadPage", Caller(), ThreadPoolExecutor(1)))
-            raise AssertionError("given out")
-    assert len(source.frames) == 2  # one shot
-    assert not any(frame() is not None for frame in source.frames)
 
 
 @pytest.mark.parametrize(
@@ -92,7 +31,6 @@ def test_nothing_holds_the_frames_of_a_lost_page(request_id: str, decoder: Decod
     [
         LostShotError("page 1", "no frame", "one", Reason.MISSING_FRAME),
         UnconfirmedPageError("pilots", "none", "some", Reason.PILOTS_DISAGREE, recalibration_due=True),
-        SourceError("source", "black", "light"),
     ],
     ids=lambda error: type(error).__name__,
 )
@@ -215,3 +153,52 @@ def test_who_waits_goes_when_its_time_is_up_or_it_leaves(asked: Asked) -> None:
         left.result(60)
     with pytest.raises(RequestIdError):
         asked.replays.once("a", b"another request", Caller(), bytes)
+
+
+SHAPE = (4, 5)
+
+
+def received(budget: ReceiveBudget, value: int) -> PairReceiver:
+    receiver = PairReceiver(SHAPE, "uint8", 1000, budget)
+    receiver.add(bytes([value]) * receiver.size)
+    return receiver
+
+
+def address(receiver: PairReceiver) -> int:
+    return receiver.pair().in_phase.ctypes.data
+
+
+def test_a_pair_lies_where_one_lay_before_that_nobody_looks_at() -> None:
+    budget = ReceiveBudget(1000)
+    first = received(budget, 1)
+    before = address(first)
+    first.close()
+    first.close()  # is nothing new
+    held = np.empty(40, np.uint8)  # would have got it from the system otherwise
+    second = received(budget, 2)
+    assert address(second) == before
+    assert (second.pair().in_phase == 2).all()
+    assert (budget.used, budget.taken) == (held.size, 2 * held.size)
+
+
+def test_frames_that_are_still_held_stay_as_they_are() -> None:
+    budget = ReceiveBudget(1000)
+    first = received(budget, 1)
+    frame = first.pair().quadrature[1:, ::2]  # a view of a view
+    first.close()
+    second = received(budget, 2)
+    assert (frame == 1).all()
+    assert (second.pair().in_phase == 2).all()
+    assert address(second) != frame.ctypes.data
+
+
+def test_another_size_takes_memory_of_its_own_and_one_pair_at_a_time_is_kept() -> None:
+    budget = ReceiveBudget(1000)
+    first, second = received(budget, 1), received(budget, 2)
+    assert address(first) != address(second)
+    first.close()
+    small = PairReceiver((2, 2), "uint16", 1000, budget)
+    small.add(bytes(16))
+    assert small.pair().in_phase.shape == (2, 2)
+    second.close()
+    assert budget.used == 16

@@ -18,18 +18,13 @@ TIMES = LineTimes(answer_s=0.15, quiet_s=0.03, late_s=0.4, synchronise_s=1.5)
 class MemoryPort(VirtualSerialPort):
     """The port that pyserial's `serial_for_url` opens from now on; a driver that waits for it moves the clock.
 
-    Attributes:
-        answer: of the device; may be exchanged.
-        answer_s: how long it takes for an answer.
-        path: where it is.
-        asked_for: paths under which it was looked for.
+    Its device's `answer` may be exchanged, and takes `answer_s`.
     """
 
     def __init__(self, answer: Callable[[str], str], monkeypatch: pytest.MonkeyPatch) -> None:
         super().__init__(lambda message: self.answer(message))
         self.answer, self.answer_s, self.clock = answer, 0.0, HandClock()
         self.path = "/dev/ttyUSB0"
-        self.asked_for: list[str] = []
         self.driver: MemoryDriver | None = None
         """What works: nothing while the port is unplugged, nor what was opened before it was."""
         self._plugged = True
@@ -73,7 +68,6 @@ class MemoryPort(VirtualSerialPort):
         self.clock.advance(max(0.0, min([now + seconds, *(first[0] for first in self._coming[:1])]) - now))
 
     def _open(self, path: str, **_: object) -> MemoryDriver:
-        self.asked_for.append(path)
         if path.startswith("nonsense:"):
             raise ValueError(path)
         if not self._plugged or path != self.path:

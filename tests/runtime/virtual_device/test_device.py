@@ -1,5 +1,4 @@
-"""A page travels from the modulator through light, trigger and packets to its symbols; what goes wrong on the way is
-named, and costs no other page."""
+"""A page travels from the modulator through light, trigger and packets to its symbols."""
 
 from __future__ import annotations
 
@@ -16,19 +15,16 @@ from lightpage.recording.pages import PagesWriter
 from lightpage.simulator.simulator import Simulator
 from runtime.acquisition.camera_source import CameraSource
 from runtime.acquisition.sources import open_source
-from runtime.errors import LostShotError, Reason, SourceError
+from runtime.errors import Reason, SourceError
 from runtime.virtual_device.device import VirtualDevice
 from tests.lightpage.small import small_profile
+from tests.runtime.acquisition.lab import reason_of
 
 pytestmark = pytest.mark.own_network
 
 PROFILE = small_profile()
 SEED = 5
 WAIT_S = 120.0
-
-
-def spec_of(hardware: VirtualDevice) -> str:
-    return f"camera:{hardware.config}?pages={hardware.folder / 'pages.h5'}"
 
 
 @pytest.fixture
@@ -41,15 +37,12 @@ def symbols(tmp_path: Path) -> np.ndarray:
 
 
 @contextmanager
-def running(folder: Path, device: Device, **settings: object) -> Iterator[tuple[VirtualDevice, CameraSource]]:
-    with VirtualDevice(PROFILE, device, folder, SEED, **settings) as hardware:  # type: ignore[arg-type]
-        text = hardware.config.read_text()
-        hardware.config.write_text(text.replace("repeats = 3", "repeats = 50\nreference_frames = 2\ndark_frames = 2"))
-        source = open_source(spec_of(hardware))
+def opened(hardware: VirtualDevice, old: str, new: str) -> Iterator[CameraSource]:
+    """A device, and something that its configuration says changed."""
+    hardware.config.write_text(hardware.config.read_text().replace(old, new))
+    with open_source(f"camera:{hardware.config}?pages={hardware.folder / 'pages.h5'}") as source:
         assert isinstance(source, CameraSource)
-        with source:
-            yield hardware, source
-        hardware.check()
+        yield source
 
 
 def test_pages_arrive_as_the_simulator_makes_them_with_the_black_level_and_hot_pixels_taken_off(
@@ -57,89 +50,38 @@ def test_pages_arrive_as_the_simulator_makes_them_with_the_black_level_and_hot_p
 ) -> None:
     device = Device().with_settings(["sensor.bit_depth=12"])
     expected = Simulator(PROFILE, device, 16, SEED)
-    given = {"pixel_format": "Mono12Packed", "black_level": 6, "hot_pixels": 20}
-    with running(tmp_path, device, **given) as (_, source):
-        source.check_against(PROFILE)
-        assert (source.bit_depth, source.levels) == (12, 16)
-        dark, _ = source.dark_frames()
-        assert (dark.black_level, len(dark.hot)) == (6, 20)
-        free = np.ones(PROFILE.frame_shape, bool)
-        free[tuple(dark.hot.T)] = False
-        for page in (0, 1):
-            shot, pair = source.shot(WAIT_S), expected.page(symbols[page])
-            assert shot.page_index == page
-            assert shot.symbols is not None
-            assert (shot.symbols == symbols[page]).all()
-            for seen, made in ((shot.pair.in_phase, pair.in_phase), (shot.pair.quadrature, pair.quadrature)):
-                below = free & (made <= 4095 - 6)  # full scale cuts off what is brighter
-                assert (seen[below] == made[below]).all()
-            away = np.abs(shot.pair.in_phase.astype(int) - pair.in_phase)
-            assert np.median(away[~free]) < 1000
-        references = source.references()
-        assert (references.in_phase[free] == expected.references().in_phase[free]).all()
-
-
-def test_a_missed_trigger_a_lost_packet_an_unplugged_line_and_a_camera_that_goes_cost_no_page(
-    tmp_path: Path, symbols: np.ndarray
-) -> None:
-    with running(tmp_path, Device()) as (hardware, source):
-        edge, missed = hardware.wire, [True]
-
-        def missing(camera: int) -> None:
-            if camera == 1 and missed:
-                missed.clear()
-            else:
-                edge(camera)
-
-        def read(page: int) -> bool:
-            """Whether a page's shot shows what is on display."""
-            shot, light = source.shot(WAIT_S, page), hardware.light
-            seen = light.pair()
-            return light.page_index == page and bool(
-                (shot.pair.in_phase == seen.in_phase).all() and (shot.pair.quadrature == seen.quadrature).all()
-            )
-
-        assert read(0)
-        hardware.wire = missing
-        assert read(1)
-        assert source.shots_by_outcome()["TAKEN"] == 2
-        assert source.shots_by_outcome()["MISSING_FRAME"] >= 1
-        hardware.wire = edge
-
-        lost: list[Reason] = []
-
-        def mend(page: int, error: LostShotError) -> None:
-            lost.append(error.reason)
-            if error.reason is Reason.TRIGGER_GONE:
-                hardware.port.plug()
-            elif error.reason is Reason.CAMERA_GONE:
-                hardware.cameras[1].start()
-            elif error.reason is Reason.INCOMPLETE_FRAME:
-                hardware.cameras[0].lose(0.0)
-
-        source.on_lost = mend
-        for page, reason, break_it in (
-            (0, Reason.INCOMPLETE_FRAME, lambda: hardware.cameras[0].lose(0.3)),
-            (1, Reason.TRIGGER_GONE, hardware.port.unplug),
-            (0, Reason.CAMERA_GONE, hardware.cameras[1].close),
-        ):
-            lost.clear()
-            break_it()
-            assert read(page)
-            assert reason in lost
+    sensor = {"pixel_format": "Mono12Packed", "black_level": 6, "hot_pixels": 20}
+    many = "repeats = 50\nreference_frames = 2\ndark_frames = 2"
+    with VirtualDevice(PROFILE, device, tmp_path, SEED, **sensor) as hardware:  # type: ignore[arg-type]
+        with opened(hardware, "repeats = 3", many) as source:
+            source.check_against(PROFILE)
+            assert (source.bit_depth, source.levels) == (12, 16)
+            dark, _ = source.dark_frames()
+            assert (dark.black_level, len(dark.hot)) == (6, 20)
+            free = np.ones(PROFILE.frame_shape, bool)
+            free[tuple(dark.hot.T)] = False
+            edge, missed = hardware.wire, [1]
+            hardware.wire = lambda camera: missed.clear() if camera in missed else edge(camera)
+            for page in (0, 1):
+                shot, pair = source.shot(WAIT_S), expected.page(symbols[page])
+                assert shot.page_index == page
+                assert shot.symbols is not None
+                assert (shot.symbols == symbols[page]).all()
+                for seen, made in ((shot.pair.in_phase, pair.in_phase), (shot.pair.quadrature, pair.quadrature)):
+                    below = free & (made <= 4095 - 6)  # full scale cuts off what is brighter
+                    assert (seen[below] == made[below]).all()
+                away = np.abs(shot.pair.in_phase.astype(int) - pair.in_phase)
+                assert np.median(away[~free]) < 1000
+            assert source.shots_by_outcome()["MISSING_FRAME"] >= 1
+            references = source.references()
+            assert (references.in_phase[free] == expected.references().in_phase[free]).all()
+        hardware.check()
 
 
 def test_channels_that_no_camera_is_on_and_a_device_that_does_not_run_are_named(
     tmp_path: Path, symbols: np.ndarray
 ) -> None:
-    with VirtualDevice(PROFILE, Device(), tmp_path, SEED) as hardware:
-        with open_source(spec_of(hardware)) as source:
-            source.shot(WAIT_S)
-        hardware.config.write_text(hardware.config.read_text().replace("channels = [1, 2]", "channels = [3, 4]"))
-        with open_source(spec_of(hardware)) as source, pytest.raises(LostShotError) as raised:
-            source.shot(WAIT_S)
-        assert raised.value.reason is Reason.MISSING_FRAME
-    source = open_source(spec_of(hardware))
-    with pytest.raises(SourceError, match=r"modulator\.sock"):
+    with VirtualDevice(PROFILE, Device(), tmp_path, SEED) as hardware, opened(hardware, "[1, 2]", "[3, 4]") as source:
+        assert reason_of(lambda: source.shot(WAIT_S)) is Reason.MISSING_FRAME
+    with pytest.raises(SourceError, match=r"modulator\.sock"), opened(hardware, "", "") as source:
         source.arm()
-    source.close()

@@ -6,6 +6,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import click
 import h5py
@@ -18,12 +19,10 @@ from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.calibration.parameters import NAMES, PRIORS
 from lightpage.device.profile import Profile, load_profile
 from lightpage.device.state import Device
-from lightpage.errors import CalibrationError, FrameError, InvalidInputError, LightpageError, RecordingError
-from lightpage.page.symbols import random_symbols
+from lightpage.errors import CalibrationError, FrameError, LightpageError, RecordingError
 from lightpage.progress import reporting
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording, RecordingWriter
-from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
 from tests.told import Told
 from train.commands.calibrate import calibrate
@@ -122,37 +121,27 @@ def test_symbols_whose_light_misses_a_camera_are_counted(tmp_path: Path, monkeyp
     aside = np.where(np.array(NAMES) == "in_phase_shift_x_px", 100.0, REGISTERED.parameters)
     fake_registration(monkeypatch, replace(REGISTERED, parameters=aside))
     figures = tmp_path / "figures.json"
-    text = run(flat_recording(tmp_path / "R.h5", 100), tmp_path / "calibration.toml", "--json", str(figures))
-    lost = json.loads(figures.read_text())["symbols_beside_cameras"]
-    assert lost == 5 * 56  # columns at 24, 39, 55, 70 and 86 pixels are moved beyond the camera's edge
-    assert f"{lost} of 4872" in text
+    run(flat_recording(tmp_path / "R.h5", 100), tmp_path / "calibration.toml", "--json", str(figures))
+    # columns at 24, 39, 55, 70 and 86 pixels are moved beyond the camera's edge
+    assert json.loads(figures.read_text())["symbols_beside_cameras"] == 5 * 56
 
 
-def test_the_table_is_for_people_and_the_json_for_machines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_found_is_written_as_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake_registration(monkeypatch, REGISTERED)
     out, figures = tmp_path / "calibration.toml", tmp_path / "figures.json"
-    text = run(flat_recording(tmp_path / "R.h5", 100), out, "--json", str(figures))
+    run(flat_recording(tmp_path / "R.h5", 100), out, "--json", str(figures))
     data = json.loads(figures.read_text())
     calibration = load_calibration(out)
     assert data["angle_deg"] == pytest.approx(-0.6)
     assert data["turn_deg"] == pytest.approx(-88)
     assert (data["pages_used"], data["coherence_before"], data["coherence_after"]) == (2, 0.02, 0.71)
-    assert data["seconds"] > 0
     assert data["parameters"] == calibration.parameters
     assert data["symbols_beside_cameras"] == 0
-    rows = {line[:32].strip(): line[32:].split() for line in text.splitlines()}
-    assert rows["pipe angle, degree"][0] == "-0.6"
-    assert rows["focal length, mm"] == ["20", "0.0008", "20"]
-    assert set(NAMES[4:]) <= set(rows)
 
 
 @pytest.mark.parametrize(
     ("pages", "with_symbols", "profile", "complaint"),
-    [
-        (2, False, "bench", "'symbols'"),
-        (1, True, "bench", "--pages"),
-        (2, True, "paper", "3648 x 5472"),
-    ],
+    [(2, False, "bench", "'symbols'"), (1, True, "bench", "--pages"), (2, True, "paper", "3648 x 5472")],
 )
 def test_a_recording_that_cannot_serve_is_refused_by_name(
     tmp_path: Path, pages: int, with_symbols: bool, profile: str, complaint: str
@@ -160,26 +149,6 @@ def test_a_recording_that_cannot_serve_is_refused_by_name(
     recording = flat_recording(tmp_path / "R.h5", 100, pages, with_symbols)
     with pytest.raises(RecordingError, match=complaint):
         run(recording, tmp_path / "calibration.toml", profile=profile)
-
-
-def test_a_folder_that_is_not_there_is_named_before_the_work(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match="nowhere"):
-        run(tmp_path / "R.h5", tmp_path / "nowhere" / "calibration.toml")
-
-
-@pytest.mark.long  # a whole search
-def test_a_device_outside_the_capture_range_is_not_guessed_at(tmp_path: Path) -> None:
-    """At 4.5 degrees all light but that of the y walls lies where it would at 0."""
-    profile, rng = load_profile("bench"), np.random.default_rng(0)
-    device = Device().with_settings(["geometry.pipe_angle_deg=4.5"])
-    simulator = Simulator(profile, device, 256, 0)
-    with RecordingWriter(tmp_path / "R.h5", profile, 256, device.sensor.bit_depth, simulator.references()) as writer:
-        symbols = random_symbols(profile, 256, 1, rng)[0]
-        writer.append(symbols, simulator.page(symbols))
-    out = tmp_path / "calibration.toml"
-    with pytest.raises(CalibrationError, match="along y"):
-        run(tmp_path / "R.h5", out, "--pages", "1")
-    assert not out.exists()
 
 
 @pytest.mark.parametrize("stop", [KeyboardInterrupt(), CalibrationError("calibration", "nothing", "something")])
@@ -195,16 +164,17 @@ def test_a_calibration_that_is_stopped_leaves_the_earlier_one_alone(
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["R.h5", "calibration.toml"]
 
 
-@pytest.mark.parametrize(("in_phase", "quadrature", "named"), [("", "x", "quadrature"), ("xy", "xy", "in-phase")])
+@pytest.mark.parametrize(
+    ("flipped", "named"),
+    [({"quadrature": -1}, "quadrature"), ({"in_phase": (-2, -1), "quadrature": (-2, -1)}, "in-phase")],
+)
 def test_a_camera_that_is_mounted_otherwise_is_named(
-    in_phase: str, quadrature: str, named: str, bench_recording: Path, tmp_path: Path
+    flipped: dict[str, Any], named: str, bench_recording: Path, tmp_path: Path
 ) -> None:
-    flips = {"in_phase": in_phase, "quadrature": quadrature}
     shutil.copy(bench_recording, tmp_path / "R.h5")
     with h5py.File(tmp_path / "R.h5", "r+") as file:
-        for name, flip in flips.items():
+        for name, axes in flipped.items():
             for dataset in (file[f"reference_{name}"], file[name]):
-                axes = [axis for axis, letter in ((-2, "y"), (-1, "x")) if letter in flip]
                 dataset[...] = np.flip(dataset[()], axes)
     with pytest.raises(CalibrationError, match=f"{named} camera"):
         run(tmp_path / "R.h5", tmp_path / "C.toml", "--pages", "1")

@@ -66,13 +66,6 @@ def test_estimates_of_an_earlier_pass_are_read_where_earlier_versions_kept_them(
     torch.testing.assert_close(estimate, -positions, rtol=0, atol=0)
 
 
-def test_what_is_complete_is_not_made_again(tmp_path: Path) -> None:
-    fill(tmp_path, "device", 3, Pages(), "pages")
-    again = Pages()
-    fill(tmp_path, "device", 3, again, "pages")
-    assert again.made == []
-
-
 def test_further_processes_take_what_the_first_has_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fill(tmp_path, "device", 3, Pages(), "pages")
     monkeypatch.setenv("LOCAL_RANK", "1")
@@ -81,12 +74,16 @@ def test_further_processes_take_what_the_first_has_made(tmp_path: Path, monkeypa
     assert other.made == []
 
 
-@pytest.mark.parametrize(("key", "count"), [("another device", 3), ("device", 2), ("device", 4)])
-def test_pages_of_something_else_are_made_anew(tmp_path: Path, key: str, count: int) -> None:
+@pytest.mark.parametrize(
+    ("key", "count", "made"), [("device", 3, 0), ("another device", 3, 3), ("device", 2, 2), ("device", 4, 4)]
+)
+def test_what_is_complete_is_kept_and_pages_of_something_else_are_made_anew(
+    tmp_path: Path, key: str, count: int, made: int
+) -> None:
     fill(tmp_path, "device", 3, Pages(), "pages")
     again = Pages()
     fill(tmp_path, key, count, again, "pages")
-    assert again.made[:count] == list(range(count))
+    assert again.made[:count] == list(range(made))
     assert len(FeatureStore(tmp_path)) == count
 
 
@@ -97,22 +94,20 @@ def test_a_part_of_the_pages_is_numbered_from_zero(tmp_path: Path) -> None:
     assert torch.all(part[0][2] == 3)
 
 
-@pytest.mark.parametrize(("number", "kind"), [(errno.ENOSPC, SurroundingsError), (errno.EOPNOTSUPP, None)])
+@pytest.mark.parametrize(
+    ("lacking", "number", "kind"),
+    [
+        ("os.posix_fallocate", errno.ENOSPC, SurroundingsError),
+        ("os.posix_fallocate", errno.EOPNOTSUPP, None),
+        ("train.data.feature_store.open_memmap", errno.ENODEV, LightpageError),
+    ],
+)
 def test_room_is_taken_before_pages_are_made(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, kind: type[Exception] | None
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lacking: str, number: int, kind: type[Exception] | None
 ) -> None:
-    def lacking(*_: int) -> None:
+    def lacks(*_: object, **__: object) -> None:
         raise OSError(number, os.strerror(number))
 
-    monkeypatch.setattr(os, "posix_fallocate", lacking)
-    with pytest.raises(kind, match="room") if kind else nullcontext():
-        fill(tmp_path, "device", 2, Pages(), "pages")
-
-
-def test_a_file_system_that_maps_no_files_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def lacking(*_: object, **__: object) -> None:
-        raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
-
-    monkeypatch.setattr("train.data.feature_store.open_memmap", lacking)
-    with pytest.raises(LightpageError, match="features"):
+    monkeypatch.setattr(lacking, lacks)
+    with pytest.raises(kind) if kind else nullcontext():
         fill(tmp_path, "device", 2, Pages(), "pages")

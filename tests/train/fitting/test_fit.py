@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import shutil
 from dataclasses import replace
@@ -11,6 +12,7 @@ import lightning as L
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 from torch.utils.data import TensorDataset
 
 from lightpage.errors import InvalidInputError
@@ -18,6 +20,8 @@ from lightpage.metrics.information import achievable_rate
 from train.fitting.concentration_scale import best_kappa_scale, decode_pages, most_likely_factor
 from train.fitting.fit import fit_network
 from train.fitting.fitted import CHECKPOINTS, FITTED, FITTED_WEIGHTS, Fitted
+from train.fitting.loss import training_rate, von_mises_nll
+from train.fitting.memory import keep_freed_memory
 from train.fitting.validation import held_out_air
 from train.models.hyperparameters import Hyperparameters
 
@@ -144,3 +148,41 @@ def test_air_does_not_see_the_piston_and_leaves_pilots_out() -> None:
     assert exact > 3.5
     assert held_out_air(wrong_pilots, truth, MASK, LEVELS) == pytest.approx(exact, abs=0.02)
     assert held_out_air(p, wrong_data, MASK, LEVELS) < 0
+
+
+def test_freed_memory_is_left_to_another_c_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ctypes, "CDLL", lambda name: object())
+    assert not keep_freed_memory()
+
+
+# ---- loss -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_loss_is_the_density_that_scipy_has() -> None:
+    kappa, mu, theta = np.array([0.1, 2.0, 40.0]), np.array([0.3, -2.0, 3.0]), np.array([1.0, 2.5, -3.1])
+    p = torch.from_numpy(np.stack([kappa * np.cos(mu), kappa * np.sin(mu)])[None])
+    expected = -stats.vonmises.logpdf(theta, kappa, loc=mu)
+    got = von_mises_nll(p, torch.from_numpy(theta)[None])[0].numpy()
+    np.testing.assert_allclose(got, expected, atol=2e-5)
+
+
+def test_the_loss_is_finite_with_its_gradient_at_no_and_at_huge_confidence() -> None:
+    p = torch.tensor([[[0.0, 1e4], [0.0, 0.0]]], requires_grad=True)
+    loss = von_mises_nll(p, torch.zeros(1, 2)).sum()
+    loss.backward()
+    assert torch.isfinite(loss)
+    assert p.grad is not None
+    assert torch.isfinite(p.grad).all()
+
+
+@pytest.mark.parametrize(("levels", "concentration"), [(2, 100), (100, 4000), (256, 8000)])
+def test_the_rate_in_training_is_that_of_the_symbols_whatever_the_piston(levels: int, concentration: float) -> None:
+    rng = np.random.default_rng(levels)
+    symbols, kappa = rng.integers(levels, size=4000), rng.gamma(2.0, concentration / 2, 4000)
+    mu = symbols * 2 * np.pi / levels + rng.vonmises(0, kappa)
+    expected = achievable_rate(mu, kappa, symbols, levels).mean()
+    for piston in (0.0, 2.1):
+        p = torch.from_numpy(kappa * np.stack([np.cos(mu + piston), np.sin(mu + piston)]))
+        phases = torch.from_numpy(symbols * 2 * np.pi / levels + piston)
+        assert training_rate(p, phases, levels) == pytest.approx(expected, abs=2e-3)
+    assert expected < np.log2(levels)

@@ -115,21 +115,7 @@ class TestAccuracy:
         overlap = np.vdot(field[inside()], page.truth[inside()])
         assert abs(np.angle(overlap)) < 0.01
 
-    def test_without_its_rounds_against_the_signals_own_light_it_is_worse(self, recorded: Recorded) -> None:
-        full = error_db(solve(recorded)[0], recorded.truth)
-        assert error_db(solve(recorded, rounds=0)[0], recorded.truth) > full + 5
-
-    def test_of_few_photons_little_is_lost(self) -> None:
-        """At 64 electrons of full well noise is most of the error: -17.3 dB, and -14.7 for the plain inverse of the
-        equations, which follows the noise where the signal is as bright as the reference."""
-        dim = record(full_well_e=64)
-        full = error_db(solve(dim)[0], dim.truth)
-        assert error_db(solve(dim, rounds=0)[0], dim.truth) > full + 2
-
-    @pytest.mark.parametrize(
-        ("rounds", "binning", "step_px", "expected_db"),
-        [(ROUNDS, 1, 3, -10.1), (0, 2, 2, -10.2)],
-    )
+    @pytest.mark.parametrize(("rounds", "binning", "step_px", "expected_db"), [(ROUNDS, 1, 3, -10.1), (0, 2, 2, -10.2)])
     def test_hurry_and_a_coarser_grid_cost_what_the_documents_say(
         self, rounds: int, binning: int, step_px: int, expected_db: float
     ) -> None:
@@ -165,22 +151,14 @@ class TestClosedRoot:
 
 
 class TestResidual:
-    def test_it_rises_when_the_angle_between_the_arms_is_wrong(self, recorded: Recorded) -> None:
+    def test_it_tells_a_wrong_angle_a_misplaced_camera_and_swapped_frames(self, recorded: Recorded) -> None:
         right = left_over(*solve(recorded))
         for wrong_deg in (-15, 15):
             assert left_over(*solve(recorded, turn=recorded.turn + np.deg2rad(wrong_deg))) > 1.15 * right
-
-    def test_it_tells_a_swapped_pair(self, recorded: Recorded) -> None:
+        moved = registration((SHIFTS_PX[0], SHIFTS_PX[1] + 3))
+        assert left_over(*solve(recorded, where=moved)) > 2 * right
         swapped = FramePair(recorded.pair.quadrature, recorded.pair.in_phase)
-        assert left_over(*solve(recorded, pair=swapped)) > 8 * left_over(*solve(recorded))
-
-    def test_it_tells_frames_of_two_different_pages(self, recorded: Recorded) -> None:
-        other = FramePair(recorded.pair.in_phase, recorded.pair.quadrature[::-1].copy())
-        assert left_over(*solve(recorded, pair=other)) > 8 * left_over(*solve(recorded))
-
-    def test_it_rises_when_one_camera_is_misplaced(self, recorded: Recorded) -> None:
-        moved = solve(recorded, where=registration((SHIFTS_PX[0], SHIFTS_PX[1] + 3)))
-        assert left_over(*moved) > 2 * left_over(*solve(recorded))
+        assert left_over(*solve(recorded, pair=swapped)) > 8 * right
 
     def test_it_cannot_tell_the_sign_of_q(self, recorded: Recorded) -> None:
         """The two equations are those of the conjugate field: only known symbols tell."""
@@ -188,7 +166,6 @@ class TestResidual:
         mirrored, same = solve(recorded, turn=-recorded.turn)
         np.testing.assert_allclose(mirrored, field.conj(), atol=1e-5)
         np.testing.assert_allclose(same, residual, atol=1e-5)
-        assert error_db(mirrored, recorded.truth) > -0.5
 
 
 class TestDarkness:
@@ -205,8 +182,7 @@ class TestDarkness:
             recorded.turn,
         )
         field, residual = solve(dimmed)
-        assert np.isfinite(field).all()
-        assert np.isfinite(residual).all()
+        assert np.isfinite([*np.abs(field).ravel(), *residual.ravel()]).all()
         columns = field.shape[1]
         lit, plain = field[:, columns // 2 + 30 :], solve(recorded)[0][:, columns // 2 + 30 :]
         assert np.abs(field[:, : columns // 2 - 30]).max() < 0.05 * np.abs(lit).max()

@@ -1,12 +1,15 @@
-"""The symbol U-Net."""
+"""The symbol U-Net, and the separable filter that is plain convolution."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 
+from train.models.filters import SeparableFilter
 from train.models.network import PositionModulation, Refiner, SymbolUNet, estimate
 
 
@@ -53,3 +56,18 @@ def test_outputs_add_to_an_estimate_and_scale_it() -> None:
     torch.testing.assert_close(more / before, torch.full_like(before, 2.0))
     scaled = estimate(torch.tensor([0.0, 0.0, 0.2]).reshape(1, 3, 1, 1), before)
     torch.testing.assert_close(scaled / before, torch.full_like(before, math.exp(2)))
+
+
+def symmetric_taps(count: int) -> np.ndarray:
+    half = np.random.default_rng(count).standard_normal(count // 2 + 1)
+    return np.concatenate([half[:0:-1], half])
+
+
+@pytest.mark.parametrize(("shape", "taps"), [((1, 16, 32), 1), ((2, 37, 50), 11), ((3, 5, 7), 31)])
+def test_it_equals_scipys_convolution_with_zeros_beyond_the_edges(shape: tuple[int, int, int], taps: int) -> None:
+    images, kernel = np.random.default_rng(0).standard_normal(shape), symmetric_taps(taps)
+    expected = ndimage.convolve1d(images, kernel, axis=1, mode="constant")
+    expected = ndimage.convolve1d(expected, kernel, axis=2, mode="constant")
+    got = SeparableFilter(kernel)(torch.tensor(images, dtype=torch.float32)).numpy()
+    assert got.shape == shape
+    np.testing.assert_allclose(got, expected, atol=1e-5 * np.abs(expected).max())

@@ -35,11 +35,12 @@ def page_points(profile: Profile, count: int, seed: int = 0) -> np.ndarray:
 
 @dataclass
 class Ray:
-    """One ray that has left the pipe: what it met, in order, where it goes and with what phase."""
+    """One ray that has left the pipe: what it met, in order, where it goes and with what phase, and if it was lost."""
 
     met: str
     direction: np.ndarray
     phase: float
+    lost: bool
 
 
 def follow(profile: Profile, values: dict[str, float], point: np.ndarray, entry: np.ndarray) -> Ray:
@@ -64,7 +65,7 @@ def follow(profile: Profile, values: dict[str, float], point: np.ndarray, entry:
     transverse = -(k0 / f) * (point + np.array([values["page_centre_x_m"], values["page_centre_y_m"]]))
     k = np.append(transverse, np.sqrt(nk**2 - transverse @ transverse))
     across = np.linalg.solve(np.stack([normals["x"], normals["y"]]), w * entry + np.array([offsets["x"], offsets["y"]]))
-    at, met = np.append(across, 0.0), ""
+    at, met, lost = np.append(across, 0.0), "", False
     phase = k[:2] @ at[:2] - nk * length
     for _ in range(50):
         ahead = [((c - n @ at) / (n @ k), name, n) for name, n, c in planes if n @ k > 0]
@@ -72,8 +73,9 @@ def follow(profile: Profile, values: dict[str, float], point: np.ndarray, entry:
         phase += reach * nk**2  # |k| times the distance reach |k|
         at = at + reach * k
         if name == "end":
-            return Ray(met, -(f / k0) * k[:2], phase - k[:2] @ at[:2])
+            return Ray(met, -(f / k0) * k[:2], phase - k[:2] @ at[:2], lost)
         met += name
+        lost |= bool(normal @ k > np.sqrt(nk**2 - k0**2))  # steeper than the critical angle
         phase += np.pi
         k = k - 2 * (k @ normal) * normal
     raise AssertionError("the ray never left the pipe")
@@ -116,26 +118,6 @@ class TestAgainstSingleRays:
         assert sum(seen.values()) > 0.95 * 1200
         assert min(seen.values()) > 30
 
-    def test_the_exit_centroid_is_the_mean_unfolded_way_of_the_rays(self) -> None:
-        profile = small_profile()
-        parameters = only(pipe_angle_rad=-0.01, pipe_roll_rad=0.004, page_centre_x_m=3e-5)
-        values = dict(zip(NAMES, parameters, strict=True))
-        # a point near the middle, whose light meets no wall
-        point = np.array([20e-6, -35e-6])
-        position = TorchTwin(RayTwin(profile)).trace(parameters, point[None]).positions[0]
-        ray = follow(profile, values, point, np.zeros(2))
-        assert ray.met == ""
-        k0 = 2 * np.pi / profile.light.wavelength_m
-        k = -ray.direction * k0 / profile.lens.focal_length_m
-        kz = np.sqrt((profile.pipe.refractive_index * k0) ** 2 - k @ k)
-        way = k / kz * profile.pipe.length_m
-        roll, t = 0.004, -0.01
-        in_pipe = np.array(
-            [way[0] * np.cos(roll) + way[1] * np.sin(roll), -way[0] * np.sin(roll) + way[1] * np.cos(roll)]
-        )
-        expected = np.array([in_pipe[0], in_pipe[0] * np.sin(t) + in_pipe[1] * np.cos(t)]) / profile.pipe.width_m
-        assert position == pytest.approx(expected, rel=1e-9)
-
 
 class TestClosedForms:
     def test_a_long_square_pipe_unfolds(self) -> None:
@@ -144,13 +126,18 @@ class TestClosedForms:
             update={"pipe": small.pipe.model_copy(update={"length_m": 7.3 * small.pipe.length_m})}
         )
         points = page_points(profile, 400)
-        rays = TorchTwin(RayTwin(profile)).trace(nominal(), points)
+        twin = TorchTwin(RayTwin(profile))
+        rays = twin.trace(nominal(), points)
         k0, w = 2 * np.pi / profile.light.wavelength_m, profile.pipe.width_m
         nk = profile.pipe.refractive_index * k0
         k = -k0 / profile.lens.focal_length_m * points
         kz = np.sqrt(nk**2 - (k**2).sum(1))
         unfolded = k / kz[:, None] * profile.pipe.length_m / w
         assert np.abs(unfolded).max() > 8
+        np.testing.assert_allclose(rays.positions, unfolded, rtol=1e-12, atol=1e-12)
+        sheared = np.stack([unfolded[:, 0], unfolded @ [np.sin(0.01), np.cos(0.01)]], axis=-1)
+        found = twin.trace(only(pipe_angle_rad=0.01), points).positions
+        np.testing.assert_allclose(found, sheared, rtol=1e-12, atol=1e-12)
         even = 2 * np.round(unfolded / 2)
         odd = 2 * np.floor(unfolded / 2) + 1
         for b, branch in enumerate(BRANCHES):
@@ -192,18 +179,6 @@ class TestPaths:
         at_left = twin.trace(nominal(), left).phases[direct, 0]
         assert abs(own - at_left) > 100
         assert abs(of_left - at_left) < 10
-
-    def test_many_devices_at_once_equal_one_at_a_time(self) -> None:
-        profile = small_profile()
-        twin, points = TorchTwin(RayTwin(profile)), page_points(profile, 30)
-        anchors = points + 5e-6
-        many = np.stack([some_device(seed) for seed in range(4)])
-        together, pixels = twin.trace(many, points, anchors), twin.pixels(many, points)
-        for index, parameters in enumerate(many):
-            alone = twin.trace(parameters, points, anchors)
-            for one, all_of_them in zip(alone, together, strict=True):
-                np.testing.assert_allclose(all_of_them[index], one, rtol=1e-13, atol=1e-9)
-            np.testing.assert_allclose(pixels[index], twin.pixels(parameters, points), rtol=1e-13)
 
     def test_no_parameter_is_dead(self) -> None:
         profile = small_profile().model_copy(update={"lens_path": THICK})

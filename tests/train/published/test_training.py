@@ -1,29 +1,40 @@
-"""Training of the published decoders: learning rates, clipping, and the command."""
+"""The published decoders: their network, what classes say, learning rates, clipping, and the command."""
 
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner
+from torch.nn import functional
 
 from lightpage.device.profile import load_profile
+from lightpage.errors import InvalidInputError
 from lightpage.page.symbols import pilot_mask
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
 from tests.conftest import SMALL_PAGES
 from tests.lightpage.small import THICK, small_profile
-from train.commands.train import train
 from train.data.features import PageState
 from train.data.pages import Page
+from train.published.decoder import p_of_classes
 from train.published.trainer import published_choices, published_decoder, train_published
-from train.published.training import DataPages, FramePages, PublishedChoices, PublishedTraining
+from train.published.training import (
+    NOT_ASKED,
+    DataPages,
+    FramePages,
+    PublishedChoices,
+    PublishedTraining,
+    nearest_class,
+)
+from train.published.unet import PublishedUNet, samples_for
 from train.runs import load_run
 
 STEP_RATES = (1e-3, 2e-4, 1e-4)
+LEVELS = 64
 
 
 def module(localizer: str, choices: PublishedChoices) -> PublishedTraining:
@@ -55,7 +66,6 @@ def test_every_parameter_has_one_rate() -> None:
     sizes = [sum(parameter.numel() for parameter in group["params"]) for group in groups]
     assert sizes[1:] == [2 * 4 + 2 * 2, 1]
     assert sum(sizes) == sum(parameter.numel() for parameter in made.parameters())
-    assert len(module("mode", PublishedChoices(channels=(4, 8))).configure_optimizers()["optimizer"].param_groups) == 2
 
 
 def test_the_gradient_of_the_network_alone_is_clipped() -> None:
@@ -83,9 +93,8 @@ def test_the_authors_choices() -> None:
     assert published_choices("mode", load_profile("paper"), 450) == PublishedChoices()  # which traces none
 
 
-@pytest.mark.parametrize("localizer", ["none", "mode", "ray"])
-def test_the_network_gets_two_images_and_the_places_they_stand_for(localizer: str) -> None:
-    made = module(localizer, PublishedChoices(channels=(4, 8)))
+def test_the_network_gets_two_images_and_the_places_they_stand_for() -> None:
+    made = module("ray", PublishedChoices(channels=(4, 8)))
     given: list[torch.Tensor] = []
     made.network.unet.register_forward_pre_hook(lambda _, inputs: given.append(inputs[0]))
     frames = 100 + 10 * torch.rand(1, 2, *small_profile().frame_shape)
@@ -134,17 +143,67 @@ def test_pages_come_with_frames_state_and_phases(small_device: list[str]) -> Non
         assert phases.shape == recording.page_shape
 
 
-@pytest.mark.parametrize("localizer", ["mode", "ray"])
-def test_the_command_trains_and_says_what_it_did(
-    localizer: str, small_device: list[str], tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
-    folder = tmp_path / "run" if localizer == "mode" else request.getfixturevalue("ray_run")
-    words = [*small_device, "--localizer", localizer, "--channels", "4", "--steps", "12", "--out", str(folder)]
-    CliRunner().invoke(train, words, standalone_mode=False, catch_exceptions=False)
-    described = load_run(folder)
+def test_a_run_says_what_it_did(ray_run: Path) -> None:
+    described = load_run(ray_run)
     assert described.pages == (6, 1, 1)
     assert described.hyperparameters == PublishedChoices(channels=(4, 8), steps=12)
-    weights = torch.load(folder / "decoder.pt", weights_only=True)
-    assert ("localizer.angle" in weights) == (localizer == "ray")
-    states = json.loads((folder / "states.json").read_text())["states"]
+    assert "localizer.angle" in torch.load(ray_run / "decoder.pt", weights_only=True)
+    states = json.loads((ray_run / "states.json").read_text())["states"]
     assert len(states) == SMALL_PAGES - 1
+
+
+# ---- network and classes --------------------------------------------------------------------------------------------
+
+
+def test_table_1_of_samples_and_no_others() -> None:
+    assert [samples_for(size) for size in (2, 4, 8, 16)] == [4, 4, 8, 16]
+    with pytest.raises(InvalidInputError, match="4, 8, 16"):
+        PublishedUNet(5)
+
+
+@pytest.mark.parametrize("kappa", [0.3, 3.0, 30.0])
+def test_a_von_mises_posterior_over_classes_comes_back(kappa: float) -> None:
+    angles = torch.arange(LEVELS) * (2 * math.pi / LEVELS)
+    direction = 1.3
+    logits = (kappa * torch.cos(angles - direction))[None, :, None, None]
+    px, py = p_of_classes(logits)[0, :, 0, 0].tolist()
+    assert math.atan2(py, px) == pytest.approx(direction, abs=1e-3)
+    assert math.hypot(px, py) == pytest.approx(kappa, rel=0.06)
+
+
+def test_no_knowledge_is_no_p_and_a_sure_one_is_finite() -> None:
+    none = p_of_classes(torch.zeros(1, LEVELS, 1, 1))
+    assert float(none.abs().max()) < 1e-5
+    sure = torch.zeros(1, LEVELS, 1, 1)
+    sure[0, 5] = 1000.0
+    p = p_of_classes(sure)[0, :, 0, 0]
+    assert torch.isfinite(p).all()
+    assert float(p.norm()) > 1e4
+
+
+def test_the_nearest_class_goes_round() -> None:
+    phases = torch.tensor([0.0, 2 * math.pi - 0.01, math.pi, -math.pi / 2])
+    assert nearest_class(phases, 4).tolist() == [0, 0, 2, 3]
+    assert nearest_class(torch.tensor([math.nan]), 4).tolist() == [NOT_ASKED]
+
+
+def test_classes_are_judged_by_what_they_say_of_the_data_with_the_piston_known() -> None:
+    made = module("none", PublishedChoices(channels=(4, 8), classes=4))
+    rng = np.random.default_rng(0)
+    symbols = torch.from_numpy(rng.integers(4, size=(2, 28, 44)))
+    scores = 3.0 * functional.one_hot(symbols, 4).movedim(-1, 1).float()
+    scores[:, :, torch.from_numpy(made.pilot_mask)] = 0
+    made.network.scores = lambda frames, shift: scores  # type: ignore[method-assign]
+    piston = torch.tensor([math.pi / 2, -math.pi])
+    phases = symbols * (math.pi / 2) - piston[:, None, None]
+    state = torch.stack([torch.zeros(2), torch.zeros(2), piston], dim=1)
+    right = 3 - math.log(math.exp(3) + 3)
+    assert made.rate((torch.zeros(2, 2, 8, 8), state, phases)) == pytest.approx(2 + right / math.log(2), rel=1e-5)
+
+
+def test_classes_are_learned_by_cross_entropy() -> None:
+    training = module("none", PublishedChoices(channels=(4, 8), classes=4))
+    training.log = lambda *_, **__: None  # type: ignore[assignment,method-assign]
+    phases = torch.from_numpy(np.random.default_rng(0).integers(4, size=(1, 28, 44)) * math.pi / 2).float()
+    loss = training.training_step((100 + 20 * torch.randn(1, 2, 456, 684), torch.zeros(1, 3), phases), 0)
+    assert float(loss.detach()) == pytest.approx(math.log(4), abs=0.1)  # it begins by guessing

@@ -1,0 +1,1 @@
+"""Faults of one line, planted one by one to see which of them the tests find."""
