@@ -67,10 +67,10 @@ def test_wrong_symbols_are_refused_with_what_came(symbols: np.ndarray, got: obje
 
 
 def test_good_symbols_come_back_as_bytes() -> None:
-    checked = check_symbols(np.full((3, 4, 6), 15, np.int64), (4, 6), 16, "page")
+    checked = check_symbols(np.arange(72).reshape(3, 4, 6) % 16, (4, 6), 16, "page")
     assert checked.dtype == np.uint8
     assert checked.shape == (3, 4, 6)
-    assert (checked == 15).all()
+    assert np.array_equal(checked.ravel(), np.arange(72) % 16)
 
 
 def test_a_negative_page_count_is_refused() -> None:
