@@ -144,7 +144,7 @@ def test_late_identifications_are_waited_for(lab: Lab, late_s: float) -> None:
     assert lab.line.faults[Fault.LATE] == 3
 
 
-@pytest.mark.parametrize("fault", set(Fault) - {Fault.LATE})
+@pytest.mark.parametrize("fault", sorted(set(Fault) - {Fault.LATE}))
 def test_damaged_answers_are_lost_and_the_next_is_right(lab: Lab, fault: Fault) -> None:
     for _ in range(20):
         lab.once(fault, ":PULSE1:WIDT?")
