@@ -352,3 +352,24 @@ def test_a_range_that_is_not_read_is_ended(start: Start, caplog: pytest.LogCaptu
     told = refused_as(caught.value)
     assert (told.code, type(told.error)) == (grpc.StatusCode.CANCELLED, StalledError)
     assert not [record for record in caplog.records if record.levelname == "ERROR"]
+
+
+# A client of this library sends no two pings within 10 s, and the server forgives two: nothing shorter shows it.
+@pytest.mark.long
+def test_a_client_that_asks_for_a_sign_of_life_every_ten_seconds_is_not_hung_up_on(service: Running) -> None:
+    options = (
+        ("grpc.keepalive_time_ms", 10_000),
+        ("grpc.keepalive_permit_without_calls", 1),
+        ("grpc.http2.max_pings_without_data", 0),
+    )
+    lost, states = threading.Event(), list[grpc.ChannelConnectivity]()
+
+    def changed(state: grpc.ChannelConnectivity) -> None:
+        if grpc.ChannelConnectivity.READY in states:
+            lost.set()
+        states.append(state)
+
+    with grpc.insecure_channel(service.server.target, options) as channel:
+        channel.subscribe(changed, try_to_connect=True)
+        grpc.channel_ready_future(channel).result(30)
+        assert not lost.wait(55)
