@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +74,7 @@ def test_what_cannot_be_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_a_case_is_measured_once_and_comes_back_with_its_arrays(tmp_path: Path) -> None:
     case, told = {"name": "square-diagonal", "shape": "square", "centroid": (1, 1)}, list[str]()
 
-    def again() -> dict[str, Any]:
+    def again() -> Mapping[str, Any]:
         settings = Settings(SMALL, quick=True)
         return measured(cross_section.STUDY, settings, case, tmp_path, lambda what, share: told.append(what))
 
