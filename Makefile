@@ -16,7 +16,7 @@ export PYTHONDONTWRITEBYTECODE =
 export ORT_DISABLE_TELEMETRY = 1
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMEXPR_NUM_THREADS=1
 
-.PHONY: help setup demo demo-hardware test pytest test-long planted test-lowest messages bench bench-speed bench-service bench-other-servers bench-scaling dashboard soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image sbom check-image check-camera-image lock licences audit proto lint format clean
+.PHONY: help setup demo demo-hardware test pytest test-busy test-long planted test-lowest messages bench bench-speed bench-service bench-other-servers bench-scaling dashboard soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image sbom check-image check-camera-image lock licences audit proto lint format clean
 .DELETE_ON_ERROR:
 
 help:  ## list the targets
@@ -47,6 +47,12 @@ test: $(STAMP)  ## lint, then every test but the long ones; prints the slowest, 
 
 pytest: $(STAMP)
 	$(PYTEST) -m "not long" --durations 20 --durations-min 5 $(PYTEST_ARGS)
+
+# Files whose tests wait for threads or processes.
+WAITING = $(shell grep -lrE "eventually|Popen|subprocess" tests --include="test_*.py")
+test-busy: $(STAMP)  ## beside four busy processes: every test but the long ones once, then ten times those that wait: two hours
+	$(BIN)/python -m tests.busy 1 $(MAKE) --no-print-directory pytest
+	$(BIN)/python -m tests.busy 10 env $(PYTEST) -q -m "not long" $(WAITING)
 
 test-long: $(STAMP)  ## tests that take minutes and prove little more
 	$(PYTEST) -m long $(PYTEST_ARGS)

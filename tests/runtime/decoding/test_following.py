@@ -59,7 +59,7 @@ def test_a_name_is_the_shipped_bundle_even_beside_a_folder_of_that_name(
         assert bundle_path(given) == Path(given)
 
 
-@pytest.mark.long
+@pytest.mark.long  # traces full pages of the shipped bundle; the tracker by itself is tested on small ones
 def test_the_shipped_decoder_follows_an_image_that_moves_over_its_reference() -> None:
     """Which tilts it; so far off, the table is traced again, and holds the tilt from then on."""
     decoder = Decoder.load(bundle_path(DEFAULT))
