@@ -50,7 +50,7 @@ pytest: $(STAMP)
 
 # Files whose tests wait for threads or processes.
 WAITING = $(shell grep -lrE "eventually|Popen|subprocess" tests --include="test_*.py")
-test-busy: $(STAMP)  ## beside four busy processes: every test but the long ones once, then ten times those that wait: two hours
+test-busy: $(STAMP)  ## beside four busy processes: every test but the long ones once, then ten times those that wait
 	$(BIN)/python -m tests.busy 1 $(MAKE) --no-print-directory pytest
 	$(BIN)/python -m tests.busy 10 env $(PYTEST) -q -m "not long" $(WAITING)
 
@@ -72,7 +72,7 @@ test-lowest: $(STAMP)  ## a share of the tests with the lowest versions that pyp
 	$(ONE_THREAD) $(LOWEST)/bin/python -m pytest -q -p no:cacheprovider tests/lightpage/recording tests/lightpage/test_files.py \
 	    tests/runtime/bundle tests/runtime/decoding/test_following.py tests/runtime/wire tests/runtime/scaling/test_storage.py
 
-lint: $(STAMP)  ## ruff, layers of imports, mypy --strict, hadolint
+lint: $(STAMP)  ## ruff, layers of imports, mypy --strict, rules of the tests, hadolint
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-cache --no-logo

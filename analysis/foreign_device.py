@@ -41,7 +41,7 @@ REFERENCE_EXPOSURES = 64
 
 @dataclass(frozen=True)
 class Design:
-    """What is nominal of a device, and how finely it is computed.
+    """Nominal values of a device, and how finely it is computed.
 
     Attributes:
         focal_length, pipe_length, pipe_width: mm.
@@ -89,7 +89,7 @@ HALF = Design(
 
 @dataclass(frozen=True)
 class Camera:
-    """Where a camera sits: the image is scaled and turned about the frame's centre, then shifted."""
+    """Place of a camera: the image is scaled and turned about the frame's centre, then shifted."""
 
     scale: float = 0.0
     rotation_deg: float = 0.0
@@ -186,7 +186,7 @@ def draw_parameters(rng: np.random.Generator) -> Parameters:
 
 @dataclass(frozen=True)
 class PageDrift:
-    """Where the random walks stand on one page."""
+    """State of the random walks on one page."""
 
     piston_rad: float = 0.0
     shift_px: tuple[float, float] = (0.0, 0.0)
@@ -194,7 +194,7 @@ class PageDrift:
 
 @dataclass(frozen=True)
 class ForeignDevice:
-    """One device with its optics, cameras and noise."""
+    """A device with its optics, cameras and noise."""
 
     parameters: Parameters = Parameters()
     design: Design = BENCH
@@ -257,7 +257,7 @@ class ForeignDevice:
         return np.asarray((1 - p.falloff * rho**2) * np.exp(1j * phase))
 
     def launch(self, page: ComplexArray) -> ComplexArray:
-        """From SLM pixels to the entrance facet [y', x], as the pipe sees it."""
+        """Return the field on the entrance facet [y', x] of SLM pixels, as the pipe sees it."""
         roll, f = np.deg2rad(self.parameters.pipe_roll_deg), self.focal_length
         padded = np.zeros(self.design.padded_px, complex)
         top, left = ((a - b) // 2 for a, b in zip(self.design.padded_px, self.design.page_px, strict=True))
@@ -289,7 +289,7 @@ class ForeignDevice:
         return propagate_pipe(facet, self.pipe_width, self.pipe_length, self.angle, steps or self.design.steps)
 
     def delaunch(self, facet: ComplexArray) -> Image:
-        """From the exit facet to the camera plane, in the pipe's axes."""
+        """Return the field on the camera plane of that on the exit facet, in the pipe's axes."""
         f, (facet_y, facet_x), (dy, dx) = self.focal_length, self.facet_coordinates, self.pitches
         counts = [
             int(np.ceil((n * CAMERA_PITCH / 2 + IMAGE_MARGIN) / IMAGE_PITCH)) * 2 + 1 for n in self.design.frame_shape

@@ -1,4 +1,4 @@
-"""Time as what waits sees it: the system's clock, in whose place a test gives one that it moves itself."""
+"""The clock by which code waits: the system's, in whose place a test gives one that it moves."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Callable
 class Clock:
     """The system's monotonic clock.
 
-    What reads the time and waits too takes a `Clock`; what only reads it takes `clock: Callable[[], float]`.
+    A class that waits takes a `Clock`; one that only reads the time takes `clock: Callable[[], float]`.
     """
 
     def now(self) -> float:
@@ -36,4 +36,4 @@ class Clock:
 
 
 SYSTEM = Clock()
-"""The clock of everything that is given none."""
+"""Default of every class and function that takes a clock."""

@@ -33,7 +33,7 @@ SCHEMAS = Path(__file__).resolve().parents[1] / "tests" / "deploy" / "schemas"
 
 
 def stripped(schema: Any) -> Any:
-    """Without what only people read, and without the extensions of Kubernetes."""
+    """Return a schema without descriptions and without the extensions of Kubernetes."""
     if isinstance(schema, list):
         return [stripped(each) for each in schema]
     if not isinstance(schema, dict):
@@ -47,7 +47,7 @@ def stripped(schema: Any) -> Any:
 
 
 def strict(schema: Any) -> Any:
-    """With every object closed that says what it has, and without null in place of a value."""
+    """Return a schema whose objects take no other properties, and whose values are never null."""
     if isinstance(schema, list):
         return [strict(each) for each in schema]
     if not isinstance(schema, dict):
@@ -60,7 +60,7 @@ def strict(schema: Any) -> Any:
 
 
 def referred(schema: Any) -> set[str]:
-    """Names of the definitions that a schema refers to."""
+    """Return the names of the definitions that a schema refers to."""
     if isinstance(schema, list):
         return set().union(*map(referred, schema))
     if not isinstance(schema, dict):
@@ -70,7 +70,7 @@ def referred(schema: Any) -> set[str]:
 
 
 def closure(definitions: dict[str, Any], names: set[str]) -> dict[str, Any]:
-    """Definitions of these names, and all that they refer to."""
+    """Return the definitions of these names, and all that they refer to."""
     found: dict[str, Any] = {}
     while names:
         name = names.pop()
@@ -80,7 +80,7 @@ def closure(definitions: dict[str, Any], names: set[str]) -> dict[str, Any]:
 
 
 def kubernetes() -> dict[str, Any]:
-    """Definitions, and by "apiVersion kind" which of them describes it."""
+    """Return Kubernetes' definitions, and by "apiVersion kind" which of them describes it."""
     folder = files("kubernetes_validate") / "kubernetes-json-schema" / f"{KUBERNETES}-local-strict"
     definitions = json.loads((folder / "_definitions.json").read_text())["$defs"]
     kinds = {told: {"$ref": f"#/$defs/{name}"} for told, name in KINDS.items()}
@@ -90,7 +90,7 @@ def kubernetes() -> dict[str, Any]:
 
 
 def service_monitor() -> dict[str, Any]:
-    """The same of Prometheus operator's ServiceMonitor, whose metadata are Kubernetes' own."""
+    """Return those of Prometheus operator's ServiceMonitor, whose metadata are Kubernetes' own."""
     from cloudcoil.models.prometheus_operator.v1 import ServiceMonitor  # type: ignore[import-not-found]
 
     schema = strict(stripped(ServiceMonitor.model_json_schema(by_alias=True)))

@@ -55,7 +55,7 @@ class HelperProcess:
 
     @property
     def pid(self) -> int:
-        """Its number."""
+        """Number of the process."""
         return self._process.pid
 
     def send(self, data: bytes, deadline: float) -> None:

@@ -13,6 +13,8 @@ from pathlib import Path
 
 def main() -> int:
     """Run it, and return its exit status."""
+    if len(sys.argv) < 3:
+        sys.exit("usage: python -m tests.budget NAME COMMAND ...")
     name, *command = sys.argv[1:]
     budget = tomllib.loads(Path(__file__).with_name("limits.toml").read_text("utf-8"))["seconds"]
     begun = time.perf_counter()

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
-from contextlib import ExitStack
+
+from analysis.speed.beside_others import busy_cores
 
 PROCESSES = 4
-_BUSY = "import os, sys\nwhile os.getppid() == int(sys.argv[1]):\n    sum(range(100_000))"
 
 
 def main() -> int:
     """Return 1 if the command failed at least once."""
+    if len(sys.argv) < 3 or not sys.argv[1].isdigit():
+        sys.exit("usage: python -m tests.busy TIMES COMMAND ...")
     times, *command = sys.argv[1:]
-    with ExitStack() as stack:
-        for _ in range(PROCESSES):
-            busy = stack.enter_context(subprocess.Popen([sys.executable, "-c", _BUSY, str(os.getpid())]))
-            stack.callback(busy.kill)
+    with busy_cores(PROCESSES):
         failed = sum(subprocess.run(command).returncode != 0 for _ in range(int(times)))
     print(f"{failed} of {times} failed beside {PROCESSES} busy processes")
     return int(failed > 0)

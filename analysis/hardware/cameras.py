@@ -1,4 +1,4 @@
-"""What a camera's driver delivers: to the byte, without old frames, how fast, and how it leaves other threads alone.
+"""Measures what a camera's driver delivers: to the byte, without old frames, how fast, beside other threads.
 
 Pairs a second over the whole chain are compared with the cameras alone, fired as fast as their frames come, and with
 pairing alone, over cameras that deliver in no time.
@@ -65,7 +65,7 @@ _UNPACKED = 21
 
 
 class Eye:
-    """What one fake camera sees."""
+    """Frames that one fake camera sees."""
 
     def __init__(self, image: Counts) -> None:
         self.image = image
@@ -123,7 +123,7 @@ def stale_frames(changes: int) -> dict[str, int]:
 
 
 def take(stage: list[tuple[FakeCamera, AravisCamera, Eye]]) -> list[Frame | None]:
-    """One edge to all cameras, and a frame of each."""
+    """Fire one edge to all cameras, and return a frame of each."""
     for fake, _, _ in stage:
         fake.edge()
     return [camera.frame(_FRAME_S) for _, camera, _ in stage]
@@ -241,7 +241,7 @@ class Edges:
         self._fakes = fakes
 
     def fire(self) -> float:
-        """One edge to all."""
+        """Fire one edge to all."""
         fired = time.monotonic()
         for fake in self._fakes:
             fake.edge()

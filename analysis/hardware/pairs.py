@@ -137,7 +137,7 @@ class Stage:
         """See `Beams`: there are none."""
 
     def begin(self, fault: str, camera: int, delay_s: float) -> None:
-        """What goes wrong with the next shot."""
+        """Choose what goes wrong with the next shot."""
         self.fault, self.camera, self.delay_s = fault, camera, delay_s
         self.fakes[camera].lose({"packets lost": 0.03, "leader lost": 0.5}.get(fault, 0.0))
         for one, held in enumerate(self.cameras):
@@ -147,7 +147,7 @@ class Stage:
             self.fakes[camera].start()
 
     def end(self) -> None:
-        """From here on nothing goes wrong."""
+        """End all faults."""
         self.fakes[self.camera].lose(0.0)
         self.fault = ""
         for held in self.cameras:

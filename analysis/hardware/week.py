@@ -214,7 +214,7 @@ class Watched(Recalibrator):
                 self._ends.append(end)
 
     def ended(self) -> list[str]:
-        """How recalibrations ended since this was last asked."""
+        """Return how recalibrations ended since the last call."""
         with self._lock:
             ends, self._ends = self._ends, []
         return ends
@@ -236,7 +236,7 @@ def _wait(until: Callable[[], bool], seconds: float) -> None:
 
 
 def figures_of(rows: Rows, pages: int) -> dict[str, Any]:
-    """What the week comes to."""
+    """Return the figures of the week."""
     air = np.array([row["air"] for row in rows])
     share = air / np.array([row["true_air"] for row in rows])
     ends = [end for row in rows for end in row["ended"]]

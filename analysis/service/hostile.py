@@ -119,7 +119,7 @@ def mutated(data: bytes, chance: random.Random) -> bytes:
 
 
 def requests_of(method: Any, chance: random.Random, pages: PagesToSend) -> list[bytes]:
-    """What one call sends."""
+    """Bytes that one call sends."""
     kind = GetMessageClass(method.input_type)
     if not method.client_streaming:
         if method.name == "ModelInfer" and chance.random() < 0.5:

@@ -82,7 +82,7 @@ class Called:
 
     @property
     def outgoing(self) -> bool:
-        """Whether it leaves this machine, or may make another do so: a local name server asks others."""
+        """Return whether a call leaves this machine, or may make another do so: a local name server asks others."""
         if "/" in self.address or self.address.startswith("@"):
             return False
         address = ipaddress.ip_address(self.address)
@@ -90,7 +90,7 @@ class Called:
 
 
 def calls(trace: Path) -> Iterator[Called]:
-    """What a trace that `TRACE` made tells.
+    """Return what a trace that `TRACE` made tells.
 
     Raises:
         LightpageError: a process made a ring, through which it may have sent anything.
@@ -122,7 +122,7 @@ def seen_when_planted(folder: Path) -> list[Called]:
 
 
 def control(folder: Path) -> int:
-    """How many planted calls were seen.
+    """Number of planted calls that were seen.
 
     Raises:
         LightpageError: not all of them; a trace here would prove nothing.

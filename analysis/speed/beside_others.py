@@ -29,10 +29,10 @@ _BUSY = "import os, sys\nwhile os.getppid() == int(sys.argv[1]):\n    sum(range(
 
 
 @contextmanager
-def busy_cores() -> Iterator[None]:
-    """Keep every core busy with a process of its own while the `with` statement lasts."""
+def busy_cores(processes: int | None = None) -> Iterator[None]:
+    """Keep cores busy while the `with` statement lasts, with so many processes; by default one for each core."""
     with ExitStack() as stack:
-        for _ in range(len(os.sched_getaffinity(0))):
+        for _ in range(processes or len(os.sched_getaffinity(0))):
             process = stack.enter_context(subprocess.Popen([sys.executable, "-c", _BUSY, str(os.getpid())]))
             stack.callback(process.kill)
         yield

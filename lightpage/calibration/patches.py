@@ -44,7 +44,7 @@ class Patch:
 
 @dataclass(frozen=True)
 class Measurement:
-    """What one patch says of one branch.
+    """Measurement of one branch on one patch.
 
     Attributes:
         branch: name.
@@ -98,7 +98,7 @@ def middle_patches(profile: Profile, all_patches: list[Patch], least: int) -> li
     """The patches in the middle third of the page, or as many around them, whole rings, as make `least`."""
 
     def distance(patch: Patch) -> float:
-        """From the page's centre; 1 on the middle's border."""
+        """Distance from the page's centre; 1 on the middle's border."""
         x, y = patch.centre_m
         return max(abs(x) / (_MIDDLE_X * profile.page_width_m), abs(y) / (_MIDDLE_Y * profile.page_height_m))
 

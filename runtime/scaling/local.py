@@ -36,26 +36,26 @@ class WorkerLink(Protocol):
 
     @property
     def status(self) -> int | None:
-        """Its exit status; None while it runs."""
+        """Exit status of the worker; None while it runs."""
 
     def send(self, data: bytes, deadline: float) -> None:
         """Send it a task."""
 
     def line(self, deadline: float) -> bytes:
-        """The next line of its answer."""
+        """Return the next line of its answer."""
 
     def has_line(self) -> bool:
-        """Whether a line has come already."""
+        """Return whether a line has come already."""
 
     def fileno(self) -> int:
-        """Of its socket."""
+        """Return the file descriptor of its socket."""
 
     def end(self, grace_s: float = 0.0) -> None:
-        """End it."""
+        """End the worker after so many seconds of grace."""
 
 
 def started(module: str, threads: int) -> WorkerLink:
-    """A process that runs a module with so many threads.
+    """Start a process that runs a module with so many threads.
 
     Raises:
         SurroundingsError, WorkerError: it cannot be started.
