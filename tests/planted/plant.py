@@ -117,7 +117,9 @@ def measure(faults: list[Fault], given: argparse.Namespace, temporary: Path) -> 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     known = [fault.id for fault in load("fault")]
-    parser.add_argument("--only", action="append", choices=known, metavar="ID", help="a fault; several times for several")
+    parser.add_argument(
+        "--only", action="append", choices=known, metavar="ID", help="a fault; several times for several"
+    )
     parser.add_argument("--tests", metavar="REV", help="take tests/ from this git revision")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="keeps results: the same command goes on")
     parser.add_argument("--json", type=Path, metavar="FILE", help="for the results")
