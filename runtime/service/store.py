@@ -37,9 +37,10 @@ LOCK = ".lock"
 UPLOAD = ".upload-"
 """How the name of an unfinished upload begins."""
 
-_PROBE = ".probe-"
+PROBE = ".probe-"
+"""How the name of a file begins that tries whether the store can be written."""
 
-_LEFTOVERS = (f"{UPLOAD}*", f"{SCRATCH}*", f"{_PROBE}*", f".{CURRENT}-*", ".*.zip-*")
+_LEFTOVERS = (f"{UPLOAD}*", f"{SCRATCH}*", f"{PROBE}*", f".{CURRENT}-*", ".*.zip-*")
 """Names of what a program that was killed leaves here."""
 
 KEPT_BUNDLES = 32
@@ -381,7 +382,7 @@ class ModelStore:
 
     def _probe(self, needed_bytes: int) -> None:
         self._check_folder()
-        descriptor, name = new_file(self.folder, _PROBE.strip(".-"))
+        descriptor, name = new_file(self.folder, PROBE.strip(".-"))
         try:
             with os.fdopen(descriptor, "wb") as file:
                 file.write(bytes(4096))

@@ -24,7 +24,7 @@ from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from runtime.rpc.server import LightpageServer
 from runtime.service.dataplane import DataPlane
 from runtime.service.recalibrator import Recalibrator
-from runtime.service.store import CURRENT, ModelStore
+from runtime.service.store import CURRENT, PROBE, ModelStore
 from runtime.wire.status import STATUS_KEY, error_of
 from tests.runtime import toy
 
@@ -58,8 +58,8 @@ class Running:
 
     @property
     def left_behind(self) -> list[str]:
-        """What lies in the store beside its note and its bundles."""
-        names = [path.name for path in self.store.folder.iterdir()]
+        """Names in the store beside its note, its bundles, and a probe that tries whether it can be written."""
+        names = [path.name for path in self.store.folder.iterdir() if not path.name.startswith(PROBE)]
         return [name for name in names if name != CURRENT and (name[0] == "." or not name.endswith(".zip"))]
 
     def count(self, name: str, **labels: str) -> float:

@@ -166,7 +166,7 @@ def test_a_caller_who_is_slow_leaves_nothing(stored: Start, new: Path) -> None:
 def test_a_caller_who_leaves_leaves_nothing_and_one_upload_is_taken_at_a_time(stored: Start, new: Path) -> None:
     service, data, more = stored(), new.read_bytes(), threading.Event()
     call = service.stub.UploadModel.future(until_told([header(data), chunk(data[:9])], more), timeout=60)
-    eventually(lambda: service.left_behind != [])
+    eventually(lambda: service.plane.uploads.busy == 1 and service.left_behind != [])
     with pytest.raises(SlotsTakenError):
         service.client.upload_model(new)
     call.cancel()
