@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import ClassVar
+from traceback import clear_frames
+from typing import ClassVar, Self
 
 
 class Cause(StrEnum):
@@ -140,3 +141,197 @@ class LimitError(LightpageError):
     """A request is larger than the service accepts."""
 
     cause = Cause.CONTENT
+
+
+
+class SourceError(LightpageError):
+    """The service's own source or recordings are missing, damaged or dark: nothing that the caller sent is wrong."""
+
+
+class NoSourceError(SourceError):
+    """The service has no source, or none that can do this."""
+
+
+class MalformedError(InvalidInputError):
+    """A message that cannot be parsed, or one of a stream that does not belong there."""
+
+
+class RequestIdError(InvalidInputError):
+    """A request id that was given with another request."""
+
+
+class StoppingError(LightpageError):
+    """The service is being stopped and drops the work."""
+
+
+class WorkerError(LightpageError):
+    """A process that the service had started was killed, broke, or took too long; what it worked on is as before."""
+
+
+class ProviderError(LightpageError):
+    """The execution provider that was asked for is not here, or failed: nothing is wrong with the bundle."""
+
+
+class NotAllowedError(LightpageError):
+    """The caller's certificate does not allow this."""
+
+
+class CallerLeft(Exception):
+    """The caller has gone away; the work is dropped."""
+
+
+class SlotsTakenError(BusyError):
+    """The service does as much as it may at once, and did so until the caller's time was up.
+
+    Args:
+        subject, got, expected: see `LightpageError`.
+        retry_s: when to try again, seconds from now; None where that is of no use.
+    """
+
+    def __init__(self, subject: str, got: object, expected: object, retry_s: float | None = None) -> None:
+        super().__init__(subject, got, expected)
+        self.retry_s = retry_s
+
+
+class OverloadedError(SlotsTakenError):
+    """What the caller wants could not be done before its deadline, so it is not begun."""
+
+
+class StalledError(LightpageError):
+    """The caller sent nothing for too long."""
+
+
+class JobCancelledError(LightpageError):
+    """Somebody cancelled the job; nothing was changed."""
+
+
+class NoSuchJobError(LightpageError):
+    """There is no such job, or it ended long ago."""
+
+
+class OtherModelError(BusyError):
+    """Another model is in service than the caller expected; nothing was changed. `got` is its version."""
+
+
+class NoSuchModelError(BundleError):
+    """The service has no such model, or none of this version."""
+
+
+class ModelExistsError(BundleError):
+    """The service has a model of this version already."""
+
+
+class StoreError(BundleError):
+    """The folder in which the service keeps its models is full, read-only, or gone; nothing was changed."""
+
+
+class Reason(StrEnum):
+    """Why a page is lost."""
+
+    UNSPECIFIED = "UNSPECIFIED"
+    PILOTS_DISAGREE = "PILOTS_DISAGREE"
+    """The pilots contradict what was decoded; the image was found, or nobody looked for it."""
+    IMAGE_NOT_FOUND = "IMAGE_NOT_FOUND"
+    """The same, and a search did not find the image: it lies further off, or the frames are not this page's."""
+    TOO_FEW_PILOTS = "TOO_FEW_PILOTS"
+    """The pilots agree, but are too few, or too dim, to tell a page from chance."""
+    MISSING_FRAME = "MISSING_FRAME"
+    """A camera sent no frame after a trigger."""
+    INCOMPLETE_FRAME = "INCOMPLETE_FRAME"
+    """Parts of a frame were lost on the way from a camera."""
+    SKIPPED_FRAME = "SKIPPED_FRAME"
+    """A frame's number does not follow the last one: a frame, or a trigger, was missed or doubled."""
+    STRAY_FRAME = "STRAY_FRAME"
+    """A frame came that no trigger was waiting for."""
+    OTHER_SHOT = "OTHER_SHOT"
+    """By its camera's clock a frame is not of this trigger."""
+    NOT_SYNCHRONISED = "NOT_SYNCHRONISED"
+    """The cameras' clocks do not agree with the trigger's for long enough to tell whose a frame is."""
+    CAMERA_GONE = "CAMERA_GONE"
+    """A camera does not answer any more."""
+    TRIGGER_GONE = "TRIGGER_GONE"
+    """The trigger does not answer any more."""
+    TRIGGER_REFUSED = "TRIGGER_REFUSED"
+    """The trigger answers with an error."""
+    NOT_ON_DISPLAY = "NOT_ON_DISPLAY"
+    """The page was not on display in time, or not until both frames were in."""
+    BEAM_CONTROL_FAILED = "BEAM_CONTROL_FAILED"
+    """A beam could not be blocked or let through."""
+
+
+class LostPageError(LightpageError):
+    """A page could not be read, and nothing that the caller sent need be wrong: write or read it again.
+
+    Args:
+        subject, got, expected: see `LightpageError`.
+        reason: why.
+        recalibration_due: whether the device has changed since it was calibrated, as far as this page shows.
+    """
+
+    cause = Cause.LIGHT
+
+    def __init__(
+        self,
+        subject: str,
+        got: object,
+        expected: object,
+        reason: Reason = Reason.UNSPECIFIED,
+        recalibration_due: bool = False,
+    ) -> None:
+        super().__init__(subject, got, expected)
+        self.reason, self.recalibration_due = reason, recalibration_due
+
+    def about(self, page: str) -> Self:
+        """The same error, and of which page it is."""
+        return type(self)(f"{page}: {self.subject}", self.got, self.expected, self.reason, self.recalibration_due)
+
+
+class LostShotError(LostPageError):
+    """A page was not photographed as one whole pair of frames; what is wrong is in the device."""
+
+    def __str__(self) -> str:
+        told = super().__str__()
+        return told if self.reason is Reason.UNSPECIFIED else f"{told} ({self.reason.value})"
+
+
+class UnconfirmedPageError(LostPageError):
+    """The pilots of a page do not bear out what the decoder claims of it: its symbols would be noise.
+
+    Attributes:
+        page: what was decoded, for figures and never for an answer (`runtime.decoding.tracking.unconfirmed_page`); None
+            on the client's side.
+    """
+
+    page: object = None
+
+    def of(self, page: object) -> Self:
+        """Itself, with what was decoded."""
+        self.page = page
+        return self
+
+    def about(self, page: str) -> Self:
+        """See `LostPageError`."""
+        return super().about(page).of(self.page)
+
+
+def let_go(error: BaseException) -> None:
+    """Drop what the frames hold that led to an error, and to those behind it: pairs of camera frames among it.
+
+    Whoever keeps the error for a while then keeps its class and words alone.
+    """
+    seen: set[int] = set()
+    waiting: list[BaseException | None] = [error]
+    while waiting:
+        one = waiting.pop()
+        if one is not None and id(one) not in seen:
+            seen.add(id(one))
+            clear_frames(one.__traceback__)
+            waiting += [one.__cause__, one.__context__]
+
+
+ERRORS: dict[str, type[LightpageError]] = {
+    name: kind
+    for name, kind in dict(globals()).items()
+    if isinstance(kind, type) and issubclass(kind, LightpageError)
+}
+"""Every error by its name, for one that another process has met."""
