@@ -6,7 +6,7 @@
 #       -e LIGHTPAGE_SERVICE__INSECURE=true lightpage:runtime
 #
 # The build argument `BASE` names the Debian that it is made from; a release names it with its digest. Python packages are
-# those of packaging/locks, each checked by its SHA-256 (docs/supply-chain.md).
+# those of release/locks, each checked by its SHA-256 (docs/supply-chain.md).
 #
 # Two optional build secrets carry the builder's own package settings in without leaving them in a layer:
 # `pip_conf` (a pip configuration file) and `ca_bundle` (trusted certificates, where the registry needs its own). A build
@@ -35,17 +35,20 @@ RUN apt-get update \
     && python3 -m venv /opt/build \
     && python3 -m venv --without-pip /opt/lightpage
 WORKDIR /src
-COPY packaging packaging
+COPY release release
 RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
     --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
     --mount=type=bind,from=packages,target=/run/packages \
-    /opt/build/bin/pip install --no-cache-dir --require-hashes --only-binary :all: --requirement packaging/locks/build.txt
+    /opt/build/bin/pip install --no-cache-dir --require-hashes --only-binary :all: --requirement release/locks/build.txt
 COPY pyproject.toml LICENSE README.md ./
 COPY lightpage lightpage
 COPY train train
 COPY export export
 COPY runtime runtime
-COPY analysis analysis
+COPY demo demo
+COPY report report
+COPY study study
+COPY virtual_device virtual_device
 RUN /opt/build/bin/pip wheel --no-deps --no-build-isolation --no-index --wheel-dir /dist .
 
 FROM base AS service
@@ -63,7 +66,7 @@ WORKDIR /state
 VOLUME ["/bundles", "/state"]
 EXPOSE 50051 50052
 HEALTHCHECK --interval=10s --timeout=5s --start-period=60s --retries=3 \
-    CMD ["python", "-m", "runtime.commands.healthcheck"]
+    CMD ["python", "-m", "lightpage.runtime.commands.service.healthcheck"]
 ENTRYPOINT ["lightpage", "serve"]
 CMD ["--source", "simulator:bench", "--address", "0.0.0.0:50051"]
 
@@ -71,7 +74,7 @@ FROM build AS build-runtime
 RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
     --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
     --mount=type=bind,from=packages,target=/run/packages \
-    packaging/install_locked.sh packaging/locks/runtime.txt /opt/lightpage
+    release/install_locked.sh release/locks/runtime.txt /opt/lightpage
 
 FROM service AS runtime
 COPY --from=build-runtime /opt/lightpage /opt/lightpage
@@ -80,7 +83,7 @@ FROM build AS build-camera
 RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
     --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
     --mount=type=bind,from=packages,target=/run/packages \
-    packaging/install_locked.sh packaging/locks/camera.txt /opt/lightpage
+    release/install_locked.sh release/locks/camera.txt /opt/lightpage
 
 FROM service AS camera
 USER 0:0
@@ -94,7 +97,7 @@ FROM build AS build-deep
 RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
     --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
     --mount=type=bind,from=packages,target=/run/packages \
-    packaging/install_locked.sh packaging/locks/deep.txt /opt/lightpage
+    release/install_locked.sh release/locks/deep.txt /opt/lightpage
 
 FROM service AS deep
 COPY --from=build-deep /opt/lightpage /opt/lightpage
@@ -103,7 +106,7 @@ FROM build AS build-gpu
 RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
     --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
     --mount=type=bind,from=packages,target=/run/packages \
-    packaging/install_locked.sh packaging/locks/gpu.txt /opt/lightpage
+    release/install_locked.sh release/locks/gpu.txt /opt/lightpage
 
 FROM service AS gpu
 COPY --from=build-gpu /opt/lightpage /opt/lightpage
@@ -113,7 +116,7 @@ FROM build AS build-ray
 RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
     --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
     --mount=type=bind,from=packages,target=/run/packages \
-    packaging/install_locked.sh packaging/locks/ray.txt /opt/lightpage
+    release/install_locked.sh release/locks/ray.txt /opt/lightpage
 
 FROM service AS ray
 COPY --from=build-ray /opt/lightpage /opt/lightpage

@@ -70,14 +70,14 @@ test-lowest: $(STAMP)  ## a share of the tests with the lowest versions that pyp
 	$(BIN)/uv pip compile --quiet --python $(LOWEST) --resolution lowest-direct --extra cpu pyproject.toml -o $(LOWEST)/requirements.txt
 	$(BIN)/uv pip install --quiet --python $(LOWEST) -r $(LOWEST)/requirements.txt pytest pytest-timeout onnx
 	$(ONE_THREAD) $(LOWEST)/bin/python -m pytest -q -p no:cacheprovider tests/lightpage/recording tests/lightpage/test_files.py \
-	    tests/runtime/bundle tests/runtime/decoding/test_following.py tests/runtime/wire tests/runtime/scaling/test_storage.py
+	    tests/runtime/model/bundle tests/runtime/model/decoding/test_following.py tests/runtime/client/wire tests/runtime/archives/run/test_storage.py
 
 lint: $(STAMP)  ## ruff, layers of imports, mypy --strict, rules of the tests, hadolint
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-cache --no-logo
 	$(BIN)/mypy
-	$(BIN)/mypy packaging/*.py
+	$(BIN)/mypy release/*.py
 	$(BIN)/python -m tests.rules
 	$(BIN)/hadolint Dockerfile
 
@@ -123,17 +123,17 @@ bench-service: $(STAMP)  ## the service under load, faults and attack, from outs
 	$(BIN)/python -m analysis.service.overload --json $(BENCH_SERVICE)/overload.json
 	$(BIN)/python -m analysis.service.lifecycle --json $(BENCH_SERVICE)/lifecycle.json
 	$(BIN)/python -m analysis.service.changes --json $(BENCH_SERVICE)/changes.json
-	$(BIN)/python -m analysis.service.hostile --json $(BENCH_SERVICE)/hostile.json
-	$(BIN)/python -m analysis.service.outgoing --json $(BENCH_SERVICE)/outgoing.json
+	$(BIN)/python -m analysis.attacks.hostile --json $(BENCH_SERVICE)/hostile.json
+	$(BIN)/python -m analysis.attacks.outgoing --json $(BENCH_SERVICE)/outgoing.json
 	$(BIN)/python -m analysis.service.inference_protocol --out $(BENCH_SERVICE)/inference-protocol --json $(BENCH_SERVICE)/inference-protocol.json
-	$(BIN)/python -m analysis.service.kills --out $(BENCH_SERVICE)/kills --json $(BENCH_SERVICE)/kills.json
-	$(BIN)/python -m analysis.service.identity --json $(BENCH_SERVICE)/identity.json
+	$(BIN)/python -m analysis.attacks.kills --out $(BENCH_SERVICE)/kills --json $(BENCH_SERVICE)/kills.json
+	$(BIN)/python -m analysis.attacks.identity --json $(BENCH_SERVICE)/identity.json
 	$(BIN)/python -m analysis.service.transport --json $(BENCH_SERVICE)/transport.json
-	$(BIN)/python -m analysis.service.memory_attacks --json $(BENCH_SERVICE)/memory.json
+	$(BIN)/python -m analysis.attacks.memory_attacks --json $(BENCH_SERVICE)/memory.json
 	$(BIN)/python -m analysis.hardware.recalibration --load 0.6 --json $(BENCH_SERVICE)/recalibration.json
 
 dashboard: $(STAMP)  ## draw docs/images/dashboard.png from a service under load: needs prometheus
-	$(BIN)/python -m analysis.service.dashboard --out docs/images/dashboard.png
+	$(BIN)/python -m analysis.dashboard.dashboard --out docs/images/dashboard.png
 
 bench-other-servers: $(STAMP)  ## the service beside MLServer, KServe and Ray Serve with the same graph: installs them first, 1.5 GB
 	@mkdir -p $(BENCH_SERVICE)
@@ -184,27 +184,27 @@ proto: $(STAMP)  ## regenerate the gRPC stubs from proto/
 
 image:  ## build the container image (IMAGE_TARGET=runtime, camera, deep, gpu or ray; RELEASE=1 BASE=NAME@sha256:DIGEST; IMAGE_PLATFORM)
 	LIGHTPAGE_RELEASE=$(RELEASE) LIGHTPAGE_BASE=$(BASE) LIGHTPAGE_PLATFORM=$(IMAGE_PLATFORM) \
-	    packaging/build_image.sh $(IMAGE_TARGET) $(IMAGE_TAG)
+	    release/build_image.sh $(IMAGE_TARGET) $(IMAGE_TAG)
 
 # Needs root where buildah made the image, since it mounts it; so does check-image.
 sbom: $(STAMP)  ## write build/sbom/lightpage-TARGET.cdx.json: all that is in the image, as CycloneDX
-	LIGHTPAGE_PYTHON=$(BIN)/python packaging/write_sbom.sh $(IMAGE_TAG)
+	LIGHTPAGE_PYTHON=$(BIN)/python release/write_sbom.sh $(IMAGE_TAG)
 
 check-image:  ## start the image that buildah built, and see whether it keeps its promises
-	packaging/check_image.sh $(IMAGE_TAG) $(BUNDLE)
+	release/check_image.sh $(IMAGE_TAG) $(BUNDLE)
 
 check-camera-image: $(STAMP)  ## the same with image `camera`, which then does the main job over the simulated device
 	LIGHTPAGE_CHECK_DEVICE=build/device $(BIN)/lightpage virtual-device --out build/device -- \
-	    packaging/check_image.sh lightpage:camera
+	    release/check_image.sh lightpage:camera
 
-lock: $(STAMP)  ## write packaging/locks anew from pyproject.toml and constraints.txt: versions, and a SHA-256 of every file
-	UV_FIND_LINKS="$${UV_FIND_LINKS:-$$PIP_FIND_LINKS}" $(BIN)/python packaging/lock.py
+lock: $(STAMP)  ## write release/locks anew from pyproject.toml and constraints.txt: versions, and a SHA-256 of every file
+	UV_FIND_LINKS="$${UV_FIND_LINKS:-$$PIP_FIND_LINKS}" $(BIN)/python release/lock.py
 
 licences: $(STAMP)  ## list the licences of all that is in the image, by its SBOM; fails on one that is not allowed
-	$(BIN)/python packaging/licences.py build/sbom/$(subst /,-,$(subst :,-,$(IMAGE_TAG))).cdx.json
+	$(BIN)/python release/licences.py build/sbom/$(subst /,-,$(subst :,-,$(IMAGE_TAG))).cdx.json
 
 audit: $(STAMP)  ## ask for known vulnerabilities of the locked packages; ends with 3 where nobody could tell of all
-	$(BIN)/python packaging/audit.py
+	$(BIN)/python release/audit.py
 
 clean:  ## remove what was built and measured, and leave the environment
 	rm -rf build out .pytest_cache .mypy_cache .ruff_cache

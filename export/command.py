@@ -11,7 +11,11 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from export.graph import (
+from lightpage.calibration.sampling_table import sampling_table
+from lightpage.cli.paths import NewPath, OutputFile
+from lightpage.cli.progress_bar import percent_bar
+from lightpage.errors import BundleError, InvalidInputError
+from lightpage.export.graph import (
     FRAME_INPUTS,
     DecoderGraph,
     FieldGraph,
@@ -20,22 +24,18 @@ from export.graph import (
     published_tensors,
     table_tensors,
 )
-from export.half import LARGEST_DEVIATION, PRECISIONS, check_deviation, in_half, rounded
-from export.onnx_files import decoder_onnx, field_onnx, twin_onnx
-from export.parity import check_parity, torch_answer
-from lightpage.calibration.sampling_table import sampling_table
-from lightpage.cli.paths import NewPath, OutputFile
-from lightpage.cli.progress_bar import percent_bar
-from lightpage.errors import BundleError, InvalidInputError
+from lightpage.export.half import LARGEST_DEVIATION, PRECISIONS, check_deviation, in_half, rounded
+from lightpage.export.onnx_files import decoder_onnx, field_onnx, twin_onnx
+from lightpage.export.parity import check_parity, torch_answer
 from lightpage.files import write_json
 from lightpage.progress import Progress, note, warn
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
-from runtime.bulk.coded_pages import choose_code
-from runtime.bulk.evaluation import check_recording
-from runtime.bundle.bundle import Bundle, npz, write_bundle
-from runtime.bundle.golden import in_few_counts, shows_page
-from runtime.bundle.manifest import (
+from lightpage.runtime.archives.recordings.coded_pages import choose_code
+from lightpage.runtime.archives.recordings.evaluation import check_recording
+from lightpage.runtime.model.bundle.bundle import Bundle, npz, write_bundle
+from lightpage.runtime.model.bundle.golden import in_few_counts, shows_page
+from lightpage.runtime.model.bundle.manifest import (
     DECODER,
     FIELD,
     FLOAT16,
@@ -49,15 +49,15 @@ from runtime.bundle.manifest import (
     check_version,
     sha256,
 )
-from runtime.decoding.decoder import GOLDEN_TOLERANCE, PAGE_INPUTS, Decoder
-from runtime.decoding.frames import narrow
-from runtime.decoding.image_tracker import tracker_for
-from runtime.execution.session import open_session
-from train.models.twin import RayTwin, TorchTwin
-from train.published.trainer import published_decoder
-from train.published.training import PublishedChoices
-from train.runs import GOLDEN as RUN_GOLDEN
-from train.runs import REFERENCES, Run, load_arrays, load_decoder, load_run, load_weights
+from lightpage.runtime.model.decoding.decoder import GOLDEN_TOLERANCE, PAGE_INPUTS, Decoder
+from lightpage.runtime.model.decoding.frames import narrow
+from lightpage.runtime.model.decoding.image_tracker import tracker_for
+from lightpage.runtime.model.execution.session import open_session
+from lightpage.train.models.twin import RayTwin, TorchTwin
+from lightpage.train.published.trainer import published_decoder
+from lightpage.train.published.training import PublishedChoices
+from lightpage.train.runs import GOLDEN as RUN_GOLDEN
+from lightpage.train.runs import REFERENCES, Run, load_arrays, load_decoder, load_run, load_weights
 
 Tensors = dict[str, NDArray[np.generic]]
 PILOT_ARRAYS = {"mask": "pilots", "phases": "pilot_phases"}

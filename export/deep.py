@@ -9,32 +9,32 @@ from pathlib import Path
 
 import torch
 
-from export.command import export_run
 from lightpage.calibration.calibrate import calibrate
 from lightpage.calibration.document import Calibration, load_calibration, parse_calibration
 from lightpage.calibration.known_pages import known_pages
 from lightpage.errors import CalibrationError, InvalidInputError
+from lightpage.export.command import export_run
 from lightpage.progress import Progress, note
 from lightpage.recording.reader import Recording
-from runtime.bundle.bundle import Bundle, write_bundle
-from runtime.bundle.manifest import Manifest, Provenance
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.image_tracker import tracker_for
-from runtime.recalibration.judgement import JudgedPage, Verdict, judge, judged_pages
-from runtime.recalibration.known_pages import KnownPages, read_recorded
-from runtime.recalibration.outcome import RecalibrationOutcome, RefitReport
-from runtime.recalibration.recalibration import next_version
-from runtime.recalibration.refit import refit
-from runtime.scaling.fine_tuning import DeepRecalibration
-from runtime.scaling.task import FineTuning
-from train.fitting.memory import keep_freed_memory
-from train.models.field import FieldRecovery, TorchFieldSolver
-from train.models.hyperparameters import Hyperparameters
-from train.models.twin import RayTwin, TorchTwin
-from train.processes import ONE
-from train.runs import WEIGHTS, load_run, sole_writer
-from train.trainers.symbols import SymbolTrainer
-from train.trainers.whole_run import Split, make_run, usable_pages
+from lightpage.runtime.archives.run.task import FineTuning
+from lightpage.runtime.archives.workers.fine_tuning import DeepRecalibration
+from lightpage.runtime.model.bundle.bundle import Bundle, write_bundle
+from lightpage.runtime.model.bundle.manifest import Manifest, Provenance
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.image_tracker import tracker_for
+from lightpage.runtime.recalibration.judgement import JudgedPage, Verdict, judge, judged_pages
+from lightpage.runtime.recalibration.known_pages import KnownPages, read_recorded
+from lightpage.runtime.recalibration.outcome import RecalibrationOutcome, RefitReport
+from lightpage.runtime.recalibration.recalibration import next_version
+from lightpage.runtime.recalibration.refit import refit
+from lightpage.train.fitting.memory import keep_freed_memory
+from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
+from lightpage.train.models.hyperparameters import Hyperparameters
+from lightpage.train.models.twin import RayTwin, TorchTwin
+from lightpage.train.processes import ONE
+from lightpage.train.runs import WEIGHTS, load_run, sole_writer
+from lightpage.train.trainers.symbols import SymbolTrainer
+from lightpage.train.trainers.whole_run import Split, make_run, usable_pages
 
 VALIDATION_SHARE, TEST_SHARE = 0.1, 0.2
 """Of the known pages: those that say which weights are best, and those that the old and the new model are judged by."""
@@ -48,7 +48,7 @@ _WANTED = "the folder of the training run that the device's bundle was made from
 
 
 class TorchRecalibration:
-    """See `runtime.scaling.fine_tuning.DeepRecalibration`."""
+    """See `lightpage.runtime.archives.workers.fine_tuning.DeepRecalibration`."""
 
     def check(self, bundle: Path, run: Path | None, pages: int) -> None:
         """See there."""

@@ -12,9 +12,9 @@ from torch import Tensor, nn
 
 from lightpage.device.profile import Profile
 from lightpage.recording.frame_pair import FramePair
-from train.models.decoder import SymbolDecoder
-from train.models.field import FieldRecovery, relative_power
-from train.published.decoder import PublishedDecoder, sample_frames
+from lightpage.train.models.decoder import SymbolDecoder
+from lightpage.train.models.field import FieldRecovery, relative_power
+from lightpage.train.published.decoder import PublishedDecoder, sample_frames
 
 FRAME_INPUTS = ("in_phase", "quadrature")
 ANSWERS = ("p", "phase", "concentration")

@@ -15,9 +15,9 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, shape_inference
 
-from export.graph import FRAME_INPUTS
 from lightpage.errors import BundleError, InvalidInputError
-from runtime.bundle.manifest import FLOAT16, FLOAT32, Precision
+from lightpage.export.graph import FRAME_INPUTS
+from lightpage.runtime.model.bundle.manifest import FLOAT16, FLOAT32, Precision
 
 PRECISIONS: tuple[Precision, ...] = (FLOAT32, FLOAT16)
 LARGEST_DEVIATION = 1e-2
@@ -35,7 +35,7 @@ def in_half(model: bytes, fed: Collection[str]) -> bytes:
     What follows from the table alone is computed once, in float32, and rounded.
 
     Args:
-        model: serialised, its nodes named after the modules that they come from (`export.onnx_files`).
+        model: serialised, its nodes named after the modules that they come from (`lightpage.export.onnx_files`).
         fed: table inputs that may differ from page to page.
 
     Raises:

@@ -17,9 +17,9 @@ from onnx import numpy_helper
 from onnxscript import optimizer
 from torch import nn
 
-from export.graph import FRAME_INPUTS, HALVED, TABLE_INPUTS, FieldGraph, Graph
 from lightpage.calibration.parameters import nominal
-from train.models.twin import RayTwin
+from lightpage.export.graph import FRAME_INPUTS, HALVED, TABLE_INPUTS, FieldGraph, Graph
+from lightpage.train.models.twin import RayTwin
 
 OPSET = 20
 _FOLDED = 20_000

@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from export.graph import Graph
 from lightpage.errors import BundleError
+from lightpage.export.graph import Graph
 from lightpage.recording.frame_pair import FramePair
-from runtime.bundle.manifest import FLOAT32
-from runtime.decoding.decoder import GOLDEN_TOLERANCE
+from lightpage.runtime.model.bundle.manifest import FLOAT32
+from lightpage.runtime.model.decoding.decoder import GOLDEN_TOLERANCE
 
 
 def torch_answer(

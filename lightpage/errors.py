@@ -143,7 +143,6 @@ class LimitError(LightpageError):
     cause = Cause.CONTENT
 
 
-
 class SourceError(LightpageError):
     """The service's own source or recordings are missing, damaged or dark: nothing that the caller sent is wrong."""
 
@@ -298,7 +297,7 @@ class UnconfirmedPageError(LostPageError):
     """The pilots of a page do not bear out what the decoder claims of it: its symbols would be noise.
 
     Attributes:
-        page: what was decoded, for figures and never for an answer (`runtime.decoding.tracking.unconfirmed_page`); None
+        page: what was decoded, for figures and never for an answer (`unconfirmed_page`); None
             on the client's side.
     """
 
@@ -330,8 +329,6 @@ def let_go(error: BaseException) -> None:
 
 
 ERRORS: dict[str, type[LightpageError]] = {
-    name: kind
-    for name, kind in dict(globals()).items()
-    if isinstance(kind, type) and issubclass(kind, LightpageError)
+    name: kind for name, kind in dict(globals()).items() if isinstance(kind, type) and issubclass(kind, LightpageError)
 }
 """Every error by its name, for one that another process has met."""

@@ -42,7 +42,7 @@ class HelperProcess:
             try:
                 # In a session of its own: Ctrl-C is for the service, which then ends its helpers.
                 self._process = subprocess.Popen(
-                    [sys.executable, "-m", module, *arguments],
+                    [sys.executable, "-P", "-m", module, *arguments],
                     stdin=other.fileno(),
                     stdout=subprocess.DEVNULL,
                     start_new_session=True,

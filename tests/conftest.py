@@ -19,9 +19,9 @@ from lightpage.calibration.parameters import NAMES
 from lightpage.cli.simulate import simulate
 from lightpage.device.profile import Profile, load_profile
 from lightpage.device.state import Device
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.simulator.true_optics import true_parameters
-from runtime.bundle.bundle import Bundle
-from runtime.decoding.decoder import Decoder
 from tests.lightpage.small import small_profile
 from tests.runtime import toy
 
@@ -50,7 +50,7 @@ def bench_calibration(
     """The bench profile, a recording of a realistic device, and what the command finds by its first page."""
 
     def make(out: Path) -> None:
-        from train.commands.calibrate import calibrate
+        from lightpage.train.commands.calibrate import calibrate
 
         _command(calibrate, "--profile", "bench", "--recording", bench_recording, "--pages", 1, "--out", out)
 
@@ -82,7 +82,7 @@ def small_run(small_device: list[str], tmp_path_factory: pytest.TempPathFactory)
     """A training of two passes on the small device: four pages to train on, two to validate, two left."""
 
     def make(out: Path) -> None:
-        from train.commands.train import train
+        from lightpage.train.commands.train import train
 
         size = "--channels 12 --blocks 1 --synthetic-pages 0 --validation-share 0.25 --test-share 0.25 --steps 120"
         _command(train, *small_device, *size.split(), "--out", out)
@@ -95,7 +95,7 @@ def small_bundle(small_run: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     """The bundle of that training, version small-1."""
 
     def make(out: Path) -> None:
-        from export.command import export_run
+        from lightpage.export.command import export_run
 
         export_run(small_run, out, version="small-1")
 
@@ -107,7 +107,7 @@ def ray_run(small_device: list[str], tmp_path_factory: pytest.TempPathFactory) -
     """A few steps of the published decoder by rays on the small device."""
 
     def make(out: Path) -> None:
-        from train.commands.train import train
+        from lightpage.train.commands.train import train
 
         _command(train, *small_device, "--localizer", "ray", "--channels", 4, "--steps", 12, "--out", out)
 

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import pytest
 
-from runtime.cameras.aravis_library import PACKAGE, aravis
-from runtime.errors import SourceError
-from runtime.virtual_device import namespace
+from lightpage.errors import SourceError
+from lightpage.runtime.device.cameras.aravis_library import PACKAGE, aravis
+from lightpage.virtual_device import namespace
 from tests.skips import NO_NETWORKS
 
 MARKER = "own_network"

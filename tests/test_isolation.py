@@ -21,24 +21,25 @@ def watch(name, *rest, **named):
         telemetry.append(os.environ.get("ORT_DISABLE_TELEMETRY"))
     return load(name, *rest, **named)
 builtins.__import__ = watch
-import runtime
-for module in pkgutil.walk_packages(runtime.__path__, "runtime."):
+import lightpage.runtime
+for module in pkgutil.walk_packages(lightpage.runtime.__path__, "lightpage.runtime."):
     importlib.import_module(module.name)
-from runtime.acquisition.sources import open_source
-from runtime.bundle.bundle import Bundle
-from runtime.client.client import LightpageClient
-from runtime.decoding.decoder import Decoder
-from runtime.rpc.server import LightpageServer
-from runtime.service.dataplane import DataPlane
-from runtime.service.recalibrator import Recalibrator
-from runtime.service.registry import ModelRegistry
+from lightpage.runtime.device.acquisition.sources import open_source
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.client.client import LightpageClient
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.service.server.server import LightpageServer
+from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.jobs.recalibrator import Recalibrator
+from lightpage.runtime.service.models.registry import ModelRegistry
 plane = DataPlane(ModelRegistry(Decoder(Bundle.open(sys.argv[1]))), open_source("recording:" + sys.argv[2]))
 server = LightpageServer(plane, Recalibrator(plane, None))
 with server, LightpageClient(server.target) as client:
     page = client.read_page(want_written=True)
     assert (page.symbols == page.written).all()
-loaded = {name.partition(".")[0] for name in sys.modules}
-bad = loaded & {"torch", "lightning", "onnx", "onnxscript", "opentelemetry", "ray", "train", "export", "tests"}
+loaded = {name.partition(".")[0] for name in sys.modules} | {".".join(name.split(".")[:2]) for name in sys.modules}
+bad = loaded & {"torch", "lightning", "onnx", "onnxscript", "opentelemetry", "ray", "tests"}
+bad |= loaded & {"lightpage.train", "lightpage.export", "lightpage.study", "lightpage.report", "runtime"}
 assert not bad, bad
 assert telemetry and set(telemetry) == {"1"}, telemetry
 """
@@ -64,8 +65,8 @@ if child == 0:
     socket.socket(socket.AF_INET)
     os._exit(0)
 assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGSYS
-from runtime.bundle.bundle import Bundle
-from runtime.decoding.decoder import Decoder
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.decoding.decoder import Decoder
 decoder = Decoder(Bundle.open(sys.argv[1]))
 decoder.decode(decoder.bundle.golden.pair, 16)
 """
@@ -94,6 +95,6 @@ def test_decoding_asks_for_no_connection_to_anybody(toy_zip: Path) -> None:
 
 def test_every_folder_of_code_is_a_package() -> None:
     """Setuptools leaves a folder without `__init__.py` out of the image, and here nobody would notice."""
-    packages = [ROOT / name for name in ("lightpage", "train", "runtime", "export", "analysis")]
-    folders = {path.parent for package in packages for path in package.rglob("*.py")}
+    walked = list(os.walk(ROOT / "lightpage", followlinks=True))
+    folders = [Path(folder) for folder, _, names in walked if any(name.endswith(".py") for name in names)]
     assert [str(folder.relative_to(ROOT)) for folder in folders if not (folder / "__init__.py").exists()] == []

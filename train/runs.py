@@ -23,12 +23,12 @@ from lightpage.calibration.document import Calibration, parse_calibration
 from lightpage.device.profile import Profile, parse_profile
 from lightpage.errors import InvalidInputError
 from lightpage.files import lock, replace_file, replace_text
-from train.fitting.fitted import CHECKPOINTS, FITTED
-from train.models.decoder import SymbolDecoder
-from train.models.hyperparameters import Hyperparameters
-from train.processes import is_first_process
-from train.published.localizers import NAMES as PUBLISHED
-from train.published.training import PublishedChoices
+from lightpage.train.fitting.fitted import CHECKPOINTS, FITTED
+from lightpage.train.models.decoder import SymbolDecoder
+from lightpage.train.models.hyperparameters import Hyperparameters
+from lightpage.train.processes import is_first_process
+from lightpage.train.published.localizers import NAMES as PUBLISHED
+from lightpage.train.published.training import PublishedChoices
 
 BEGUN = "begun.json"
 DESCRIPTION = "run.json"

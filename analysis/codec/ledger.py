@@ -31,14 +31,14 @@ from lightpage.device.state import Device
 from lightpage.files import write_json
 from lightpage.recording.pages import Pages, PagesWriter
 from lightpage.recording.reader import Recording
+from lightpage.runtime.archives.recordings.coded_pages import choose_code
+from lightpage.runtime.archives.recordings.recovery import Recovery, recover
+from lightpage.runtime.model.bundle.shipped import bundle_path
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.simulator.recording_job import RecordingJob
-from runtime.bulk.coded_pages import choose_code
-from runtime.bulk.recovery import Recovery, recover
-from runtime.bundle.shipped import bundle_path
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.image_tracker import tracker_for
-from train.models.decoder import COHERENT, WAVE
-from train.models.presets import FAST
+from lightpage.train.models.decoder import COHERENT, WAVE
+from lightpage.train.models.presets import FAST
 
 WEIGHTS = Path("analysis/weights")
 LOSS = 1e-6

@@ -20,13 +20,13 @@ from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import symbol_phases
 from lightpage.progress import track
 from lightpage.recording.reader import Recording
-from runtime.bulk.coded_pages import AIR_LEVELS, phase_errors
-from runtime.bulk.evaluation import was_seen
-from runtime.bundle.shipped import DEFAULT, bundle_path
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.frames import narrow
-from runtime.decoding.image_tracker import tracker_for
-from runtime.decoding.phase_refit import ROUNDS, PhaseRefit
+from lightpage.runtime.archives.recordings.coded_pages import AIR_LEVELS, phase_errors
+from lightpage.runtime.archives.recordings.evaluation import was_seen
+from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.frames import narrow
+from lightpage.runtime.model.decoding.image_tracker import tracker_for
+from lightpage.runtime.model.decoding.phase_refit import ROUNDS, PhaseRefit
 
 LEVELS = (32, 64, 128, 256)
 Page = tuple[NDArray[np.float32], NDArray[np.float32]]

@@ -25,8 +25,8 @@ from lightpage.errors import LightpageError
 from lightpage.files import write_json
 from lightpage.page.symbols import pilot_mask, pilot_symbols, symbol_phases
 from lightpage.progress import track
-from runtime.bundle.bundle import Bundle
-from runtime.bundle.shipped import bundle_path
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.bundle.shipped import bundle_path
 
 Floats = NDArray[np.float64]
 Damage = Callable[[Floats, Floats, np.random.Generator], None]

@@ -25,16 +25,16 @@ from lightpage.cli.paths import OutputFolder
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device
 from lightpage.files import write_json
-from train.data.feature_store import FeatureStore, fill
-from train.data.features import FeatureExtractor, PageFeatures
-from train.data.patches import training_pages
-from train.fitting.fit import fit_network
-from train.fitting.memory import keep_freed_memory
-from train.models.field import ROUNDS
-from train.models.hyperparameters import Hyperparameters
-from train.models.network import SymbolUNet
-from train.processes import ONE
-from train.runs import sole_writer
+from lightpage.train.data.feature_store import FeatureStore, fill
+from lightpage.train.data.features import FeatureExtractor, PageFeatures
+from lightpage.train.data.patches import training_pages
+from lightpage.train.fitting.fit import fit_network
+from lightpage.train.fitting.memory import keep_freed_memory
+from lightpage.train.models.field import ROUNDS
+from lightpage.train.models.hyperparameters import Hyperparameters
+from lightpage.train.models.network import SymbolUNet
+from lightpage.train.processes import ONE
+from lightpage.train.runs import sole_writer
 
 NOTHING = "nothing"
 REFLECTIONS, POSITIONS = "reflections", "positions"

@@ -29,28 +29,28 @@ from lightpage.metrics.measures import measure
 from lightpage.page.symbols import pilot_mask
 from lightpage.recording.reader import Recording
 from lightpage.simulator.true_optics import perfectly_calibrated
-from train.data.feature_store import FeatureStore, fill
-from train.data.features import FeatureExtractor, PageFeatures
-from train.data.known_light import explained
-from train.data.pages import Page
-from train.data.patches import training_pages
-from train.fitting.concentration_scale import best_kappa_scale, decode_pages
-from train.fitting.fit import fit_network
-from train.fitting.fitted import Fitted
-from train.fitting.modules import DecoderTraining, SymbolTraining
-from train.fitting.validation import without_piston
-from train.models.decoder import LOCALIZERS
-from train.models.hyperparameters import Hyperparameters
-from train.models.prediction import Prediction
-from train.models.presets import FAST, PRESETS
-from train.processes import ONE
-from train.published.localizers import NAMES as PUBLISHED
-from train.published.states import page_states
-from train.published.trainer import train_published
-from train.published.training import FramePages, PublishedChoices
-from train.runs import begin
-from train.trainers.refinement import RefinementPages, fit_prediction, fit_refinements, refined_pages
-from train.trainers.symbols import MATCHED_PAGES
+from lightpage.train.data.feature_store import FeatureStore, fill
+from lightpage.train.data.features import FeatureExtractor, PageFeatures
+from lightpage.train.data.known_light import explained
+from lightpage.train.data.pages import Page
+from lightpage.train.data.patches import training_pages
+from lightpage.train.fitting.concentration_scale import best_kappa_scale, decode_pages
+from lightpage.train.fitting.fit import fit_network
+from lightpage.train.fitting.fitted import Fitted
+from lightpage.train.fitting.modules import DecoderTraining, SymbolTraining
+from lightpage.train.fitting.validation import without_piston
+from lightpage.train.models.decoder import LOCALIZERS
+from lightpage.train.models.hyperparameters import Hyperparameters
+from lightpage.train.models.prediction import Prediction
+from lightpage.train.models.presets import FAST, PRESETS
+from lightpage.train.processes import ONE
+from lightpage.train.published.localizers import NAMES as PUBLISHED
+from lightpage.train.published.states import page_states
+from lightpage.train.published.trainer import train_published
+from lightpage.train.published.training import FramePages, PublishedChoices
+from lightpage.train.runs import begin
+from lightpage.train.trainers.refinement import RefinementPages, fit_prediction, fit_refinements, refined_pages
+from lightpage.train.trainers.symbols import MATCHED_PAGES
 
 Real = NDArray[np.float64]
 

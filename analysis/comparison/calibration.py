@@ -9,7 +9,7 @@ the true cameras and turn, the image's drift included. The cameras' relation is 
 wrong against the in-phase one, root mean square over the page: the field that is recovered from both depends on it. A
 foreign device comes from a simulator that shares nothing with this project; its true geometry has other parameters, so
 it has neither. An interrupted run goes on where it stopped: seeds that are in the JSON file are not computed again,
-failed ones are; a file of another format of runs (`train.runs.FORMAT`) is refused.
+failed ones are; a file of another format of runs (`lightpage.train.runs.FORMAT`) is refused.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
+from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
+from lightpage.train.models.twin import RayTwin, TorchTwin
+from lightpage.train.runs import FORMAT
 from lightpage.waves.grid import field_grid
-from train.models.field import FieldRecovery, TorchFieldSolver
-from train.models.twin import RayTwin, TorchTwin
-from train.runs import FORMAT
 
 LEVELS = 256
 WANTED_SHARE = 0.95

@@ -14,9 +14,9 @@ from lightpage.device.profile import Profile
 from lightpage.device.state import Device, Sensor
 from lightpage.recording.reader import Recording, hash_frames
 from lightpage.simulator.recording_job import RecordingJob
-from train.models.field import FieldRecovery, TorchFieldSolver
-from train.models.twin import RayTwin, TorchTwin
-from train.runs import begin
+from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
+from lightpage.train.models.twin import RayTwin, TorchTwin
+from lightpage.train.runs import begin
 
 LEVELS = 256
 CALIBRATED = 2

@@ -36,12 +36,12 @@ from lightpage.cli.paths import OutputFolder
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, Sensor, ideal_device
 from lightpage.files import write_json
-from train.fitting.memory import keep_freed_memory
-from train.models.hyperparameters import Hyperparameters
-from train.models.presets import FAST
-from train.published.localizers import NAMES as PUBLISHED
-from train.published.trainer import published_choices
-from train.runs import sole_writer
+from lightpage.train.fitting.memory import keep_freed_memory
+from lightpage.train.models.hyperparameters import Hyperparameters
+from lightpage.train.models.presets import FAST
+from lightpage.train.published.localizers import NAMES as PUBLISHED
+from lightpage.train.published.trainer import published_choices
+from lightpage.train.runs import sole_writer
 
 
 class Size(click.ParamType[str]):

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from train.published.localizers import NAMES as PUBLISHED
+from lightpage.train.published.localizers import NAMES as PUBLISHED
 
 MAP = "air_map.npy"
 """File of a method's run: AIR of each symbol, mean over the held-out pages, [ny, nx]."""

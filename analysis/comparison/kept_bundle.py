@@ -18,9 +18,6 @@ import torch
 
 from analysis.comparison.data_set import CALIBRATED
 from analysis.comparison.weight_store import CALIBRATION
-from export.command import export_run
-from export.graph import DecoderGraph, table_tensors
-from export.parity import torch_answer
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.calibration.known_pages import known_pages
@@ -30,21 +27,24 @@ from lightpage.cli.paths import NewPath, OutputFolder
 from lightpage.device.profile import Profile, parse_profile
 from lightpage.device.state import Device
 from lightpage.errors import InvalidInputError
+from lightpage.export.command import export_run
+from lightpage.export.graph import DecoderGraph, table_tensors
+from lightpage.export.parity import torch_answer
 from lightpage.page.symbols import pilot_mask, symbol_phases
 from lightpage.recording.reader import Recording, hash_frames
 from lightpage.simulator.recording_job import RecordingJob
-from train.data.features import FeatureExtractor
-from train.data.known_light import explained
-from train.fitting.concentration_scale import calibrating_factor
-from train.fitting.fitted import FITTED, FITTED_WEIGHTS
-from train.fitting.validation import without_piston
-from train.models.decoder import COHERENT, SymbolDecoder
-from train.models.hyperparameters import Hyperparameters
-from train.models.presets import FAST
-from train.models.twin import RayTwin, TorchTwin
-from train.runs import BEGUN, GOLDEN, REFERENCES, Run, renamed, save_arrays, save_weights
-from train.trainers.refinement import fit_prediction
-from train.trainers.symbols import MATCHED_PAGES
+from lightpage.train.data.features import FeatureExtractor
+from lightpage.train.data.known_light import explained
+from lightpage.train.fitting.concentration_scale import calibrating_factor
+from lightpage.train.fitting.fitted import FITTED, FITTED_WEIGHTS
+from lightpage.train.fitting.validation import without_piston
+from lightpage.train.models.decoder import COHERENT, SymbolDecoder
+from lightpage.train.models.hyperparameters import Hyperparameters
+from lightpage.train.models.presets import FAST
+from lightpage.train.models.twin import RayTwin, TorchTwin
+from lightpage.train.runs import BEGUN, GOLDEN, REFERENCES, Run, renamed, save_arrays, save_weights
+from lightpage.train.trainers.refinement import fit_prediction
+from lightpage.train.trainers.symbols import MATCHED_PAGES
 
 LEVELS = 256
 JUDGED = 3

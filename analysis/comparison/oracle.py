@@ -15,7 +15,7 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
 from lightpage.simulator.cameras import resample
 from lightpage.simulator.true_optics import TrueOptics, perfectly_calibrated
-from train.data.features import FeatureExtractor, PageFeatures
+from lightpage.train.data.features import FeatureExtractor, PageFeatures
 
 
 def without_signal_power(

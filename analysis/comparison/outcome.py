@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.comparison.levels import LevelFigures
-from analysis.report.data import exit_centroids
 from lightpage.calibration.document import Calibration
 from lightpage.device.profile import Profile
-from train.fitting.curves import Curve
+from lightpage.report.contents.data import exit_centroids
+from lightpage.train.fitting.curves import Curve
 
 WALLS = {"no wall": (0, 0), "x": (1, 0), "y": (0, 1), "both": (1, 1)}
 """Whether a symbol's light meets walls of a pair, as the columns of the table say it."""

@@ -16,8 +16,8 @@ import torch
 
 from lightpage.errors import InvalidInputError
 from lightpage.files import replace_file
-from train.fitting.fitted import CHECKPOINTS, FITTED, FITTED_WEIGHTS
-from train.runs import BEGUN, FORMAT, renamed
+from lightpage.train.fitting.fitted import CHECKPOINTS, FITTED, FITTED_WEIGHTS
+from lightpage.train.runs import BEGUN, FORMAT, renamed
 
 TRAINED = Path(__file__).parents[1] / "weights"
 CALIBRATION = "calibration.toml"

@@ -25,21 +25,21 @@ from numpy.typing import NDArray
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import load_profile
+from lightpage.errors import LostShotError
 from lightpage.files import write_json
 from lightpage.progress import track
 from lightpage.recording.layout import FrameInfo, frame_type
-from runtime.acquisition.camera_source import CameraSource, Exposures
-from runtime.acquisition.pairing import PairingSettings
-from runtime.cameras.aravis import AravisCamera
-from runtime.cameras.camera import Camera, Frame, FrameStatus
-from runtime.cameras.pixel_formats import bit_depth, pack, unpack
-from runtime.cameras.settings import CameraSettings
-from runtime.errors import LostShotError
-from runtime.modulator.operator import OperatorBeams
-from runtime.trigger.software import SoftwareTrigger
-from runtime.trigger.trigger import Trigger
-from runtime.virtual_device.fake_camera import FakeCamera
-from runtime.virtual_device.namespace import ADDRESSES, go_on_inside
+from lightpage.runtime.device.acquisition.camera_source import CameraSource, Exposures
+from lightpage.runtime.device.acquisition.pairing import PairingSettings
+from lightpage.runtime.device.cameras.aravis import AravisCamera
+from lightpage.runtime.device.cameras.camera import Camera, Frame, FrameStatus
+from lightpage.runtime.device.cameras.pixel_formats import bit_depth, pack, unpack
+from lightpage.runtime.device.cameras.settings import CameraSettings
+from lightpage.runtime.device.modulator.operator import OperatorBeams
+from lightpage.runtime.device.trigger.software import SoftwareTrigger
+from lightpage.runtime.device.trigger.trigger import Trigger
+from lightpage.virtual_device.fake_camera import FakeCamera
+from lightpage.virtual_device.namespace import ADDRESSES, go_on_inside
 
 Counts = NDArray[np.unsignedinteger[Any]]
 

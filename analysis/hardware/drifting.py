@@ -18,12 +18,12 @@ from lightpage.codec.volume import Volume, encode_volume
 from lightpage.device.state import Device
 from lightpage.page.pilots import Pilots
 from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.archives.recordings.coded_pages import air_bits
+from lightpage.runtime.device.acquisition.source import SHOT_S, FrameSource, Shot
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.execution.twin import OnnxTwin
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
-from runtime.acquisition.source import SHOT_S, FrameSource, Shot
-from runtime.bulk.coded_pages import air_bits
-from runtime.decoding.decoder import Decoder
-from runtime.execution.twin import OnnxTwin
 
 UNITS: Mapping[str, float] = {
     "geometry.pipe_angle_deg": 0.0037,

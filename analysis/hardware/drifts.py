@@ -27,14 +27,14 @@ from lightpage.device.state import Device
 from lightpage.errors import LightpageError
 from lightpage.files import write_json
 from lightpage.progress import track
-from runtime.bundle.shipped import DEFAULT, bundle_path
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.image_tracker import tracker_for
-from runtime.service.caller import Caller
-from runtime.service.dataplane import DataPlane
-from runtime.service.monitor import Monitor, MonitorSettings, PageFigures
-from runtime.service.observation import Observation
-from runtime.service.registry import ModelRegistry
+from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.image_tracker import tracker_for
+from lightpage.runtime.service.caller import Caller
+from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.monitoring.monitor import Monitor, MonitorSettings, PageFigures
+from lightpage.runtime.service.monitoring.observation import Observation
 
 QUIET_BEFORE = 25
 """Pages of a drift before it begins: the monitor learns what is usual by 20."""

@@ -21,21 +21,21 @@ from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.codec.volume import DATA_PAGES, PARITY_PAGES, Volume, encode_volume
 from lightpage.device.state import Device
+from lightpage.errors import LostPageError
 from lightpage.files import write_json
 from lightpage.progress import track
 from lightpage.recording.pages import PagesWriter
-from runtime.acquisition.camera_source import CameraSource
-from runtime.acquisition.sources import open_source
-from runtime.bundle.shipped import bundle_path
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.image_tracker import tracker_for
-from runtime.errors import LostPageError
-from runtime.service.caller import Caller
-from runtime.service.dataplane import DataPlane
-from runtime.service.registry import ModelRegistry
-from runtime.trigger.trigger import Trigger
-from runtime.virtual_device.device import VirtualDevice
-from runtime.virtual_device.namespace import go_on_inside
+from lightpage.runtime.device.acquisition.camera_source import CameraSource
+from lightpage.runtime.device.acquisition.sources import open_source
+from lightpage.runtime.device.trigger.trigger import Trigger
+from lightpage.runtime.model.bundle.shipped import bundle_path
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.image_tracker import tracker_for
+from lightpage.runtime.service.caller import Caller
+from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.virtual_device.device import VirtualDevice
+from lightpage.virtual_device.namespace import go_on_inside
 
 
 class TimedTrigger:

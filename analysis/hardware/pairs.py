@@ -26,20 +26,20 @@ from numpy.typing import NDArray
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import Profile, load_profile
+from lightpage.errors import LostShotError, Reason
 from lightpage.files import write_json
 from lightpage.progress import track
-from runtime.acquisition.camera_source import CameraSource, Exposures
-from runtime.acquisition.page_store import PageStore
-from runtime.acquisition.pairing import PairingSettings
-from runtime.cameras.aravis import AravisCamera
-from runtime.cameras.camera import Frame
-from runtime.cameras.settings import CameraSettings
-from runtime.errors import LostShotError, Reason
-from runtime.trigger.pulse_generator import PulseGenerator, PulseGeneratorSettings
-from runtime.virtual_device.fake_camera import FakeCamera
-from runtime.virtual_device.namespace import ADDRESSES, go_on_inside
-from runtime.virtual_device.pulse_generator import PulseGeneratorEmulator
-from runtime.virtual_device.serial_port import Pty
+from lightpage.runtime.device.acquisition.camera_source import CameraSource, Exposures
+from lightpage.runtime.device.acquisition.page_store import PageStore
+from lightpage.runtime.device.acquisition.pairing import PairingSettings
+from lightpage.runtime.device.cameras.aravis import AravisCamera
+from lightpage.runtime.device.cameras.camera import Frame
+from lightpage.runtime.device.cameras.settings import CameraSettings
+from lightpage.runtime.device.trigger.pulse_generator import PulseGenerator, PulseGeneratorSettings
+from lightpage.virtual_device.fake_camera import FakeCamera
+from lightpage.virtual_device.namespace import ADDRESSES, go_on_inside
+from lightpage.virtual_device.pulse_generator import PulseGeneratorEmulator
+from lightpage.virtual_device.serial_port import Pty
 
 SIDE_PX = 256
 FAULTS = (

@@ -22,11 +22,11 @@ import click
 from analysis.hardware.pairs import Stage, small_cameras, source_of
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
+from lightpage.errors import LostShotError, SourceError
 from lightpage.files import write_json
 from lightpage.progress import track
-from runtime.acquisition.camera_source import CameraSource
-from runtime.errors import LostShotError, SourceError
-from runtime.virtual_device.namespace import go_on_inside
+from lightpage.runtime.device.acquisition.camera_source import CameraSource
+from lightpage.virtual_device.namespace import go_on_inside
 
 AWAY_S = 1.0
 _PATIENCE_S = 30.0

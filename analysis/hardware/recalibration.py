@@ -28,15 +28,15 @@ from lightpage.errors import LightpageError
 from lightpage.files import write_json
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
-from runtime.acquisition.source import SHOT_S, FrameSource, Shot
-from runtime.bundle.shipped import DEFAULT, bundle_path
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.image_tracker import tracker_for
-from runtime.execution.cpus import available_cpus
-from runtime.service.caller import Caller
-from runtime.service.dataplane import DataPlane
-from runtime.service.recalibrator import Recalibrator
-from runtime.service.registry import ModelRegistry
+from lightpage.runtime.device.acquisition.source import SHOT_S, FrameSource, Shot
+from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.image_tracker import tracker_for
+from lightpage.runtime.model.execution.cpus import available_cpus
+from lightpage.runtime.service.caller import Caller
+from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.jobs.recalibrator import Recalibrator
+from lightpage.runtime.service.models.registry import ModelRegistry
 
 PAGES = 16
 """Different pages that are read, over and over."""

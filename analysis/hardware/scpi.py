@@ -25,12 +25,12 @@ import click
 import numpy as np
 
 from lightpage.cli.main import run
+from lightpage.errors import LostShotError
 from lightpage.files import write_json
-from runtime.errors import LostShotError
-from runtime.trigger.scpi_line import ScpiLine
-from runtime.trigger.scpi_port import LineTimes
-from runtime.virtual_device.pulse_generator import CHANNELS, PulseGeneratorEmulator
-from runtime.virtual_device.serial_port import Fault, Pty, TcpPort, VirtualSerialPort
+from lightpage.runtime.device.trigger.scpi_line import ScpiLine
+from lightpage.runtime.device.trigger.scpi_port import LineTimes
+from lightpage.virtual_device.pulse_generator import CHANNELS, PulseGeneratorEmulator
+from lightpage.virtual_device.serial_port import Fault, Pty, TcpPort, VirtualSerialPort
 
 TIMES = LineTimes(answer_s=0.1, quiet_s=0.02, late_s=0.4, synchronise_s=2.0)
 LATE_S = (0.02, 0.35)

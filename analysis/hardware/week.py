@@ -35,23 +35,22 @@ from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile, OutputFolder
 from lightpage.clock import Clock
 from lightpage.device.state import Device
-from lightpage.errors import FramesDisagreeError, LightpageError
+from lightpage.errors import FramesDisagreeError, LightpageError, LostPageError
 from lightpage.files import write_json
 from lightpage.progress import track
-from runtime.bulk.coded_pages import air_bits
-from runtime.bundle.shipped import DEFAULT, bundle_path
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.image_tracker import tracker_for
-from runtime.errors import LostPageError
-from runtime.recalibration.outcome import RecalibrationOutcome
-from runtime.service.caller import Caller
-from runtime.service.dataplane import DataPlane
-from runtime.service.flight_recorder import FlightRecorder
-from runtime.service.monitor import Monitor
-from runtime.service.recalibrator import Recalibrator, Step
-from runtime.service.registry import ModelRegistry
-from runtime.service.self_calibration import SelfCalibration, SelfCalibrationSettings
-from runtime.service.store import ModelStore
+from lightpage.runtime.archives.recordings.coded_pages import air_bits
+from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.image_tracker import tracker_for
+from lightpage.runtime.recalibration.outcome import RecalibrationOutcome
+from lightpage.runtime.service.caller import Caller
+from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.jobs.recalibrator import Recalibrator, Step
+from lightpage.runtime.service.jobs.self_calibration import SelfCalibration, SelfCalibrationSettings
+from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.models.store import ModelStore
+from lightpage.runtime.service.monitoring.flight_recorder import FlightRecorder
+from lightpage.runtime.service.monitoring.monitor import Monitor
 
 PAGE_S = 300.0
 """Simulated time from one page to the next."""

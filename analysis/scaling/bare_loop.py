@@ -10,10 +10,10 @@ import time
 from pathlib import Path
 
 from lightpage.recording.reader import Recording
-from runtime.bulk.evaluation import decode_unseen, pilots_of
-from runtime.bulk.read_ahead import read_ahead
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.image_tracker import tracker_for
+from lightpage.runtime.archives.recordings.evaluation import decode_unseen, pilots_of
+from lightpage.runtime.archives.recordings.read_ahead import read_ahead
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.image_tracker import tracker_for
 
 
 def main(recording: Path, bundle: Path, first: int, end: int, threads: int) -> None:

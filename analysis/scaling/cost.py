@@ -19,7 +19,6 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from analysis.report.drawing import BLUE, ORANGE
 from analysis.scaling.archive import archive
 from analysis.scaling.cluster_model import (
     Cluster,
@@ -36,7 +35,8 @@ from lightpage.cli.paths import OutputFile, OutputFolder
 from lightpage.errors import InvalidInputError
 from lightpage.files import replace_text, write_json
 from lightpage.progress import track
-from runtime.scaling.ray_engine import AHEAD
+from lightpage.report.drawing import BLUE, ORANGE
+from lightpage.runtime.archives.workers.ray_engine import AHEAD
 
 NODES = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 ETHERNET_BYTES_PER_S = 1.25e9

@@ -40,16 +40,16 @@ from analysis.service.running import until
 from lightpage.cli.main import run as run_command
 from lightpage.cli.paths import OutputFile, OutputFolder
 from lightpage.files import write_json
-from runtime.bundle.shipped import DEFAULT, bundle_path
-from runtime.helper_process import same_packages
-from runtime.scaling.driver import run
-from runtime.scaling.inline import InlineEngine
-from runtime.scaling.job import Choices, Job, of_recordings
-from runtime.scaling.ledger import Ledger
-from runtime.scaling.shard import RECORD, SYMBOLS, ShardRecord
-from runtime.scaling.task import Operation
-from runtime.scaling.work import Worker
-from train.models.presets import FAST
+from lightpage.helper_process import same_packages
+from lightpage.runtime.archives.run.driver import run
+from lightpage.runtime.archives.run.job import Choices, Job, of_recordings
+from lightpage.runtime.archives.run.ledger import Ledger
+from lightpage.runtime.archives.run.shard import RECORD, SYMBOLS, ShardRecord
+from lightpage.runtime.archives.run.task import Operation
+from lightpage.runtime.archives.workers.inline import InlineEngine
+from lightpage.runtime.archives.workers.work import Worker
+from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
+from lightpage.train.models.presets import FAST
 
 WORKERS, THREADS = 2, 1
 WARM_PAGES = 200

@@ -35,17 +35,17 @@ from lightpage.device.profile import Profile, load_profile
 from lightpage.device.state import Device
 from lightpage.errors import LightpageError
 from lightpage.files import write_json
+from lightpage.helper_process import same_packages
 from lightpage.page.pilots import Pilots
 from lightpage.progress import track
 from lightpage.recording.reader import Recording
+from lightpage.runtime.archives.recordings.coded_pages import air_bits
+from lightpage.runtime.archives.run.totals import DeviceState
+from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.simulator.recording_job import RecordingJob
 from lightpage.simulator.simulator import Simulator
-from runtime.bulk.coded_pages import air_bits
-from runtime.bundle.shipped import DEFAULT, bundle_path
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.image_tracker import tracker_for
-from runtime.helper_process import same_packages
-from runtime.scaling.totals import DeviceState
 
 LEVELS = 256
 KNOWN, HELD_OUT = 3, 5

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from runtime.scaling.local_worker import main
-from runtime.scaling.task import Done, Outcome, Task
-from runtime.scaling.work import Worker
+from lightpage.runtime.archives.run.task import Done, Outcome, Task
+from lightpage.runtime.archives.workers.local_worker import main
+from lightpage.runtime.archives.workers.work import Worker
 
 
 def nothing(task: Task, threads: int) -> Outcome:

@@ -17,17 +17,17 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from analysis.scaling.idle_worker import nothing
 from lightpage.errors import InvalidInputError
-from runtime.bundle.shipped import DEFAULT
-from runtime.execution.cpus import available_cpus
-from runtime.helper_process import same_packages
-from runtime.scaling.engine import Engine
-from runtime.scaling.job import Job
-from runtime.scaling.ledger import Ledger
-from runtime.scaling.local import LocalEngine
-from runtime.scaling.ray_engine import RayEngine, connected
-from runtime.scaling.shard import ShardRecord
-from runtime.scaling.task import NamedBundle, Operation, Stamp, Task
-from runtime.scaling.totals import totals
+from lightpage.helper_process import same_packages
+from lightpage.runtime.archives.run.engine import Engine
+from lightpage.runtime.archives.run.job import Job
+from lightpage.runtime.archives.run.ledger import Ledger
+from lightpage.runtime.archives.run.shard import ShardRecord
+from lightpage.runtime.archives.run.task import NamedBundle, Operation, Stamp, Task
+from lightpage.runtime.archives.run.totals import totals
+from lightpage.runtime.archives.workers.local import LocalEngine
+from lightpage.runtime.archives.workers.ray_engine import RayEngine, connected
+from lightpage.runtime.model.bundle.shipped import DEFAULT
+from lightpage.runtime.model.execution.cpus import available_cpus
 
 IN_FLIGHT = (2, 64, 512, 2048)
 """Ranges on their way at once, at which the driver of a cluster is measured."""

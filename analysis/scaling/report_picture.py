@@ -21,22 +21,22 @@ import h5py
 import numpy as np
 from playwright.sync_api import sync_playwright
 
-from analysis.report.from_bulk import PAUSE_S
 from analysis.scaling.processes import children
 from analysis.service.running import until
 from lightpage.cli.main import run as run_command
 from lightpage.cli.paths import OutputFile, OutputFolder
+from lightpage.demo.demo import drifted
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device
 from lightpage.errors import InvalidInputError
+from lightpage.helper_process import same_packages
 from lightpage.page.symbols import random_symbols
 from lightpage.progress import track
 from lightpage.recording.reader import RecordingWriter
+from lightpage.report.contents.from_bulk import PAUSE_S
+from lightpage.runtime.archives.run.shard import RECORD
+from lightpage.runtime.model.bundle.shipped import DEFAULT
 from lightpage.simulator.simulator import Simulator
-from runtime.bundle.shipped import DEFAULT
-from runtime.demo.demo import drifted
-from runtime.helper_process import same_packages
-from runtime.scaling.shard import RECORD
 
 DRIFTS = (0.0, 0.25, 0.5, 0.75, 1.0)
 """Of each device, as shares of the demo's drift."""

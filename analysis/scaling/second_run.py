@@ -24,13 +24,13 @@ import click
 from lightpage.cli.main import run as run_command
 from lightpage.cli.paths import OutputFile, OutputFolder
 from lightpage.files import write_json
-from runtime.bundle.shipped import DEFAULT
-from runtime.helper_process import same_packages
-from runtime.scaling.job import RANGE_PAGES, Choices, Job, of_recordings
-from runtime.scaling.ledger import Ledger
-from runtime.scaling.shard import record_of
-from runtime.scaling.task import Operation
-from runtime.scaling.volumes import FOLDER
+from lightpage.helper_process import same_packages
+from lightpage.runtime.archives.run.job import RANGE_PAGES, Choices, Job, of_recordings
+from lightpage.runtime.archives.run.ledger import Ledger
+from lightpage.runtime.archives.run.shard import record_of
+from lightpage.runtime.archives.run.task import Operation
+from lightpage.runtime.archives.run.volumes import FOLDER
+from lightpage.runtime.model.bundle.shipped import DEFAULT
 
 WANTED_S = 2.0
 OPERATIONS = (Operation.DECODE, Operation.EVALUATE, Operation.RECOVER)

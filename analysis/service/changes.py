@@ -30,10 +30,10 @@ from lightpage.cli.paths import OutputFile
 from lightpage.errors import BundleError
 from lightpage.files import write_json
 from lightpage.progress import track
-from runtime.bundle.bundle import Bundle
-from runtime.bundle.shipped import DEFAULT, bundle_path
-from runtime.client.client import LightpageClient
-from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+from lightpage.runtime.client.client import LightpageClient
+from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 
 _LEVELS = 256
 _SHIFTS_PX = (0.2, -0.2)

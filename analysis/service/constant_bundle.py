@@ -17,8 +17,8 @@ from lightpage.device.profile import Profile, load_profile
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.page.symbols import random_symbols, symbol_phases
 from lightpage.recording.frame_pair import FramePair
-from runtime.bundle.bundle import npz, write_bundle
-from runtime.bundle.manifest import DECODER, GOLDEN, TWIN, Manifest
+from lightpage.runtime.model.bundle.bundle import npz, write_bundle
+from lightpage.runtime.model.bundle.manifest import DECODER, GOLDEN, TWIN, Manifest
 
 _KAPPA = 400.0
 """Claimed of every symbol."""

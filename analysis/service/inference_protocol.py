@@ -23,10 +23,10 @@ from analysis.service.running import RunningService
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile, OutputFolder
 from lightpage.files import write_json
-from runtime.bundle.bundle import Bundle
-from runtime.bundle.shipped import DEFAULT, bundle_path
-from runtime.client.client import LightpageClient
-from runtime.service.settings import ADDRESS
+from lightpage.runtime.client.client import LightpageClient
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
+from lightpage.runtime.service.settings import ADDRESS
 
 PACKAGES = ("tritonclient[grpc]==2.73.0", "grpcio-health-checking==1.81.1", "grpcio-reflection==1.81.1")
 """The last two of the last version that goes with tritonclient's protobuf."""

@@ -32,7 +32,7 @@ from lightpage.cli.paths import OutputFile
 from lightpage.files import write_json
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
-from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 
 _SHIFTS_PX = (1, -2, 3, 0)
 """Of another caller's pages, columns."""

@@ -30,8 +30,8 @@ from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.files import write_json
 from lightpage.progress import track
-from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.rpc.health_server import HealthServer
+from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
+from lightpage.runtime.service.server.health_server import HealthServer
 
 _CONNECTIONS = 24
 _ONE_DEVICE = pb.DecodeOptions(session="device")

@@ -21,23 +21,23 @@ import numpy as np
 
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
+from lightpage.errors import Reason, UnconfirmedPageError
 from lightpage.files import write_json
 from lightpage.page.pilots import Pilots
 from lightpage.recording.frame_pair import FramePair
-from runtime.acquisition.source import SHOT_S, FrameSource, Shot
-from runtime.bundle.bundle import Bundle
-from runtime.bundle.shipped import DEFAULT, bundle_path
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.page import DecodedPage
-from runtime.decoding.tracking import NoTracker
-from runtime.errors import Reason, UnconfirmedPageError
-from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.rpc.call import Call
-from runtime.rpc.page_calls import PageCalls
-from runtime.service.caller import Caller
-from runtime.service.dataplane import DataPlane
-from runtime.service.monitor import Monitor
-from runtime.service.registry import ModelRegistry
+from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
+from lightpage.runtime.device.acquisition.source import SHOT_S, FrameSource, Shot
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.page import DecodedPage
+from lightpage.runtime.model.decoding.tracking import NoTracker
+from lightpage.runtime.service.caller import Caller
+from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.monitoring.monitor import Monitor
+from lightpage.runtime.service.pages.page_calls import PageCalls
+from lightpage.runtime.service.server.call import Call
 
 PAGES = 1000
 

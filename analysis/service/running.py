@@ -22,13 +22,13 @@ import numpy as np
 
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.writer import RecordingWriter
-from runtime.bundle.bundle import Bundle
-from runtime.bundle.shipped import DEFAULT, bundle_path
-from runtime.pb.inference import open_inference_pb2 as oip
-from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
-from runtime.rpc.inference_calls import MODEL
-from runtime.wire.messages import PIXEL_CODES
+from lightpage.runtime.client.pb.inference import open_inference_pb2 as oip
+from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
+from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
+from lightpage.runtime.client.wire.messages import PIXEL_CODES
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
+from lightpage.runtime.service.frames.inference_calls import MODEL
 
 START_S = 120.0
 _CHUNK = 1 << 20

@@ -28,8 +28,8 @@ from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.files import write_json
 from lightpage.progress import track
-from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.rpc.call import SERVICE
+from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
+from lightpage.runtime.service.server.call import SERVICE
 
 _LOOK_S = 2.0
 _CALLERS = 4

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from runtime.bundle.bundle import Bundle, npz, write_bundle
-from runtime.bundle.manifest import GOLDEN, TABLE
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.drift_tables import BundleTables
-from runtime.execution.twin import TWIN_THREADS, OnnxTwin
+from lightpage.runtime.model.bundle.bundle import Bundle, npz, write_bundle
+from lightpage.runtime.model.bundle.manifest import GOLDEN, TABLE
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.drift_tables import BundleTables
+from lightpage.runtime.model.execution.twin import TWIN_THREADS, OnnxTwin
 
 
 def write_variant(base: Bundle, version: str, shift_px: float, path: Path) -> Path:

@@ -21,26 +21,26 @@ from numpy.typing import NDArray
 
 from analysis.comparison.kept_bundle import LEVELS, data_set_of, export_kept
 from analysis.speed.speed import opened, seconds_of
-from export.graph import FRAME_INPUTS, DecoderGraph, table_tensors
-from export.half import deviation, rounded
-from export.onnx_files import decoder_onnx
 from lightpage.calibration.sampling_table import sampling_table
 from lightpage.cli.main import run as run_command
 from lightpage.cli.paths import OutputFolder
+from lightpage.export.graph import FRAME_INPUTS, DecoderGraph, table_tensors
+from lightpage.export.half import deviation, rounded
+from lightpage.export.onnx_files import decoder_onnx
 from lightpage.files import write_json
 from lightpage.metrics.information import achievable_rate
 from lightpage.page.pilots import Pilots
 from lightpage.progress import track
 from lightpage.recording.reader import Recording
+from lightpage.runtime.model.decoding.decoder import PAGE_INPUTS, Decoder
+from lightpage.runtime.model.decoding.image_tracker import tracker_for
+from lightpage.runtime.model.execution.cpus import available_cpus
 from lightpage.simulator.recording_job import RecordingJob
-from runtime.decoding.decoder import PAGE_INPUTS, Decoder
-from runtime.decoding.image_tracker import tracker_for
-from runtime.execution.cpus import available_cpus
-from train.models.decoder import SymbolDecoder
-from train.models.prediction import Prediction
-from train.models.twin import RayTwin, TorchTwin
-from train.models.waves import EXACT, ROUGH, Fidelity
-from train.runs import Run, load_decoder, load_run
+from lightpage.train.models.decoder import SymbolDecoder
+from lightpage.train.models.prediction import Prediction
+from lightpage.train.models.twin import RayTwin, TorchTwin
+from lightpage.train.models.waves import EXACT, ROUGH, Fidelity
+from lightpage.train.runs import Run, load_decoder, load_run
 
 Complex = NDArray[np.complexfloating]
 HALF = "float16"

@@ -28,7 +28,7 @@ from lightpage.device.profile import Profile, load_profile
 from lightpage.device.state import Device
 from lightpage.errors import InvalidInputError
 from lightpage.files import write_json
-from runtime.execution.cpus import available_cpus
+from lightpage.runtime.model.execution.cpus import available_cpus
 
 _PROCESS = "analysis.speed.footprint_process"
 _PATIENCE_S = 900

@@ -13,7 +13,7 @@ import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from runtime.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.decoder import Decoder
 
 _LEVELS = 16
 

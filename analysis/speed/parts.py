@@ -20,7 +20,7 @@ import numpy as np
 import onnx
 
 from lightpage.errors import InvalidInputError
-from runtime.execution.session import open_session
+from lightpage.runtime.model.execution.session import open_session
 
 _SIDE = 2048
 """Of the square matrices whose product measures the peak."""

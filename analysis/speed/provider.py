@@ -24,25 +24,25 @@ from pathlib import Path
 import click
 import numpy as np
 
-from export.half import PRECISIONS, deviation, in_half
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.errors import RecordingError
+from lightpage.export.half import PRECISIONS, deviation, in_half
 from lightpage.files import write_json
 from lightpage.metrics.information import achievable_rate
 from lightpage.page.pilots import Pilots
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
-from runtime.bundle.bundle import Bundle
-from runtime.bundle.manifest import DECODER, FLOAT32, Precision
-from runtime.decoding.decoder import PAGE_INPUTS, Decoder
-from runtime.decoding.page import DecodedPage
-from runtime.execution.constant_table import GraphFile
-from runtime.execution.memory import share_freed_memory
-from runtime.execution.providers import ON_CPU, WANTED, Provider
-from runtime.execution.session import VERSION
-from runtime.execution.table_graph import TableGraph
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.bundle.manifest import DECODER, FLOAT32, Precision
+from lightpage.runtime.model.decoding.decoder import PAGE_INPUTS, Decoder
+from lightpage.runtime.model.decoding.page import DecodedPage
+from lightpage.runtime.model.execution.constant_table import GraphFile
+from lightpage.runtime.model.execution.memory import share_freed_memory
+from lightpage.runtime.model.execution.providers import ON_CPU, WANTED, Provider
+from lightpage.runtime.model.execution.session import VERSION
+from lightpage.runtime.model.execution.table_graph import TableGraph
 
 _ALONE = 11
 """Pages of a single caller, whose median is told."""

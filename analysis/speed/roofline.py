@@ -23,16 +23,16 @@ import onnx
 from onnx import helper, shape_inference
 
 from analysis.speed.speed import makers_of
-from export.graph import FRAME_INPUTS
-from export.half import PRECISIONS, in_half
-from export.onnx_files import decoder_onnx
-from export.operators.check import page_part
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import Profile, load_profile
+from lightpage.export.graph import FRAME_INPUTS
+from lightpage.export.half import PRECISIONS, in_half
+from lightpage.export.onnx_files import decoder_onnx
+from lightpage.export.operators.check import page_part
 from lightpage.files import write_json
-from runtime.bundle.manifest import FLOAT16
-from runtime.decoding.decoder import PAGE_INPUTS
+from lightpage.runtime.model.bundle.manifest import FLOAT16
+from lightpage.runtime.model.decoding.decoder import PAGE_INPUTS
 
 CONVOLUTIONS, PRODUCTS, SAMPLING, LAYOUT, POINTWISE = (
     "convolutions",

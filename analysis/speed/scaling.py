@@ -15,13 +15,13 @@ import click
 import numpy as np
 
 from analysis.speed.speed import frames_of, makers, makers_of, opened, seconds_of
-from analysis.studies.scaling import enlarged
-from export.onnx_files import decoder_onnx
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import load_profile
+from lightpage.export.onnx_files import decoder_onnx
 from lightpage.files import write_json
-from runtime.execution.cpus import available_cpus
+from lightpage.runtime.model.execution.cpus import available_cpus
+from lightpage.study.studies.scaling import enlarged
 
 
 @dataclass(frozen=True)

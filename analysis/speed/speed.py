@@ -21,7 +21,12 @@ import numpy as np
 from torch import nn
 
 from analysis.speed.parts import Machine, Part, lines, measured_machine, parts_of
-from export.graph import (
+from lightpage.calibration.parameters import nominal
+from lightpage.calibration.sampling_table import sampling_table
+from lightpage.cli.main import run
+from lightpage.cli.paths import OutputFile
+from lightpage.device.profile import Profile, load_profile
+from lightpage.export.graph import (
     FRAME_INPUTS,
     DecoderGraph,
     Graph,
@@ -29,24 +34,19 @@ from export.graph import (
     published_tensors,
     table_tensors,
 )
-from export.onnx_files import decoder_onnx
-from lightpage.calibration.parameters import nominal
-from lightpage.calibration.sampling_table import sampling_table
-from lightpage.cli.main import run
-from lightpage.cli.paths import OutputFile
-from lightpage.device.profile import Profile, load_profile
+from lightpage.export.onnx_files import decoder_onnx
 from lightpage.files import write_json
 from lightpage.recording.frame_pair import FramePair
-from runtime.decoding.decoder import PAGE_INPUTS
-from runtime.execution.constant_table import GraphFile
-from runtime.execution.cpus import available_cpus
-from runtime.execution.table_graph import TableGraph
-from train.models.decoder import SymbolDecoder
-from train.models.hyperparameters import Hyperparameters
-from train.models.presets import FAST, PRESETS
-from train.models.twin import RayTwin, TorchTwin
-from train.published.trainer import published_decoder
-from train.published.training import PublishedChoices
+from lightpage.runtime.model.decoding.decoder import PAGE_INPUTS
+from lightpage.runtime.model.execution.constant_table import GraphFile
+from lightpage.runtime.model.execution.cpus import available_cpus
+from lightpage.runtime.model.execution.table_graph import TableGraph
+from lightpage.train.models.decoder import SymbolDecoder
+from lightpage.train.models.hyperparameters import Hyperparameters
+from lightpage.train.models.presets import FAST, PRESETS
+from lightpage.train.models.twin import RayTwin, TorchTwin
+from lightpage.train.published.trainer import published_decoder
+from lightpage.train.published.training import PublishedChoices
 
 Tensors = dict[str, np.ndarray]
 SETTLE_S = 0.2

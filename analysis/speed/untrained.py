@@ -9,23 +9,23 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from export.command import export_run
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.document import Calibration
 from lightpage.calibration.parameters import NAMES
 from lightpage.device.profile import Profile
 from lightpage.device.state import Device
+from lightpage.export.command import export_run
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.page.symbols import pilot_mask, random_symbols
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording, hash_frames
+from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
-from runtime.bundle.bundle import Bundle
-from train.models.decoder import SymbolDecoder
-from train.models.hyperparameters import Hyperparameters
-from train.models.network import SymbolUNet
-from train.runs import GOLDEN, REFERENCES, Run, save_arrays, save_weights
+from lightpage.train.models.decoder import SymbolDecoder
+from lightpage.train.models.hyperparameters import Hyperparameters
+from lightpage.train.models.network import SymbolUNet
+from lightpage.train.runs import GOLDEN, REFERENCES, Run, save_arrays, save_weights
 
 _HEAD = 0.01
 """Deviation of the weights of networks' last layers, which begin with zeros: an answer of zeros would prove nothing."""
@@ -78,7 +78,7 @@ def untrained_bundle(
         out: new bundle, a zip where it ends in .zip.
         profile: the nominal device.
         seen: frames of a page, and the device that they are of.
-        localizer, choices: of `train.models.decoder.SymbolDecoder`.
+        localizer, choices: of `lightpage.train.models.decoder.SymbolDecoder`.
         seed: of the weights.
 
     Returns:

@@ -45,7 +45,7 @@ from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFolder
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, draw_device
-from lightpage.errors import FrameError, InvalidInputError
+from lightpage.errors import FrameError, InvalidInputError, UnconfirmedPageError
 from lightpage.files import write_json
 from lightpage.metrics.measures import measure
 from lightpage.page.pilots import Pilots
@@ -53,19 +53,18 @@ from lightpage.page.symbols import random_symbols
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
+from lightpage.runtime.archives.recordings.evaluation import evaluate, was_seen
+from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.frames import narrow
+from lightpage.runtime.model.decoding.image_search import BundleSearch
+from lightpage.runtime.model.decoding.image_tracker import tracker_for
+from lightpage.runtime.model.decoding.tracking import Tracker, unconfirmed_page
+from lightpage.runtime.model.execution.twin import TWIN_THREADS, OnnxTwin
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
-from runtime.bulk.evaluation import evaluate, was_seen
-from runtime.bundle.shipped import DEFAULT, bundle_path
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.frames import narrow
-from runtime.decoding.image_search import BundleSearch
-from runtime.decoding.image_tracker import tracker_for
-from runtime.decoding.tracking import Tracker, unconfirmed_page
-from runtime.errors import UnconfirmedPageError
-from runtime.execution.twin import TWIN_THREADS, OnnxTwin
-from train.models.field import FieldRecovery, TorchFieldSolver
-from train.models.twin import RayTwin, TorchTwin
+from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
+from lightpage.train.models.twin import RayTwin, TorchTwin
 
 Figures = dict[str, Any]
 

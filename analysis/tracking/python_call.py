@@ -1,4 +1,4 @@
-"""Prints the share of wrong symbols that `runtime.load(...).decode` reads on some pages of a drifting recording.
+"""Prints the share of wrong symbols that `lightpage.load(...).decode` reads on some pages of a drifting recording.
 
 `lightpage simulate --profile bench --pages 30 --seed 2 --out R.h5; python -m analysis.tracking.python_call R.h5`
 """
@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-import runtime
+import lightpage
 from lightpage.errors import LightpageError
 from lightpage.recording.reader import Recording
 
@@ -22,7 +22,7 @@ from lightpage.recording.reader import Recording
 @click.option("--tracking/--no-tracking", default=True, help="Follow the image.")
 def main(recording: Path, bundle: str, pages: tuple[int, ...], tracking: bool) -> None:
     """Decode pages of RECORDING by the Python call, and compare them with what was written."""
-    decoder = runtime.load(bundle, tracking=tracking)
+    decoder = lightpage.load(bundle, tracking=tracking)
     data = ~decoder.bundle.pilot_mask
     with Recording.open(recording) as file:
         for page in pages:

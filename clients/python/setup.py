@@ -14,10 +14,10 @@ ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 DEPENDENCIES = ("googleapis-common-protos", "grpcio", "numpy", "protobuf")
 PACKAGE = "lightpage_client"
-START = ("runtime.client.client",)
-"""What a caller imports; whatever these modules import of the two packages comes along."""
+START = ("lightpage.runtime.client.client",)
+"""What a caller imports; whatever these modules import of the package comes along."""
 
-_IMPORT = re.compile(r"^(\s*)(from|import) (lightpage|runtime)\b", re.MULTILINE)
+_IMPORT = re.compile(r"^(\s*)(from|import) lightpage\b", re.MULTILINE)
 
 
 def file_of(module: str) -> Path | None:
@@ -27,7 +27,7 @@ def file_of(module: str) -> Path | None:
 
 
 def imports(file: Path) -> set[str]:
-    """The modules of the two packages that a file imports when it is itself imported."""
+    """The modules of the package that a file imports when it is itself imported."""
     found = set()
     for node in ast.parse(file.read_text("utf-8")).body:
         if isinstance(node, ast.Import):
@@ -35,7 +35,7 @@ def imports(file: Path) -> set[str]:
         elif isinstance(node, ast.ImportFrom) and node.module:
             inner = {f"{node.module}.{alias.name}" for alias in node.names}
             found |= {node.module} | {name for name in inner if file_of(name)}
-    return {name for name in found if name.partition(".")[0] in ("lightpage", "runtime") and "." in name}
+    return {name for name in found if name.startswith("lightpage.")}
 
 
 def needed() -> list[str]:
@@ -63,9 +63,9 @@ class Build(build_py):
             assert source is not None  # `needed` has seen it
             for file in (source, source.with_suffix(".pyi")):
                 if file.is_file():
-                    copy = target / file.relative_to(ROOT)
+                    copy = target / file.relative_to(ROOT / "lightpage")
                     copy.parent.mkdir(parents=True, exist_ok=True)
-                    copy.write_text(_IMPORT.sub(rf"\1\2 {PACKAGE}.\3", file.read_text("utf-8")), "utf-8")
+                    copy.write_text(_IMPORT.sub(rf"\1\2 {PACKAGE}", file.read_text("utf-8")), "utf-8")
                     for folder in copy.relative_to(target).parents[:-1]:
                         (target / folder / "__init__.py").touch()
         (target / "py.typed").touch()

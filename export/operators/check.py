@@ -10,10 +10,10 @@ import onnx
 from onnx import shape_inference
 from onnx.defs import OpSchema
 
-from export.operators.operator_list import FLOATING, Kernel, Operator, OperatorList, dtype_name
 from lightpage.errors import InvalidInputError
-from runtime.decoding.decoder import PAGE_INPUTS
-from runtime.execution.constant_table import GraphFile
+from lightpage.export.operators.operator_list import FLOATING, Kernel, Operator, OperatorList, dtype_name
+from lightpage.runtime.model.decoding.decoder import PAGE_INPUTS
+from lightpage.runtime.model.execution.constant_table import GraphFile
 
 _SHAPES = frozenset(["Shape", "Size"])
 _RANDOM = frozenset(["Bernoulli", "Multinomial", "RandomNormalLike", "RandomUniformLike"])

@@ -1,4 +1,4 @@
-"""Operator lists from the documents of their projects: `python -m export.operators.collect`.
+"""Operator lists from the documents of their projects: `python -m lightpage.export.operators.collect`.
 
 The CUDA provider's is a section of docs/OperatorKernels.md of onnxruntime, that is made from its registered kernels.
 TensorRT's is docs/operators.md of onnx-tensorrt, the parser that onnxruntime's provider is built with. Of the
@@ -12,8 +12,8 @@ from pathlib import Path
 
 import click
 
-from export.operators.operator_list import FLOATING, PROVIDERS, Kernel, Operator, OperatorList, dtype_name
 from lightpage.errors import InvalidInputError
+from lightpage.export.operators.operator_list import FLOATING, PROVIDERS, Kernel, Operator, OperatorList, dtype_name
 
 DOMAINS = {"ai.onnx": "", "com.microsoft": "com.microsoft"}
 """Domains that are kept, by their name in the document; the others are onnxruntime's own or other kinds of models."""

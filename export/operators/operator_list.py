@@ -11,7 +11,7 @@ from typing import Any
 
 from lightpage.errors import InvalidInputError
 from lightpage.files import replace_text
-from runtime.execution.providers import CUDA, TENSORRT
+from lightpage.runtime.model.execution.providers import CUDA, TENSORRT
 
 PROVIDERS = (CUDA, TENSORRT)
 """Providers whose lists lie beside this file."""
@@ -93,7 +93,9 @@ class OperatorList:
         """
         if provider not in PROVIDERS:
             raise InvalidInputError("execution provider", repr(provider), f"one of {', '.join(PROVIDERS)}")
-        return cls.from_json(resources.files("export.operators").joinpath(f"{provider}.json").read_text("utf-8"))
+        return cls.from_json(
+            resources.files("lightpage.export.operators").joinpath(f"{provider}.json").read_text("utf-8")
+        )
 
     @classmethod
     def from_json(cls, text: str) -> OperatorList:

@@ -24,7 +24,7 @@ from lightpage.calibration.patches import (
 )
 from lightpage.calibration.samplers import FieldSampler, FrameSampler
 from lightpage.calibration.sampling_table import registration_coefficients
-from lightpage.calibration.wave_fit import WaveFit
+from lightpage.calibration.waves.wave_fit import WaveFit
 from lightpage.device.profile import Profile
 from lightpage.errors import CalibrationError
 from lightpage.progress import Progress

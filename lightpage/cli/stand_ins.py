@@ -10,8 +10,6 @@ from importlib.util import find_spec
 from types import ModuleType
 from typing import Any
 
-_OWN = {"lightpage", "train", "export", "runtime", "analysis"}
-
 
 class _Anything(type):
     """A class that has every attribute, may be a base, and as a decorator changes nothing."""
@@ -86,5 +84,5 @@ def stand_ins(packages: Set[str]) -> Iterator[None]:
     finally:
         sys.meta_path.remove(finder)
         for name in set(sys.modules) - before:
-            if name.partition(".")[0] in packages | _OWN:
+            if name.partition(".")[0] in packages | {"lightpage"}:
                 del sys.modules[name]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.parameters import NAMES, as_dict, as_vector
-from lightpage.calibration.wave_model import fitted_geometry
+from lightpage.calibration.waves.wave_model import fitted_geometry
 from lightpage.device.profile import Profile
 from lightpage.device.state import CameraPose, Device
 from lightpage.recording.frame_pair import FramePair

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from lightpage.codec.page_bytes import PageBytes
 from lightpage.errors import LightpageError
-from runtime.decoding.image_position import ImagePosition
-from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.wire.messages import image_of, user_data_of
-from runtime.wire.status import error_from
+from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
+from lightpage.runtime.client.wire.messages import image_of, user_data_of
+from lightpage.runtime.client.wire.status import error_from
+from lightpage.runtime.model.decoding.image_position import ImagePosition
 
 
 @dataclass(frozen=True)

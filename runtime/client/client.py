@@ -18,8 +18,7 @@ from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import FrameError, InvalidInputError, LightpageError, PageError
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.recording.frame_pair import FramePair
-from runtime.bundle.signature_file import read_signature
-from runtime.client.answers import (
+from lightpage.runtime.client.answers import (
     Description,
     DisplayOrder,
     JobInfo,
@@ -33,18 +32,26 @@ from runtime.client.answers import (
     recalibrated,
     remote_data,
 )
-from runtime.client.shared_memory import SharedMemory
-from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
-from runtime.wire.address import check_address
-from runtime.wire.channel import open_channel
-from runtime.wire.frame_parts import FramePart, chunks_of, serialized_part
-from runtime.wire.messages import PIXEL_CODES, PIXEL_TYPES, KnownPilots, message_of, pilots_message, set_fields
-from runtime.wire.page_options import PageOptions, options_message
-from runtime.wire.pages import RemotePage, remote_page
-from runtime.wire.sizes import CHUNK_BYTES
-from runtime.wire.status import error_from, error_of, is_lost_connection
-from runtime.wire.tls import TlsFiles
+from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
+from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
+from lightpage.runtime.client.shared_memory import SharedMemory
+from lightpage.runtime.client.wire.address import check_address
+from lightpage.runtime.client.wire.channel import open_channel
+from lightpage.runtime.client.wire.frame_parts import FramePart, chunks_of, serialized_part
+from lightpage.runtime.client.wire.messages import (
+    PIXEL_CODES,
+    PIXEL_TYPES,
+    KnownPilots,
+    message_of,
+    pilots_message,
+    set_fields,
+)
+from lightpage.runtime.client.wire.page_options import PageOptions, options_message
+from lightpage.runtime.client.wire.pages import RemotePage, remote_page
+from lightpage.runtime.client.wire.sizes import CHUNK_BYTES
+from lightpage.runtime.client.wire.status import error_from, error_of, is_lost_connection
+from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.model.bundle.signature_file import read_signature
 
 CALL_S = 60.0
 """Deadline of a call where none is given."""

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from lightpage.errors import InvalidInputError, LightpageError
 from lightpage.recording.frame_pair import FramePair
-from runtime.wire.address import check_socket_path
-from runtime.wire.shared_memory import GRANTED, HANDLE_BYTES, SIZE, WHY_BYTES, memory_path
+from lightpage.runtime.client.wire.address import check_socket_path
+from lightpage.runtime.client.wire.shared_memory import GRANTED, HANDLE_BYTES, SIZE, WHY_BYTES, memory_path
 
 _ANSWER_S = 10.0
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import click
 
-from runtime.bundle.shipped import DEFAULT, bundle_path
-from runtime.commands.provider_option import PROVIDER
-from runtime.decoding.decoder import Decoder
-from runtime.execution.providers import CPU, Provider
+from lightpage.runtime.commands.provider_option import PROVIDER
+from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.execution.providers import CPU, Provider
 
 Load = Callable[[], Decoder]
 """Opens the decoder that the options name; raises as `Decoder.load` does."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from runtime.execution.providers import CPU, WANTED
+from lightpage.runtime.model.execution.providers import CPU, WANTED
 
 PROVIDER = click.option(
     "--provider",

@@ -7,13 +7,13 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from lightpage.errors import InvalidInputError
-from runtime.client.answers import job_info
-from runtime.identity.roles import Role
-from runtime.recalibration.known_pages import MIN_PAGES
-from runtime.service.caller import Actor
-from runtime.service.dataplane import DataPlane
-from runtime.service.recalibrator import Recalibrator
-from runtime.wire.status import without_folders
+from lightpage.runtime.client.answers import job_info
+from lightpage.runtime.client.wire.status import without_folders
+from lightpage.runtime.recalibration.known_pages import MIN_PAGES
+from lightpage.runtime.service.caller import Actor
+from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.jobs.recalibrator import Recalibrator
+from lightpage.runtime.service.server.roles import Role
 
 ROLE = Role.ADMIN
 """Who may do all of it."""

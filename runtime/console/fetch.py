@@ -7,7 +7,7 @@ from urllib.error import HTTPError
 from urllib.request import HTTPSHandler, ProxyHandler, build_opener
 
 from lightpage.errors import LightpageError
-from runtime.wire.tls import TlsFiles
+from lightpage.runtime.client.wire.tls import TlsFiles
 
 _ANSWER_S = 5.0
 _MOST_BYTES = 16 << 20

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.recording.frame_pair import FramePair
-from runtime.service.observation import Observation
+from lightpage.runtime.service.monitoring.observation import Observation
 
 PAGES = 5000
 """Pages whose figures are kept."""

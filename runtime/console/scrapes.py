@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from prometheus_client.parser import text_string_to_metric_families
 
 from lightpage.errors import LightpageError
-from runtime.console.fetch import fetch, wanted
-from runtime.wire.tls import TlsFiles
+from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.console.fetch import fetch, wanted
 
 WINDOW_S = 60.0
 """Rates and times are those of so many seconds, once it has been scraped for so long."""

@@ -19,19 +19,18 @@ from wsgiref.simple_server import WSGIRequestHandler, make_server
 from prometheus_client import make_wsgi_app
 from prometheus_client.exposition import ThreadingWSGIServer
 
-from lightpage.errors import InvalidInputError, LightpageError
-from runtime.console.actions import ROLE, Actions
-from runtime.console.history import History, PageRow
-from runtime.console.pictures import confidence_png, frame_png
-from runtime.errors import NotAllowedError
-from runtime.identity.certificates import Certificates
-from runtime.identity.roles import Identity, Role, identity_of
-from runtime.service.caller import Actor
-from runtime.service.metrics import ServiceMetrics
-from runtime.service.monitor import Monitor
-from runtime.service.registry import Model, ModelRegistry
-from runtime.wire.address import names_machine
-from runtime.wire.status import without_folders
+from lightpage.errors import InvalidInputError, LightpageError, NotAllowedError
+from lightpage.runtime.client.wire.address import names_machine
+from lightpage.runtime.client.wire.status import without_folders
+from lightpage.runtime.console.actions import ROLE, Actions
+from lightpage.runtime.console.history import History, PageRow
+from lightpage.runtime.console.pictures import confidence_png, frame_png
+from lightpage.runtime.service.caller import Actor
+from lightpage.runtime.service.models.registry import Model, ModelRegistry
+from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
+from lightpage.runtime.service.monitoring.monitor import Monitor
+from lightpage.runtime.service.server.certificates import Certificates
+from lightpage.runtime.service.server.roles import Identity, Role, identity_of
 
 if TYPE_CHECKING:
     from _typeshed.wsgi import StartResponse, WSGIApplication, WSGIEnvironment
@@ -171,7 +170,7 @@ class Console:
     def _content(self, path: str, identity: Identity | None) -> tuple[bytes, str] | None:
         if path in _STATIC:
             name, kind = _STATIC[path]
-            return resources.files("runtime.console").joinpath("static", name).read_bytes(), kind
+            return resources.files("lightpage.runtime.console").joinpath("static", name).read_bytes(), kind
         if path == "/state.json":
             return json.dumps(self.state(identity), allow_nan=False).encode(), "application/json"
         _, pair, confidence = self._history.pictures()

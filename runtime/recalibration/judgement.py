@@ -9,14 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.errors import FrameError, RecalibrationRefusedError
+from lightpage.errors import FrameError, LostPageError, RecalibrationRefusedError, UnconfirmedPageError
 from lightpage.metrics.information import achievable_rate
 from lightpage.page.pilots import Pilots
-from runtime.bundle.bundle import Bundle
-from runtime.decoding.page import DecodedPage
-from runtime.decoding.tracking import Tracker, unconfirmed_page
-from runtime.errors import LostPageError, UnconfirmedPageError
-from runtime.recalibration.known_pages import KnownPages
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.decoding.page import DecodedPage
+from lightpage.runtime.model.decoding.tracking import Tracker, unconfirmed_page
+from lightpage.runtime.recalibration.known_pages import KnownPages
 
 MIN_AIR_SHARE = 0.02
 """Share of log2 M below which a held-back page does not match its symbols at all: wrong pilots, wrong device."""

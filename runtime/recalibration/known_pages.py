@@ -14,8 +14,8 @@ from lightpage.progress import warn
 from lightpage.recording.exposure import check_pair_light
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording, hash_frames
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.frames import named, narrow
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.frames import named, narrow
 
 MIN_PAGES = 2
 """One to fit on, one to judge by."""

@@ -8,10 +8,10 @@ from typing import Protocol
 
 from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.progress import Progress
-from runtime.bundle.bundle import Bundle
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.image_position import ImagePosition
-from runtime.recalibration.known_pages import KnownPages
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.image_position import ImagePosition
+from lightpage.runtime.recalibration.known_pages import KnownPages
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class RecalibrationOutcome:
     """A new bundle and why it is better: AIR in bits per symbol on held-back pages, decoded as the service does it.
 
     `pages_lost_before` of these pages the earlier model would not have given out; they count with no bits. `air_limit`
-    is the least `air_after` that would have been accepted, see `runtime.recalibration.judgement.judge`, and
+    is the least `air_after` that would have been accepted, see `lightpage.runtime.recalibration.judgement.judge`, and
     `air_standard_error` that of the difference; None where an earlier version has judged.
     """
 

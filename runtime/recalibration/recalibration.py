@@ -19,15 +19,15 @@ from lightpage.errors import CalibrationError, FrameError, RecalibrationRefusedE
 from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import hash_frames
-from runtime.bundle.bundle import Bundle, npz, write_bundle
-from runtime.bundle.golden import in_few_counts, shows_page
-from runtime.bundle.manifest import GOLDEN, TABLE, Manifest, Provenance, check_version
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.image_tracker import tracker_for
-from runtime.decoding.tracking import Tracker
-from runtime.recalibration.judgement import Verdict, judge, judged_pages
-from runtime.recalibration.known_pages import KnownPages
-from runtime.recalibration.outcome import RecalibrationOutcome, Refit, RefitResult
+from lightpage.runtime.model.bundle.bundle import Bundle, npz, write_bundle
+from lightpage.runtime.model.bundle.golden import in_few_counts, shows_page
+from lightpage.runtime.model.bundle.manifest import GOLDEN, TABLE, Manifest, Provenance, check_version
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.image_tracker import tracker_for
+from lightpage.runtime.model.decoding.tracking import Tracker
+from lightpage.runtime.recalibration.judgement import Verdict, judge, judged_pages
+from lightpage.runtime.recalibration.known_pages import KnownPages
+from lightpage.runtime.recalibration.outcome import RecalibrationOutcome, Refit, RefitResult
 
 _RECALIBRATED = re.compile(r"(.*)\+r(\d+)")
 

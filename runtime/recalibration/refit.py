@@ -17,14 +17,14 @@ from lightpage.page.symbols import symbol_phases
 from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import hash_frames
-from runtime.bundle.bundle import Bundle
-from runtime.bundle.calibrated import calibration_of
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.image_position import ImagePosition
-from runtime.decoding.image_search import BundleSearch
-from runtime.execution.twin import TWIN_THREADS, OnnxTwin
-from runtime.recalibration.known_pages import KnownPages
-from runtime.recalibration.outcome import RefitReport, RefitResult
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.bundle.calibrated import calibration_of
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.image_position import ImagePosition
+from lightpage.runtime.model.decoding.image_search import BundleSearch
+from lightpage.runtime.model.execution.twin import TWIN_THREADS, OnnxTwin
+from lightpage.runtime.recalibration.known_pages import KnownPages
+from lightpage.runtime.recalibration.outcome import RefitReport, RefitResult
 
 Real = NDArray[np.float64]
 

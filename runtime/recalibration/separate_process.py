@@ -16,21 +16,20 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
-from lightpage.errors import BundleError, SurroundingsError
+from lightpage.errors import BundleError, SurroundingsError, WorkerError
 from lightpage.failures import short_resource
+from lightpage.helper_process import same_packages
 from lightpage.progress import Progress
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.tracking import Tracker
+from lightpage.runtime.recalibration.known_pages import KnownPages
+from lightpage.runtime.recalibration.outcome import RecalibrationOutcome
+from lightpage.runtime.recalibration.work import Job, WorkFolder, heard_step
 from lightpage.temporary import temporary_folder
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.tracking import Tracker
-from runtime.errors import WorkerError
-from runtime.helper_process import same_packages
-from runtime.recalibration.known_pages import KnownPages
-from runtime.recalibration.outcome import RecalibrationOutcome
-from runtime.recalibration.work import Job, WorkFolder, heard_step
 
 _log = logging.getLogger(__name__)
 
-WORKER = ("-m", "runtime.recalibration.worker")
+WORKER = ("-P", "-m", "lightpage.runtime.recalibration.worker")
 
 SCRATCH = ".recalibration-"
 """How the name of a folder begins in which a recalibration keeps its files."""
@@ -63,7 +62,7 @@ def recalibrate_apart(
     worker: Sequence[str] = WORKER,
     clock: Callable[[], float] = time.monotonic,
 ) -> RecalibrationOutcome:
-    """Recalibrate in a process of its own; see `runtime.recalibration.recalibration.recalibrate`.
+    """Recalibrate in a process of its own; see `lightpage.runtime.recalibration.recalibration.recalibrate`.
 
     Whatever ends it early, the process, its files and what it has written of the new bundle are gone.
 

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, TypeAdapter
 
-from lightpage.errors import LightpageError
+from lightpage.errors import ERRORS, LightpageError
 from lightpage.recording.frame_pair import FramePair
-from runtime.bundle.bundle import Bundle, write_bundle
-from runtime.decoding.tracking import TrackerMemory
-from runtime.errors import ERRORS
-from runtime.recalibration.known_pages import KnownPages
-from runtime.recalibration.outcome import RecalibrationOutcome
+from lightpage.runtime.model.bundle.bundle import Bundle, write_bundle
+from lightpage.runtime.model.decoding.tracking import TrackerMemory
+from lightpage.runtime.recalibration.known_pages import KnownPages
+from lightpage.runtime.recalibration.outcome import RecalibrationOutcome
 
 _BUNDLE, _PAGES, _JOB, _RESULT = "bundle.zip", "pages.npz", "job.json", "result.json"
 

@@ -1,4 +1,4 @@
-"""A recalibration's own process: `python -m runtime.recalibration.worker FOLDER`, started by `separate_process`."""
+"""A recalibration's own process, started by `separate_process` with the folder of its work."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from pathlib import Path
 
 from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import LightpageError
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.image_tracker import tracker_for
-from runtime.decoding.tracking import NoTracker
-from runtime.recalibration.outcome import Refit
-from runtime.recalibration.recalibration import recalibrate
-from runtime.recalibration.refit import refit
-from runtime.recalibration.work import WorkFolder, told_step
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.image_tracker import tracker_for
+from lightpage.runtime.model.decoding.tracking import NoTracker
+from lightpage.runtime.recalibration.outcome import Refit
+from lightpage.runtime.recalibration.recalibration import recalibrate
+from lightpage.runtime.recalibration.refit import refit
+from lightpage.runtime.recalibration.work import WorkFolder, told_step
 
 NICENESS = 10
 """Beside reads without a pause such a process gets a tenth of a core, and ends. With a higher niceness it would starve,

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
 
-from runtime.errors import CallerLeft
+from lightpage.errors import CallerLeft
 
 
 @dataclass(frozen=True)

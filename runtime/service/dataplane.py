@@ -13,32 +13,38 @@ from numpy.typing import NDArray
 
 from lightpage.clock import SYSTEM, Clock
 from lightpage.codec.page_bytes import Header, Loss, PageBytes
-from lightpage.errors import FrameError, InvalidInputError
+from lightpage.errors import (
+    FrameError,
+    InvalidInputError,
+    LostPageError,
+    NoSourceError,
+    SourceError,
+    UnconfirmedPageError,
+)
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.page.pilots import Pilots
 from lightpage.recording.frame_pair import FramePair
-from runtime.acquisition.source import FrameSource, Shot, own_fault
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.page import DecodedPage
-from runtime.decoding.tracking import unconfirmed_page
-from runtime.errors import LostPageError, NoSourceError, SourceError, UnconfirmedPageError
-from runtime.service.audit import AuditLog
-from runtime.service.caller import NOBODY, Actor, Caller
-from runtime.service.display import Display
-from runtime.service.heart import Heart
-from runtime.service.limits import Limits
-from runtime.service.metrics import ServiceMetrics
-from runtime.service.models import Models
-from runtime.service.monitor import Monitor, SessionMonitors
-from runtime.service.observation import Observer, Seen, observed
-from runtime.service.receiver import PairReceiver, ReceiveBudget
-from runtime.service.registry import Model, ModelRegistry
-from runtime.service.replays import Replays
-from runtime.service.shared_memory import SharedMemory
-from runtime.service.slots import Slots
-from runtime.service.stages import Stage, Stages
-from runtime.service.store import ModelStore
-from runtime.service.store_health import StoreHealth
+from lightpage.runtime.device.acquisition.source import FrameSource, Shot, own_fault
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.page import DecodedPage
+from lightpage.runtime.model.decoding.tracking import unconfirmed_page
+from lightpage.runtime.service.caller import NOBODY, Actor, Caller
+from lightpage.runtime.service.display.display import Display
+from lightpage.runtime.service.frames.receiver import PairReceiver, ReceiveBudget
+from lightpage.runtime.service.frames.shared_memory import SharedMemory
+from lightpage.runtime.service.limits import Limits
+from lightpage.runtime.service.models.audit import AuditLog
+from lightpage.runtime.service.models.models import Models
+from lightpage.runtime.service.models.registry import Model, ModelRegistry
+from lightpage.runtime.service.models.store import ModelStore
+from lightpage.runtime.service.models.store_health import StoreHealth
+from lightpage.runtime.service.monitoring.heart import Heart
+from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
+from lightpage.runtime.service.monitoring.monitor import Monitor, SessionMonitors
+from lightpage.runtime.service.monitoring.observation import Observer, Seen, observed
+from lightpage.runtime.service.monitoring.stages import Stage, Stages
+from lightpage.runtime.service.pages.replays import Replays
+from lightpage.runtime.service.slots import Slots
 
 
 @dataclass(frozen=True)

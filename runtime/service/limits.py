@@ -7,8 +7,8 @@ from typing import Annotated
 from pydantic import ConfigDict, Field
 
 from lightpage.device.profile import TomlTable
-from runtime.acquisition.page_store import UPLOADED_BYTES
-from runtime.wire.sizes import CHUNK_BYTES, MESSAGE_BYTES, REPLY_BYTES
+from lightpage.runtime.client.wire.sizes import CHUNK_BYTES, MESSAGE_BYTES, REPLY_BYTES
+from lightpage.runtime.device.acquisition.page_store import UPLOADED_BYTES
 
 PAIR_BYTES = 256 << 20
 """Both frames of a pair: three times a full-scale 20-megapixel pair of 16 bits."""

@@ -6,7 +6,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 
-from runtime.decoding.tracking import Tracker
+from lightpage.runtime.model.decoding.tracking import Tracker
 
 MOST_SESSIONS = 256
 """Sessions that a model remembers; of more, the one that was silent for longest is forgotten, and begins anew."""

@@ -28,17 +28,17 @@ from lightpage.device.problems import WANTED, expected_of, problem_of
 from lightpage.device.profile import TomlTable, toml_value
 from lightpage.errors import InvalidInputError
 from lightpage.files import read_text
-from runtime.bundle.shipped import DEFAULT
-from runtime.execution.providers import CPU, Provider
-from runtime.recalibration.known_pages import MIN_PAGES
-from runtime.service.audit import AUDIT_BYTES, AUDIT_KEPT
-from runtime.service.flight_recorder import PAGES, RING_BYTES, FlightSettings
-from runtime.service.limits import Limits
-from runtime.service.self_calibration import SelfCalibrationSettings
-from runtime.service.sessions import named_session
-from runtime.service.traces import check_endpoint
-from runtime.wire.address import check_address, is_local
-from runtime.wire.tls import TlsFiles
+from lightpage.runtime.client.wire.address import check_address, is_local
+from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.model.bundle.shipped import DEFAULT
+from lightpage.runtime.model.execution.providers import CPU, Provider
+from lightpage.runtime.recalibration.known_pages import MIN_PAGES
+from lightpage.runtime.service.jobs.self_calibration import SelfCalibrationSettings
+from lightpage.runtime.service.limits import Limits
+from lightpage.runtime.service.models.audit import AUDIT_BYTES, AUDIT_KEPT
+from lightpage.runtime.service.monitoring.flight_recorder import PAGES, RING_BYTES, FlightSettings
+from lightpage.runtime.service.monitoring.traces import check_endpoint
+from lightpage.runtime.service.sessions import named_session
 
 PREFIX = "LIGHTPAGE_"
 """Of variables of the environment: LIGHTPAGE_TABLE__KEY."""

@@ -11,8 +11,8 @@ from math import ceil
 from statistics import median
 
 from lightpage.clock import SYSTEM, Clock
-from runtime.errors import OverloadedError, SlotsTakenError
-from runtime.service.caller import Caller
+from lightpage.errors import OverloadedError, SlotsTakenError
+from lightpage.runtime.service.caller import Caller
 
 MARGIN = 1.1
 """Of the usual time: a call with less time left than this many times it is not begun."""

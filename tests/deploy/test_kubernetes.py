@@ -17,8 +17,8 @@ import pytest
 import yaml
 
 from lightpage.cli.main import EXIT_AGAIN, EXIT_ERROR, EXIT_LOST
-from runtime.scaling.part import Part
-from runtime.service.settings import ServiceSettings, service_settings
+from lightpage.runtime.archives.run.part import Part
+from lightpage.runtime.service.settings import ServiceSettings, service_settings
 from tests.deploy import manifests
 from tests.deploy.manifests import FOLDER, KUSTOMIZATION
 from tests.skips import NO_KUSTOMIZE

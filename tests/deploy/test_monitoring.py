@@ -16,19 +16,19 @@ import pytest
 import yaml
 from click.testing import CliRunner
 
-from runtime.bundle.bundle import Bundle
-from runtime.commands.serve import serve
-from runtime.console.history import History
-from runtime.console.server import Console, ConsoleServer
-from runtime.decoding.decoder import Decoder
-from runtime.service.caller import Caller
-from runtime.service.dataplane import DataPlane
-from runtime.service.metrics import ServiceMetrics
-from runtime.service.monitor import Monitor
-from runtime.service.registry import ModelRegistry
-from runtime.service.settings import Option, service_settings
-from runtime.service.stages import Stages
-from runtime.service.store import ModelStore
+from lightpage.runtime.commands.service.serve import serve
+from lightpage.runtime.console.history import History
+from lightpage.runtime.console.server import Console, ConsoleServer
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.service.caller import Caller
+from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.models.store import ModelStore
+from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
+from lightpage.runtime.service.monitoring.monitor import Monitor
+from lightpage.runtime.service.monitoring.stages import Stages
+from lightpage.runtime.service.settings import Option, service_settings
 from tests.deploy.manifests import DEPLOY
 from tests.runtime import toy
 

@@ -19,7 +19,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from tests.deploy import manifests
-from tests.runtime.identity.authority import Authority
+from tests.runtime.service.server.authority import Authority
 from tests.waiting import eventually
 
 ROOT = manifests.FOLDER.parents[1]

@@ -14,14 +14,14 @@ from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.image_drift import SHIFT, DriftModel
+from lightpage.runtime.model.decoding.image_tracker import WIDEST, ImageTracker, tracker_for
+from lightpage.runtime.model.execution.twin import OnnxTwin
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.image_drift import SHIFT, DriftModel
-from runtime.decoding.image_tracker import WIDEST, ImageTracker, tracker_for
-from runtime.execution.twin import OnnxTwin
+from lightpage.train.models.twin import RayTwin, TorchTwin
 from tests.lightpage.small import small_profile
-from train.models.twin import RayTwin, TorchTwin
 
 DEVICE = Device()
 

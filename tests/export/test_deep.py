@@ -10,18 +10,18 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from export.deep import DEEP
 from lightpage.cli.main import run as run_command
 from lightpage.cli.simulate import simulate
 from lightpage.errors import InvalidInputError
-from runtime.bundle.bundle import Bundle
-from runtime.commands.bulk import bulk
-from runtime.scaling.fine_tuning import GROUP, deep_recalibration
+from lightpage.export.deep import DEEP
+from lightpage.runtime.archives.workers.fine_tuning import GROUP, deep_recalibration
+from lightpage.runtime.commands.archives.bulk import bulk
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.train.commands.train import train
+from lightpage.train.models.hyperparameters import Hyperparameters
+from lightpage.train.runs import WEIGHTS, Run
 from tests.lightpage.small import small_profile
 from tests.runtime import toy
-from train.commands.train import train
-from train.models.hyperparameters import Hyperparameters
-from train.runs import WEIGHTS, Run
 
 TRAINED = ("1" * 64,)
 
@@ -34,8 +34,8 @@ def made_run(folder: Path, profile_toml: str) -> Path:
 
 
 def test_the_entry_point_names_it() -> None:
-    packaging = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text("utf-8"))
-    ((name, value),) = packaging["project"]["entry-points"][GROUP].items()
+    release = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text("utf-8"))
+    ((name, value),) = release["project"]["entry-points"][GROUP].items()
     assert deep_recalibration([EntryPoint(name, value, GROUP)]) is DEEP
 
 
@@ -60,7 +60,7 @@ def test_a_device_without_what_it_needs_is_told(tmp_path: Path) -> None:
 def test_a_drifted_device_is_found_trained_on_and_judged_by_pages_of_its_own(
     small_device: list[str], tmp_path: Path
 ) -> None:
-    from export.command import export_run
+    from lightpage.export.command import export_run
 
     run = tmp_path / "run"
     small = [*small_device, "--channels", "8", "--blocks", "1", "--refinements", "0", "--synthetic-pages", "0"]

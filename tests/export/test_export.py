@@ -13,28 +13,28 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from export import command as cli_export
-from export.command import export, export_run
-from export.graph import TABLE_INPUTS, angle
-from export.operators.check import fallbacks, page_part
-from export.operators.operator_list import PROVIDERS
-from export.parity import check_parity
 from lightpage.calibration.parameters import nominal
 from lightpage.calibration.sampling_table import sampling_table
 from lightpage.device.state import Device
 from lightpage.errors import BundleError, InvalidInputError
+from lightpage.export import command as cli_export
+from lightpage.export.command import export, export_run
+from lightpage.export.graph import TABLE_INPUTS, angle
+from lightpage.export.operators.check import fallbacks, page_part
+from lightpage.export.operators.operator_list import PROVIDERS
+from lightpage.export.parity import check_parity
 from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.commands.archives.evaluate import evaluate
+from lightpage.runtime.model.bundle.bundle import Bundle, npz, write_bundle
+from lightpage.runtime.model.bundle.golden import in_few_counts
+from lightpage.runtime.model.bundle.manifest import DECODER, FIELD, TWIN
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.execution.session import open_session
 from lightpage.simulator.true_optics import true_parameters
+from lightpage.train.models.twin import RayTwin, TorchTwin
+from lightpage.train.runs import GOLDEN, REFERENCES, WEIGHTS, load_run
 from lightpage.waves.grid import field_grid
-from runtime.bundle.bundle import Bundle, npz, write_bundle
-from runtime.bundle.golden import in_few_counts
-from runtime.bundle.manifest import DECODER, FIELD, TWIN
-from runtime.commands.evaluate import evaluate
-from runtime.decoding.decoder import Decoder
-from runtime.execution.session import open_session
 from tests.lightpage.small import small_profile
-from train.models.twin import RayTwin, TorchTwin
-from train.runs import GOLDEN, REFERENCES, WEIGHTS, load_run
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +112,7 @@ def test_the_fields_own_graph_shows_the_decoders_field(
     np.testing.assert_allclose(field, expected, atol=1e-4)
     np.testing.assert_allclose(left, expected_left, atol=1e-4)
     # as a decoder that looks at the field more coarsely would have it
-    monkeypatch.setattr("runtime.decoding.field_solver.field_grid", partial(field_grid, step_px=3))
+    monkeypatch.setattr("lightpage.runtime.model.decoding.field_solver.field_grid", partial(field_grid, step_px=3))
     with pytest.raises(BundleError, match="output field"):
         without.field_solver(*asked)
 

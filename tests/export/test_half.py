@@ -9,10 +9,10 @@ import torch
 from onnx import TensorProto, numpy_helper, parser
 from torch import nn
 
-from export.half import check_deviation, in_half, rounded
-from export.onnx_files import _export
 from lightpage.errors import BundleError, InvalidInputError
-from runtime.execution.session import open_session
+from lightpage.export.half import check_deviation, in_half, rounded
+from lightpage.export.onnx_files import _export
+from lightpage.runtime.model.execution.session import open_session
 
 GRAPH = """<ir_version: 10, opset_import: ["" : 20]>
 decoder (float[2, 3] in_phase, float[2, 3] quadrature, float[3] gain = {1, 0.3, 2}) => (float[2, 3] p)

@@ -10,22 +10,22 @@ import pytest
 from click.testing import CliRunner
 from onnx import TensorProto, helper, parser
 
-from export.graph import FRAME_INPUTS, DecoderGraph, table_tensors
-from export.onnx_files import OPSET, decoder_onnx
-from export.operators.check import fallbacks, page_part, repeated_products, shape_computations
-from export.operators.collect import collect
-from export.operators.operator_list import PROVIDERS, OperatorList
 from lightpage.calibration.sampling_table import sampling_table
 from lightpage.device.state import Device
 from lightpage.errors import InvalidInputError
+from lightpage.export.graph import FRAME_INPUTS, DecoderGraph, table_tensors
+from lightpage.export.onnx_files import OPSET, decoder_onnx
+from lightpage.export.operators.check import fallbacks, page_part, repeated_products, shape_computations
+from lightpage.export.operators.collect import collect
+from lightpage.export.operators.operator_list import PROVIDERS, OperatorList
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.bundle.manifest import DECODER
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
-from runtime.bundle.bundle import Bundle
-from runtime.bundle.manifest import DECODER
+from lightpage.train.models.decoder import SymbolDecoder
+from lightpage.train.models.presets import FAST, PRESETS
+from lightpage.train.models.twin import RayTwin, TorchTwin
 from tests.lightpage.small import small_profile
-from train.models.decoder import SymbolDecoder
-from train.models.presets import FAST, PRESETS
-from train.models.twin import RayTwin, TorchTwin
 
 ORIGIN = "someone/project docs/file.md at 0000000 (1.0)"
 SMALL = "agraph (float[1, 2, 6, 8] x, float[1, 4, 4, 2] grid) => (float[1, 2, 4, 4] y)"

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from export.command import export_run
 from lightpage.errors import BundleError
+from lightpage.export.command import export_run
 from lightpage.recording.reader import Recording
-from runtime.decoding.decoder import Decoder
-from runtime.recalibration.known_pages import KnownPages
-from runtime.recalibration.recalibration import recalibrate
-from runtime.recalibration.refit import refit
-from train.published.trainer import published_decoder
-from train.published.training import PublishedChoices
-from train.runs import load_run, load_weights
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.recalibration.known_pages import KnownPages
+from lightpage.runtime.recalibration.recalibration import recalibrate
+from lightpage.runtime.recalibration.refit import refit
+from lightpage.train.published.trainer import published_decoder
+from lightpage.train.published.training import PublishedChoices
+from lightpage.train.runs import load_run, load_weights
 
 
 def test_a_published_decoder_runs_without_torch_and_says_the_same(

@@ -20,19 +20,22 @@ from tests.planted.faults import ROOT, Fault, blocks_of, load
 COUNT = 60
 AREAS = {
     "page-code": {"lightpage/codec": "* ldpc/*"},
-    "decoder": {"lightpage": "page/* metrics/*", "runtime/decoding": "decoder page frames phase_refit field_solver"},
-    "tracking": {"runtime/decoding": "image_tracker following tracking image_search image_drift"},
+    "decoder": {
+        "lightpage": "page/* metrics/*",
+        "runtime/model/decoding": "decoder page frames phase_refit field_solver",
+    },
+    "tracking": {"runtime/model/decoding": "image_tracker following tracking image_search image_drift"},
     "calibration": {"lightpage/calibration": "*", "train/fitting": "fit fitted"},
     "registry": {"runtime/service": "registry models replays"},
     "store": {"runtime/service": "store store_health file_ring flight_recorder jobs"},
-    "pairing": {"runtime/acquisition": "pairing camera_source beam_keeper page_store source"},
+    "pairing": {"runtime/device/acquisition": "pairing camera_source beam_keeper page_store source"},
     "ledger": {"runtime/scaling": "ledger totals shard task work job driver volumes"},
     "failures": {"lightpage": "failures errors", "runtime": "errors wire/status rpc/call"},
     "limits": {
         "runtime": "rpc/message_gate rpc/uploads rpc/sent_pages rpc/frame_calls",
         "runtime/service": "slots limits settings sessions incoming receiver",
     },
-    "wire": {"runtime/wire": "[!s]* s[!t]*", "runtime/client": "[!c]*", "runtime/rpc": "tensors"},
+    "wire": {"runtime/client/wire": "[!s]* s[!t]*", "runtime/client": "[!c]*", "runtime/rpc": "tensors"},
 }
 """Files of an area by their folder, without .py."""
 KINDS = ("comparison", "bound", "sign", "constant", "condition", "swallowed", "exchanged", "unstored")

@@ -13,8 +13,8 @@ from lightpage.errors import PageError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.pages import Pages
 from lightpage.recording.reader import RecordingWriter
-from runtime.acquisition.source import SHOT_S, FrameSource, Shot
-from runtime.commands.encode import encode
+from lightpage.runtime.commands.archives.encode import encode
+from lightpage.runtime.device.acquisition.source import SHOT_S, FrameSource, Shot
 from tests.runtime import toy
 
 CODE = Code(levels=32, coded_bits=2, rate_per_mille=500, corrections=1, needed_information=0.6)

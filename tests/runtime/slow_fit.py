@@ -6,10 +6,10 @@ import threading
 from dataclasses import dataclass, field
 
 from lightpage.progress import Progress
-from runtime.bundle.bundle import Bundle
-from runtime.decoding.decoder import Decoder
-from runtime.recalibration.known_pages import KnownPages
-from runtime.recalibration.outcome import RefitResult
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.recalibration.known_pages import KnownPages
+from lightpage.runtime.recalibration.outcome import RefitResult
 from tests.runtime import toy
 
 

@@ -22,12 +22,12 @@ from lightpage.page.symbols import random_symbols, symbol_phases
 from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording, RecordingWriter
-from runtime.acquisition.source import SHOT_S, FrameSource, Shot
-from runtime.bundle.bundle import Bundle, npz, write_bundle
-from runtime.bundle.manifest import DECODER, GOLDEN, PILOTS, TWIN, Manifest
-from runtime.decoding.decoder import Decoder
-from runtime.recalibration.known_pages import KnownPages
-from runtime.recalibration.outcome import RefitReport, RefitResult
+from lightpage.runtime.device.acquisition.source import SHOT_S, FrameSource, Shot
+from lightpage.runtime.model.bundle.bundle import Bundle, npz, write_bundle
+from lightpage.runtime.model.bundle.manifest import DECODER, GOLDEN, PILOTS, TWIN, Manifest
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.recalibration.known_pages import KnownPages
+from lightpage.runtime.recalibration.outcome import RefitReport, RefitResult
 
 PROFILE: Profile = load_profile("bench").model_copy(
     update={

@@ -14,19 +14,19 @@ from pathlib import Path
 import grpc
 import pytest
 
+from lightpage.errors import OverloadedError
 from lightpage.recording.frame_pair import FramePair
-from runtime.decoding.decoder import Decoder
-from runtime.errors import OverloadedError
-from runtime.identity.certificates import Certificates
-from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
-from runtime.rpc.server import LightpageServer
-from runtime.service.dataplane import DataPlane
-from runtime.service.recalibrator import Recalibrator
-from runtime.service.registry import ModelRegistry
-from runtime.wire.status import status_of, told, trailers
+from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
+from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
+from lightpage.runtime.client.wire.status import status_of, told, trailers
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.jobs.recalibrator import Recalibrator
+from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.server.certificates import Certificates
+from lightpage.runtime.service.server.server import LightpageServer
 from tests.runtime import toy
-from tests.runtime.identity.authority import Authority
+from tests.runtime.service.server.authority import Authority
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = (*sorted((ROOT / "clients/cpp").iterdir()), ROOT / "proto/lightpage/v1/lightpage.proto")

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from grpc_tools import protoc
 
-from runtime.decoding.decoder import Decoder
-from runtime.rpc.server import LightpageServer
-from runtime.service.dataplane import DataPlane
-from runtime.service.recalibrator import Recalibrator
-from runtime.service.registry import ModelRegistry
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.jobs.recalibrator import Recalibrator
+from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.server.server import LightpageServer
 from tests.runtime import toy
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -34,7 +34,7 @@ def run(*command: str | Path, cwd: Path) -> str:
     return done.stdout
 
 
-@pytest.mark.parametrize("package", ["lightpage", "lightpage.codec", "runtime"])
+@pytest.mark.parametrize("package", ["lightpage", "lightpage.codec"])
 def test_every_name_of_a_door_is_there(package: str) -> None:
     module = importlib.import_module(package)
     assert [name for name in module.__all__ if getattr(module, name, None) is None] == []
@@ -47,18 +47,18 @@ def test_a_callers_own_stubs_work_beside_the_installed_package_and_the_client_is
     made = ["protoc", f"-I{ROOT / 'proto'}", f"--python_out={tmp_path}", "lightpage/v1/lightpage.proto"]
     assert protoc.main(made) == 0
     script = """
-import runtime.client.client
+import lightpage.runtime.client.client
 print(*sorted({name.partition(".")[0] for name in sys.modules}))
-import lightpage, runtime
-from runtime.pb.lightpage.v1 import lightpage_pb2 as ours
+import lightpage
+from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as ours
 from lightpage.v1 import lightpage_pb2 as theirs
 theirs.DecodeReply.FromString(ours.DecodeReply(rows=3).SerializeToString())
-print(theirs.__file__, lightpage.Recording, runtime.LightpageClient)
+print(theirs.__file__, lightpage.Recording, lightpage.LightpageClient)
 """
-    for first in ("lightpage, runtime", "lightpage.v1.lightpage_pb2"):
+    for first in ("lightpage", "lightpage.v1.lightpage_pb2"):
         code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import {first}\n{script}"
         loaded, theirs = run(sys.executable, "-c", code, cwd=ROOT).splitlines()
-        assert {"grpc", "numpy", "runtime"} <= set(loaded.split())
+        assert {"grpc", "numpy", "lightpage"} <= set(loaded.split())
         assert set(loaded.split()) & HEAVY == set()
         assert str(tmp_path) in theirs
 
@@ -66,7 +66,7 @@ print(theirs.__file__, lightpage.Recording, runtime.LightpageClient)
 DECODE = f"""
 import sys
 sys.path.insert(0, sys.argv[4])
-sys.modules.update(dict.fromkeys({["lightpage", "runtime", *HEAVY]}))  # as if they were not there
+sys.modules.update(dict.fromkeys({["lightpage", *HEAVY]}))  # as if they were not there
 import json
 import numpy as np
 from lightpage_client import FramePair, LightpageClient
@@ -92,7 +92,7 @@ print(json.dumps({{
 
 def test_it_decodes_a_page_as_the_services_own_client_does(decoder: Decoder, tmp_path: Path) -> None:
     source, installed = tmp_path / "source", tmp_path / "installed"
-    for name in ("lightpage", "runtime", "clients/python"):  # a copy: a build leaves its traces
+    for name in ("lightpage", "clients/python"):  # a copy: a build leaves its traces
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__", "build", "*.egg-info"))
     shutil.copy(ROOT / "pyproject.toml", source)
     pip = (sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index")

@@ -1,4 +1,4 @@
-"""The shell around the code: set-up, packaging, image and commands are what they say."""
+"""The shell around the code: set-up, release, image and commands are what they say."""
 
 from __future__ import annotations
 
@@ -18,17 +18,16 @@ from typing import Any
 
 import pytest
 
-from tests.packaging.scripts import script
+from tests.release.scripts import script
 
 ROOT = Path(__file__).resolve().parents[2]
 SETTINGS: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PROJECT, DATA = SETTINGS["project"], SETTINGS["tool"]["setuptools"]["package-data"]
 NAMED: list[dict[str, str]] = [PROJECT["scripts"], *PROJECT["entry-points"].values()]
-LOCKS = ROOT / "packaging" / "locks"
+LOCKS = ROOT / "release" / "locks"
 # What a wheel is made of, and what the image build is given beside that.
-PACKAGES = ("lightpage", "train", "export", "runtime", "analysis")
+PACKAGES = ("lightpage", "train", "export", "runtime", "report", "study", "demo", "virtual_device")
 SOURCES = ("pyproject.toml", "LICENSE", "README.md", *PACKAGES)
-TYPED = ("lightpage", "train", "export", "runtime")
 
 
 def run(command: Sequence[str | Path], *, cwd: Path = ROOT, timeout_s: float = 60) -> subprocess.CompletedProcess[str]:
@@ -44,7 +43,7 @@ def run(command: Sequence[str | Path], *, cwd: Path = ROOT, timeout_s: float = 6
 
 def test_scripts_parse() -> None:
     assert run(["make", "--dry-run"]).stdout == run(["make", "--dry-run", "help"]).stdout
-    for path in (ROOT / ".ci/run", *ROOT.glob("packaging/*.sh")):
+    for path in (ROOT / ".ci/run", *ROOT.glob("release/*.sh")):
         assert os.access(path, os.X_OK)
         assert run(["bash", "-n", path]).stderr == ""
 
@@ -69,12 +68,12 @@ def test_every_command_and_plug_in_is_there() -> None:
 
 
 def test_data_files_of_the_packages_travel_with_the_wheel() -> None:
-    for package in TYPED:
-        for path in (ROOT / package).rglob("*"):
-            if path.is_file() and path.suffix not in (".py", ".pyc", ".pyi", ".typed"):
-                within = [parent for parent in path.relative_to(ROOT).parents if ".".join(parent.parts) in DATA]
+    for folder, _, names in os.walk(ROOT / "lightpage", followlinks=True):
+        for path in (Path(folder, name).relative_to(ROOT) for name in names):
+            if path.suffix not in (".py", ".pyc", ".pyi"):
+                within = [parent for parent in path.parents if ".".join(parent.parts) in DATA]
                 patterns = [within[0] / pattern for pattern in DATA[".".join(within[0].parts)]] if within else []
-                assert any(path.relative_to(ROOT).match(str(pattern)) for pattern in patterns), path
+                assert any(path.match(str(pattern)) for pattern in patterns), path
 
 
 # ---- image --------------------------------------------------------------------------------------------------------
@@ -87,7 +86,11 @@ def stages() -> dict[str, str]:
 
 
 def test_the_image_is_not_root_quiet_and_checked() -> None:
-    for line in ("USER 10001:10001", "ORT_DISABLE_TELEMETRY=1", 'CMD ["python", "-m", "runtime.commands.healthcheck"]'):
+    for line in (
+        "USER 10001:10001",
+        "ORT_DISABLE_TELEMETRY=1",
+        'CMD ["python", "-m", "lightpage.runtime.commands.service.healthcheck"]',
+    ):
         assert line in stages()["service"]
     for name in ("runtime", "camera", "deep", "gpu"):  # whatever is installed, it is run alike
         assert f"FROM service AS {name}" in (ROOT / "Dockerfile").read_text()
@@ -96,9 +99,9 @@ def test_the_image_is_not_root_quiet_and_checked() -> None:
 
 def test_the_image_is_built_of_what_the_wheel_is_built_of() -> None:
     copied = re.findall(r"^COPY (?!--)(.*) \S+$", stages()["build"], re.MULTILINE)
-    assert sorted(" ".join(copied).split()) == sorted((*SOURCES, "packaging"))
+    assert sorted(" ".join(copied).split()) == sorted((*SOURCES, "release"))
     let_through = [line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")]
-    assert sorted(let_through) == sorted((*SOURCES, "packaging"))
+    assert sorted(let_through) == sorted((*SOURCES, "release"))
 
 
 # ---- what the image build is lent ---------------------------------------------------------------------------------
@@ -138,27 +141,32 @@ def test_settings_of_pip_are_lent_to_the_build_of_an_image(tmp_path: Path) -> No
 # ---- an environment without torch ---------------------------------------------------------------------------------
 
 
-NEED_AN_EXTRA = {"runtime.modulator.present": "xcffib", "runtime.modulator.x_window": "xcffib"}
+NEED_AN_EXTRA = {
+    "lightpage.runtime.device.modulator.screen.present": "xcffib",
+    "lightpage.runtime.device.modulator.screen.x_window": "xcffib",
+}
 """Modules that the process of a modulator's window alone loads, and what they lack without the extra `screen`."""
+
+WITH_TORCH = ("lightpage.train", "lightpage.export", "lightpage.study", "lightpage.report")
 
 IN_THE_IMAGE = f"""
 import importlib, json, pkgutil, sys
 lacking = {{}}
-for package in ("lightpage", "runtime"):
-    for module in pkgutil.walk_packages(importlib.import_module(package).__path__, package + "."):
-        try:
+without = ("train", "export", "study", "report")  # what needs torch
+names = [name for _, name, is_package in pkgutil.iter_modules(lightpage.__path__) if name not in without]
+
             importlib.import_module(module.name)
         except ModuleNotFoundError as error:
             lacking[module.name] = error.name
 assert lacking == {NEED_AN_EXTRA}, lacking
-assert {{"lightpage.cli.main", "runtime.commands.healthcheck"}} <= sys.modules.keys()
+assert {{"lightpage.cli.main", "lightpage.runtime.commands.service.healthcheck"}} <= sys.modules.keys()
 import numpy as np
 from importlib.resources import files
 from click.testing import CliRunner
 from lightpage.cli.main import lightpage
 from lightpage.device.profile import load_profile
-from runtime.bundle.shipped import bundle_path
-from runtime.decoding.decoder import Decoder
+from lightpage.runtime.model.bundle.shipped import bundle_path
+from lightpage.runtime.model.decoding.decoder import Decoder
 decoder = Decoder.load(bundle_path("bench"), threads=1)
 page = decoder.decode(decoder.bundle.golden.pair, 16)
 print(json.dumps({{
@@ -166,7 +174,7 @@ print(json.dumps({{
     "help": CliRunner().invoke(lightpage, ["--help"]).output,
     "profiles": [load_profile(name).name for name in ("bench", "paper")],
     "torch": "torch" in sys.modules,
-    "typed": [name for name in {TYPED} if files(name).joinpath("py.typed").is_file()],
+    "typed": files("lightpage").joinpath("py.typed").is_file(),
 }}))
 """
 """What must go well with what the runtime image has, all in one process: importing everything takes seconds."""
@@ -176,7 +184,7 @@ def does_its_work(said: str) -> None:
     told = json.loads(said)
     assert told["decoded"] == [[56, 87], True]
     assert told["profiles"] == ["bench", "paper"]
-    assert (told["torch"], len(told["typed"])) == (False, 4)
+    assert (told["torch"], told["typed"]) == (False, True)
     assert re.search(r"^  serve ", told["help"], re.MULTILINE), told["help"]
 
 

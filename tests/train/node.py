@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Subset, TensorDataset
 
-from train.data.pages import Page
-from train.fitting.fit import fit
-from train.fitting.modules import SymbolTraining
-from train.models.hyperparameters import Hyperparameters
-from train.models.network import SymbolUNet
-from train.processes import Processes, is_first_process
+from lightpage.train.data.pages import Page
+from lightpage.train.fitting.fit import fit
+from lightpage.train.fitting.modules import SymbolTraining
+from lightpage.train.models.hyperparameters import Hyperparameters
+from lightpage.train.models.network import SymbolUNet
+from lightpage.train.processes import Processes, is_first_process
 
 STEPS = 8
 _PAGES, _SHAPE, _CHANNELS = 4, (12, 16), 8

@@ -13,10 +13,10 @@ import pytest
 import torch
 
 from lightpage.errors import InvalidInputError, LightpageError
+from lightpage.train.fitting.curves import curves_of
+from lightpage.train.processes import Processes, is_first_process, process_number, wait_for_first
 from tests.clock import HandClock
 from tests.train.node import STEPS, train
-from train.fitting.curves import curves_of
-from train.processes import Processes, is_first_process, process_number, wait_for_first
 
 SECONDS = 240
 ROUNDING = 1e-5

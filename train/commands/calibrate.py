@@ -19,8 +19,8 @@ from lightpage.device.profile import Profile, load_profile
 from lightpage.files import write_json
 from lightpage.progress import Progress, warn
 from lightpage.recording.reader import Recording
-from train.models.field import FieldRecovery, TorchFieldSolver
-from train.models.twin import RayTwin, TorchTwin
+from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
+from lightpage.train.models.twin import RayTwin, TorchTwin
 
 DEFAULT_PAGES = 2
 MAX_PAGES = 4

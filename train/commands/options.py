@@ -12,17 +12,17 @@ import click
 
 from lightpage.device.profile import Profile, load_profile
 from lightpage.errors import InvalidInputError
+from lightpage.train.fitting.precision import PRECISIONS
+from lightpage.train.models.decoder import LOCALIZERS, WAVE
+from lightpage.train.models.hyperparameters import Hyperparameters
+from lightpage.train.models.localizers.coherent import BICUBIC, BILINEAR
+from lightpage.train.models.presets import ACCURATE, FAST, PRESETS
+from lightpage.train.published.decoder import LENS_CHOICES
+from lightpage.train.published.localizers import NAMES as PUBLISHED
+from lightpage.train.published.trainer import PublishedTrainer, published_choices
+from lightpage.train.published.training import PublishedChoices
+from lightpage.train.trainers.symbols import SymbolTrainer, default_synthetic_pages
 from lightpage.waves.grid import GRID_STEP_PX
-from train.fitting.precision import PRECISIONS
-from train.models.decoder import LOCALIZERS, WAVE
-from train.models.hyperparameters import Hyperparameters
-from train.models.localizers.coherent import BICUBIC, BILINEAR
-from train.models.presets import ACCURATE, FAST, PRESETS
-from train.published.decoder import LENS_CHOICES
-from train.published.localizers import NAMES as PUBLISHED
-from train.published.trainer import PublishedTrainer, published_choices
-from train.published.training import PublishedChoices
-from train.trainers.symbols import SymbolTrainer, default_synthetic_pages
 
 _ALL = (*PUBLISHED, *LOCALIZERS)
 _COHERENT = tuple(name for name in LOCALIZERS if name != WAVE)

@@ -18,9 +18,9 @@ from torch.utils.data import Dataset
 from lightpage.failures import os_failure
 from lightpage.files import replace_text, reserve
 from lightpage.progress import track
-from train.data.features import PageFeatures, PageState
-from train.data.pages import Page
-from train.processes import is_first_process, wait_for_first
+from lightpage.train.data.features import PageFeatures, PageState
+from lightpage.train.data.pages import Page
+from lightpage.train.processes import is_first_process, wait_for_first
 
 _STATE = "state.json"
 _FILES = {"light": "light", "positions": "positions", "estimate": "belief", "phases": "phases"}

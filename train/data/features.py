@@ -21,13 +21,13 @@ from lightpage.errors import CalibrationError
 from lightpage.page.symbols import symbol_phases
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
+from lightpage.train.models.field import Measured, TorchFieldSolver
+from lightpage.train.models.hyperparameters import Hyperparameters
+from lightpage.train.models.localizers.coherent import CoherentLocalizer
+from lightpage.train.models.localizers.wave import WaveLocalizer
+from lightpage.train.models.parts import stacked
+from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.waves.grid import GRID_STEP_PX, FieldGrid
-from train.models.field import Measured, TorchFieldSolver
-from train.models.hyperparameters import Hyperparameters
-from train.models.localizers.coherent import CoherentLocalizer
-from train.models.localizers.wave import WaveLocalizer
-from train.models.parts import stacked
-from train.models.twin import RayTwin, TorchTwin
 
 Real = NDArray[np.float64]
 

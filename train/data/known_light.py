@@ -10,11 +10,11 @@ import torch
 from numpy.typing import NDArray
 
 from lightpage.calibration.calibrate import KnownPage
-from lightpage.calibration.wave_model import FittedWaves, illumination_terms, on_modulator
+from lightpage.calibration.waves.wave_model import FittedWaves, illumination_terms, on_modulator
 from lightpage.progress import track
+from lightpage.train.data.features import FeatureExtractor
+from lightpage.train.models.field import Measured
 from lightpage.waves.grid import symbol_samples
-from train.data.features import FeatureExtractor
-from train.models.field import Measured
 
 ACCURACY = 3 / 8
 """Share of a simulation's splitting steps."""

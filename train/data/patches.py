@@ -11,10 +11,10 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from lightpage.errors import InvalidInputError
-from train.data.feature_store import FeatureStore
-from train.data.pages import Page
-from train.models.hyperparameters import Hyperparameters
-from train.models.network import reach, with_page_coordinates
+from lightpage.train.data.feature_store import FeatureStore
+from lightpage.train.data.pages import Page
+from lightpage.train.models.hyperparameters import Hyperparameters
+from lightpage.train.models.network import reach, with_page_coordinates
 
 
 def training_pages(stores: Sequence[FeatureStore], mask: NDArray[np.bool_], choices: Hyperparameters) -> Dataset[Page]:

@@ -17,15 +17,15 @@ from scipy import signal
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.parameters import NAMES
 from lightpage.calibration.sampling_table import sampling_table
-from lightpage.calibration.wave_model import FittedWaves, illumination_terms, on_modulator
+from lightpage.calibration.waves.wave_model import FittedWaves, illumination_terms, on_modulator
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.page.symbols import random_symbols, symbol_phases
+from lightpage.train.data.features import PageFeatures, PageState, demodulate, localized
+from lightpage.train.data.known_light import Explained
+from lightpage.train.models.localizers.coherent import CoherentLocalizer
+from lightpage.train.models.localizers.wave import WaveLocalizer
+from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.waves.grid import FieldGrid, field_grid, symbol_samples
-from train.data.features import PageFeatures, PageState, demodulate, localized
-from train.data.known_light import Explained
-from train.models.localizers.coherent import CoherentLocalizer
-from train.models.localizers.wave import WaveLocalizer
-from train.models.twin import RayTwin, TorchTwin
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]

@@ -12,8 +12,8 @@ from torch import Tensor
 from lightpage.calibration.document import Calibration
 from lightpage.device.profile import Profile
 from lightpage.recording.reader import Recording
-from train.data.features import FeatureExtractor
-from train.processes import Processes
+from lightpage.train.data.features import FeatureExtractor
+from lightpage.train.processes import Processes
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from scipy import optimize
 from torch.utils.data import DataLoader, Dataset
 
 from lightpage.progress import warn
-from train.data.pages import Page
-from train.fitting.loss import von_mises_nll
-from train.fitting.modules import DecoderTraining
-from train.fitting.validation import without_piston
+from lightpage.train.data.pages import Page
+from lightpage.train.fitting.loss import von_mises_nll
+from lightpage.train.fitting.modules import DecoderTraining
+from lightpage.train.fitting.validation import without_piston
 
 _SCALE_BOUNDS = (-3.0, 3.0)
 """Bounds of the logarithm of a factor that calibrates concentrations: hardly trained decoders were off by five."""

@@ -21,15 +21,15 @@ from torch.utils.data import DataLoader, Dataset, RandomSampler
 
 from lightpage.errors import LightpageError
 from lightpage.progress import track
-from train.data.pages import Page
-from train.fitting.curves import TENSORBOARD, curves_of, thinned
-from train.fitting.fitted import CHECKPOINTS, KEPT_POINTS, Fitted, M, finished, is_finished
-from train.fitting.modules import AVERAGED_SHARE, SymbolTraining
-from train.fitting.precision import lightning_precision
-from train.fitting.provenance import provenance_of
-from train.models.hyperparameters import Hyperparameters
-from train.models.network import Refiner, SymbolUNet
-from train.processes import AS_IT_IS, Processes, is_first_process, process_number, wait_for_first
+from lightpage.train.data.pages import Page
+from lightpage.train.fitting.curves import TENSORBOARD, curves_of, thinned
+from lightpage.train.fitting.fitted import CHECKPOINTS, KEPT_POINTS, Fitted, M, finished, is_finished
+from lightpage.train.fitting.modules import AVERAGED_SHARE, SymbolTraining
+from lightpage.train.fitting.precision import lightning_precision
+from lightpage.train.fitting.provenance import provenance_of
+from lightpage.train.models.hyperparameters import Hyperparameters
+from lightpage.train.models.network import Refiner, SymbolUNet
+from lightpage.train.processes import AS_IT_IS, Processes, is_first_process, process_number, wait_for_first
 
 _LAST = "last.ckpt"
 
@@ -59,7 +59,7 @@ def fit_network(
 
     Args:
         run, validation, processes: as for `fit`.
-        training: pages whose phases are NaN where nothing is asked (`train.data.patches.training_pages`).
+        training: pages whose phases are NaN where nothing is asked (`lightpage.train.data.patches.training_pages`).
         hyperparameters: the run's choices.
         pilot_mask: bool [ny, nx].
         levels: M of the pages.
@@ -115,7 +115,7 @@ def fit(
 
     Args:
         run: folder of the run; checkpoints and TensorBoard logs go there, and the last checkpoint is resumed from: the
-            caller sees to it that it belongs to these pages and choices (`train.runs.begin`).
+            caller sees to it that it belongs to these pages and choices (`lightpage.train.runs.begin`).
         module: with its first weights.
         training: batches of pages whose phases are NaN where nothing is asked.
         validation: pages.

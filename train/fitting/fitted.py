@@ -13,9 +13,9 @@ import torch
 
 from lightpage.errors import InvalidInputError
 from lightpage.files import replace_file, replace_text
-from train.fitting.curves import Curve
-from train.fitting.modules import DecoderTraining
-from train.fitting.provenance import provenance_of
+from lightpage.train.fitting.curves import Curve
+from lightpage.train.fitting.modules import DecoderTraining
+from lightpage.train.fitting.provenance import provenance_of
 
 CHECKPOINTS = "checkpoints"
 """Folder of a run's checkpoints."""
@@ -39,7 +39,7 @@ class Fitted(Generic[M]):
         module: the best one, in float32.
         validation_air: its AIR on the validation pages, bits per data symbol.
         seconds: of training, all stretches of an interrupted run together.
-        curves: of `train.fitting.curves.CURVES`, thinned.
+        curves: of `lightpage.train.fitting.curves.CURVES`, thinned.
     """
 
     module: M

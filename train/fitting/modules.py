@@ -12,12 +12,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from train.data.pages import Page
-from train.fitting.loss import training_rate, von_mises_nll
-from train.fitting.validation import held_out_air
-from train.models.hyperparameters import Hyperparameters
-from train.models.network import Refiner, SymbolUNet
-from train.models.parts import turned
+from lightpage.train.data.pages import Page
+from lightpage.train.fitting.loss import training_rate, von_mises_nll
+from lightpage.train.fitting.validation import held_out_air
+from lightpage.train.models.hyperparameters import Hyperparameters
+from lightpage.train.models.network import Refiner, SymbolUNet
+from lightpage.train.models.parts import turned
 
 AVERAGED_SHARE = 0.05
 """Share of a run's steps over which its weights are averaged, exponentially: what is validated, kept and exported."""

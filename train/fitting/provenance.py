@@ -47,7 +47,7 @@ def commit() -> str:
 
     What is committed while a process works is not what it runs.
     """
-    tree = Path(__file__).parents[2]
+    tree = Path(__file__).resolve().parents[2]
     toplevel, _, found = _git(tree, "rev-parse", "--show-toplevel", "HEAD").partition("\n")
     if not found or Path(toplevel) != tree.resolve():
         return ""

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from lightpage.metrics.information import achievable_rate, decide
 from lightpage.page.pilots import Pilots, estimate_piston
-from train.models.parts import turned
+from lightpage.train.models.parts import turned
 
 
 def held_out_air(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.bool_], levels: int) -> float:

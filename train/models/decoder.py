@@ -7,13 +7,13 @@ from collections.abc import Mapping
 from torch import Tensor, nn
 
 from lightpage.device.profile import Profile
-from train.models.field import FieldRecovery, Measured
-from train.models.hyperparameters import Hyperparameters
-from train.models.localizers.coherent import CoherentLocalizer
-from train.models.localizers.wave import WaveLocalizer
-from train.models.network import Refiner, SymbolUNet
-from train.models.prediction import Prediction
-from train.models.waves import Real
+from lightpage.train.models.field import FieldRecovery, Measured
+from lightpage.train.models.hyperparameters import Hyperparameters
+from lightpage.train.models.localizers.coherent import CoherentLocalizer
+from lightpage.train.models.localizers.wave import WaveLocalizer
+from lightpage.train.models.network import Refiner, SymbolUNet
+from lightpage.train.models.prediction import Prediction
+from lightpage.train.models.waves import Real
 
 COHERENT, WAVE = "coherent", "wave"
 LOCALIZERS = (COHERENT, WAVE)

@@ -19,12 +19,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lightpage.calibration.sampling_table import monomial_powers
-from lightpage.calibration.wave_fit import READ_NOISE
+from lightpage.calibration.waves.wave_fit import READ_NOISE
 from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError
 from lightpage.recording.frame_pair import FramePair
+from lightpage.train.models.filters import BLOCK, SeparableFilter
 from lightpage.waves.grid import FieldGrid, field_grid
-from train.models.filters import BLOCK, SeparableFilter
 
 ROUNDS = 6
 """Of descent; beyond these the band filter's ripple adds up."""

@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass, replace
 
 from lightpage.device.profile import Profile
+from lightpage.train.models.field import ROUNDS, FieldRecovery
+from lightpage.train.models.localizers.coherent import BICUBIC, CoherentLocalizer
 from lightpage.waves.grid import GRID_STEP_PX, FieldGrid, field_grid
-from train.models.field import ROUNDS, FieldRecovery
-from train.models.localizers.coherent import BICUBIC, CoherentLocalizer
 
 _REFINEMENT_STEPS = 0.25
 """Steps of a refinement's network over those of the first."""
@@ -23,8 +23,8 @@ class Hyperparameters:
 
     Attributes:
         channels, blocks, depth: size of the network, see `SymbolUNet`.
-        refinements: further passes of the decoder, see `train.trainers.refinement`.
-        field_rounds, binning: of the field's recovery, see `train.models.field.FieldRecovery`.
+        refinements: further passes of the decoder, see `lightpage.train.trainers.refinement`.
+        field_rounds, binning: of the field's recovery, see `lightpage.train.models.field.FieldRecovery`.
         field_step: pitch of the common grid, camera pixels.
         samples, interpolation: see `CoherentLocalizer`.
         steps: optimiser steps.
@@ -33,7 +33,7 @@ class Hyperparameters:
         learning_rate: peak of the one-cycle schedule.
         weight_decay: of AdamW.
         seed: of initial weights, batches and rotations.
-        precision: see `train.fitting.precision`.
+        precision: see `lightpage.train.fitting.precision`.
     """
 
     channels: int = 96

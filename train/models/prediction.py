@@ -5,13 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from lightpage.calibration.wave_model import illumination_terms
+from lightpage.calibration.waves.wave_model import illumination_terms
 from lightpage.device.profile import Profile
+from lightpage.train.models.field import FieldRecovery, Measured
+from lightpage.train.models.localizers.wave import by_symbol
+from lightpage.train.models.parts import conjugate, multiply, parts
+from lightpage.train.models.waves import EXACT, ROUGH, Fidelity, Real, WaveMatrices, Waves
 from lightpage.waves.grid import FieldGrid, symbol_samples
-from train.models.field import FieldRecovery, Measured
-from train.models.localizers.wave import by_symbol
-from train.models.parts import conjugate, multiply, parts
-from train.models.waves import EXACT, ROUGH, Fidelity, Real, WaveMatrices, Waves
 
 
 class Prediction(nn.Module):

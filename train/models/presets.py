@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from train.models.decoder import COHERENT, WAVE
-from train.models.hyperparameters import Hyperparameters
-from train.models.localizers.coherent import BILINEAR
+from lightpage.train.models.decoder import COHERENT, WAVE
+from lightpage.train.models.hyperparameters import Hyperparameters
+from lightpage.train.models.localizers.coherent import BILINEAR
 
 FAST, STANDARD, ACCURATE = "fast", "standard", "accurate"
 

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from lightpage.calibration.interfaces import BRANCHES, Rays
 from lightpage.calibration.parameters import NAMES
 from lightpage.calibration.phases import camera_phase, launch_phase
-from lightpage.calibration.wave_model import fitted_geometry
+from lightpage.calibration.waves.wave_model import fitted_geometry
 from lightpage.device.lens_path import SeidelTerms
 from lightpage.device.profile import Profile
 

@@ -17,11 +17,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lightpage.device.lens_path import SeidelTerms
+from lightpage.train.models.parts import Matrix, Parts, conjugate, multiply, phasor, scaled, stacked
 from lightpage.waves.geometry import WaveGeometry, couplings, on_facet
 from lightpage.waves.lens import LensPath
 from lightpage.waves.low_rank import Interpolation, Phase
 from lightpage.waves.sinc_interpolation import interpolation, sparse_axis
-from train.models.parts import Matrix, Parts, conjugate, multiply, phasor, scaled, stacked
 
 Real = NDArray[np.floating]
 

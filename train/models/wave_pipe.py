@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from lightpage.train.models.parts import Parts, conjugate, multiply, phasor
 from lightpage.waves.geometry import WaveGeometry, detuning
 from lightpage.waves.pipe import ParityBasis, modes_by_parity
-from train.models.parts import Parts, conjugate, multiply, phasor
 
 MODES_A_BLOCK = 120
 """Modes of a parity along each side of a block, at least."""
@@ -87,7 +87,7 @@ class TiledPipe(nn.Module):
 
         Both parts and all parities go through each product as one stack [2, 2, 2, Ky, Kx]: an exported graph is made
         and run node by node. To modes and back, the parities of an axis are one matrix: no product repeats both of its
-        factors, which ONNX Runtime gets wrong on a GPU (`export.operators.check.repeated_products`).
+        factors, which ONNX Runtime gets wrong on a GPU (`lightpage.export.operators.check.repeated_products`).
         """
         y_modes, x_modes = (
             _sine_modes(numbers, cells).flatten(0, 1)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lightpage.calibration.parameters import NAMES, as_dict
-from lightpage.calibration.wave_model import (
+from lightpage.calibration.waves.wave_model import (
     fitted_camera_phase,
     fitted_geometry,
     fitted_launch_phase,
@@ -22,13 +22,13 @@ from lightpage.calibration.wave_model import (
 )
 from lightpage.device.lens_path import IDEAL
 from lightpage.device.profile import Profile
+from lightpage.train.models.parts import Parts, conjugate, multiply, parts, phasor
+from lightpage.train.models.wave_lens import OVERSAMPLING, LensMatrices, TiledLens
+from lightpage.train.models.wave_pipe import BlockMatrices, TiledPipe
 from lightpage.waves.geometry import cells_for, highest_frequencies
 from lightpage.waves.grid import FieldGrid, field_grid, symbol_samples
 from lightpage.waves.lens import entrance_window
 from lightpage.waves.sinc_interpolation import interpolation, sparse_axis
-from train.models.parts import Parts, conjugate, multiply, parts, phasor
-from train.models.wave_lens import OVERSAMPLING, LensMatrices, TiledLens
-from train.models.wave_pipe import BlockMatrices, TiledPipe
 
 Real = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ from lightpage.device.lenses import LENSES
 from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError
 from lightpage.recording.frame_pair import FramePair
-from train.published.localizers import NAMES, Localizer, ModeLocalizer, NoLocalizer, RayLocalizer
-from train.published.unet import PublishedUNet, samples_for
+from lightpage.train.published.localizers import NAMES, Localizer, ModeLocalizer, NoLocalizer, RayLocalizer
+from lightpage.train.published.unet import PublishedUNet, samples_for
 
 PARAXIAL = "paraxial"
 LENS_CHOICES = (PARAXIAL, *LENSES)

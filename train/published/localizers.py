@@ -8,10 +8,10 @@ from torch import Tensor, nn
 
 from lightpage.device.lenses import LensPrescription
 from lightpage.device.profile import Profile
+from lightpage.train.models.parts import adjoint, matmul, multiply, parts, stacked
+from lightpage.train.published.rays import RayTracer
 from lightpage.waves.geometry import WaveGeometry, cells_for, mode_detuning
 from lightpage.waves.lens import modes_of_plane
-from train.models.parts import adjoint, matmul, multiply, parts, stacked
-from train.published.rays import RayTracer
 
 AFFINE_START = (0.98, 0.95)
 """Page over camera along x and y, roughly: where each camera's affine starts."""

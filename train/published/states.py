@@ -13,7 +13,7 @@ from lightpage.files import replace_text
 from lightpage.page.symbols import symbol_phases
 from lightpage.progress import track
 from lightpage.recording.reader import Recording
-from train.data.features import FeatureExtractor, PageState
+from lightpage.train.data.features import FeatureExtractor, PageState
 
 _AT_ONCE = 16
 """Pages between two writes of the file."""

@@ -14,15 +14,15 @@ from torch.utils.data import DataLoader
 from lightpage.device.lenses import lens_of
 from lightpage.device.profile import Profile
 from lightpage.recording.frame_pair import FramePair
-from train.data.training_inputs import Trained, TrainingInputs
-from train.fitting.concentration_scale import best_kappa_scale
-from train.fitting.fit import fit, seed_stretch
-from train.fitting.fitted import Fitted
-from train.processes import AS_IT_IS, Processes
-from train.published.decoder import PARAXIAL, PublishedDecoder, make_localizer
-from train.published.states import page_states
-from train.published.training import DataPages, FramePages, PublishedChoices, PublishedTraining
-from train.published.unet import samples_for
+from lightpage.train.data.training_inputs import Trained, TrainingInputs
+from lightpage.train.fitting.concentration_scale import best_kappa_scale
+from lightpage.train.fitting.fit import fit, seed_stretch
+from lightpage.train.fitting.fitted import Fitted
+from lightpage.train.processes import AS_IT_IS, Processes
+from lightpage.train.published.decoder import PARAXIAL, PublishedDecoder, make_localizer
+from lightpage.train.published.states import page_states
+from lightpage.train.published.training import DataPages, FramePages, PublishedChoices, PublishedTraining
+from lightpage.train.published.unet import samples_for
 
 EPOCHS = {4: 50, 8: 30, 16: 15}
 """Passes over the training pages, by samples per symbol and axis (table 1)."""
@@ -50,7 +50,7 @@ class PublishedTrainer:
     """Trains a published decoder.
 
     Attributes:
-        localizer: of `train.published.localizers.NAMES`.
+        localizer: of `lightpage.train.published.localizers.NAMES`.
         choices: the run's.
     """
 
@@ -109,7 +109,7 @@ def train_published(
         localizer, choices, profile, quadrature_phase: as for `published_decoder`.
         mask: pilots, bool [ny, nx], which are not learnt from.
         training, validation: pages of one recording.
-        callbacks, processes: as for `train.fitting.fit.fit`.
+        callbacks, processes: as for `lightpage.train.fitting.fit.fit`.
     """
     seed_stretch(run, choices.seed)
     recording = training.recording
@@ -133,7 +133,7 @@ def published_decoder(
     """A published decoder with its first weights.
 
     Args:
-        localizer: of `train.published.localizers.NAMES`.
+        localizer: of `lightpage.train.published.localizers.NAMES`.
         choices: its size and lenses.
         profile: the nominal device.
         references: reference-only frames.

@@ -16,11 +16,11 @@ from torch.utils.data import Dataset
 
 from lightpage.page.symbols import symbol_phases
 from lightpage.recording.reader import Recording
-from train.data.features import PageState
-from train.data.pages import Page
-from train.fitting.modules import DecoderTraining
-from train.published.decoder import PARAXIAL, PublishedDecoder
-from train.published.localizers import RayLocalizer
+from lightpage.train.data.features import PageState
+from lightpage.train.data.pages import Page
+from lightpage.train.fitting.modules import DecoderTraining
+from lightpage.train.published.decoder import PARAXIAL, PublishedDecoder
+from lightpage.train.published.localizers import RayLocalizer
 
 WARM_UP = 0.02
 """Share of the steps over which learning rates rise."""
@@ -42,9 +42,9 @@ class PublishedChoices:
         batch: pages a step.
         decoder_rate, affine_rate, angle_rate: learning rates of U-Net, registration and pipe angle (radians).
         decay: factor on the decoder's learning rate at each of `DECAYS`.
-        lenses: of `train.published.decoder.LENS_CHOICES`.
+        lenses: of `lightpage.train.published.decoder.LENS_CHOICES`.
         seed: of initial weights and batches.
-        precision: see `train.fitting.precision`.
+        precision: see `lightpage.train.fitting.precision`.
         classes: levels that the decoder tells apart by cross-entropy; 0 for the von Mises likelihood.
     """
 

@@ -18,18 +18,18 @@ import numpy as np
 from torch import nn
 
 from lightpage.recording.reader import Recording
-from train.data.feature_store import FeatureStore, fill
-from train.data.features import FeatureExtractor, PageFeatures
-from train.data.known_light import Explained
-from train.data.patches import training_pages
-from train.fitting.fit import fit_network
-from train.fitting.fitted import Fitted
-from train.fitting.modules import SymbolTraining
-from train.models.hyperparameters import Hyperparameters
-from train.models.network import Refiner
-from train.models.parts import stacked, turned
-from train.models.prediction import Prediction
-from train.processes import AS_IT_IS, Processes
+from lightpage.train.data.feature_store import FeatureStore, fill
+from lightpage.train.data.features import FeatureExtractor, PageFeatures
+from lightpage.train.data.known_light import Explained
+from lightpage.train.data.patches import training_pages
+from lightpage.train.fitting.fit import fit_network
+from lightpage.train.fitting.fitted import Fitted
+from lightpage.train.fitting.modules import SymbolTraining
+from lightpage.train.models.hyperparameters import Hyperparameters
+from lightpage.train.models.network import Refiner
+from lightpage.train.models.parts import stacked, turned
+from lightpage.train.models.prediction import Prediction
+from lightpage.train.processes import AS_IT_IS, Processes
 
 _FLOORS = (0.05, 20.0)
 """Least and largest `Measured.pull` floor that is accepted."""

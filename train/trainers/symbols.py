@@ -13,20 +13,20 @@ from lightpage.calibration.known_pages import known_pages
 from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError
 from lightpage.progress import note
+from lightpage.train.data.feature_store import FeatureStore, fill
+from lightpage.train.data.known_light import Explained, explained
+from lightpage.train.data.patches import training_pages
+from lightpage.train.data.synthetic import MOST_NOISE, SyntheticPages, model_match
+from lightpage.train.data.training_inputs import Trained, TrainingInputs
+from lightpage.train.fitting.concentration_scale import best_kappa_scale
+from lightpage.train.fitting.fit import fit_network
+from lightpage.train.fitting.fitted import Fitted
+from lightpage.train.fitting.modules import SymbolTraining
+from lightpage.train.models.decoder import WAVE, SymbolDecoder
+from lightpage.train.models.hyperparameters import Hyperparameters
+from lightpage.train.runs import load_decoder, load_run
+from lightpage.train.trainers.refinement import Refined, RefinementPages, fit_prediction, fit_refinements
 from lightpage.waves.grid import symbol_samples
-from train.data.feature_store import FeatureStore, fill
-from train.data.known_light import Explained, explained
-from train.data.patches import training_pages
-from train.data.synthetic import MOST_NOISE, SyntheticPages, model_match
-from train.data.training_inputs import Trained, TrainingInputs
-from train.fitting.concentration_scale import best_kappa_scale
-from train.fitting.fit import fit_network
-from train.fitting.fitted import Fitted
-from train.fitting.modules import SymbolTraining
-from train.models.decoder import WAVE, SymbolDecoder
-from train.models.hyperparameters import Hyperparameters
-from train.runs import load_decoder, load_run
-from train.trainers.refinement import Refined, RefinementPages, fit_prediction, fit_refinements
 
 _SYNTHETIC_SYMBOLS = 470_000
 """Of all synthetic pages together, unless told otherwise: 96 pages of the bench device."""

@@ -19,14 +19,14 @@ from lightpage.errors import InvalidInputError, RecordingError
 from lightpage.page.symbols import pilot_mask, pilot_symbols, symbol_phases
 from lightpage.progress import note, warn
 from lightpage.recording.reader import Recording, hash_frames
-from train.data.features import FeatureExtractor
-from train.data.training_inputs import TrainingInputs
-from train.fitting.provenance import provenance
-from train.models.decoder import LOCALIZERS
-from train.models.hyperparameters import Hyperparameters
-from train.processes import AS_IT_IS, Processes, is_first_process
-from train.published.trainer import PublishedTrainer
-from train.runs import (
+from lightpage.train.data.features import FeatureExtractor
+from lightpage.train.data.training_inputs import TrainingInputs
+from lightpage.train.fitting.provenance import provenance
+from lightpage.train.models.decoder import LOCALIZERS
+from lightpage.train.models.hyperparameters import Hyperparameters
+from lightpage.train.processes import AS_IT_IS, Processes, is_first_process
+from lightpage.train.published.trainer import PublishedTrainer
+from lightpage.train.runs import (
     DESCRIPTION,
     GOLDEN,
     REFERENCES,
@@ -37,7 +37,7 @@ from train.runs import (
     save_arrays,
     save_weights,
 )
-from train.trainers.symbols import MATCHED_PAGES, SymbolTrainer
+from lightpage.train.trainers.symbols import MATCHED_PAGES, SymbolTrainer
 
 FEWEST_PAGES = 6
 """To train, validate and evaluate with."""
@@ -112,7 +112,7 @@ def make_run(
         usable: see `usable_pages`.
         split: of these pages.
         calibrate: gives the device's calibration; it is called once the options are known to be those of before.
-        processes: see `train.fitting.fit.fit`.
+        processes: see `lightpage.train.fitting.fit.fit`.
 
     Returns:
         The run; None in the processes of further devices.

@@ -1,7 +1,8 @@
 """Graphs in a process that serves nobody: what a run takes at least.
 
 It is a helper process (`BareRuns`). It answers each line, ``whole NAME`` or ``cut NAME``, with the seconds of one run:
-of the graph as the other servers have it, or cut in two as the service has it (`runtime/execution/constant_table.py`).
+of the graph as the other servers have it, or cut in two as the service has it
+(`runtime/model/execution/constant_table.py`).
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ import numpy as np
 from analysis.service.other_servers.graphs import Graph
 from analysis.service.other_servers.onnx_run import FRAMES, open_all
 from analysis.service.other_servers.timing import Timed
+from lightpage.helper_process import HelperProcess, parent_link
 from lightpage.recording.frame_pair import FramePair
-from runtime.bundle.bundle import Bundle
-from runtime.decoding.decoder import Decoder, open_graph
-from runtime.helper_process import HelperProcess, parent_link
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.decoding.decoder import Decoder, open_graph
 
 WHOLE, CUT = "whole", "cut"
 _MODULE = "analysis.service.other_servers.bare_run"

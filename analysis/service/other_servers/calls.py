@@ -17,12 +17,12 @@ from analysis.service.other_servers.graphs import Graph
 from analysis.service.other_servers.onnx_run import OUTPUT
 from lightpage.errors import LightpageError
 from lightpage.recording.frame_pair import FramePair
-from runtime.client.client import LightpageClient
-from runtime.pb.inference import open_inference_pb2 as oip
-from runtime.rpc.inference_calls import INFERENCE
-from runtime.rpc.tensors import RAW_TYPES
-from runtime.wire.pages import RemotePage
-from runtime.wire.sizes import REPLY_BYTES
+from lightpage.runtime.client.client import LightpageClient
+from lightpage.runtime.client.pb.inference import open_inference_pb2 as oip
+from lightpage.runtime.client.wire.pages import RemotePage
+from lightpage.runtime.client.wire.sizes import REPLY_BYTES
+from lightpage.runtime.service.frames.inference_calls import INFERENCE
+from lightpage.runtime.service.frames.tensors import RAW_TYPES
 
 Answer = dict[str, NDArray[Any]]
 """Arrays by name."""

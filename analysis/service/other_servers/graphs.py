@@ -15,9 +15,9 @@ from analysis.service.constant_bundle import constant_bundle
 from analysis.service.other_servers.onnx_run import FRAMES, GRAPH
 from lightpage.device.profile import load_profile
 from lightpage.recording.frame_pair import FramePair
-from runtime.bundle.bundle import Bundle
-from runtime.bundle.manifest import DECODER
-from runtime.bundle.shipped import DEFAULT, bundle_path
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.bundle.manifest import DECODER
+from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 
 DECODER_NAME = "decoder"
 CONSTANT = {"constant-small": "bench", "constant-large": "paper"}

@@ -22,7 +22,7 @@ from analysis.service.other_servers.servers import MARK, Marked, OtherServer
 from analysis.service.other_servers.timing import CALLERS, in_turns, rate, timed
 from analysis.service.running import RunningService
 from lightpage.errors import LightpageError
-from runtime.rpc.inference_calls import MODEL
+from lightpage.runtime.service.frames.inference_calls import MODEL
 
 OWN = "Lightpage"
 CALLS_EACH = {"constant-small": 12, "constant-large": 3, DECODER_NAME: 4}

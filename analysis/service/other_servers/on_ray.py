@@ -18,7 +18,7 @@ from ray.serve.config import HTTPOptions, gRPCOptions
 
 from analysis.service.other_servers.onnx_run import FRAMES, OUTPUT, open_all
 
-_STUBS = "runtime.pb.inference.open_inference_pb2_grpc.add_GRPCInferenceServiceServicer_to_server"
+_STUBS = "lightpage.runtime.client.pb.inference.open_inference_pb2_grpc.add_GRPCInferenceServiceServicer_to_server"
 _ONGOING = 64
 """Requests that the replica has taken at once: more than there are callers."""
 _STORE_BYTES = 1 << 30
@@ -39,7 +39,7 @@ class Graphs:
 
     def ModelInfer(self, request: Any) -> Any:
         """p of the frames that came, over gRPC."""
-        from runtime.pb.inference import open_inference_pb2 as oip
+        from lightpage.runtime.client.pb.inference import open_inference_pb2 as oip
 
         frames = {
             tensor.name: np.frombuffer(content, tensor.datatype.lower()).reshape(tuple(tensor.shape))

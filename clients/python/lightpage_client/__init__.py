@@ -1,11 +1,11 @@
 """A client of the Lightpage service: `LightpageClient("HOST:PORT")`. Its errors are of the classes in `errors`."""
 
 from lightpage_client import errors
-from lightpage_client.lightpage.errors import LightpageError
-from lightpage_client.lightpage.recording.frame_pair import FramePair
+from lightpage_client.errors import LightpageError
+from lightpage_client.recording.frame_pair import FramePair
 from lightpage_client.runtime.client.client import LightpageClient
-from lightpage_client.runtime.wire.messages import KnownPilots
-from lightpage_client.runtime.wire.pages import RemotePage
-from lightpage_client.runtime.wire.tls import TlsFiles
+from lightpage_client.runtime.client.wire.messages import KnownPilots
+from lightpage_client.runtime.client.wire.pages import RemotePage
+from lightpage_client.runtime.client.wire.tls import TlsFiles
 
 __all__ = ["FramePair", "KnownPilots", "LightpageClient", "LightpageError", "RemotePage", "TlsFiles", "errors"]

@@ -18,8 +18,8 @@ from lightpage.device.state import Device, ideal_device
 from lightpage.errors import InvalidInputError
 from lightpage.page.symbols import pilot_mask
 from lightpage.simulator.true_optics import true_parameters
+from lightpage.train.runs import BEGUN
 from tests.lightpage.small import small_profile
-from train.runs import BEGUN
 
 PROFILE = small_profile()
 

@@ -17,8 +17,8 @@ from analysis.hardware.rows import append_row, kept_rows
 from analysis.hardware.week import figures_of
 from analysis.hardware.week_figure import draw
 from lightpage.device.state import Device
-from runtime.bundle.shipped import DEFAULT, bundle_path
-from runtime.decoding.decoder import Decoder
+from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
+from lightpage.runtime.model.decoding.decoder import Decoder
 
 
 def measured(command: click.Command, arguments: str, folder: Path) -> Any:

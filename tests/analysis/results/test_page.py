@@ -11,8 +11,8 @@ from click.testing import CliRunner, Result
 from analysis.results.measurements import Measurement, collected, kept_measurements
 from analysis.results.page import PAGE, ROOT, Results, main, render
 from lightpage.errors import InvalidInputError
-from runtime.bundle.bundle import Bundle
-from runtime.bundle.shipped import bundle_path
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.bundle.shipped import bundle_path
 
 README = {
     "published, ray localizer": "ray",

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from analysis.speed import provider
 from analysis.speed.fidelity import FORMS, HALF, measured, name_of
 from lightpage.recording.reader import Recording
-from runtime.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.decoder import Decoder
 from tests.runtime import toy
 
 

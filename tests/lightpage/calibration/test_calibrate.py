@@ -13,9 +13,9 @@ from lightpage.page.symbols import symbol_phases
 from lightpage.progress import Progress
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
+from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
+from lightpage.train.models.twin import RayTwin, TorchTwin
 from tests.lightpage.refused import refused
-from train.models.field import FieldRecovery, TorchFieldSolver
-from train.models.twin import RayTwin, TorchTwin
 
 
 def begin(progress: Progress, again: bool = False) -> None:

@@ -12,10 +12,10 @@ from lightpage.calibration.samplers import FieldSampler
 from lightpage.device.state import Geometry
 from lightpage.simulator.simulator import resample
 from lightpage.simulator.true_optics import TrueOptics, true_parameters
+from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.waves.grid import field_grid
 from tests.lightpage.calibration.flat_twin import FlatTwin, Picture
 from tests.lightpage.small import on_slm, perfect_device, random_phases, small_profile
-from train.models.twin import RayTwin, TorchTwin
 
 PROFILE = small_profile()
 PHASES = random_phases(PROFILE, 1)

@@ -14,9 +14,9 @@ from lightpage.page.symbols import random_symbols
 from lightpage.recording.frame_pair import FramePair
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
+from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
+from lightpage.train.models.twin import RayTwin, TorchTwin
 from tests.lightpage.small import small_profile
-from train.models.field import FieldRecovery, TorchFieldSolver
-from train.models.twin import RayTwin, TorchTwin
 
 PROFILE = small_profile()
 DEVICE = Device().with_settings(["drift.shift_px=0.0"])

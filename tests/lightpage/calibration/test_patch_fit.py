@@ -11,8 +11,8 @@ from lightpage.calibration.interfaces import BRANCHES
 from lightpage.calibration.parameters import NAMES, PRIORS, indices, nominal
 from lightpage.calibration.patch_fit import Design, fit_parameters
 from lightpage.calibration.patches import Measurement, patches
+from lightpage.train.models.twin import RayTwin, TorchTwin
 from tests.lightpage.small import small_profile
-from train.models.twin import RayTwin, TorchTwin
 
 PROFILE = small_profile()
 TWIN = TorchTwin(RayTwin(PROFILE))

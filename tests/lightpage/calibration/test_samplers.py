@@ -10,9 +10,9 @@ from lightpage.calibration.samplers import FieldSampler, FrameSampler
 from lightpage.device.state import CameraPose, Homodyne, Reference, Sensor
 from lightpage.simulator.simulator import Simulator, resample
 from lightpage.simulator.true_optics import true_parameters
+from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.waves.grid import field_grid
 from tests.lightpage.small import perfect_device, small_profile
-from train.models.twin import RayTwin, TorchTwin
 
 PROFILE = small_profile()
 TWIN = TorchTwin(RayTwin(PROFILE))

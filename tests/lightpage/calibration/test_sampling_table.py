@@ -15,9 +15,9 @@ from lightpage.calibration.sampling_table import (
     symbol_centres,
 )
 from lightpage.device.profile import Profile, load_profile
+from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.waves.grid import field_grid
 from tests.lightpage.small import small_profile
-from train.models.twin import RayTwin, TorchTwin
 
 TURN = -1.5
 

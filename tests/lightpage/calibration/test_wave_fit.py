@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lightpage.calibration import wave_fit
 from lightpage.calibration.parameters import NAMES, PARAMETERS, PRIORS, indices
-from lightpage.calibration.wave_fit import WaveFit
+from lightpage.calibration.waves import wave_fit
+from lightpage.calibration.waves.wave_fit import WaveFit
 from lightpage.device.profile import Profile
 from lightpage.device.state import Aberration, CameraPose, Device, Drift, Homodyne, Reference, Sensor, draw_device
 from lightpage.page.symbols import symbol_phases
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
+from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.waves.grid import field_grid
 from tests.lightpage.small import THICK, small_profile
-from train.models.twin import RayTwin, TorchTwin
 
 PROFILE = small_profile()
 TWIN = TorchTwin(RayTwin(PROFILE))

@@ -7,9 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from lightpage.calibration import wave_model as fitted_waves
 from lightpage.calibration.parameters import as_dict, as_vector, nominal
-from lightpage.calibration.wave_model import FittedWaves
+from lightpage.calibration.waves import wave_model as fitted_waves
+from lightpage.calibration.waves.wave_model import FittedWaves
 from lightpage.waves.geometry import cells_for
 from lightpage.waves.grid import field_grid
 from tests.lightpage.small import small_profile

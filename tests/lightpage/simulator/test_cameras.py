@@ -15,8 +15,8 @@ from lightpage.simulator.cameras import (
     to_counts,
 )
 from lightpage.simulator.true_optics import true_parameters
+from lightpage.train.models.twin import RayTwin, TorchTwin
 from tests.lightpage.small import perfect_device, small_profile
-from train.models.twin import RayTwin, TorchTwin
 
 
 def complex_noise(seed: int, shape: tuple[int, ...] = (500,)) -> np.ndarray:

@@ -27,12 +27,12 @@ from lightpage.errors import PageError, ProfileError
 from lightpage.simulator.cameras import resample
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import TrueOptics, true_parameters
+from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.waves import lens
 from lightpage.waves.grid import splitting_steps
 from lightpage.waves.lens import FourierLens
 from tests.lightpage.refused import refused
 from tests.lightpage.small import THICK, on_slm, perfect_device, random_phases, small_profile
-from train.models.twin import RayTwin, TorchTwin
 
 FINE_SENSOR = Sensor(full_well_e=1e9, read_noise_e=0, bit_depth=16)
 """Hardly any noise: one electron in thirty thousand, one count in 65,535."""

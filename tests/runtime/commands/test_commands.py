@@ -19,19 +19,19 @@ from lightpage.cli import main as cli_main
 from lightpage.cli.main import RESUME_KEY, LazyGroup, lightpage
 from lightpage.errors import LightpageError, SurroundingsError
 from lightpage.page.pilots import Pilots
+from lightpage.recording.decoded_file import DecodedWriter
 from lightpage.recording.reader import Recording, RecordingWriter
-from runtime.acquisition.sources import open_source
-from runtime.bundle.bundle import Bundle
-from runtime.client.client import LightpageClient
-from runtime.client.decoded_file import DecodedWriter
-from runtime.commands import recalibrate as cli_recalibrate
-from runtime.decoding.decoder import Decoder
-from runtime.recalibration.outcome import Refit
-from runtime.rpc.server import LightpageServer
-from runtime.service.dataplane import DataPlane
-from runtime.service.recalibrator import Recalibrator
-from runtime.service.registry import ModelRegistry
-from runtime.wire.pages import RemotePage
+from lightpage.runtime.client.client import LightpageClient
+from lightpage.runtime.client.wire.pages import RemotePage
+from lightpage.runtime.commands.client import recalibrate as cli_recalibrate
+from lightpage.runtime.device.acquisition.sources import open_source
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.recalibration.outcome import Refit
+from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.jobs.recalibrator import Recalibrator
+from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.server.server import LightpageServer
 from tests.lightpage.full_disk import full_disk
 from tests.runtime import toy
 from tests.runtime.slow_fit import SlowFit

@@ -11,15 +11,15 @@ import pytest
 
 from lightpage.cli import main as cli_main
 from lightpage.cli.main import EXIT_ERROR, EXIT_LOST, lightpage
+from lightpage.errors import LostShotError, Reason
 from lightpage.recording.black_level import DarkFrame
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import FrameInfo
 from lightpage.recording.pages import PagesWriter
 from lightpage.recording.reader import Recording
-from runtime.acquisition.page_store import PageStore
-from runtime.acquisition.source import SHOT_S, FrameSource, Shot
-from runtime.commands import record as module
-from runtime.errors import LostShotError, Reason
+from lightpage.runtime.commands.archives import record as module
+from lightpage.runtime.device.acquisition.page_store import PageStore
+from lightpage.runtime.device.acquisition.source import SHOT_S, FrameSource, Shot
 from tests.runtime import toy
 
 Record = Callable[..., int]

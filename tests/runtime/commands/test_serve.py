@@ -21,17 +21,17 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 
 from lightpage.cli import main as cli_main
 from lightpage.cli.main import lightpage
+from lightpage.errors import StoreError, UnconfirmedPageError
 from lightpage.recording.reader import Recording
-from runtime.client.client import LightpageClient
-from runtime.commands.healthcheck import is_serving
-from runtime.commands.healthcheck import main as healthcheck
-from runtime.commands.serve import leave_the_rest, serve, stop_signals
-from runtime.decoding.decoder import Decoder
-from runtime.errors import StoreError, UnconfirmedPageError
-from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
-from runtime.service.settings import ServiceSettings
-from runtime.service.store import ModelStore
+from lightpage.runtime.client.client import LightpageClient
+from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
+from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
+from lightpage.runtime.commands.service.healthcheck import is_serving
+from lightpage.runtime.commands.service.healthcheck import main as healthcheck
+from lightpage.runtime.commands.service.serve import leave_the_rest, serve, stop_signals
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.service.models.store import ModelStore
+from lightpage.runtime.service.settings import ServiceSettings
 from tests.runtime import toy
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -16,10 +16,10 @@ import pytest
 
 from lightpage.cli import main as cli_main
 from lightpage.cli.main import EXIT_ERROR, lightpage
-from runtime.commands.top import top
-from runtime.console.scrapes import Change, Scrape, Scrapes, scrape
-from runtime.console.server import ConsoleServer
-from runtime.decoding.decoder import Decoder
+from lightpage.runtime.commands.client.top import top
+from lightpage.runtime.console.scrapes import Change, Scrape, Scrapes, scrape
+from lightpage.runtime.console.server import ConsoleServer
+from lightpage.runtime.model.decoding.decoder import Decoder
 from tests.runtime.console.stage import Stage, stage
 from tests.waiting import eventually
 
@@ -118,7 +118,13 @@ def test_in_a_terminal_it_outlives_the_service_and_ends_with_q(decoder: Decoder)
     with stage(decoder) as running:
         running.read(3)
         port = running.server.port
-        command = [sys.executable, "-c", "from runtime.commands.top import top; top()", "--address", address(running)]
+        command = [
+            sys.executable,
+            "-c",
+            "from lightpage.runtime.commands.client.top import top; top()",
+            "--address",
+            address(running),
+        ]
         environment = {**os.environ, "TERM": "xterm", "COLUMNS": "120", "LINES": "50", "PYTHONPATH": str(ROOT)}
         process = subprocess.Popen([*command, "--interval", "0.1"], stdin=own, stdout=own, stderr=own, env=environment)
         os.close(own)

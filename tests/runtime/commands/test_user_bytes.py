@@ -20,9 +20,9 @@ from lightpage.errors import (
 )
 from lightpage.page.symbols import pilot_mask
 from lightpage.recording.pages import Pages
-from runtime.commands.code import code as code_command
-from runtime.commands.encode import encode
-from runtime.commands.recover import recover
+from lightpage.runtime.commands.archives.code import code as code_command
+from lightpage.runtime.commands.archives.encode import encode
+from lightpage.runtime.commands.archives.recover import recover
 from tests.runtime import coded, toy
 
 STORAGE = StorageError("page of the recording", "Input/output error", "data")

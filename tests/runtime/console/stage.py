@@ -6,20 +6,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
-from runtime.acquisition.source import SHOT_S, Shot
-from runtime.console.actions import Actions
-from runtime.console.history import History
-from runtime.console.server import Console, ConsoleServer
-from runtime.decoding.decoder import Decoder
-from runtime.errors import LostPageError, LostShotError, Reason
-from runtime.identity.certificates import Certificates
-from runtime.service.caller import Caller
-from runtime.service.dataplane import DataPlane
-from runtime.service.metrics import ServiceMetrics
-from runtime.service.monitor import Monitor
-from runtime.service.recalibrator import Recalibrator
-from runtime.service.registry import ModelRegistry
-from runtime.wire.tls import TlsFiles
+from lightpage.errors import LostPageError, LostShotError, Reason
+from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.console.actions import Actions
+from lightpage.runtime.console.history import History
+from lightpage.runtime.console.server import Console, ConsoleServer
+from lightpage.runtime.device.acquisition.source import SHOT_S, Shot
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.service.caller import Caller
+from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.jobs.recalibrator import Recalibrator
+from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
+from lightpage.runtime.service.monitoring.monitor import Monitor
+from lightpage.runtime.service.server.certificates import Certificates
 from tests.runtime import toy
 
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, expect, sync_playwright
 
-from runtime.decoding.decoder import Decoder
-from runtime.wire.tls import TlsFiles
+from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.model.decoding.decoder import Decoder
 from tests.runtime import toy
 from tests.runtime.console.stage import stage
-from tests.runtime.identity.authority import Authority
+from tests.runtime.service.server.authority import Authority
 
 WIDE, NARROW = 1400, 420
 _WAIT_MS = 60_000

@@ -21,26 +21,26 @@ from PIL import Image
 
 from lightpage.cli import main as cli_main
 from lightpage.cli.main import EXIT_ERROR, lightpage
-from runtime.acquisition.source import Shot
-from runtime.console.actions import Actions
-from runtime.console.fetch import fetch
-from runtime.console.history import History
-from runtime.console.pictures import SIDE_PX, confidence_png, frame_png
-from runtime.console.server import IDENTITY, POINTS, RECENT, Console, ConsoleServer
-from runtime.decoding.decoder import Decoder
-from runtime.errors import Reason
-from runtime.identity.roles import NOBODY, Identity, Role
-from runtime.service.caller import Actor, Caller
-from runtime.service.dataplane import DataPlane
-from runtime.service.metrics import ServiceMetrics
-from runtime.service.monitor import Monitor
-from runtime.service.observation import Observation
-from runtime.service.recalibrator import Recalibrator
-from runtime.service.registry import ModelRegistry
+from lightpage.errors import Reason
+from lightpage.runtime.console.actions import Actions
+from lightpage.runtime.console.fetch import fetch
+from lightpage.runtime.console.history import History
+from lightpage.runtime.console.pictures import SIDE_PX, confidence_png, frame_png
+from lightpage.runtime.console.server import IDENTITY, POINTS, RECENT, Console, ConsoleServer
+from lightpage.runtime.device.acquisition.source import Shot
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.service.caller import Actor, Caller
+from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.jobs.recalibrator import Recalibrator
+from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
+from lightpage.runtime.service.monitoring.monitor import Monitor
+from lightpage.runtime.service.monitoring.observation import Observation
+from lightpage.runtime.service.server.roles import NOBODY, Identity, Role
 from tests.clock import HandClock
 from tests.runtime import toy
 from tests.runtime.console.stage import Stage, stage
-from tests.runtime.identity.authority import Authority
+from tests.runtime.service.server.authority import Authority
 from tests.waiting import eventually
 
 
@@ -234,7 +234,7 @@ def test_callers_that_say_nothing_or_hang_up_hold_up_nobody(
 def test_a_body_that_does_not_come_is_refused_and_nothing_else_is_said(
     decoder: Decoder, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("runtime.console.server.SILENCE_S", 0.1)
+    monkeypatch.setattr("lightpage.runtime.console.server.SILENCE_S", 0.1)
     with stage(decoder) as running, connected(running) as connection:
         connection.sendall(b"POST /actions HTTP/1.1\r\nContent-Length: 100\r\n\r\nx")
         assert b" 408 " in connection.recv(1000)
@@ -242,8 +242,8 @@ def test_a_body_that_does_not_come_is_refused_and_nothing_else_is_said(
 
 
 def test_connections_are_bounded_in_number_and_in_time(decoder: Decoder, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("runtime.console.server.MOST_CONNECTIONS", 3)
-    monkeypatch.setattr("runtime.console.server.LONGEST_S", 0.5)
+    monkeypatch.setattr("lightpage.runtime.console.server.MOST_CONNECTIONS", 3)
+    monkeypatch.setattr("lightpage.runtime.console.server.LONGEST_S", 0.5)
     with stage(decoder) as running:
         silent = [connected(running) for _ in range(3)]
         with connected(running) as late:
@@ -260,7 +260,7 @@ def test_a_connection_that_cannot_be_answered_gives_its_room_back(
     def fail(*_: object) -> None:
         raise OSError(errno.EMFILE, "Too many open files")
 
-    monkeypatch.setattr("runtime.console.server.MOST_CONNECTIONS", 1)
+    monkeypatch.setattr("lightpage.runtime.console.server.MOST_CONNECTIONS", 1)
     with stage(decoder) as running:
         with monkeypatch.context() as patch:
             patch.setattr("socket.socket.dup", fail)

@@ -18,25 +18,25 @@ from lightpage.errors import (
     InvalidInputError,
     PageError,
     RecalibrationRefusedError,
+    UnconfirmedPageError,
 )
 from lightpage.page.symbols import random_symbols
 from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import hash_frames
+from lightpage.runtime.model.bundle.bundle import Bundle, npz
+from lightpage.runtime.model.bundle.calibrated import calibration_of
+from lightpage.runtime.model.bundle.manifest import TABLE
+from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.tracking import NoTracker
+from lightpage.runtime.recalibration import refit as module
+from lightpage.runtime.recalibration.judgement import JudgedPage, judge
+from lightpage.runtime.recalibration.known_pages import KnownPages
+from lightpage.runtime.recalibration.outcome import Refit, RefitReport, RefitResult
+from lightpage.runtime.recalibration.recalibration import next_version, reading_share, recalibrate
+from lightpage.runtime.recalibration.refit import refit
 from lightpage.simulator.simulator import Simulator
-from runtime.bundle.bundle import Bundle, npz
-from runtime.bundle.calibrated import calibration_of
-from runtime.bundle.manifest import TABLE
-from runtime.bundle.shipped import DEFAULT, bundle_path
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.tracking import NoTracker
-from runtime.errors import UnconfirmedPageError
-from runtime.recalibration import refit as module
-from runtime.recalibration.judgement import JudgedPage, judge
-from runtime.recalibration.known_pages import KnownPages
-from runtime.recalibration.outcome import Refit, RefitReport, RefitResult
-from runtime.recalibration.recalibration import next_version, reading_share, recalibrate
-from runtime.recalibration.refit import refit
 from tests.runtime import toy
 from tests.runtime.recalibration.toy_worker import known, quiet, shuffled
 

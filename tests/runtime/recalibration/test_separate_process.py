@@ -15,15 +15,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lightpage.errors import BundleError, RecalibrationRefusedError
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.tracking import NoTracker
-from runtime.errors import CallerLeft, WorkerError
-from runtime.recalibration.outcome import RecalibrationOutcome
-from runtime.recalibration.recalibration import recalibrate
-from runtime.recalibration.separate_process import recalibrate_apart
-from runtime.recalibration.work import Job, WorkFolder, heard_step, told_step
-from runtime.recalibration.worker import LOWEST, NICENESS, ROOM, work, yield_more
+from lightpage.errors import BundleError, CallerLeft, RecalibrationRefusedError, WorkerError
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.tracking import NoTracker
+from lightpage.runtime.recalibration.outcome import RecalibrationOutcome
+from lightpage.runtime.recalibration.recalibration import recalibrate
+from lightpage.runtime.recalibration.separate_process import recalibrate_apart
+from lightpage.runtime.recalibration.work import Job, WorkFolder, heard_step, told_step
+from lightpage.runtime.recalibration.worker import LOWEST, NICENESS, ROOM, work, yield_more
 from tests.clock import HandClock
 from tests.runtime import toy
 from tests.runtime.recalibration.toy_worker import known, quiet, shuffled
@@ -149,7 +148,7 @@ def test_the_worker_leaves_its_refusal_in_its_folder(
 def test_it_ends_with_its_parent() -> None:
     worker = (
         "import sys, threading\n"
-        "from runtime.recalibration.worker import end_with_parent\n"
+        "from lightpage.runtime.recalibration.worker import end_with_parent\n"
         "end_with_parent(sys.stdin.fileno())\n"
         "print(1, flush=True)\n"
         "threading.Event().wait()\n"

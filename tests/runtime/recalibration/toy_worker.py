@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from lightpage.progress import Progress
-from runtime.bundle.bundle import Bundle
-from runtime.decoding.decoder import Decoder
-from runtime.recalibration.known_pages import KnownPages
-from runtime.recalibration.outcome import RefitResult
-from runtime.recalibration.work import WorkFolder
-from runtime.recalibration.worker import end_with_parent, work, yield_to_reads
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.recalibration.known_pages import KnownPages
+from lightpage.runtime.recalibration.outcome import RefitResult
+from lightpage.runtime.recalibration.work import WorkFolder
+from lightpage.runtime.recalibration.worker import end_with_parent, work, yield_to_reads
 from tests.runtime import toy
 
 DRIFTED = (150.0, 62.0)

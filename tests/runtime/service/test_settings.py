@@ -10,7 +10,14 @@ import pytest
 
 from lightpage.device.profile import TomlTable
 from lightpage.errors import InvalidInputError
-from runtime.service.settings import Effective, Option, Secret, ServiceSettings, read_settings, service_settings
+from lightpage.runtime.service.settings import (
+    Effective,
+    Option,
+    Secret,
+    ServiceSettings,
+    read_settings,
+    service_settings,
+)
 
 ROOT = Path(__file__).resolve().parents[3]
 EXAMPLE = ROOT / "docs" / "service-example.toml"

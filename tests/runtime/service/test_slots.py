@@ -8,11 +8,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from runtime.errors import CallerLeft, OverloadedError, SlotsTakenError
-from runtime.service.caller import Caller
-from runtime.service.heart import Heart
-from runtime.service.sessions import Sessions, named_session, own_name
-from runtime.service.slots import FORGET_S, Slots
+from lightpage.errors import CallerLeft, OverloadedError, SlotsTakenError
+from lightpage.runtime.service.caller import Caller
+from lightpage.runtime.service.monitoring.heart import Heart
+from lightpage.runtime.service.sessions import Sessions, named_session, own_name
+from lightpage.runtime.service.slots import FORGET_S, Slots
 from tests.clock import HandClock
 from tests.waiting import eventually
 

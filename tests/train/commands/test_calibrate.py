@@ -24,8 +24,8 @@ from lightpage.progress import reporting
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording, RecordingWriter
 from lightpage.simulator.true_optics import true_parameters
+from lightpage.train.commands.calibrate import calibrate
 from tests.told import Told
-from train.commands.calibrate import calibrate
 
 
 def run(recording: Path, out: Path, *more: str, profile: str = "bench") -> str:
@@ -61,7 +61,7 @@ def fake_registration(monkeypatch: pytest.MonkeyPatch, outcome: Registered | Bas
             raise outcome
         return outcome
 
-    monkeypatch.setattr("train.commands.calibrate.register", register)
+    monkeypatch.setattr("lightpage.train.commands.calibrate.register", register)
 
 
 REGISTERED = Registered(

@@ -22,20 +22,20 @@ from lightpage.errors import CalibrationError, InvalidInputError
 from lightpage.page.symbols import pilot_mask
 from lightpage.progress import Progress, reporting
 from lightpage.recording.reader import Recording
+from lightpage.train.commands import train as cli_train
+from lightpage.train.commands.options import CHOICES, chosen_localizer, chosen_trainer, given_choices
+from lightpage.train.commands.train import train
+from lightpage.train.fitting import provenance as origin
+from lightpage.train.fitting.curves import curves_of
+from lightpage.train.fitting.modules import SymbolTraining
+from lightpage.train.fitting.provenance import provenance_of
+from lightpage.train.models.hyperparameters import Hyperparameters
+from lightpage.train.models.presets import PRESETS
+from lightpage.train.published.training import PublishedChoices
+from lightpage.train.runs import FORMAT, begin, check_begun, load_run, sole_writer
+from lightpage.train.trainers.whole_run import own_pilots
 from tests.lightpage.small import small_profile
 from tests.told import Told
-from train.commands import train as cli_train
-from train.commands.options import CHOICES, chosen_localizer, chosen_trainer, given_choices
-from train.commands.train import train
-from train.fitting import provenance as origin
-from train.fitting.curves import curves_of
-from train.fitting.modules import SymbolTraining
-from train.fitting.provenance import provenance_of
-from train.models.hyperparameters import Hyperparameters
-from train.models.presets import PRESETS
-from train.published.training import PublishedChoices
-from train.runs import FORMAT, begin, check_begun, load_run, sole_writer
-from train.trainers.whole_run import own_pilots
 
 LAST = Path("checkpoints") / "last.ckpt"
 

@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from lightpage.errors import LightpageError, SurroundingsError
-from train.data.feature_store import FeatureStore, fill
-from train.data.features import PageFeatures, PageState
+from lightpage.train.data.feature_store import FeatureStore, fill
+from lightpage.train.data.features import PageFeatures, PageState
 
 
 class Pages:
@@ -99,7 +99,7 @@ def test_a_part_of_the_pages_is_numbered_from_zero(tmp_path: Path) -> None:
     [
         ("os.posix_fallocate", errno.ENOSPC, SurroundingsError),
         ("os.posix_fallocate", errno.EOPNOTSUPP, None),
-        ("train.data.feature_store.open_memmap", errno.ENODEV, LightpageError),
+        ("lightpage.train.data.feature_store.open_memmap", errno.ENODEV, LightpageError),
     ],
 )
 def test_room_is_taken_before_pages_are_made(

@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from lightpage.errors import InvalidInputError
-from train.data.feature_store import FeatureStore, fill
-from train.data.features import PageFeatures, PageState
-from train.data.patches import Patches, patch_start, training_pages
-from train.fitting.modules import SymbolTraining
-from train.models.hyperparameters import Hyperparameters
-from train.models.network import SymbolUNet, reach, with_page_coordinates
+from lightpage.train.data.feature_store import FeatureStore, fill
+from lightpage.train.data.features import PageFeatures, PageState
+from lightpage.train.data.patches import Patches, patch_start, training_pages
+from lightpage.train.fitting.modules import SymbolTraining
+from lightpage.train.models.hyperparameters import Hyperparameters
+from lightpage.train.models.network import SymbolUNet, reach, with_page_coordinates
 
 SHAPE = (30, 41)
 SIDE = 24

@@ -15,11 +15,11 @@ from lightpage.device.state import Device, SlmDefects
 from lightpage.page.symbols import random_symbols, symbol_phases
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import perfectly_calibrated
+from lightpage.train.data.features import FeatureExtractor, PageFeatures
+from lightpage.train.data.known_light import explained
+from lightpage.train.data.synthetic import MOST_NOISE, PAGES_PER_STATE, ModelMatch, SyntheticPages, model_match
+from lightpage.train.models.localizers.coherent import CoherentLocalizer
 from tests.lightpage.small import small_profile
-from train.data.features import FeatureExtractor, PageFeatures
-from train.data.known_light import explained
-from train.data.synthetic import MOST_NOISE, PAGES_PER_STATE, ModelMatch, SyntheticPages, model_match
-from train.models.localizers.coherent import CoherentLocalizer
 
 SEED = 5
 FALLOFF = 0.25

@@ -17,13 +17,13 @@ from torch.utils.data import TensorDataset
 
 from lightpage.errors import InvalidInputError
 from lightpage.metrics.information import achievable_rate
-from train.fitting.concentration_scale import best_kappa_scale, decode_pages, most_likely_factor
-from train.fitting.fit import fit_network
-from train.fitting.fitted import CHECKPOINTS, FITTED, FITTED_WEIGHTS, Fitted
-from train.fitting.loss import training_rate, von_mises_nll
-from train.fitting.memory import keep_freed_memory
-from train.fitting.validation import held_out_air
-from train.models.hyperparameters import Hyperparameters
+from lightpage.train.fitting.concentration_scale import best_kappa_scale, decode_pages, most_likely_factor
+from lightpage.train.fitting.fit import fit_network
+from lightpage.train.fitting.fitted import CHECKPOINTS, FITTED, FITTED_WEIGHTS, Fitted
+from lightpage.train.fitting.loss import training_rate, von_mises_nll
+from lightpage.train.fitting.memory import keep_freed_memory
+from lightpage.train.fitting.validation import held_out_air
+from lightpage.train.models.hyperparameters import Hyperparameters
 
 PAGE = (8, 12)
 LEVELS = 256
@@ -90,7 +90,7 @@ def test_further_processes_take_what_the_first_one_has_made(tmp_path: Path, monk
         replace(first, validation_air=1.25).save(tmp_path / "other")
 
     monkeypatch.setattr(L.Trainer, "fit", then_the_first_ends)
-    monkeypatch.setattr("train.fitting.fit.is_first_process", lambda: False)
+    monkeypatch.setattr("lightpage.train.fitting.fit.is_first_process", lambda: False)
     other = fit_network(tmp_path / "other", choices, MASK, LEVELS, pages(2, 0), pages(1, 1))
     assert (other.validation_air, other.curves) == (1.25, first.curves)
     torch.testing.assert_close(other.module.network.state_dict(), first.module.network.state_dict())

@@ -15,9 +15,9 @@ from lightpage.errors import InvalidInputError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.simulator.cameras import resample
 from lightpage.simulator.simulator import Simulator
+from lightpage.train.models.field import ROUNDS, FieldRecovery, TorchFieldSolver
 from lightpage.waves.grid import field_grid
 from tests.lightpage.small import small_profile
-from train.models.field import ROUNDS, FieldRecovery, TorchFieldSolver
 
 PROFILE = small_profile()
 SHIFTS_PX = (0.5, 4.3)

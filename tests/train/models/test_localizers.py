@@ -10,10 +10,10 @@ from lightpage.device.state import Device, Drift, SlmDefects
 from lightpage.page.symbols import random_symbols, symbol_phases
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import perfectly_calibrated
+from lightpage.train.data.features import FeatureExtractor
+from lightpage.train.models.hyperparameters import Hyperparameters
 from lightpage.waves.grid import GRID_STEP_PX
 from tests.lightpage.small import small_profile
-from train.data.features import FeatureExtractor
-from train.models.hyperparameters import Hyperparameters
 
 SEED = 3
 

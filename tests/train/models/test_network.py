@@ -9,8 +9,8 @@ import pytest
 import torch
 from scipy import ndimage
 
-from train.models.filters import SeparableFilter
-from train.models.network import PositionModulation, Refiner, SymbolUNet, estimate
+from lightpage.train.models.filters import SeparableFilter
+from lightpage.train.models.network import PositionModulation, Refiner, SymbolUNet, estimate
 
 
 @pytest.mark.parametrize("depth", [0, 1, 2])

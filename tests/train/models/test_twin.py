@@ -11,8 +11,8 @@ import torch
 from lightpage.calibration.interfaces import BRANCHES
 from lightpage.calibration.parameters import NAMES, PRIORS, nominal
 from lightpage.device.profile import Profile, load_profile
+from lightpage.train.models.twin import RayTwin, TorchTwin
 from tests.lightpage.small import THICK, small_profile
-from train.models.twin import RayTwin, TorchTwin
 
 
 def some_device(seed: int, scale: float = 0.5) -> np.ndarray:

@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from lightpage.calibration.parameters import NAMES, PRIORS
-from lightpage.calibration.wave_model import FittedWaves, on_modulator
+from lightpage.calibration.waves.wave_model import FittedWaves, on_modulator
 from lightpage.device.profile import Profile
 from lightpage.device.state import Device
 from lightpage.simulator.true_optics import true_parameters
+from lightpage.train.models import wave_lens, wave_pipe
+from lightpage.train.models.parts import stacked
+from lightpage.train.models.waves import EXACT, ROUGH, Banded, Fidelity, Waves
 from tests.lightpage.small import THICK, small_profile
-from train.models import wave_lens, wave_pipe
-from train.models.parts import stacked
-from train.models.waves import EXACT, ROUGH, Banded, Fidelity, Waves
 
 PROFILE = small_profile()
 SAMPLES = 4

@@ -1,1 +1,1 @@
-"""Tests of the package `train.published`."""
+"""Tests of the package `lightpage.train.published`."""

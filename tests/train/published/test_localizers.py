@@ -8,11 +8,11 @@ import torch
 from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile
+from lightpage.train.published.decoder import sample_pair
+from lightpage.train.published.localizers import Localizer, ModeLocalizer, NoLocalizer, RayLocalizer, page_places
 from lightpage.waves.channel import WaveChannel
 from lightpage.waves.geometry import WaveGeometry, cells_for
 from tests.lightpage.small import small_profile
-from train.published.decoder import sample_pair
-from train.published.localizers import Localizer, ModeLocalizer, NoLocalizer, RayLocalizer, page_places
 
 SAMPLES = 4
 Complex = NDArray[np.complexfloating]

@@ -12,10 +12,10 @@ from lightpage.calibration.parameters import NAMES
 from lightpage.device.lenses import LENSES, LensPrescription
 from lightpage.device.profile import Profile, load_profile
 from lightpage.errors import InvalidInputError
+from lightpage.train.published.rays import RayTracer, Traced, _Rays, _through
 from tests.lightpage.small import small_profile
 from tests.train.models.test_twin import Ray, page_points
 from tests.train.models.test_twin import follow as one_ray
-from train.published.rays import RayTracer, Traced, _Rays, _through
 
 ACHROMAT = LENSES["AC508-080-A"]
 SLOPED = np.deg2rad(-0.6)

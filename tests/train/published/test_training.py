@@ -16,13 +16,11 @@ from lightpage.errors import InvalidInputError
 from lightpage.page.symbols import pilot_mask
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
-from tests.conftest import SMALL_PAGES
-from tests.lightpage.small import THICK, small_profile
-from train.data.features import PageState
-from train.data.pages import Page
-from train.published.decoder import p_of_classes
-from train.published.trainer import published_choices, published_decoder, train_published
-from train.published.training import (
+from lightpage.train.data.features import PageState
+from lightpage.train.data.pages import Page
+from lightpage.train.published.decoder import p_of_classes
+from lightpage.train.published.trainer import published_choices, published_decoder, train_published
+from lightpage.train.published.training import (
     NOT_ASKED,
     DataPages,
     FramePages,
@@ -30,8 +28,10 @@ from train.published.training import (
     PublishedTraining,
     nearest_class,
 )
-from train.published.unet import PublishedUNet, samples_for
-from train.runs import load_run
+from lightpage.train.published.unet import PublishedUNet, samples_for
+from lightpage.train.runs import load_run
+from tests.conftest import SMALL_PAGES
+from tests.lightpage.small import THICK, small_profile
 
 STEP_RATES = (1e-3, 2e-4, 1e-4)
 LEVELS = 64
@@ -125,7 +125,7 @@ def test_pilots_are_not_learnt_from(classes: int) -> None:
 
 def test_training_hides_the_pilots(small_device: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
-    monkeypatch.setattr("train.published.trainer.fit", lambda *given, **_: seen.append(given[2]))
+    monkeypatch.setattr("lightpage.train.published.trainer.fit", lambda *given, **_: seen.append(given[2]))
     profile = small_profile()
     with Recording.open(small_device[3]) as recording:
         pages = FramePages(recording, [2], [PageState((0.0, 0.0), 0.0)])

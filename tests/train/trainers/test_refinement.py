@@ -10,18 +10,18 @@ import torch
 from scipy import special
 
 from lightpage.calibration.calibrate import KnownPage
-from lightpage.calibration.wave_model import illumination_terms
+from lightpage.calibration.waves.wave_model import illumination_terms
 from lightpage.device.state import Device, Drift, Sensor
 from lightpage.page.symbols import random_symbols, symbol_phases
 from lightpage.recording.frame_pair import FramePair
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import perfectly_calibrated
+from lightpage.train.data.features import FeatureExtractor
+from lightpage.train.data.known_light import explained
+from lightpage.train.models.parts import turned
+from lightpage.train.models.prediction import Prediction, expected_phasors
+from lightpage.train.trainers.refinement import fit_prediction
 from tests.lightpage.small import small_profile
-from train.data.features import FeatureExtractor
-from train.data.known_light import explained
-from train.models.parts import turned
-from train.models.prediction import Prediction, expected_phasors
-from train.trainers.refinement import fit_prediction
 
 PROFILE = small_profile()
 SURE = 1e4

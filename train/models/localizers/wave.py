@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from lightpage.device.profile import Profile
+from lightpage.train.models.waves import Real, Waves
 from lightpage.waves.grid import FieldGrid, symbol_samples
-from train.models.waves import Real, Waves
 
 
 class WaveLocalizer(nn.Module):

@@ -1,0 +1,1 @@
+"""Attacks on a running service, kills and forbidden calls: nothing may break, leak or answer wrongly."""

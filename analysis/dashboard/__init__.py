@@ -1,0 +1,1 @@
+"""The dashboard of deploy/grafana, drawn from what a Prometheus has scraped."""

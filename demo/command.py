@@ -1,0 +1,77 @@
+"""`lightpage demo`: the main job on the simulated device, with the shipped bundle."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import click
+
+from lightpage.cli.paths import OutputFile, OutputFolder
+from lightpage.cli.progress_bar import percent_bar
+from lightpage.demo.demo import DemoResult, run_demo
+from lightpage.errors import InvalidInputError
+from lightpage.files import write_json
+from lightpage.runtime.archives.recordings.coded_pages import AIR_LEVELS
+from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
+
+
+@click.command()
+@click.option("--bundle", default=DEFAULT, show_default=True, help="A bundle's path, or the name of a shipped one.")
+@click.option("--out", default="out/demo", show_default=True, type=OutputFolder(), help="Folder.")
+@click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Of what is written.")
+@click.option("--source", "spec", help="A simulated device that runs as hardware, camera:FOLDER/device.toml.")
+@click.option("--json", "json_path", type=OutputFile(), help="Also write the figures to this file.")
+def demo(bundle: str, out: Path, seed: int, spec: str | None, json_path: Path | None) -> None:
+    """Store a picture on the simulated device and read it back, before a drift, after it and recalibrated.
+
+    Writes to the folder --out: pages.h5 (what the modulator shows), demo.json, demo.png, and the picture as it was read
+    in each state (.pgm).
+    """
+    from lightpage.demo.figure import write_figure  # matplotlib takes long to import
+
+    start = time.perf_counter()
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidInputError(f"--out {out}", error, "a folder that can be written") from None
+    with percent_bar() as progress:
+        result = run_demo(bundle_path(bundle), out, seed, progress, spec)
+    figures = result.to_json() | {"seconds": time.perf_counter() - start}
+    write_json(out / "demo.json", figures)
+    if json_path is not None:
+        write_json(json_path, figures)
+    write_figure(result, out / "demo.png")
+    click.echo(describe(result))
+    click.echo(f"\nwritten to {out}: demo.json, demo.png, pages.h5, pictures ({figures['seconds']:.0f} s)")
+
+
+def describe(result: DemoResult) -> str:
+    """The figures as a table for people."""
+    lines = [
+        f"{'device':<16}{'model':<16}{'AIR, bit/symbol*':>17}{'margin':>9}{'unread':>8}{'restored':>10}{'lost':>6}"
+        f"{'picture':>10}{'decode, ms':>12}"
+    ]
+    lines += [
+        f"{phase.name:<16}{phase.model_version:<16}{phase.air_bits_per_symbol:>17.3f}"
+        f"{'' if phase.margin_bits is None else f'{phase.margin_bits:.3f}':>9}{phase.unread:>8}{phase.restored:>10}"
+        f"{phase.lost:>6}{'exact' if phase.exact else 'damaged':>10}{1e3 * phase.seconds:>12.0f}"
+        for phase in result.phases
+    ]
+    volume = result.volume
+    lines.append(
+        f"\na picture of {volume.file_bytes} bytes on {volume.pages} pages, {volume.parity_pages} of each group of "
+        f"{volume.group_pages} parity, one page spoilt; {volume.page_bytes} user bytes a page"
+    )
+    for step in result.drift:
+        margin = "" if step.margin_bits is None else f" margin {step.margin_bits:+.3f} bit a symbol,"
+        due = ", recalibration due" if step.recalibration_due else ""
+        lines.append(f"drift {step.share:.2f}:{margin} page {'lost' if step.lost else 'read'}{due}")
+    found = result.recalibrated
+    angle = "" if found.angle_deg is None else f", pipe angle {found.angle_deg:.3f} degree"
+    lines.append(f"recalibrated with {found.pages_used} known pages in {found.seconds:.0f} s{angle}")
+    if result.shots:
+        told = ", ".join(f"{count} {outcome}" for outcome, count in sorted(result.shots.items()))
+        lines.append(f"shots of {result.source}: {told}")
+    lines.append(f"* what a phase carries, counted in {AIR_LEVELS} levels; the pages have {result.code.levels}")
+    return "\n".join(lines)

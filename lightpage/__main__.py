@@ -1,0 +1,6 @@
+"""`python -m lightpage`: the command line."""
+
+from lightpage.cli.main import main
+
+if __name__ == "__main__":
+    main()

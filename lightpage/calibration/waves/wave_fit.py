@@ -1,0 +1,316 @@
+"""The device as the waves of one known page show it: least squares of both raw frames against the fitted wave model.
+
+Once rays have found the device to a fraction of a speckle, the wave model says what each camera should have seen of a
+known page, the signal's own power included. All pixels together then say how the cameras lie, what the angle between
+the arms is, and what pipe and lenses are: more than patches of symbols do, since the light of every path counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal, NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from lightpage.calibration.interfaces import Twin
+from lightpage.calibration.parameters import NAMES, PARAMETERS, PRIORS, indices
+from lightpage.calibration.samplers import smooth_reference
+from lightpage.calibration.waves.wave_model import FittedWaves, illumination_terms, on_modulator
+from lightpage.device.profile import Profile
+from lightpage.recording.frame_pair import FramePair
+from lightpage.waves.grid import field_grid, symbol_samples
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complexfloating]
+
+READ_NOISE = 0.3
+"""Variance of an equation that does not grow with the light, over the shot noise of the reference alone."""
+ROUNDS = 9
+_CHORD = 4
+"""Rounds that share one derivative of the light, which costs as much as several rounds."""
+_CHORD_ACCURACY = 3 / 8
+"""Share of the splitting steps for that derivative: an error of a percent in it costs no round."""
+_NEARLY = 0.02
+"""Relative fall of the residual, by a whole step, below which the derivative at hand serves to the end."""
+_CONVERGED = 3e-3
+"""Relative fall of the residual below which another round does not pay."""
+_LARGEST_MOVE_PX = 1.5
+"""A round's largest step: the model is linear in the displacement over about a speckle."""
+_EQUATIONS = 100_000
+"""Of each camera, at most about: more say nothing new of a few dozen unknowns."""
+_LEAST_STRIDE = 2
+"""Grid samples from one equation to the next: the grid has twice the rate that the light needs."""
+_INSIDE = 0.98
+"""Share of the page's image that is compared, to either side."""
+_DIFFERENCE = 1e-3
+"""Finite difference of the derivatives, in standard deviations of the priors."""
+_CAMERAS = ("in_phase", "quadrature")
+_AT_CAMERA = frozenset(indices("camera_phase"))
+"""Parameters whose change of the light needs no propagation."""
+_OF_REAL_LENSES = (NAMES.index("lens_path_relative"),)
+"""Parameters that do nothing where the profile's lenses are ideal."""
+_SEEN = frozenset(indices(*_CAMERAS, "distortion"))
+"""Parameters that say where the cameras see a place; all others change the light itself."""
+
+
+@dataclass(frozen=True)
+class WaveFitted:
+    """Outcome of a fit.
+
+    Attributes:
+        parameters: [P] fitted vector; held parameters keep their value.
+        deviations: [P] standard deviations, zero where held. What the model leaves unexplained counts as noise that
+            differs from symbol to symbol.
+        quadrature_phase: angle between the homodyne arms, radians.
+        residual: root mean square of what is left of the equations, in standard deviations of the reference's noise
+            times an unknown factor: it says which of two fits is better.
+    """
+
+    parameters: Real
+    deviations: Real
+    quadrature_phase: float
+    residual: float
+
+
+class _State(NamedTuple):
+    """What is fitted: parameters [P], the angle between the arms, coefficients [T] of the illumination's terms."""
+
+    parameters: Real
+    quadrature_phase: float
+    light: Complex
+
+
+class _Slopes(NamedTuple):
+    """Derivatives at the places of the equations [...].
+
+    Attributes:
+        by_term: of the light by the illumination's terms, [T, ...].
+        of_light: of the light by parameters that change it, [...] each.
+        of_cameras: of the places' pixels by parameters that move them, [2, ..., 2] each.
+    """
+
+    by_term: Complex
+    of_light: list[Complex]
+    of_cameras: list[Real]
+
+
+class WaveFit:
+    """Least squares of two frames against the waves of the page that they show.
+
+    Unknown are, beside the parameters asked for, the page's illumination (a quadratic over the page) and the angle
+    between the arms.
+
+    Args:
+        twin: ray tracer of the nominal device, for the cameras' poses.
+        profile: the nominal device.
+        pair, references: frames of a known page, and reference-only frames.
+        symbols: its unit phasors, complex [ny, nx].
+    """
+
+    def __init__(
+        self, twin: Twin, profile: Profile, pair: FramePair, references: FramePair, symbols: NDArray[np.complex128]
+    ) -> None:
+        self._twin, self._profile, self._symbols = twin, profile, symbols.size
+        self._samples = symbol_samples(profile)
+        page = on_modulator(np.angle(symbols), self._samples)
+        waves = self._waves(np.zeros(len(PARAMETERS)))
+        self._pages = np.stack([page * term for term in illumination_terms(waves.x, waves.y)])
+        grid = field_grid(profile)
+        self._pitch_px = grid.pitch_m / profile.camera.pitch_m
+        self._stride = max(_LEAST_STRIDE, int(np.sqrt(np.prod(grid.shape) / _EQUATIONS)))
+        self._every = (slice(None, None, self._stride), slice(None, None, self._stride))
+        self._places = np.stack(np.meshgrid(grid.x_m, grid.y_m), axis=-1)[self._every]
+        half = _INSIDE * np.array([profile.page_width_m, profile.page_height_m]) / 2
+        self._inside = np.all(np.abs(self._places) < half, axis=-1)
+        self._levels = [smooth_reference(frame) for frame in (references.in_phase, references.quadrature)]
+        self._images = [
+            scipy.ndimage.spline_filter((frame.astype(np.float32) - level) / (2 * level), order=3, output=np.float32)
+            for frame, level in zip((pair.in_phase, pair.quadrature), self._levels, strict=True)
+        ]
+
+    def fit(
+        self,
+        start: Real,
+        quadrature_phase: float,
+        groups: tuple[str, ...],
+        centre: Real | None = None,
+        prior_scale: float | Real = 1.0,
+        progress: Callable[[float], None] = lambda share: None,
+    ) -> WaveFitted:
+        """Fit the parameters of `groups` and the angle between the arms.
+
+        Args:
+            start: [P], right to within about a speckle and a radian.
+            quadrature_phase: angle between the arms to start from, good to some tens of degrees.
+            groups: of `lightpage.calibration.parameters`. Without ``launch``, the illumination may bend the page's
+                phases instead.
+            centre: [P] centre of the priors, nominal (zero) if None.
+            prior_scale: factor on the priors' standard deviations, one for all or [P].
+            progress: told of every round and of every derivative, with the share of the most rounds that is behind,
+                0 to 1. It may raise to stop the work.
+        """
+        without_effect = _OF_REAL_LENSES if self._profile.ideal_lenses else ()
+        of_light = [index for index in indices(*groups) if index not in (*_SEEN, *without_effect)]
+        of_cameras = [index for index in indices(*groups) if index in _SEEN]
+        free = of_light + of_cameras
+        precision = 1 / (PRIORS * prior_scale)[free] ** 2
+        centre = np.zeros(len(PARAMETERS)) if centre is None else centre
+        state = self._start(start, quadrature_phase)
+        best = WaveFitted(start, np.zeros(len(PARAMETERS)), quadrature_phase, np.inf)
+        fall, whole, slopes = 1.0, False, None
+        for number in range(ROUNDS):
+            progress(number / ROUNDS)
+            if slopes is None or (number % _CHORD == 0 and not (whole and fall < _NEARLY)):
+                slopes = self._slopes(state, of_light, of_cameras, partial(_within_round, progress, number))
+            directions = _directions(state.light, bends="launch" not in groups)
+            columns, left = self._equations(state, slopes, directions)
+            residual = float(np.sqrt(np.mean(left**2)))
+            fall = 1 - residual / best.residual
+            if not fall > _CONVERGED:
+                break
+            # What is unexplained differs from symbol to symbol, so equations tell no more than symbols do.
+            variance = residual**2 * max(1.0, len(left) / (2 * self._symbols))
+            others = columns.shape[1] - len(free)
+            information = columns.T @ columns / variance + np.diag(np.r_[np.zeros(others), precision])
+            pull = columns.T @ left / variance
+            pull[others:] -= precision * (state.parameters[free] - centre[free])
+            covariance = _inverse(information)
+            deviations = np.zeros(len(PARAMETERS))
+            deviations[free] = np.sqrt(np.diag(covariance)[others:])
+            best = WaveFitted(state.parameters, deviations, state.quadrature_phase, residual)
+            state, whole = self._moved(state, covariance @ pull, directions, free)
+        return best
+
+    def _waves(self, parameters: Real) -> FittedWaves:
+        return FittedWaves(self._profile, parameters, self._samples, filled=True)
+
+    def _light(self, parameters: Real, light: Complex) -> Complex:
+        """The page's light on the common grid, [Gy, Gx]."""
+        return self._waves(parameters).to_camera(np.tensordot(light, self._pages, 1))
+
+    def _start(self, parameters: Real, quadrature_phase: float) -> _State:
+        """With the even illumination that fits best."""
+        chosen, counts, amplitude = self._look(parameters)
+        even = np.eye(1, len(self._pages), dtype=np.complex128)[0]
+        here = self._light(parameters, even)[self._every][chosen] / amplitude
+        columns = np.concatenate([here * np.exp(-1j * arm) for arm in (0.0, quadrature_phase)])
+        found = np.linalg.lstsq(np.stack([columns.real, -columns.imag], axis=1), counts.ravel(), rcond=None)[0]
+        return _State(parameters, quadrature_phase, even * complex(*found))
+
+    def _slopes(
+        self, state: _State, of_light: list[int], of_cameras: list[int], progress: Callable[[float], None]
+    ) -> _Slopes:
+        def waves(parameters: Real, like: FittedWaves | None = None) -> FittedWaves:
+            stride, accuracy = self._stride, _CHORD_ACCURACY
+            return FittedWaves(
+                self._profile, parameters, self._samples, filled=True, stride=stride, accuracy=accuracy, like=like
+            )
+
+        def stepped(index: int) -> tuple[Real, float]:
+            there, step = state.parameters.copy(), _DIFFERENCE * PRIORS[index]
+            there[index] += step
+            return there, step
+
+        here = waves(state.parameters)
+        by_term = np.stack([here.to_camera(page) for page in self._pages])
+        page, field = np.tensordot(state.light, self._pages, 1), np.tensordot(state.light, by_term, 1)
+        light, pixels = list[Complex](), list[Real]()
+        for number, index in enumerate(of_light):
+            progress(number / len(of_light))
+            there, step = stepped(index)
+            moved = waves(there, here)
+            at_camera = index in _AT_CAMERA
+            ratio = moved.against_reference / here.against_reference
+            light.append(((field * ratio if at_camera else moved.to_camera(page)) - field) / step)
+        for there, step in map(stepped, of_cameras):
+            pixels.append((self._pixels(there) - self._pixels(state.parameters)) / step)
+        return _Slopes(by_term, light, pixels)
+
+    def _pixels(self, parameters: Real) -> Real:
+        """Where both cameras see the places [...], [2, ..., 2]."""
+        return self._twin.pixels(parameters, self._places.reshape(-1, 2)).reshape(2, *self._places.shape)
+
+    def _look(self, parameters: Real) -> tuple[NDArray[np.bool_], Real, Real]:
+        """The frames where the cameras see the places: which of them both see, counts [2, N], amplitude [N].
+
+        Counts are over twice the reference's, less one half; the amplitude is the reference's over its mean.
+        """
+        pixels = self._pixels(parameters)
+        last = np.array(self._images[0].shape[::-1]) - 3
+        chosen = self._inside & np.all((pixels > 2) & (pixels < last), axis=(0, 3))
+        counts = [_at(image, at[chosen], order=3) for image, at in zip(self._images, pixels, strict=True)]
+        amplitude = np.sqrt(_at(self._levels[0], pixels[0][chosen], order=1))
+        return chosen, np.stack(counts), amplitude / amplitude.mean()
+
+    def _equations(self, state: _State, slopes: _Slopes, directions: Complex) -> tuple[Real, Real]:
+        """Columns [2 N, K] and what is left [2 N], over the noise of each equation's light.
+
+        A count says Re(e exp(-i arm)) + |e|^2 / 2 of the field e over the reference. Columns are those of the
+        illumination's `directions`, the turn, and the parameters of `slopes`.
+        """
+        chosen, counts, amplitude = self._look(state.parameters)
+
+        def seen(field: Complex) -> Complex:
+            return np.asarray(field[chosen] / amplitude)
+
+        field = self._light(state.parameters, state.light)
+        here, down, across = (seen(part[self._every]) for part in (field, *np.gradient(field)))
+        changes = [seen(part) for part in (*np.tensordot(directions, slopes.by_term, 1), *slopes.of_light)]
+        moves = [pixels[:, chosen] for pixels in slopes.of_cameras]
+        columns, left = [], []
+        for camera, arm in enumerate((0.0, state.quadrature_phase)):
+            phasor = np.exp(-1j * arm)
+            weight = 1 / np.sqrt(np.abs(1 / phasor + here) ** 2 + READ_NOISE)
+            along = (phasor + here.conj()) * weight  # derivative of the count by e
+            left.append((counts[camera] - (here * phasor).real - np.abs(here) ** 2 / 2) * weight)
+            mine = [(along * change).real for change in changes]
+            mine.insert(len(directions), (here * phasor * -1j).real * weight * camera)
+            slope = np.stack([(along * part).real for part in (across, down)]) / self._pitch_px
+            mine += [-(slope * move[camera].T).sum(axis=0) for move in moves]
+            columns.append(np.stack(mine, axis=1))
+        return np.concatenate(columns), np.concatenate(left)
+
+    def _moved(self, state: _State, step: Real, directions: Complex, free: list[int]) -> tuple[_State, bool]:
+        """The state after a step, shortened where it would move a camera too far, and whether it was whole."""
+        change = np.zeros(len(PARAMETERS))
+        change[free] = step[len(directions) + 1 :]
+        few = self._places[self._inside][:: 1 + len(self._places)]
+        seen = [self._twin.pixels(at, few) for at in (state.parameters, state.parameters + change)]
+        furthest = float(np.sqrt(np.mean(np.sum((seen[1] - seen[0]) ** 2, axis=-1), axis=-1)).max())
+        share = min(1.0, _LARGEST_MOVE_PX / max(furthest, 1e-9))
+        moved = _State(
+            state.parameters + share * change,
+            state.quadrature_phase + share * float(step[len(directions)]),
+            state.light + share * step[: len(directions)] @ directions,
+        )
+        return moved, share == 1
+
+
+def _within_round(progress: Callable[[float], None], number: int, share: float) -> None:
+    """Tell of a share of round `number`."""
+    progress((number + share) / ROUNDS)
+
+
+def _directions(light: Complex, *, bends: bool) -> Complex:
+    """Ways in which an illumination may change, as rows of coefficients: brightness, one phase for all, or any."""
+    terms = np.eye(len(light))
+    if bends:
+        return np.concatenate([terms, 1j * terms])
+    return np.concatenate([light[0] / abs(light[0]) * terms, 1j * light[None]])
+
+
+def _inverse(information: Real) -> Real:
+    """Of a symmetric matrix whose rows have units of very different size."""
+    unit = 1 / np.sqrt(np.diag(information))
+    inverse = np.linalg.pinv(information * unit * unit[:, None], hermitian=True)
+    return np.asarray(inverse * unit * unit[:, None])
+
+
+def _at(image: NDArray[np.float32], pixels: Real, order: Literal[1, 3]) -> Real:
+    """Values at pixels [N, 2] (column, row)."""
+    values = scipy.ndimage.map_coordinates(image, [pixels[:, 1], pixels[:, 0]], order=order, prefilter=False)
+    return np.asarray(values, dtype=np.float64)

@@ -1,0 +1,102 @@
+"""What a report shows, whichever source it was read from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.calibration.document import Calibration
+from lightpage.calibration.sampling_table import symbol_centres
+from lightpage.device.lenses import LensPrescription
+from lightpage.device.profile import Profile
+from lightpage.metrics.information import page_kilobytes
+from lightpage.metrics.measures import PageMeasures, SymbolMaps
+from lightpage.metrics.reliability import ConcentrationBin, ConfidenceBin
+from lightpage.recording.frame_pair import FramePair
+from lightpage.train.fitting.curves import Curve
+from lightpage.train.models.twin import RayTwin, TorchTwin
+
+Real = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Golden:
+    """A frame pair and the phase that is decoded from it, radians [ny, nx], piston removed."""
+
+    pair: FramePair
+    phase: NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Rays:
+    """What rays are drawn through.
+
+    Attributes:
+        angle_deg: of the pipe.
+        origin: whose angle that is.
+        lens: prescription of both lenses; None for ideal ones.
+        own: whether the decoder trained the angle itself.
+    """
+
+    angle_deg: float
+    origin: str
+    lens: LensPrescription | None = None
+    own: bool = False
+
+
+@dataclass(frozen=True)
+class ReportData:
+    """Everything that a report shows. For what is missing stands a sentence that says why.
+
+    Attributes:
+        title: of the page.
+        pages: which pages were measured, in sentences.
+        facts: decoder and provenance, (name, value).
+        profile, calibration: nominal and fitted device.
+        rays: what rays are drawn through.
+        measures: over the data symbols of all pages together.
+        maps: means over the pages at every place.
+        confidence_bins, concentration_bins: what was claimed against what happened.
+        curves: of the training, by TensorBoard's tag, for each validation at the light.
+        golden: one page.
+    """
+
+    title: str
+    pages: str
+    facts: list[tuple[str, str]]
+    profile: Profile
+    calibration: Calibration
+    rays: Rays
+    measures: PageMeasures
+    maps: SymbolMaps
+    confidence_bins: list[ConfidenceBin]
+    concentration_bins: list[ConcentrationBin]
+    curves: Sequence[Mapping[str, Curve]] | str
+    golden: Golden | str
+
+    @property
+    def data(self) -> NDArray[np.bool_]:
+        """Where the data symbols are, bool [ny, nx]."""
+        return np.isfinite(self.maps.air)
+
+    @property
+    def page_kb(self) -> float:
+        """What a page carries, by its AIR."""
+        return page_kilobytes(self.measures.air_bits_per_symbol, int(np.count_nonzero(self.data)))
+
+    @property
+    def summary(self) -> str:
+        """What matters most, in a few words."""
+        return f"AIR {self.measures.air_bits_per_symbol:.3f} bit/symbol"
+
+
+def exit_centroids(profile: Profile, calibration: Calibration) -> Real:
+    """Where each symbol's beam would leave a pipe without walls, over its width, (x, y') [2, ny, nx].
+
+    Rounded, these are the symbol's zone: how often it meets the walls x and y', with the sign of the side.
+    """
+    positions = TorchTwin(RayTwin(profile)).trace(calibration.vector, symbol_centres(profile)).positions
+    return np.ascontiguousarray(positions.T.reshape(2, *profile.page_shape))

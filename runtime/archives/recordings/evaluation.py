@@ -1,0 +1,259 @@
+"""Measures a decoder on a recording with known symbols, on pages that it has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.errors import InvalidInputError, LightpageError, LostPageError, RecordingError, StorageError
+from lightpage.metrics.accumulator import Accumulator
+from lightpage.metrics.information import achievable_rate, page_kilobytes
+from lightpage.metrics.measures import PageMeasures, SymbolMaps
+from lightpage.metrics.reliability import ConcentrationBin, ConfidenceBin
+from lightpage.page.pilots import Pilots, estimate_piston
+from lightpage.progress import track
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording, page_hashes
+from lightpage.runtime.archives.recordings.read_ahead import read_ahead
+from lightpage.runtime.archives.recordings.refused import RefusedPage, refusal, unconfirmed
+from lightpage.runtime.model.bundle.manifest import GOLDEN
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.frames import narrow
+from lightpage.runtime.model.decoding.page import DecodedPage, Timings
+from lightpage.runtime.model.decoding.tracking import Tracker
+
+_MAP_DECIMALS = 4
+"""Of maps in JSON: finer than the noise of any number of pages, and short enough to write."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Figures over the data symbols of held-out pages.
+
+    Attributes:
+        bundle_version: what was measured.
+        figures: over all pages together.
+        pages: how many were measured.
+        pages_left_out: how many the bundle was calibrated or trained on.
+        symbols_per_page: data symbols, pilots not counted.
+        seconds_per_page: median of the whole decode.
+        inference_seconds_per_page: median of the inference alone.
+        air_per_page: AIR of each page, bits per symbol.
+        concentration_bins: what concentrations promise against what happened.
+        maps: means over the pages at every place of the page.
+        confidence_bins: what confidences claim against what was right.
+        bundle: what made the bundle and where it lay, as JSON can keep it.
+        recalibration_due: pages whose pilots show that the device is no longer as it was calibrated.
+        refused: pages that could not be decoded, or were not confirmed; no figure counts them.
+        air_before_refit: AIR with the smooth phase errors that decoding takes off still in, bits per symbol.
+    """
+
+    bundle_version: str
+    figures: PageMeasures
+    pages: int
+    pages_left_out: int
+    symbols_per_page: int
+    seconds_per_page: float
+    inference_seconds_per_page: float
+    air_per_page: tuple[float, ...]
+    concentration_bins: tuple[ConcentrationBin, ...]
+    maps: SymbolMaps
+    confidence_bins: tuple[ConfidenceBin, ...]
+    bundle: dict[str, Any]
+    recalibration_due: int = 0
+    refused: tuple[RefusedPage, ...] = ()
+    air_before_refit: float = float("nan")
+
+    @property
+    def page_kb(self) -> float:
+        """What a page carries, by its AIR."""
+        return page_kilobytes(self.figures.air_bits_per_symbol, self.symbols_per_page)
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures under the names that other programs read."""
+        figures = self.figures
+        return {
+            "bundle_version": self.bundle_version,
+            "pages": self.pages,
+            "pages_left_out": self.pages_left_out,
+            "symbols_per_page": self.symbols_per_page,
+            "levels": figures.levels,
+            "air_bits_per_symbol": figures.air_bits_per_symbol,
+            "air_before_refit_bits_per_symbol": self.air_before_refit,
+            "own_mi_bits_per_symbol": figures.own_mi_bits_per_symbol,
+            "over_claim_bits_per_symbol": figures.over_claim_bits_per_symbol,
+            "gmi_bits_per_symbol": figures.gmi_bits_per_symbol,
+            "page_kB": self.page_kb,
+            "symbol_error_rate": figures.symbol_error_rate,
+            "ece": figures.ece,
+            "seconds_per_page": self.seconds_per_page,
+            "inference_seconds_per_page": self.inference_seconds_per_page,
+            "air_per_page": list(self.air_per_page),
+            "concentration_bins": [asdict(part) for part in self.concentration_bins],
+            "confidence_bins": [asdict(part) for part in self.confidence_bins],
+            "maps": {name: page.round(_MAP_DECIMALS).tolist() for name, page in vars(self.maps).items()},
+            "bundle": self.bundle,
+            "pages_recalibration_due": self.recalibration_due,
+            **_refused_json(self.refused),
+        }
+
+
+class NothingReadError(LightpageError):
+    """No page of a recording was read.
+
+    Args:
+        refusal: why, see `lightpage.runtime.archives.recordings.refused.refusal`.
+        figures: what there is to tell all the same, under the names of `Evaluation.to_json`.
+    """
+
+    def __init__(self, refusal: LightpageError, figures: dict[str, Any]) -> None:
+        super().__init__(refusal.subject, refusal.got, refusal.expected)
+        self.refusal, self.figures = refusal, figures
+
+
+def _refused_json(refused: Sequence[RefusedPage]) -> dict[str, Any]:
+    return {"pages_unconfirmed": unconfirmed(refused), "refused_pages": [asdict(page) for page in refused]}
+
+
+def was_seen(decoder: Decoder, frames: FramePair) -> bool:
+    """Whether the bundle was calibrated or trained on a page, whichever type its counts were stored in then."""
+    manifest = decoder.bundle.manifest
+    seen = {*manifest.calibrated_pages, *manifest.trained_pages}
+    return bool(seen) and not seen.isdisjoint(page_hashes(frames))
+
+
+def check_recording(decoder: Decoder, recording: Recording) -> None:
+    """Check that a recording is of this decoder's kind of device.
+
+    Raises:
+        RecordingError: other shapes or another bit depth.
+    """
+    recording.check_against(decoder.bundle.profile)
+    depth = decoder.bundle.manifest.camera_bit_depth
+    if recording.bit_depth != depth:
+        raise RecordingError(
+            f"recording {recording.path}", f"{recording.bit_depth} bits", f"{depth} bits, as the bundle"
+        )
+
+
+def pilots_of(decoder: Decoder, recording: Recording) -> NDArray[np.bool_]:
+    """Where the pilots of a recording's pages are, [ny, nx]: as it says itself, or else the bundle's."""
+    own = recording.pilots()
+    return decoder.bundle.pilot_mask if own is None else own
+
+
+def decode_unseen(
+    decoder: Decoder,
+    recording: Recording,
+    tracker: Tracker,
+    mask: NDArray[np.bool_],
+    frames: FramePair,
+    symbols: NDArray[np.uint8] | None,
+) -> DecodedPage | None:
+    """A page of a recording, decoded by its own pilots; None where its symbols are unknown, or the bundle has seen it.
+
+    Args:
+        decoder, recording, tracker: see `evaluate`.
+        mask: where the pilots are, see `pilots_of`.
+        frames, symbols: the page.
+
+    Raises:
+        InvalidInputError, LostPageError: see `Tracker.decode`.
+    """
+    if symbols is None or was_seen(decoder, frames):
+        return None
+    pilots = Pilots.of_symbols(mask, symbols, recording.levels)
+    return tracker.decode(narrow(frames, recording.bit_depth), recording.levels, pilots)
+
+
+def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evaluation:
+    """Decode all unseen pages in their order and measure them against their symbols; a bad page is left out and told.
+
+    Args:
+        decoder: what to measure.
+        recording: pages with known symbols.
+        tracker: follows the device from page to page.
+
+    Raises:
+        RecordingError: another device's recording, or one without symbols.
+        InvalidInputError: the bundle has seen every page.
+        NothingReadError: no page could be decoded, or none was confirmed.
+    """
+    check_recording(decoder, recording)
+    if not recording.has_symbols:
+        raise RecordingError(f"recording {recording.path}", "no symbols", "known symbols to measure against")
+    levels = recording.levels
+    mask = pilots_of(decoder, recording)
+    data = ~mask
+    accumulator = Accumulator(levels, data, recording.pages)
+    timings: list[Timings] = []
+    refused: list[RefusedPage] = []
+    due = 0
+    before: list[float] = []
+    for index, read in track(read_ahead(recording.shown, recording.pages), "evaluate", total=recording.pages):
+        page = symbols = None
+        try:
+            frames, symbols = read.result()
+            page = decode_unseen(decoder, recording, tracker, mask, frames, symbols)
+        except (InvalidInputError, LostPageError, StorageError) as error:
+            refused.append(RefusedPage.of(index, error))
+        if page is not None and symbols is not None:
+            accumulator.add(page.phase[data], page.concentration[data], symbols[data])
+            unfitted = (page.phase + page.phase_error)[data]
+            before.append(float(achievable_rate(unfitted, page.concentration[data], symbols[data], levels).mean()))
+            timings.append(page.timings)
+            due += page.check.recalibration_due
+    if not timings and refused:
+        told = refusal(f"recording {recording.path}", refused, recording.pages)
+        figures = {
+            "bundle_version": decoder.version,
+            "pages": 0,
+            "pages_left_out": recording.pages - len(refused),
+            "bundle": _describe(decoder, levels),
+            **_refused_json(refused),
+        }
+        raise NothingReadError(told, figures)
+    if not timings:
+        raise InvalidInputError(
+            f"recording {recording.path}",
+            f"{recording.pages} pages, all of them used to make {decoder.version}",
+            "pages that the bundle has not seen",
+        )
+    return Evaluation(
+        bundle_version=decoder.version,
+        figures=accumulator.figures(),
+        pages=len(timings),
+        pages_left_out=recording.pages - len(timings) - len(refused),
+        symbols_per_page=int(np.count_nonzero(data)),
+        seconds_per_page=float(np.median([t.total_s for t in timings])),
+        inference_seconds_per_page=float(np.median([t.inference_s for t in timings])),
+        air_per_page=tuple(page.air_bits_per_symbol for page in accumulator.pages),
+        concentration_bins=tuple(accumulator.concentration_bins()),
+        maps=accumulator.maps(),
+        confidence_bins=tuple(accumulator.confidence_bins()),
+        bundle=_describe(decoder, levels),
+        recalibration_due=due,
+        refused=tuple(refused),
+        air_before_refit=float(np.mean(before)),
+    )
+
+
+def _describe(decoder: Decoder, levels: int) -> dict[str, Any]:
+    """The bundle's device and origin, the hash of its golden page, and the piston in the answer to that, radians."""
+    bundle, manifest = decoder.bundle, decoder.bundle.manifest
+    return {
+        "path": str(bundle.path.resolve()),
+        "name": manifest.name,
+        "precision": manifest.precision,
+        "provider": str(decoder.graph.provider),
+        "profile": manifest.profile,
+        "calibration": manifest.calibration,
+        "metrics": manifest.metrics,
+        "provenance": manifest.provenance.model_dump(),
+        "golden_sha256": manifest.files[GOLDEN],
+        "golden_piston_rad": estimate_piston(bundle.golden.p, decoder.pilots(levels)).angle_rad,
+    }

@@ -1,0 +1,79 @@
+"""How ranges are spread over workers: one small interface, of which there are several engines."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+from lightpage.runtime.archives.run.task import Failed, Operation, Outcome, Problem, Task
+
+ATTEMPTS = 3
+"""Times that a range is given to a worker; a range that has cost so many workers their life is left alone."""
+
+THREADS_OF_WORKER = 2
+"""Of an inference, where nothing else is asked for and there are as many cores: a second thread is worth nearly one
+core, and a worker takes as much memory as `lightpage evaluate`."""
+
+_START_S, _PAGE_S, _RECALIBRATION_S, _FINE_TUNING_S = 600.0, 60.0, 7200.0, 86_400.0
+"""Longest time of a worker's start, of a page, of a recalibration, and of one that trains the network on; a worker that
+takes longer is taken for dead."""
+
+
+class Engine(Protocol):
+    """Has workers do tasks."""
+
+    restarts: int
+    """Workers that died until now."""
+
+    in_flight: int
+    """Ranges that were handed out and have not come back."""
+
+    workers_alive: int
+    """Workers that are at work or wait for it; of a cluster, for how many its CPUs suffice."""
+
+    def run(self, tasks: Iterable[Task]) -> Generator[Outcome, None, None]:
+        """What became of each task, in whatever order they end; each exactly once.
+
+        Tasks are taken from the iterable as workers become free, so that few are held at once. A worker that dies costs
+        the range that it was at; that is given to another one, `ATTEMPTS` times in all. Workers end with
+        the generator.
+
+        Raises:
+            WorkerError: there are no workers.
+        """
+
+
+@dataclass
+class Attempt:
+    """A task on its way.
+
+    Attributes:
+        task: what is asked.
+        number: how many workers have died at it.
+        deadline: until when it must be done, `time.monotonic` seconds; infinite until a worker has it.
+    """
+
+    task: Task
+    number: int = 0
+    deadline: float = math.inf
+
+
+def next_attempt(tasks: Iterator[Task]) -> Attempt | None:
+    """The first attempt at the next task; None after the last."""
+    task = next(tasks, None)
+    return None if task is None else Attempt(task)
+
+
+def longest_s(task: Task) -> float:
+    """Seconds after which a worker that has not done a task is taken for dead."""
+    if task.operation is not Operation.RECALIBRATE:
+        return _START_S + _PAGE_S * len(task.pages)
+    return _START_S + (_RECALIBRATION_S if task.fine_tuning is None else _FINE_TUNING_S)
+
+
+def given_up(task: Task, got: str) -> Failed:
+    """The outcome of a task that has cost too many workers their life."""
+    expected = f"a result; {ATTEMPTS} workers died at it"
+    return Failed(task=task, problem=Problem(subject=task.name, got=got, expected=expected))

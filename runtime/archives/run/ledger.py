@@ -1,0 +1,284 @@
+"""The folder of a bulk run: what was asked, which ranges are done, and what became of every page."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from lightpage.clock import SYSTEM, Clock
+from lightpage.errors import LightpageError, SurroundingsError, TakenError
+from lightpage.failures import os_failure
+from lightpage.files import check_utf8, lock
+from lightpage.runtime.archives.run.job import Job, Source
+from lightpage.runtime.archives.run.part import WHOLE, Part
+from lightpage.runtime.archives.run.shard import RECORD, PageRecord, ShardRecord, holds_losses
+from lightpage.runtime.archives.run.task import Operation, RecordedFile, Task
+
+_LOCKING = "HDF5_USE_FILE_LOCKING"
+"""Variable of the environment by which HDF5, and this, are told to go without locks."""
+
+_LOCK, _QUESTION, _SHARDS = "lock", "lock-job", "shards"
+
+_AGAIN = ".again-"
+"""In the names of shards of later rounds."""
+
+_QUESTION_S, _AGAIN_S = 600.0, 0.1
+"""Longest wait for another part that writes down what is asked, and the time between two tries."""
+
+
+class Ledger:
+    """The folder of a run; in a `with` statement it belongs to this process, or a part of its recordings does.
+
+    Args:
+        folder: of the run, there or yet to be made.
+        part: what this process does of it.
+        clock: by which another part is waited for.
+
+    Attributes:
+        doubted: paths of shards whose ranges are read again; until then they count as having no result.
+
+    Raises:
+        TakenError: another run is at work there, or on this part of it.
+        InvalidInputError: the folder cannot be written, or its name is not UTF-8.
+    """
+
+    def __init__(self, folder: Path, part: Part = WHOLE, clock: Clock = SYSTEM) -> None:
+        self.folder, self.part, self._clock = folder.absolute(), part, clock
+        self.doubted: set[Path] = set()
+        check_utf8(self.folder, "bulk run")
+        self._subject = f"bulk run {self.folder}"
+
+    def __enter__(self) -> Self:
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise self._not_writable(error) from None
+        with ExitStack() as stack:
+            if self.part == WHOLE:
+                stack.callback(os.close, self._locked(_LOCK))
+            else:
+                stack.callback(os.close, self._locked(_LOCK, shared=True))
+                stack.callback(os.close, self._locked(f"{_LOCK}-{self.part.index}"))
+            self._locks = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._locks.close()
+
+    @contextmanager
+    def question(self) -> Iterator[None]:
+        """No other part reads or writes what is asked.
+
+        Raises:
+            TakenError: another one has not ended with it in time.
+        """
+        asking = self._question_lock(self._clock.now() + _QUESTION_S)
+        try:
+            yield
+        finally:
+            os.close(asking)
+
+    def _question_lock(self, until: float) -> int:
+        while True:
+            try:
+                return self._locked(_QUESTION)
+            except TakenError:
+                if self._clock.now() > until:
+                    raise
+                self._clock.sleep(_AGAIN_S)
+
+    def _locked(self, name: str, *, shared: bool = False) -> int:
+        """A descriptor that holds a lock until it is closed.
+
+        Raises:
+            TakenError: another run holds it.
+            SurroundingsError: the storage has no locks, and nobody has said that this does not matter.
+        """
+        subject = f"lock {self.folder / name}"
+        try:
+            descriptor = os.open(self.folder / name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        except OSError as error:
+            raise self._not_writable(error) from None
+        try:
+            if not lock(descriptor, subject, shared=shared) and os.environ.get(_LOCKING) not in ("FALSE", "0"):
+                expected = f"storage that has locks, or {_LOCKING}=FALSE where no other run is at work there"
+                raise SurroundingsError(subject, os.strerror(errno.ENOLCK), expected)
+        except BaseException as error:
+            os.close(descriptor)
+            if isinstance(error, BlockingIOError):
+                raise TakenError(self._subject, "another run at work there", "its end, or another folder") from None
+            raise
+        return descriptor
+
+    def _not_writable(self, error: OSError) -> LightpageError:
+        return os_failure(self._subject, error, "a folder that can be written")
+
+    def sources(self, job: Job) -> Iterator[tuple[int, Source]]:
+        """Recordings of the part, each with its place among the run's."""
+        return self.part.sources(job)
+
+    def devices(self, job: Job) -> Iterator[tuple[int, tuple[Source, ...]]]:
+        """Recordings of each device of the part, with the place of its first one among the run's."""
+        return self.part.devices(job)
+
+    def sweep(self, job: Job) -> None:
+        """Remove what workers that were killed have left half-written; none of this part may be at work."""
+        for index, _ in self.sources(job):
+            for left in self.shard(index, 0).parent.glob(".*"):
+                shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)
+
+    def shard(self, source: int, first: int, number: int = 0) -> Path:
+        """Path of a range's result, without the end of its name.
+
+        Args:
+            source: place of the recording among the run's.
+            first: the range's first page.
+            number: of the round, 0 for the first reading.
+        """
+        again = f"{_AGAIN}{number}" if number else ""
+        return self.folder / _SHARDS / f"{source:06d}" / f"{first:08d}{again}"
+
+    def missing(self, job: Job) -> Iterator[Task]:
+        """Ranges of the first reading that have no result, recording by recording; or such devices."""
+        if job.choices.operation is Operation.RECALIBRATE:
+            for index, own in self.devices(job):
+                device = self._device(job, index, own)
+                if device is not None and not self.recalibrated(index):
+                    _make(device.shard.parent)
+                    yield device
+            return
+        for index, source in self.sources(job):
+            there = self.results(index)
+            for task in self.ranges(job, index, source):
+                if task.shard.name not in there:
+                    _make(task.shard.parent)
+                    yield task
+
+    def missing_again(self, job: Job, number: int) -> Iterator[Task]:
+        """Pages that were not read well before a round, and have no result in it, range by range.
+
+        Args:
+            job: with that round.
+            number: of the round, from 1.
+
+        Raises:
+            InvalidInputError: a shard that cannot be read.
+        """
+        for index, source in self.sources(job):
+            there = self.results(index)
+            for task in self.ranges(job, index, source):
+                shard = self.shard(index, task.pages[0], number)
+                if task.shard.name not in there or shard.name in there:
+                    continue
+                known = self.pages(index, task.pages[0], there, number)
+                if poor := tuple(page.page for page in known if not page.well):
+                    yield task.model_copy(update={"pages": poor, "bundle": job.rounds[number - 1], "shard": shard})
+
+    def pages(self, source: int, first: int, there: frozenset[str], rounds: int) -> list[PageRecord]:
+        """What is known of the pages of a range that was read: the reading of each that counts.
+
+        Args:
+            source, first: the range.
+            there: see `results`.
+            rounds: how many readings are looked at.
+
+        Raises:
+            InvalidInputError: a shard that cannot be read.
+        """
+        best = {page.page: page for page in ShardRecord.read(self.shard(source, first)).pages}
+        for number in range(1, rounds):
+            shard = self.shard(source, first, number)
+            for page in ShardRecord.read(shard).pages if shard.name in there else ():
+                if page.better_than(best[page.page]):
+                    best[page.page] = page
+        return list(best.values())
+
+    def ranges(self, job: Job, index: int, source: Source) -> Iterator[Task]:
+        """All ranges of a recording, whether they are done or not."""
+        choices = job.choices
+        if source.stamp is None:
+            return
+        count, step = source.pages, choices.range_pages
+        for first in range(0, count, step):
+            yield Task(
+                operation=choices.operation,
+                device=source.device,
+                recording=source.path,
+                stamp=source.stamp,
+                pages=tuple(range(first, min(first + step, count))),
+                bundle=job.bundles[source.bundle],
+                shard=self.shard(index, first),
+                tracking=choices.tracking,
+                symbols=choices.symbols,
+                code=choices.code,
+                provider=choices.provider,
+            )
+
+    def _device(self, job: Job, index: int, own: tuple[Source, ...]) -> Task | None:
+        """The task of a device, whose first recording has this place; None where something of it is lacking."""
+        if any(each.problem is not None for each in own):
+            return None
+        choices, (first, *others) = job.choices, own
+        count = choices.device_pages or sum(each.pages for each in own)
+        assert first.stamp is not None  # it has no problem
+        return Task(
+            operation=choices.operation,
+            device=first.device,
+            recording=first.path,
+            stamp=first.stamp,
+            pages=tuple(range(count)),
+            bundle=job.bundles[first.bundle],
+            shard=self.shard(index, 0),
+            more=tuple(RecordedFile(path=each.path, stamp=each.stamp) for each in others if each.stamp is not None),
+            run=first.run,
+            provider=choices.provider,
+            fine_tuning=choices.fine_tuning,
+        )
+
+    def doubt(self, job: Job, *, every_loss: bool = False) -> None:
+        """Have ranges read again whose pages were filed as lost for a fault of storage, as earlier versions did.
+
+        Args:
+            job: what was asked.
+            every_loss: whether ranges with lost pages of any cause are read again.
+
+        Raises:
+            StorageError, InvalidInputError: a shard that cannot be read.
+        """
+        if job.choices.operation is Operation.RECALIBRATE:
+            return
+        for index, _ in self.sources(job):
+            folder = self.shard(index, 0).parent
+            for name in self.results(index):
+                if _AGAIN not in name and holds_losses(folder / name, misfiled_only=not every_loss):
+                    self.doubted.add(folder / name)
+
+    def recalibrated(self, place: int) -> bool:
+        """Whether a device has a result, by the place of its first recording."""
+        return self.shard(place, 0).name in self.results(place)
+
+    def results(self, source: int) -> frozenset[str]:
+        """Names of the shards that a recording has, but for those that are doubted."""
+        folder = self.shard(source, 0).parent
+        try:
+            names = (name.removesuffix(RECORD) for name in os.listdir(folder) if name.endswith(RECORD))
+            return frozenset(name for name in names if folder / name not in self.doubted)
+        except FileNotFoundError:
+            return frozenset()
+        except OSError as error:
+            raise os_failure(f"folder {folder}", error, "a folder that can be read") from None
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise os_failure(f"folder {folder}", error, "a folder that can be written") from None

@@ -1,0 +1,215 @@
+"""What a worker is asked to do, and what it answers: small values that name pages and never hold any."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict
+
+from lightpage.codec.code import Code
+from lightpage.errors import LightpageError
+from lightpage.failures import may_pass
+from lightpage.runtime.model.execution.providers import CPU
+
+
+class Operation(StrEnum):
+    """What is done with pages."""
+
+    DECODE = "decode"
+    RECOVER = "recover"
+    EVALUATE = "evaluate"
+    RECALIBRATE = "recalibrate"
+
+
+class Plain(BaseModel):
+    """A value of plain parts that never changes."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Problem(Plain):
+    """An error in plain parts; see `lightpage.errors.LightpageError`.
+
+    Attributes:
+        passes: whether another try may go well a moment later, see `lightpage.failures.may_pass`.
+    """
+
+    subject: str
+    got: str
+    expected: str
+    passes: bool = False
+
+    @classmethod
+    def of(cls, error: LightpageError) -> Problem:
+        """That of an error."""
+        return cls(subject=error.subject, got=error.got, expected=error.expected, passes=may_pass(error))
+
+    def about(self, device: str) -> Problem:
+        """The same, and of which device of a fleet it is; itself without a fleet."""
+        return self.model_copy(update={"subject": f"device {device}: {self.subject}"}) if device else self
+
+    def __str__(self) -> str:
+        return f"{self.subject}: got {self.got}, wanted {self.expected}"
+
+
+class Stamp(Plain):
+    """A file's size in bytes and time of change in nanoseconds, by which it is known again."""
+
+    size: int
+    modified_ns: int
+
+    @classmethod
+    def of(cls, path: Path) -> Stamp:
+        """That of a file.
+
+        Raises:
+            OSError: there is none.
+        """
+        found = path.stat()
+        return cls(size=found.st_size, modified_ns=found.st_mtime_ns)
+
+
+class NamedBundle(Plain):
+    """A bundle, and how to know it again.
+
+    Attributes:
+        path: where it lies.
+        sha256: see `bundle_sha256`; empty of one that could not be read when the run began.
+        version: of its manifest; likewise.
+        stamp: of the file that was read; None in records of earlier versions.
+    """
+
+    path: Path
+    sha256: str
+    version: str
+    stamp: Stamp | None = None
+
+
+class RecordedFile(Plain):
+    """A recording, and how to know it again."""
+
+    path: Path
+    stamp: Stamp
+
+
+class FineTuning(Plain):
+    """How the network of a device is trained on, once its geometry is found.
+
+    Attributes:
+        steps: of the optimiser.
+        learning_rate: at its peak.
+        synthetic_pages: trained on beside the known ones.
+        seed: of batches and rotations.
+    """
+
+    steps: int = 600
+    learning_rate: float = 1e-3
+    synthetic_pages: int = 0
+    seed: int = 0
+
+
+class Task(Plain):
+    """A range of pages of one recording, or one device to recalibrate.
+
+    Attributes:
+        operation: what to do.
+        device: its name in the fleet; empty without a fleet.
+        recording: path of the file.
+        stamp: of the recording as it was when the run began.
+        pages: their numbers; to recalibrate, as many known pages as are wanted.
+        bundle: what to decode with.
+        shard: path of the result, without the end of its name.
+        tracking: whether the image is followed within the range.
+        symbols: whether decoding keeps symbols and confidences.
+        code: of the pages whose user bytes are read; None for the recording's, or else the bundle's.
+        provider: what pages are computed with, as `Provider.parse` takes it.
+        more: further recordings of a device that is recalibrated, whose pages follow those of the first.
+        run: of a device that is recalibrated deeply: folder of the training run that its bundle was made from.
+        fine_tuning: how it is trained then; None for a re-fit of the geometry alone.
+        give_up: whether pages that storage does not give are lost, in place of the range having no result.
+    """
+
+    operation: Operation
+    device: str = ""
+    recording: Path
+    stamp: Stamp
+    pages: tuple[int, ...]
+    bundle: NamedBundle
+    shard: Path
+    tracking: bool = True
+    symbols: bool = True
+    code: Code | None = None
+    provider: str = CPU
+    more: tuple[RecordedFile, ...] = ()
+    run: Path | None = None
+    fine_tuning: FineTuning | None = None
+    give_up: bool = False
+
+    @property
+    def files(self) -> tuple[RecordedFile, ...]:
+        """All recordings, in order."""
+        return (RecordedFile(path=self.recording, stamp=self.stamp), *self.more)
+
+    @property
+    def weight(self) -> int:
+        """How many pages the work is worth in a count of all of it; a device that is recalibrated counts once."""
+        return 1 if self.operation is Operation.RECALIBRATE else len(self.pages)
+
+    @property
+    def name(self) -> str:
+        """Of the range, for people."""
+        if self.operation is Operation.RECALIBRATE:
+            return f"recording {self.recording}" + (f" and {len(self.more)} more" if self.more else "")
+        return f"recording {self.recording}: pages {self.pages[0]}-{self.pages[-1]}"
+
+
+class Step(Plain):
+    """What a worker does with a device at the moment.
+
+    Attributes:
+        device: its name.
+        what: for people.
+    """
+
+    kind: Literal["step"] = "step"
+    device: str
+    what: str
+
+
+class Done(Plain):
+    """A range whose result is written.
+
+    Attributes:
+        task: what was asked.
+        lost: pages that are lost, by cause.
+        left_out: pages that the bundle was made from.
+        seconds: that it took the worker.
+        read_bytes: of frames, as they lie in the recording.
+    """
+
+    kind: Literal["done"] = "done"
+    task: Task
+    lost: dict[str, int]
+    left_out: int = 0
+    seconds: float
+    read_bytes: int = 0
+
+
+class Failed(Plain):
+    """A range without a result: nothing of it is written, and the next run tries again.
+
+    Attributes:
+        task: what was asked.
+        problem: why.
+        whole_recording: whether no page of the recording can be read, and not only this range.
+    """
+
+    kind: Literal["failed"] = "failed"
+    task: Task
+    problem: Problem
+    whole_recording: bool = False
+
+
+Outcome = Done | Failed

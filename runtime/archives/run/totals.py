@@ -1,0 +1,384 @@
+"""What a bulk run has found, added up from its shards one after the other."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from lightpage.codec.volume_file import ranges
+from lightpage.metrics.reliability import ConfidenceBin, calibration_error
+from lightpage.runtime.archives.run.job import Job, Source
+from lightpage.runtime.archives.run.ledger import Ledger
+from lightpage.runtime.archives.run.shard import BUNDLE, PageRecord, PageState, ShardRecord, record_of, with_end
+from lightpage.runtime.archives.run.task import NamedBundle, Operation, Problem, Task
+
+AIR, CONFIRMED = "air_bits_per_symbol", "confirmed_bits"
+
+UNKNOWN = "unknown"
+"""Cause of a loss that has none."""
+
+TOLD = 5
+"""Lost pages that are told with their reasons."""
+
+
+class DeviceState(StrEnum):
+    """What became of a device that was to be recalibrated."""
+
+    RECALIBRATED = "recalibrated"
+    REFUSED = "refused"
+    """It stays as it is: its pages fit no geometry, or the new model would read them worse."""
+    FAILED = "failed"
+    """The next run tries it again."""
+    MISSING = "missing"
+    """It was not come to."""
+
+
+class Mean:
+    """A mean that holds no values, and the least of them; None of no values."""
+
+    def __init__(self) -> None:
+        self._sum, self._count = 0.0, 0
+        self.least: float | None = None
+
+    def add(self, value: float | None) -> None:
+        """Count a value, if it is one."""
+        if value is not None:
+            self._sum, self._count = self._sum + value, self._count + 1
+            self.least = value if self.least is None else min(self.least, value)
+
+    @property
+    def value(self) -> float | None:
+        """None of no values."""
+        return self._sum / self._count if self._count else None
+
+
+class Means:
+    """Means of the figures of pages, by name."""
+
+    def __init__(self) -> None:
+        self._means: dict[str, Mean] = {}
+
+    def add(self, figures: dict[str, float | int | None]) -> None:
+        """Count a page."""
+        for name, value in figures.items():
+            self._means.setdefault(name, Mean()).add(value)
+
+    def value(self, name: str) -> float | None:
+        """The mean of a figure; None where no page has it."""
+        return self._means[name].value if name in self._means else None
+
+    def least(self, name: str) -> float | None:
+        """The least of them."""
+        return self._means[name].least if name in self._means else None
+
+    def to_json(self) -> dict[str, float | None]:
+        """All of them."""
+        return {name: mean.value for name, mean in self._means.items()}
+
+
+@dataclass
+class Tally:
+    """Pages of a recording, or of all.
+
+    Attributes:
+        pages: all of them; of a fleet that is recalibrated, its devices.
+        read, left_out: how many were.
+        lost: by cause.
+        recalibration_due: read, and show that the device has changed.
+        models: pages by the version of what read them.
+    """
+
+    pages: int = 0
+    read: int = 0
+    left_out: int = 0
+    lost: Counter[str] = field(default_factory=Counter)
+    recalibration_due: int = 0
+    models: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def missing(self) -> int:
+        """Pages without a result."""
+        return self.pages - self.read - self.left_out - self.lost.total()
+
+    def add(self, page: PageRecord) -> None:
+        """Count a page that has a result."""
+        self.read += page.state is PageState.READ
+        self.left_out += page.state is PageState.LEFT_OUT
+        self.recalibration_due += page.recalibration_due and page.state is PageState.READ
+        if page.state is PageState.LOST:
+            self.lost[page.loss or UNKNOWN] += 1
+
+    def to_json(self) -> dict[str, Any]:
+        """The counts under the names that other programs read."""
+        return {
+            "pages": self.pages,
+            "pages_read": self.read,
+            "pages_left_out": self.left_out,
+            "pages_lost": self.lost.total(),
+            "pages_missing": self.missing,
+            "lost": dict(self.lost),
+            "pages_recalibration_due": self.recalibration_due,
+        }
+
+
+@dataclass
+class Round:
+    """What a later reading has brought.
+
+    Attributes:
+        model: what read.
+        pages: that were read again.
+        won: that were lost before, and are read now.
+        better: that were read before, and are read better now.
+        lost: that are lost still.
+        air_before, air_after: mean AIR of all of them where it is known, a lost page counting nothing.
+    """
+
+    model: NamedBundle
+    pages: int = 0
+    won: int = 0
+    better: int = 0
+    lost: int = 0
+    air_before: Mean = field(default_factory=Mean)
+    air_after: Mean = field(default_factory=Mean)
+
+    def add(self, before: PageRecord, now: PageRecord) -> None:
+        """Count a page that was read again."""
+        took = now.better_than(before)
+        self.pages += 1
+        self.won += took and before.state is PageState.LOST
+        self.better += took and before.state is PageState.READ
+        self.lost += not took and before.state is PageState.LOST
+        if AIR in now.figures or AIR in before.figures:
+            self.air_before.add(_air(before))
+            self.air_after.add(_air(now if took else before))
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures under the names that other programs read."""
+        return {
+            "version": self.model.version,
+            "pages": self.pages,
+            "pages_won": self.won,
+            "pages_better": self.better,
+            "pages_lost_still": self.lost,
+            "air_before": self.air_before.value,
+            "air_after": self.air_after.value,
+        }
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A range that a worker has done, in whichever round.
+
+    Attributes:
+        finished_s: when, seconds since 1970.
+        seconds: that it took.
+        pages: how many, or one device.
+        worker: who did it; empty where that was not noted.
+        read_bytes: of frames, as they lie in the recording; 0 where that was not noted.
+    """
+
+    finished_s: float
+    seconds: float
+    pages: int
+    worker: str
+    read_bytes: int
+
+    @classmethod
+    def of(cls, shard: Path, record: ShardRecord, pages: int) -> Reading:
+        """That of a shard; where no time was noted, it is that of the file."""
+        finished_s = record_of(shard).stat().st_mtime if record.finished_s is None else record.finished_s
+        return cls(finished_s, record.seconds, pages, record.worker, record.read_bytes)
+
+
+@dataclass
+class Group:
+    """What was found of a device, or of a recording where there is no fleet.
+
+    Attributes:
+        recordings: that it has.
+        tally: of their pages.
+        figures: of those that were read.
+        told: the first problem that anything of it had, for people; empty without one.
+    """
+
+    recordings: int = 0
+    tally: Tally = field(default_factory=Tally)
+    figures: Means = field(default_factory=Means)
+    told: str = ""
+
+
+@dataclass
+class Totals:
+    """What a run has found.
+
+    Attributes:
+        tally: of all pages.
+        figures: means over the pages that were read.
+        confidence_bins: of all pages of an evaluation together.
+        rounds: what later readings have brought.
+        recordings: a row each, unless devices are recalibrated.
+        devices: a row each, where they are.
+        lost: the first lost pages, or devices, and why.
+        examples: the first one of each cause.
+        groups: by device, unless devices are recalibrated; by recording where there is no fleet.
+        readings: all ranges that were done, a few numbers each.
+    """
+
+    tally: Tally = field(default_factory=Tally)
+    figures: Means = field(default_factory=Means)
+    confidence_bins: dict[tuple[float, float], list[float]] = field(default_factory=dict)
+    rounds: list[Round] = field(default_factory=list)
+    recordings: list[dict[str, Any]] = field(default_factory=list)
+    devices: list[dict[str, Any]] = field(default_factory=list)
+    lost: list[str] = field(default_factory=list)
+    examples: dict[str, str] = field(default_factory=dict)
+    groups: dict[str, Group] = field(default_factory=dict)
+    readings: list[Reading] = field(default_factory=list)
+
+    @property
+    def ece(self) -> float | None:
+        """Of an evaluation."""
+        bins = [
+            ConfidenceBin(low, high, int(count), claimed / count, right / count)
+            for (low, high), (count, claimed, right) in self.confidence_bins.items()
+        ]
+        return calibration_error(bins) if bins else None
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures under the names that other programs read."""
+        return {
+            **self.tally.to_json(),
+            "models": dict(self.tally.models),
+            "figures": {**self.figures.to_json(), **({} if self.ece is None else {"ece": self.ece})},
+            "rounds": [each.to_json() for each in self.rounds],
+            **({"devices": self.devices} if self.devices else {"recordings": self.recordings}),
+        }
+
+
+def totals(ledger: Ledger, job: Job, failures: Mapping[tuple[str, Path], Problem] | None = None) -> Totals:
+    """Add up what the shards of a job say, or of the ledger's part of it; a shard is read at a time.
+
+    Args:
+        ledger: of the job.
+        job: what was asked.
+        failures: why devices have no result, see `lightpage.runtime.archives.run.driver.Progressed`.
+
+    Raises:
+        InvalidInputError: a shard cannot be read.
+    """
+    found = Totals(rounds=[Round(model) for model in job.rounds])
+    if job.choices.operation is Operation.RECALIBRATE:
+        for index, own in ledger.devices(job):
+            _add_device(found, ledger, index, own, failures or {})
+        return found
+    for index, source in ledger.sources(job):
+        _add_recording(found, ledger, job, index, source)
+    return found
+
+
+def _add_device(
+    found: Totals,
+    ledger: Ledger,
+    index: int,
+    own: tuple[Source, ...],
+    failures: Mapping[tuple[str, Path], Problem],
+) -> None:
+    shard, first = ledger.shard(index, 0), own[0]
+    row: dict[str, Any] = {"device": first.device, "recordings": [str(source.path) for source in own]}
+    problem = next((source.problem for source in own if source.problem is not None), None)
+    if problem is None:
+        found.tally.pages += 1
+        problem = failures.get((first.device, first.path))
+    if ledger.recalibrated(index):
+        record = ShardRecord.read(shard)
+        page = record.pages[0]
+        found.tally.add(page)
+        found.tally.models[record.model.version] += 1
+        found.readings.append(Reading.of(shard, record, 1))
+        state = DeviceState.RECALIBRATED if page.state is PageState.READ else DeviceState.REFUSED
+        row |= {"state": state, "air_before": None, "air_after": None, **record.summary, "reason": page.reason}
+        if state is DeviceState.RECALIBRATED:
+            row["bundle"] = str(with_end(shard, BUNDLE))
+        else:
+            _tell_lost(found, page, f"{_recording(first)}: {page.reason}")
+    else:
+        state = DeviceState.MISSING if problem is None else DeviceState.FAILED
+        row |= {"state": state, "reason": "" if problem is None else str(problem)}
+    found.devices.append(row)
+
+
+def _add_recording(found: Totals, ledger: Ledger, job: Job, index: int, source: Source) -> None:
+    own, figures, there = Tally(), Means(), ledger.results(index)
+    lost: dict[str, list[int]] = {}
+    group = found.groups.setdefault(source.device or str(source.path), Group())
+    group.recordings += 1
+    if source.problem is not None:
+        group.told = group.told or str(source.problem)
+    for task in ledger.ranges(job, index, source):
+        for tally in (own, group.tally, found.tally):
+            tally.pages += task.weight
+        for record, page in _pages(found, ledger, job, index, task, there):
+            for tally in (own, group.tally, found.tally):
+                tally.add(page)
+                tally.models[record.model.version] += 1
+            if page.state is PageState.READ:
+                for means in (figures, group.figures, found.figures):
+                    means.add(page.figures)
+                    if page.confirmed_bits is not None:
+                        means.add({CONFIRMED: page.confirmed_bits})
+            elif page.state is PageState.LOST:
+                lost.setdefault(page.loss or UNKNOWN, []).append(page.page)
+                group.told = group.told or page.reason
+                _tell_lost(found, page, f"{_recording(source)}: page {page.page}: {page.reason}")
+    row = {"device": source.device, "recording": str(source.path), **own.to_json()}
+    row |= {"lost_pages": {cause: ranges(pages) for cause, pages in lost.items()}, "figures": figures.to_json()}
+    if source.problem is not None:
+        row["problem"] = str(source.problem)
+    found.recordings.append(row)
+
+
+def _pages(
+    found: Totals, ledger: Ledger, job: Job, index: int, task: Task, there: frozenset[str]
+) -> Iterator[tuple[ShardRecord, PageRecord]]:
+    """The readings that count of the pages of a range, each with the shard that it is from; rounds are counted."""
+    if task.shard.name not in there:
+        return
+    first = ShardRecord.read(task.shard)
+    found.readings.append(Reading.of(task.shard, first, task.weight))
+    for part in first.confidence_bins:
+        sums = found.confidence_bins.setdefault((part.low, part.high), [0.0, 0.0, 0.0])
+        for place, value in enumerate((part.count, part.count * part.confidence, part.count * part.accuracy)):
+            sums[place] += value
+    best = {page.page: (first, page) for page in first.pages}
+    for number in range(1, 1 + len(job.rounds)):
+        shard = ledger.shard(index, task.pages[0], number)
+        if shard.name not in there:
+            continue
+        again = ShardRecord.read(shard)
+        found.readings.append(Reading.of(shard, again, len(again.pages)))
+        for page in again.pages:
+            before = best[page.page][1]
+            found.rounds[number - 1].add(before, page)
+            if page.better_than(before):
+                best[page.page] = again, page
+    yield from best.values()
+
+
+def _tell_lost(found: Totals, page: PageRecord, told: str) -> None:
+    found.examples.setdefault(page.loss or UNKNOWN, told)
+    if len(found.lost) < TOLD:
+        found.lost.append(told)
+
+
+def _recording(source: Source) -> str:
+    device = f"device {source.device}: " if source.device else ""
+    return f"{device}recording {source.path}"
+
+
+def _air(page: PageRecord) -> float:
+    return float(page.figures.get(AIR) or 0.0) if page.state is PageState.READ else 0.0

@@ -1,0 +1,54 @@
+"""What the service reads of a request and checks before it does anything."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lightpage.errors import InvalidInputError, PageError
+from lightpage.page.pilots import Pilots
+from lightpage.page.symbols import check_levels, symbol_phases
+from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
+
+_CONFIDENCE_FORMATS = (pb.CONFIDENCE_FORMAT_UNSPECIFIED, pb.CONFIDENCE_FORMAT_FLOAT32, pb.CONFIDENCE_FORMAT_UINT8)
+
+SESSION_CHARACTERS = 1024
+"""Of the name of a session, at most: the service remembers it."""
+
+
+def pilots_of(message: pb.Pilots, page_shape: tuple[int, int], levels: int) -> Pilots:
+    """Pilots that a caller sent.
+
+    Raises:
+        PageError: sizes that do not fit the page, or levels out of range.
+    """
+    flags = np.frombuffer(message.mask, np.uint8)
+    values = np.frombuffer(message.values, np.uint8)
+    if flags.size and int(flags.max()) > 1:
+        raise PageError("pilots", f"a flag of {flags.max()}", "flags of 0 or 1")
+    if flags.size != page_shape[0] * page_shape[1] or np.count_nonzero(flags) != values.size:
+        got = f"{flags.size} flags, {np.count_nonzero(flags)} of them set, and {values.size} values"
+        raise PageError("pilots", got, f"{page_shape[0] * page_shape[1]} flags and one value a set flag")
+    if message.levels:
+        check_levels(message.levels)
+    levels = message.levels or levels
+    if values.size and int(values.max()) >= levels:
+        raise PageError("pilots", f"level {values.max()}", f"0..{levels - 1}")
+    return Pilots(flags.reshape(page_shape) != 0, symbol_phases(values, levels))
+
+
+def check_options(options: pb.DecodeOptions) -> None:
+    """Check what a caller asks for, before a frame is received or a page is read for it.
+
+    Raises:
+        PageError: an impossible level count; 0 stands for the default.
+        InvalidInputError: an unknown format of confidences, or way of tracking, or too long a name of a session.
+    """
+    if options.levels:
+        check_levels(options.levels)
+    if options.confidence_format not in _CONFIDENCE_FORMATS:
+        expected = "CONFIDENCE_FORMAT_FLOAT32 or CONFIDENCE_FORMAT_UINT8"
+        raise InvalidInputError("confidence_format", options.confidence_format, expected)
+    if options.tracking not in pb.Tracking.values():
+        raise InvalidInputError("tracking", options.tracking, "TRACKING_SESSION or TRACKING_STATELESS")
+    if (length := len(options.session)) > SESSION_CHARACTERS:
+        raise InvalidInputError("session", f"{length} characters", f"at most {SESSION_CHARACTERS}")

@@ -1,0 +1,319 @@
+"""The one place where errors become gRPC status codes, and on the client's side errors again."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import grpc
+from google.protobuf.any_pb2 import Any as AnyMessage
+from google.protobuf.duration_pb2 import Duration
+from google.rpc import error_details_pb2 as rpc_details
+from google.rpc import status_pb2 as rpc_status
+
+from lightpage.errors import (
+    ERRORS,
+    BlackFrameError,
+    BundleError,
+    BusyError,
+    CalibrationError,
+    CallerLeft,
+    FrameError,
+    FramesDisagreeError,
+    InvalidInputError,
+    JobCancelledError,
+    LightpageError,
+    LimitError,
+    LostDataError,
+    LostPageError,
+    LostShotError,
+    MalformedError,
+    ModelExistsError,
+    NoCodeError,
+    NoSourceError,
+    NoSuchJobError,
+    NoSuchModelError,
+    NoSuchPageError,
+    NotAllowedError,
+    OtherModelError,
+    OverloadedError,
+    ProviderError,
+    Reason,
+    RecalibrationRefusedError,
+    RequestIdError,
+    SaturatedFrameError,
+    SlotsTakenError,
+    SourceError,
+    StalledError,
+    StoppingError,
+    StorageError,
+    StoreError,
+    SurroundingsError,
+    WorkerError,
+)
+from lightpage.failures import understood
+from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
+
+DETAIL_KEY = "lightpage-error-bin"
+STATUS_KEY = "grpc-status-details-bin"
+DOMAIN = "lightpage"
+
+_Code = grpc.StatusCode
+_MEANINGS: tuple[tuple[type[BaseException], grpc.StatusCode, pb.ErrorReason], ...] = (
+    (MalformedError, _Code.INVALID_ARGUMENT, pb.ERROR_REASON_MALFORMED),
+    (RequestIdError, _Code.INVALID_ARGUMENT, pb.ERROR_REASON_REQUEST_ID),
+    (NoSuchPageError, _Code.INVALID_ARGUMENT, pb.ERROR_REASON_NO_SUCH_PAGE),
+    (BlackFrameError, _Code.INVALID_ARGUMENT, pb.ERROR_REASON_FRAME_BLACK),
+    (SaturatedFrameError, _Code.INVALID_ARGUMENT, pb.ERROR_REASON_FRAME_SATURATED),
+    (FramesDisagreeError, _Code.INVALID_ARGUMENT, pb.ERROR_REASON_FRAMES_DISAGREE),
+    (FrameError, _Code.INVALID_ARGUMENT, pb.ERROR_REASON_FRAME_FORMAT),
+    (InvalidInputError, _Code.INVALID_ARGUMENT, pb.ERROR_REASON_INVALID_VALUE),
+    (LimitError, _Code.RESOURCE_EXHAUSTED, pb.ERROR_REASON_TOO_LARGE),
+    (LostShotError, _Code.DATA_LOSS, pb.ERROR_REASON_SHOT_LOST),
+    (LostPageError, _Code.DATA_LOSS, pb.ERROR_REASON_PAGE_NOT_BELIEVED),
+    (LostDataError, _Code.DATA_LOSS, pb.ERROR_REASON_PAGE_NOT_BELIEVED),
+    (SlotsTakenError, _Code.RESOURCE_EXHAUSTED, pb.ERROR_REASON_OVERLOADED),
+    (OtherModelError, _Code.ABORTED, pb.ERROR_REASON_OTHER_MODEL),
+    (BusyError, _Code.ABORTED, pb.ERROR_REASON_RECALIBRATION_RUNS),
+    (NoSourceError, _Code.FAILED_PRECONDITION, pb.ERROR_REASON_NO_SOURCE),
+    (SourceError, _Code.FAILED_PRECONDITION, pb.ERROR_REASON_SOURCE_BROKEN),
+    (StorageError, _Code.UNAVAILABLE, pb.ERROR_REASON_STORAGE),
+    (SurroundingsError, _Code.RESOURCE_EXHAUSTED, pb.ERROR_REASON_SURROUNDINGS),
+    (StoppingError, _Code.UNAVAILABLE, pb.ERROR_REASON_STOPPING),
+    (WorkerError, _Code.ABORTED, pb.ERROR_REASON_WORKER),
+    (ModelExistsError, _Code.ALREADY_EXISTS, pb.ERROR_REASON_MODEL),
+    (NoSuchModelError, _Code.NOT_FOUND, pb.ERROR_REASON_MODEL),
+    (StoreError, _Code.FAILED_PRECONDITION, pb.ERROR_REASON_STORE),
+    (NoCodeError, _Code.FAILED_PRECONDITION, pb.ERROR_REASON_NO_CODE),
+    (ProviderError, _Code.FAILED_PRECONDITION, pb.ERROR_REASON_MODEL),
+    (BundleError, _Code.FAILED_PRECONDITION, pb.ERROR_REASON_MODEL),
+    (RecalibrationRefusedError, _Code.FAILED_PRECONDITION, pb.ERROR_REASON_RECALIBRATION_REFUSED),
+    (CalibrationError, _Code.FAILED_PRECONDITION, pb.ERROR_REASON_RECALIBRATION_REFUSED),
+    (NoSuchJobError, _Code.NOT_FOUND, pb.ERROR_REASON_NO_SUCH_JOB),
+    (JobCancelledError, _Code.CANCELLED, pb.ERROR_REASON_JOB_CANCELLED),
+    (NotAllowedError, _Code.PERMISSION_DENIED, pb.ERROR_REASON_NOT_ALLOWED),
+    (StalledError, _Code.CANCELLED, pb.ERROR_REASON_STALLED),
+    (CallerLeft, _Code.CANCELLED, pb.ERROR_REASON_UNSPECIFIED),
+    (grpc.RpcError, _Code.CANCELLED, pb.ERROR_REASON_UNSPECIFIED),  # while reading from a sender who has gone
+)
+"""Of each error class its status and its reason; the first that fits counts."""
+
+_RETRY_S: dict[type[LightpageError], float] = {StorageError: 2.0, SurroundingsError: 5.0}
+"""When to try again what failed by what passes, seconds: a disk that hiccups, and memory that others give back."""
+
+_EARLIER_KINDS = frozenset(
+    [
+        "BundleError",
+        "BusyError",
+        "CalibrationError",
+        "FrameError",
+        "FramesDisagreeError",
+        "InvalidInputError",
+        "LightpageError",
+        "LimitError",
+        "LostDataError",
+        "LostPageError",
+        "LostShotError",
+        "PageError",
+        "ProfileError",
+        "RecalibrationRefusedError",
+        "RecordingError",
+        "SlotsTakenError",
+        "SourceError",
+        "StoppingError",
+        "UnconfirmedPageError",
+        "WorkerError",
+    ]
+)
+"""Classes that callers know who do not look at `exact_kind`."""
+
+_REASONS: dict[Reason, Any] = {reason: pb.LossReason.Value(f"LOSS_REASON_{reason}") for reason in Reason}
+
+_FIELD = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*")
+"""The name of a field, as those have that are about one."""
+
+_TOLD, _LOOKED_AT = 1000, 4000
+"""Characters of each part of an error that a caller hears, and of which folders are cut out: a caller's own text may be
+millions of them."""
+_FOLDERS = re.compile(r"(?<![\w./])(?:/[^\s/:'\"]+)+/(?=[^\s/:'\"])")
+"""The folders of an absolute path, up to its last name."""
+
+
+def foreseen(error: BaseException) -> BaseException:
+    """Our own error for one that a library or the system raised for want of a resource or of storage, else itself."""
+    if isinstance(error, CallerLeft | grpc.RpcError) or not isinstance(error, Exception):
+        return error
+    return understood("service", error) or error
+
+
+def status_of(error: BaseException) -> grpc.StatusCode:
+    """The status code for an error; INTERNAL for what nobody foresaw."""
+    return _meaning(error)[0]
+
+
+def reason_of(error: BaseException) -> pb.ErrorReason:
+    """The reason that goes with the status."""
+    reason = _meaning(error)[1]
+    if reason == pb.ERROR_REASON_OVERLOADED and isinstance(error, OverloadedError) and error.retry_s is None:
+        return pb.ERROR_REASON_DEADLINE_TOO_SHORT
+    return reason
+
+
+def reason_name(error: BaseException) -> str:
+    """The reason's name without its prefix, as callers read it."""
+    return pb.ErrorReason.Name(reason_of(error)).removeprefix("ERROR_REASON_")
+
+
+def _meaning(error: BaseException) -> tuple[grpc.StatusCode, pb.ErrorReason]:
+    error = foreseen(error)
+    for kind, code, reason in _MEANINGS:
+        if isinstance(error, kind):
+            return code, reason
+    return grpc.StatusCode.INTERNAL, pb.ERROR_REASON_INTERNAL
+
+
+def without_folders(text: str) -> str:
+    """`text` with every absolute path in it cut to its last name: where the service keeps its files is its own."""
+    return _FOLDERS.sub("", text)
+
+
+def detail_of(error: LightpageError) -> pb.ErrorDetail:
+    """A foreseen error as its message, files named without their folders."""
+    parts = (error.subject, error.got, error.expected)
+    subject, got, expected = (without_folders(text[:_LOOKED_AT])[:_TOLD] for text in parts)
+    exact = type(error).__name__
+    kind = next(known.__name__ for known in type(error).__mro__ if known.__name__ in _EARLIER_KINDS)
+    detail = pb.ErrorDetail(kind=kind, thing=subject, got=got, wanted=expected)
+    if exact != kind:
+        detail.exact_kind = exact
+    if isinstance(error, LostPageError):
+        detail.reason = _REASONS[error.reason]
+        detail.recalibration_due = error.recalibration_due
+    return detail
+
+
+def told(error: BaseException) -> str:
+    """What a caller reads. An unforeseen error gives its class only: its text may hold anything."""
+    error = foreseen(error)
+    if isinstance(error, LightpageError):
+        detail = detail_of(error)
+        return f"{detail.thing}: got {detail.got}, wanted {detail.wanted}"[:2000]
+    if isinstance(error, CallerLeft):
+        return "the caller has gone"
+    return f"{type(error).__name__} in the service; its log says more"
+
+
+def trailers(error: BaseException) -> tuple[tuple[str, bytes], ...]:
+    """The metadata that end a call beside its status: `ErrorDetail`, and google.rpc's details."""
+    error = foreseen(error)
+    code = status_of(error)
+    info = rpc_details.ErrorInfo(reason=reason_name(error), domain=DOMAIN)
+    details: list[Any] = [info]
+    own: list[tuple[str, bytes]] = []
+    if isinstance(error, LightpageError):
+        detail = detail_of(error)
+        own.append((DETAIL_KEY, detail.SerializeToString()))
+        if isinstance(error, LostPageError):
+            info.metadata["recalibration_due"] = "true" if error.recalibration_due else "false"
+            info.metadata["loss_reason"] = error.reason.value
+        elif isinstance(error, OtherModelError):
+            info.metadata["model_version"] = detail.got
+        if (job := getattr(error, "job", None)) is not None:
+            info.metadata["job"] = job
+        if (retry_s := getattr(error, "retry_s", _RETRY_S.get(type(error)))) is not None:
+            delay = Duration()
+            delay.FromNanoseconds(int(1e9 * retry_s))
+            details.append(rpc_details.RetryInfo(retry_delay=delay))
+        if isinstance(error, InvalidInputError):
+            field = detail.thing if _FIELD.fullmatch(detail.thing) else ""
+            violation = rpc_details.BadRequest.FieldViolation(field=field, description=told(error))
+            details.append(rpc_details.BadRequest(field_violations=[violation]))
+    status = rpc_status.Status(code=code.value[0], message=told(error))
+    for each in details:
+        packed = AnyMessage()
+        packed.Pack(each)
+        status.details.append(packed)
+    return (*own, (STATUS_KEY, status.SerializeToString()))
+
+
+def refusal_of(error: BaseException) -> pb.Refusal:
+    """How a call would have ended, for one page of many; an unforeseen error tells its class only."""
+    error = foreseen(error)
+    code = status_of(error).value[0]
+    if isinstance(error, LightpageError):
+        return pb.Refusal(code=code, detail=detail_of(error), reason=reason_of(error))
+    detail = pb.ErrorDetail(kind="LightpageError", thing="service", got=told(error), wanted="an answer")
+    return pb.Refusal(code=code, detail=detail, reason=reason_of(error))
+
+
+def error_of(rpc: grpc.RpcError, target: str) -> LightpageError:
+    """The error that the service at `target` meant, of the same class wherever it said which."""
+    call: Any = rpc
+    retry_s: float | None = None
+    job: str | None = None
+    detail: pb.ErrorDetail | None = None
+    for key, value in call.trailing_metadata() or ():
+        if key == DETAIL_KEY:
+            detail = pb.ErrorDetail.FromString(value)
+        elif key == STATUS_KEY:
+            retry_s, job = _retry_s(value), _job(value)
+    if detail is not None:
+        error = error_from(detail, retry_s)
+        if isinstance(error, BusyError):
+            error.job = job
+        return error
+    code, text = call.code(), call.details() or "no details"
+    subject = f"service at {target}"
+    if code == grpc.StatusCode.RESOURCE_EXHAUSTED:
+        return LimitError(subject, text, "a smaller or a later request")
+    if code == grpc.StatusCode.UNAVAILABLE:
+        return LightpageError(
+            subject,
+            f"no connection ({text})",
+            "a running Lightpage service at this address, and certificates where it asks for them",
+        )
+    if code == grpc.StatusCode.UNIMPLEMENTED:
+        return LightpageError(subject, f"no such call ({text})", "a Lightpage service, of this version or a later one")
+    if code == grpc.StatusCode.DEADLINE_EXCEEDED:
+        return LightpageError(subject, "no answer within the call's deadline", "one, or a longer deadline")
+    return LightpageError(subject, f"{code.name}: {text}", "an answer")
+
+
+def is_lost_connection(rpc: grpc.RpcError) -> bool:
+    """Whether a call ended since nobody was there any more, or in good time for another try, and no error was meant."""
+    call: Any = rpc
+    if any(key == DETAIL_KEY for key, _ in call.trailing_metadata() or ()):
+        return False
+    return call.code() in (_Code.UNAVAILABLE, _Code.CANCELLED, _Code.UNKNOWN, _Code.DEADLINE_EXCEEDED)
+
+
+def error_from(detail: pb.ErrorDetail, retry_s: float | None = None) -> LightpageError:
+    """The error that a message stands for; of a class that this version does not know, the nearest one."""
+    kind = ERRORS.get(detail.exact_kind) or ERRORS.get(detail.kind, LightpageError)
+    parts = (detail.thing, detail.got, detail.wanted)
+    if issubclass(kind, LostPageError):
+        return kind(*parts, _reason(detail.reason), detail.recalibration_due)
+    if issubclass(kind, SlotsTakenError):
+        return kind(*parts, retry_s)
+    return kind(*parts)
+
+
+def _retry_s(value: bytes) -> float | None:
+    retry = rpc_details.RetryInfo()
+    for packed in rpc_status.Status.FromString(value).details:
+        if packed.Unpack(retry):
+            return float(1e-9 * retry.retry_delay.ToNanoseconds())
+    return None
+
+
+def _job(value: bytes) -> str | None:
+    info = rpc_details.ErrorInfo()
+    for packed in rpc_status.Status.FromString(value).details:
+        if packed.Unpack(info):
+            return str(info.metadata["job"]) if "job" in info.metadata else None
+    return None
+
+
+def _reason(code: pb.LossReason) -> Reason:
+    """A reason from the wire; one that this version does not know is unspecified."""
+    return next((reason for reason, known in _REASONS.items() if known == code), Reason.UNSPECIFIED)

@@ -1,0 +1,139 @@
+"""`lightpage encode`: puts a file on pages to write."""
+
+from __future__ import annotations
+
+import secrets
+import shutil
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, cast
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.cli.paths import OutputFile
+from lightpage.codec.code import Code, load_code
+from lightpage.codec.page_codec import PageCodec
+from lightpage.codec.volume import DATA_PAGES, PARITY_PAGES, Volume, encode_volume
+from lightpage.device.profile import Profile, load_profile
+from lightpage.errors import InvalidInputError
+from lightpage.failures import os_failure
+from lightpage.files import STDOUT, write_json
+from lightpage.page.symbols import pilot_mask, pilot_symbols
+from lightpage.progress import track
+from lightpage.recording.pages import PagesWriter
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.bundle.shipped import bundle_path
+
+
+@dataclass(frozen=True)
+class Target:
+    """The device that pages are written for.
+
+    Attributes:
+        profile: nominal.
+        code: of its pages.
+        mask: where the pilots are, bool [ny, nx].
+        pilots: their levels in row order.
+    """
+
+    profile: Profile
+    code: Code
+    mask: NDArray[np.bool_]
+    pilots: NDArray[np.uint8]
+
+
+def target_of(bundle: str | None, profile_name: str | None, code_path: Path | None) -> Target:
+    """The device of a bundle, or of a profile and a code.
+
+    Raises:
+        InvalidInputError: both or neither, or no code.
+        BundleError, ProfileError: they cannot be read.
+    """
+    if (bundle is None) == (profile_name is None):
+        got = "neither --bundle nor --profile" if bundle is None else "both --bundle and --profile"
+        raise InvalidInputError("options", got, "one of them")
+    own = load_code(code_path) if code_path is not None else None
+    if profile_name is not None:
+        if own is None:
+            raise InvalidInputError("options", "--profile without --code", "the code of the device's pages")
+        profile = load_profile(profile_name)
+        mask = pilot_mask(profile)
+        return Target(profile, own, mask, pilot_symbols(profile, own.levels)[mask])
+    opened = Bundle.open(bundle_path(str(bundle)))
+    code = own or opened.code
+    if code is None:
+        raise InvalidInputError(opened.subject, "no code", "--code CODE.toml, as `lightpage code` makes it")
+    return Target(opened.profile, code, opened.pilot_mask, opened.written_pilots(code.levels))
+
+
+def _opened(file: Path) -> BinaryIO:
+    """The file, or what comes on stdin where it is `-`, kept in a temporary file: it is read more than once.
+
+    Raises:
+        InvalidInputError, StorageError, SurroundingsError: it cannot be read or kept.
+    """
+    try:
+        if file != STDOUT:
+            return file.open("rb")
+        kept = cast(BinaryIO, tempfile.TemporaryFile())  # noqa: SIM115  # the caller closes it
+        shutil.copyfileobj(sys.stdin.buffer, kept)
+        kept.seek(0)
+        return kept
+    except OSError as error:
+        raise os_failure(f"file {file}", error, "a file that can be read") from None
+
+
+@click.command()
+@click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
+@click.option("--bundle", help="A bundle of the device: its path, or the name of a shipped one.")
+@click.option("--profile", "profile_name", metavar="P", help="Or its nominal profile: a shipped name or a file.")
+@click.option(
+    "--code", "code_path", type=click.Path(path_type=Path), help="Code of its pages; the bundle's by default."
+)
+@click.option("--out", required=True, type=OutputFile(), help="The pages to write, PAGES.h5.")
+@click.option("--volume", "volume_id", type=int, help="Number that tells files on a medium apart; random if left out.")
+@click.option("--data-pages", default=DATA_PAGES, show_default=True, help="Data pages of a group.")
+@click.option("--parity-pages", default=PARITY_PAGES, show_default=True, help="Pages of a group that may be lost.")
+@click.option("--force", is_flag=True, help="Overwrite pages that exist.")
+@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
+def encode(
+    file: Path,
+    bundle: str | None,
+    profile_name: str | None,
+    code_path: Path | None,
+    out: Path,
+    volume_id: int | None,
+    data_pages: int,
+    parity_pages: int,
+    force: bool,
+    json_path: Path | None,
+) -> None:
+    """Put FILE on pages to write: user bytes in, levels with pilots out. `-` reads stdin."""
+    if out.exists() and not force:
+        raise InvalidInputError(f"--out {out}", "a file that exists", "a new name, or --force")
+    target = target_of(bundle, profile_name, code_path)
+    codec = PageCodec(target.code, target.mask)
+    number = secrets.randbits(32) if volume_id is None else volume_id
+    with _opened(file) as source:
+        volume = Volume.of_file(source, number, codec.user_bytes, data_pages, parity_pages)
+        told = target.code.model_dump() | volume.to_json()
+        with PagesWriter(out, target.profile, target.code.levels, told) as writer:
+            batches = encode_volume(codec, volume, source, target.pilots)
+            for pages in track(batches, "encode", unit="batch"):
+                writer.append(pages)
+    figures = {
+        "file_bytes": volume.file_bytes,
+        "pages": volume.pages,
+        "user_bytes_per_page": codec.user_bytes,
+        "code": told,
+    }
+    if json_path is not None:
+        write_json(json_path, figures)
+    click.echo(
+        f"{out}: volume {volume.id}, {volume.pages} pages of {target.code.levels} levels and {codec.user_bytes} bytes; "
+        f"{volume.file_pages} hold {volume.file_bytes} bytes, {volume.pages - volume.file_pages} are parity"
+    )

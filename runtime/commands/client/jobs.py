@@ -1,0 +1,58 @@
+"""`lightpage jobs`: the recalibrations of a running service."""
+
+from __future__ import annotations
+
+from datetime import datetime
+
+import click
+
+from lightpage.cli.main import RESUME_KEY
+from lightpage.cli.options import FiniteRange
+from lightpage.cli.progress_bar import percent_bar
+from lightpage.errors import InvalidInputError
+from lightpage.runtime.client.answers import JobInfo, JobState
+from lightpage.runtime.client.client import RECALIBRATION_S, LightpageClient
+from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.commands.client.connection import TARGET, with_tls
+from lightpage.runtime.commands.client.recalibrate import summary, table, watched
+
+
+@click.command()
+@TARGET
+@with_tls
+@click.option("--watch", metavar="ID", help="Follow this job to its end and show its result.")
+@click.option("--cancel", metavar="ID", help="Stop this job at its next step.")
+@click.option(
+    "--timeout",
+    "timeout_s",
+    default=RECALIBRATION_S,
+    show_default=True,
+    type=FiniteRange(0, min_open=True),
+    help="With --watch: seconds to wait for the end; the job goes on after them.",
+)
+def jobs(target: str, tls: TlsFiles | None, watch: str | None, cancel: str | None, timeout_s: float) -> None:
+    """Show, follow or cancel the recalibrations of a service; without an option all that it remembers, newest first."""
+    if watch is not None and cancel is not None:
+        raise InvalidInputError("options", "--watch and --cancel", "one of them")
+    with LightpageClient(target, tls=tls) as client:
+        if watch is not None:
+            again = f"job {watch} goes on; lightpage jobs --watch {watch} follows it again"
+            click.get_current_context().meta[RESUME_KEY] = again
+            with percent_bar() as progress:
+                result = watched(client, watch, progress, timeout_s)
+            click.echo(table(summary(result, result.seconds)))
+        else:
+            found = client.jobs() if cancel is None else [client.cancel_job(cancel)]
+            click.echo("\n".join(map(_line, found)) if found else "no jobs")
+
+
+def _line(job: JobInfo) -> str:
+    """A job in a line."""
+    begun = datetime.fromtimestamp(job.created_s).astimezone().isoformat(sep=" ", timespec="seconds")
+    if job.state is JobState.RUNNING:
+        told = f"{job.fraction:.0%} {job.step}"
+    elif job.result is not None:
+        told = f"{job.result.model_version} in service instead of {job.result.previous_version}"
+    else:
+        told = str(job.error or "")
+    return "  ".join(filter(None, [job.id, f"{job.state.lower():<11}", begun, job.pages_of, job.correlation_id, told]))

@@ -1,0 +1,211 @@
+"""`lightpage recalibrate` and `lightpage rollback`: a bundle offline, or a running service's model."""
+
+from __future__ import annotations
+
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import click
+
+from lightpage.calibration.known_pages import first_lit_pages
+from lightpage.cli.options import FiniteRange
+from lightpage.cli.paths import NewPath, OutputFile
+from lightpage.cli.progress_bar import percent_bar
+from lightpage.errors import InvalidInputError, LightpageError
+from lightpage.files import write_json
+from lightpage.progress import Progress, warn
+from lightpage.recording.reader import Recording
+from lightpage.runtime.archives.recordings.evaluation import check_recording
+from lightpage.runtime.client.answers import JobInfo, Recalibrated
+from lightpage.runtime.client.client import RECALIBRATION_S, LightpageClient
+from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.commands.client.connection import TARGET, with_tls
+from lightpage.runtime.model.bundle.manifest import check_version
+from lightpage.runtime.model.bundle.shipped import bundle_path
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.recalibration.known_pages import KnownPages, read_recorded
+from lightpage.runtime.recalibration.outcome import RecalibrationOutcome
+from lightpage.runtime.recalibration.recalibration import next_version
+from lightpage.runtime.recalibration.recalibration import recalibrate as recalibrate_bundle
+from lightpage.runtime.recalibration.refit import refit
+
+DEFAULT_PAGES = 2
+
+
+@click.command()
+@click.option("--bundle", help="Offline: the bundle to start from, a path or a shipped name.")
+@click.option(
+    "--recording",
+    help="Pages with known symbols: a file, or with --target and without --send a name in the service's folder.",
+)
+@click.option("--out", type=NewPath(), help="Offline: where the new bundle goes; a zip where it ends in .zip.")
+@click.option("--target", metavar="HOST:PORT", help="Recalibrate this running service instead of a bundle.")
+@with_tls
+@click.option("--pages", default=DEFAULT_PAGES, show_default=True, type=click.IntRange(2), help="Known pages to use.")
+@click.option(
+    "--timeout",
+    "timeout_s",
+    type=FiniteRange(0, min_open=True),
+    show_default=f"{RECALIBRATION_S:.0f}",
+    help="With --target: seconds to wait for the result.",
+)
+@click.option("--version", help="Offline: version of the new bundle; by default the next one.")
+@click.option("--send", is_flag=True, help="With --target: --recording is a file here, whose frames are sent.")
+@click.option("--detach", is_flag=True, help="With --target: print the job's id and leave it to itself.")
+@click.option("--json", "json_path", type=OutputFile(), help="Write the result to this file.")
+def recalibrate(
+    bundle: str | None,
+    recording: str | None,
+    out: Path | None,
+    target: str | None,
+    tls: TlsFiles | None,
+    pages: int,
+    timeout_s: float | None,
+    version: str | None,
+    send: bool,
+    detach: bool,
+    json_path: Path | None,
+) -> None:
+    """Re-fit the geometry of a drifted device from known pages; keep it unless it reads less than the one in use.
+
+    Less is what exceeds the standard error of the comparison on pages that were not fitted to. Where nothing has
+    drifted, it is kept only if it reads more by twice that.
+
+    Offline with --bundle, --recording and --out; over the endpoint with --target, from the service's source or, with
+    --recording, from a file in its recordings folder, or with --send from a file here. The recalibration of a service
+    ends with this command, unless it is told to --detach; `lightpage jobs` then tells how it goes.
+    """
+    start = time.perf_counter()
+    if target is not None:
+        if bundle or out or version is not None:
+            raise InvalidInputError("--target", "with --bundle, --out or --version", "either a service or a bundle")
+        if send and recording is None:
+            raise InvalidInputError("--send", "without --recording", "a file whose frames are sent")
+        wait_s = RECALIBRATION_S if timeout_s is None else timeout_s
+        if detach:
+            with LightpageClient(target, tls=tls) as client:
+                job = _start(client, recording, pages, send, wait_s)
+            if json_path is not None:
+                write_json(json_path, {"job": job.id})
+            click.echo(job.id)
+            return
+        result: RecalibrationOutcome | Recalibrated = _remote(target, tls, recording, pages, send, wait_s)
+    else:
+        if send or detach:
+            raise InvalidInputError("--send" if send else "--detach", "without --target", "a service")
+        if timeout_s is not None:
+            raise InvalidInputError("--timeout", "without --target", "a service to wait for")
+        if not (bundle and recording and out):
+            given = {"--bundle": bundle, "--recording": recording, "--out": out}
+            lacking = ", ".join(name for name, value in given.items() if not value)
+            raise InvalidInputError("options", f"no {lacking}", f"{', '.join(given)}, or --target")
+        result = _offline(bundle, recording, out, pages, version)
+    data = summary(result, time.perf_counter() - start)
+    if json_path is not None:
+        write_json(json_path, data)
+    click.echo(table(data))
+
+
+def summary(result: RecalibrationOutcome | Recalibrated, seconds: float) -> dict[str, str | float | None]:
+    """The result under the names that other programs read."""
+    report = result.report if isinstance(result, RecalibrationOutcome) else result
+    return {
+        "version": result.version if isinstance(result, RecalibrationOutcome) else result.model_version,
+        "previous_version": result.previous_version,
+        "angle_deg": report.angle_deg,
+        "pages_used": result.pages_used,
+        "pages_held_back": result.pages_held_back,
+        "seconds": seconds,
+        "coherence_before": report.coherence_before,
+        "coherence_after": report.coherence_after,
+        "air_before": result.air_before,
+        "air_after": result.air_after,
+        "air_limit": result.air_limit,
+        "air_standard_error": result.air_standard_error,
+        "pages_lost_before": result.pages_lost_before,
+        "image_shift_x_px": None if report.image is None else report.image.shift_x_px,
+        "image_shift_y_px": None if report.image is None else report.image.shift_y_px,
+    }
+
+
+def table(data: dict[str, str | float | None]) -> str:
+    """The result for people."""
+    return "\n".join(f"{name:<20} {value}" for name, value in data.items() if value is not None)
+
+
+def _remote(
+    target: str, tls: TlsFiles | None, recording: str | None, pages: int, send: bool, timeout_s: float
+) -> Recalibrated:
+    with LightpageClient(target, tls=tls) as client, percent_bar() as progress:
+        if not send:
+            return client.recalibrate(count=pages, recording=recording, progress=progress, timeout_s=timeout_s)
+        until = time.monotonic() + timeout_s
+        job = _start(client, recording, pages, send, timeout_s)
+        try:
+            return watched(client, job.id, progress, until - time.monotonic())
+        except BaseException:
+            with suppress(LightpageError):
+                client.cancel_job(job.id)  # one that has ended stays as it is
+            raise
+
+
+def watched(client: LightpageClient, job_id: str, progress: Progress, timeout_s: float) -> Recalibrated:
+    """Follow a job to its end.
+
+    Raises:
+        LightpageError: it is not done, and why.
+    """
+    for job in client.watch_job(job_id, timeout_s):
+        progress(job.step, job.fraction)
+        if job.error is not None:
+            raise job.error
+        if job.result is not None:
+            return job.result
+    raise LightpageError(f"job {job_id}", "an end without a result", "a recalibration's result")
+
+
+def _start(client: LightpageClient, recording: str | None, pages: int, send: bool, timeout_s: float) -> JobInfo:
+    if not send or recording is None:
+        return client.start_recalibration(count=pages, recording=recording)
+    with Recording.open(recording) as file:
+        known, bit_depth = read_recorded(file, first_lit_pages(file, pages, warn)), file.bit_depth
+    assert known.references is not None  # of a recording
+    return client.recalibrate_frames(
+        known.pairs,
+        known.symbols,
+        known.references,
+        levels=known.levels,
+        bit_depth=bit_depth,
+        pilot_mask=known.pilot_mask,
+        timeout_s=timeout_s,
+    )
+
+
+def _offline(bundle: str, recording: str, out: Path, pages: int, version: str | None) -> RecalibrationOutcome:
+    if out.exists():
+        raise InvalidInputError(f"--out {out}", "something that exists", "a new path: bundles are never overwritten")
+    if version is not None:
+        check_version(version, "--version")
+    decoder = Decoder.load(bundle_path(bundle))
+    with percent_bar() as progress:
+        known = _read(decoder, recording, pages)
+        new = next_version(decoder.version) if version is None else version
+        return recalibrate_bundle(decoder, known, out, new, refit, progress)
+
+
+def _read(decoder: Decoder, recording: str, pages: int) -> KnownPages:
+    with Recording.open(recording) as file:
+        check_recording(decoder, file)
+        return read_recorded(file, first_lit_pages(file, pages, warn))
+
+
+@click.command()
+@TARGET
+@with_tls
+@click.option("--expect", metavar="VERSION", default="", help="Only if this version is in service.")
+def rollback(target: str, tls: TlsFiles | None, expect: str) -> None:
+    """Put a service's previous model back in service; `lightpage models forward` undoes it."""
+    with LightpageClient(target, tls=tls) as client:
+        current, before = client.rollback(expect)
+    click.echo(f"{current} is in service again, {before} is not")

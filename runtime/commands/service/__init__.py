@@ -1,0 +1,1 @@
+"""Subcommands that run the service, check its health, or time it."""

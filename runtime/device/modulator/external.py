@@ -1,0 +1,185 @@
+"""A modulator, and beams, that a controller outside works by itself: it is asked, and says when it has done so."""
+
+from __future__ import annotations
+
+from threading import Condition
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.clock import SYSTEM, Clock
+from lightpage.errors import LostShotError, Reason
+from lightpage.runtime.device.modulator.beam_state import BOTH, BeamState
+
+T = TypeVar("T")
+
+
+class Announcement(Generic[T]):
+    """What is wanted of somebody else, and what they say that there is. Its methods may be called from many threads.
+
+    Args:
+        clock: by which it is waited.
+    """
+
+    def __init__(self, clock: Clock = SYSTEM) -> None:
+        self._clock = clock
+        self._changed = Condition()
+        self._wanted: T | None = None
+        self._announced: T | None = None
+        self._changes = 0
+        self._asked = False
+
+    def wanted(self, timeout_s: float = 0.0) -> T | None:
+        """What is being waited for, or None where nothing is, nor comes to be within `timeout_s`."""
+        with self._changed:
+            self._clock.wait_for(self._changed, lambda: self._wanted is not None, timeout_s)
+            self._asked = self._asked or self._wanted is not None
+            return self._wanted
+
+    @property
+    def heard_of(self) -> bool:
+        """Whether anybody has ever heard what was wanted, or said what there is."""
+        with self._changed:
+            return self._asked or self._changes > 0
+
+    def announced(self) -> T | None:
+        """What there is by the last word; None for nothing, or before the first one."""
+        with self._changed:
+            return self._announced
+
+    def announce(self, what: T | None) -> None:
+        """Say what there is now, None for nothing."""
+        with self._changed:
+            if what == self._wanted:
+                self._wanted = None
+            if what != self._announced:
+                self._announced = what
+                self._changes += 1
+                self._changed.notify_all()
+
+    def want(self, what: T) -> None:
+        """Ask for something, until it is there, and do not wait for it."""
+        with self._changed:
+            self._wanted = what
+            self._changed.notify_all()
+
+    def wait(self, what: T, timeout_s: float) -> tuple[T | None, int]:
+        """Ask for something until it is there or the time is up.
+
+        Returns:
+            What there is then, and `changes` then: as long as that stays, so does what there is.
+        """
+        with self._changed:
+            self.want(what)
+            try:
+                self._clock.wait_for(self._changed, lambda: self._announced == what, timeout_s)
+                return self._announced, self._changes
+            finally:
+                self._wanted = None
+
+    def changes(self) -> int:
+        """How often what there is has changed."""
+        with self._changed:
+            return self._changes
+
+
+class ExternalModulator:
+    """A modulator whose controller shows pages by itself.
+
+    One thread uses `show`, `shows` and `close`; others say what the controller does, by `shown` and `withdrawn`, and
+    look at `wanted`. A page may be announced before it is asked for.
+
+    Args:
+        clock: by which it waits.
+    """
+
+    name = "the controller's modulator"
+
+    def __init__(self, clock: Clock = SYSTEM) -> None:
+        self._pages = Announcement[int](clock)
+        self._at_last_show = -1
+
+    def wanted(self, timeout_s: float = 0.0) -> int | None:
+        """The page that is being waited for, or None where none is, nor comes to be within `timeout_s`."""
+        return self._pages.wanted(timeout_s)
+
+    def shown(self, page: int) -> None:
+        """The controller says: page number `page` is on display, and its liquid crystal has settled."""
+        self._pages.announce(page)
+
+    def withdrawn(self) -> None:
+        """The controller says: no page is on display, or will not be from now on."""
+        self._pages.announce(None)
+
+    def open(self, timeout_s: float, levels: int | None = None) -> None:
+        """See `Modulator`: the controller may come at any time."""
+
+    def show(self, symbols: NDArray[np.uint8], levels: int, page: int, timeout_s: float) -> None:
+        """Wait until the controller says that page number `page` is on display; see `Modulator`."""
+        self._at_last_show = -1
+        there, changes = self._pages.wait(page, timeout_s)
+        if there != page:
+            raise LostShotError(
+                f"page {page} on {self.name}",
+                f"{'no page' if there is None else f'page {there}'} announced after {timeout_s:g} s",
+                f"word that page {page} is on display",
+                Reason.NOT_ON_DISPLAY,
+            )
+        self._at_last_show = changes
+
+    def shows(self) -> bool:
+        """See `Modulator`: no other page was announced, and none withdrawn, since `show`."""
+        return self._pages.changes() == self._at_last_show
+
+    def close(self) -> None:
+        """Forget what was announced."""
+        self._at_last_show = -1
+        self._pages.announce(None)
+
+
+class ExternalBeams:
+    """Beams that a controller blocks and lets through by itself, and says so with `beams_set`.
+
+    Args:
+        timeout_s: longest wait for it.
+        clock: by which it waits.
+    """
+
+    name = "the controller's beams"
+
+    def __init__(self, timeout_s: float = 10.0, clock: Clock = SYSTEM) -> None:
+        self._timeout_s = timeout_s
+        self._states = Announcement[BeamState](clock)
+
+    def wanted(self, timeout_s: float = 0.0) -> BeamState | None:
+        """What is being waited for, or None where nothing is, nor comes to be within `timeout_s`."""
+        return self._states.wanted(timeout_s)
+
+    def beams_set(self, *, signal: bool, reference: bool) -> None:
+        """The controller says: so are the beams now, and they have settled."""
+        self._states.announce(BeamState(signal, reference))
+
+    def let_through(self, *, signal: bool, reference: bool) -> None:
+        """Wait until the controller says that the beams are so; see `Beams`.
+
+        Beams that nobody has heard an order for are open.
+        """
+        wanted = BeamState(signal, reference)
+        if wanted == BOTH and not self._states.heard_of:
+            return
+        there, _ = self._states.wait(wanted, self._timeout_s)
+        if there != wanted:
+            if self._states.heard_of:
+                self._states.want(BOTH)
+            raise LostShotError(
+                self.name,
+                f"{there or 'nothing'} announced after {self._timeout_s:g} s",
+                str(wanted),
+                Reason.BEAM_CONTROL_FAILED,
+            )
+
+    def close(self) -> None:
+        """Ask for both beams if the controller has blocked one; nobody waits for it."""
+        if self._states.heard_of and self._states.announced() != BOTH:
+            self._states.want(BOTH)

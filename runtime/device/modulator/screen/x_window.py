@@ -1,0 +1,210 @@
+"""A window over a whole monitor of an X server, for the process that owns it (`screen_window`)."""
+
+from __future__ import annotations
+
+import os
+from typing import Any, NamedTuple
+
+import numpy as np
+import xcffib
+from xcffib import present, randr, screensaver, xproto
+
+from lightpage.errors import SourceError
+from lightpage.runtime.device.modulator.screen.present import CompleteNotifyEvent, notify_msc, present_pixmap, put_rows
+from lightpage.runtime.device.modulator.settings import ScreenSettings
+
+_ROWS_AT_ONCE = 64
+"""A request of so many rows is below the limit of any server (16 MiB) for any modulator."""
+_GREY = 0x010101
+"""Pixel of red, green and blue 1."""
+
+
+class Monitor(NamedTuple):
+    """Where a monitor lies on the X server's screen, pixels."""
+
+    x: int
+    y: int
+    columns: int
+    rows: int
+
+    def __str__(self) -> str:
+        return f"{self.columns}x{self.rows}"
+
+
+class XWindow:
+    """A window without border and mouse pointer that no window manager moves, over one whole monitor.
+
+    Args:
+        settings: which monitor, and the modulator's resolution.
+
+    Raises:
+        SourceError: there is no such X server, screen or monitor, or it is not what a modulator needs.
+    """
+
+    def __init__(self, settings: ScreenSettings) -> None:
+        self._settings = settings
+        self._connection = _connect(settings)
+        self._screen = self._connection.setup.roots[self._connection.pref_screen]
+        self._check_server()
+        self._monitor = self._check_monitor()
+        self._serial = 0
+        self._visible = False
+        self._window, self._pixmap, self._context = self._open()
+        self._keep_awake()
+
+    @property
+    def shows(self) -> bool:
+        """Whether nothing covers the window, and its monitor is where and what it was."""
+        return self._visible and self._find_monitor() == self._monitor
+
+    def draw(self, image: bytes) -> None:
+        """Show a picture, and return once the display has scanned it out once.
+
+        The server copies the picture to the window at a refresh and says so. What covers the window is put below it.
+
+        Args:
+            image: grey values, row by row.
+        """
+        columns = self._monitor.columns
+        pixels = np.frombuffer(image, np.uint8).repeat(4).tobytes()
+        strip = _ROWS_AT_ONCE * columns * 4
+        for start in range(0, len(pixels), strip):
+            put_rows(
+                self._connection,
+                self._pixmap,
+                self._context,
+                self._screen.root_depth,
+                columns,
+                start // (4 * columns),
+                pixels[start : start + strip],
+            )
+        core = self._connection.core
+        # With this the server itself repairs what something has covered for a while.
+        core.ChangeWindowAttributes(self._window, xproto.CW.BackPixmap, [self._pixmap])
+        core.ConfigureWindow(self._window, xproto.ConfigWindow.StackMode, [xproto.StackMode.Above])
+        self._serial += 1
+        present_pixmap(self._connection, self._window, self._pixmap, self._serial)
+        shown = self._complete(present.CompleteKind.Pixmap)
+        notify_msc(self._connection, self._window, self._serial, shown.msc + 1)
+        self._complete(present.CompleteKind.NotifyMSC)
+
+    def look(self) -> None:
+        """Take note of what the server has said meanwhile."""
+        while (event := self._connection.poll_for_event()) is not None:
+            self._note(event)
+
+    def _complete(self, kind: int) -> CompleteNotifyEvent:
+        """Wait for the server's word that the last request of this kind is done."""
+        self._connection.flush()
+        while True:
+            event = self._connection.wait_for_event()
+            self._note(event)
+            if isinstance(event, CompleteNotifyEvent) and (event.kind, event.serial) == (kind, self._serial):
+                return event
+
+    def _note(self, event: Any) -> None:
+        if isinstance(event, xproto.VisibilityNotifyEvent):
+            self._visible = event.state == xproto.Visibility.Unobscured
+        elif isinstance(event, (xproto.UnmapNotifyEvent, xproto.DestroyNotifyEvent)):
+            self._visible = False
+
+    def _check_server(self) -> None:
+        screen = self._screen
+        bits = {form.depth: form.bits_per_pixel for form in self._connection.setup.pixmap_formats}
+        if (depth := (screen.root_depth, bits[screen.root_depth])) != (24, 32):
+            raise SourceError(
+                "screen", f"a colour depth of {depth[0]} bits in {depth[1]}", "24 in 32: 8 bits of each colour"
+            )
+        for extension in (randr.key, present.key):
+            if not self._connection.core.QueryExtension(len(extension.name), extension.name).reply().present:
+                raise SourceError("screen", "an X server without the extension " + extension.name, "one with it")
+        self._connection(randr.key).QueryVersion(1, 5).reply()
+        self._connection(present.key).QueryVersion(1, 0).reply()
+
+    def _monitors(self) -> list[Monitor]:
+        reply = self._connection(randr.key).GetMonitors(self._screen.root, True).reply()
+        return [Monitor(m.x, m.y, m.width, m.height) for m in reply.monitors]
+
+    def _find_monitor(self) -> Monitor | None:
+        monitors = self._monitors()
+        return monitors[self._settings.monitor] if self._settings.monitor < len(monitors) else None
+
+    def _check_monitor(self) -> Monitor:
+        """The monitor, which must have the modulator's pixels: what has others is scaled on its way."""
+        monitors = self._monitors()
+        number = self._settings.monitor
+        if number >= len(monitors):
+            sizes = ", ".join(f"{which} of {monitor} pixels" for which, monitor in enumerate(monitors))
+            raise SourceError("screen", f"monitors {sizes}" if sizes else "no monitor at all", f"monitor {number}")
+        monitor = monitors[number]
+        if (monitor.rows, monitor.columns) != (self._settings.rows_px, self._settings.columns_px):
+            raise SourceError(
+                "screen",
+                f"{monitor} pixels",
+                f"{self._settings.columns_px}x{self._settings.rows_px} pixels, as the modulator has: "
+                "set the monitor's mode to them, or columns_px and rows_px to the monitor's",
+            )
+        return monitor
+
+    def _open(self) -> tuple[int, int, int]:
+        """Make the window, the pixmap to draw in and its graphics context."""
+        connection, core, monitor, screen = self._connection, self._connection.core, self._monitor, self._screen
+        window, pixmap, context, events = (connection.generate_id() for _ in range(4))
+        mask, values = xproto.CW, xproto.EventMask
+        core.CreateWindowChecked(
+            screen.root_depth,
+            window,
+            screen.root,
+            monitor.x,
+            monitor.y,
+            monitor.columns,
+            monitor.rows,
+            0,
+            xproto.WindowClass.InputOutput,
+            screen.root_visual,
+            mask.BackPixel | mask.OverrideRedirect | mask.EventMask | mask.Cursor,
+            [
+                self._settings.background_grey * _GREY,
+                1,
+                values.StructureNotify | values.VisibilityChange,
+                self._no_pointer(),
+            ],
+        ).check()
+        core.CreatePixmapChecked(screen.root_depth, pixmap, window, monitor.columns, monitor.rows).check()
+        core.CreateGCChecked(context, pixmap, 0, []).check()
+        selected = present.EventMask.CompleteNotify
+        connection(present.key).SelectInputChecked(events, window, selected).check()
+        core.MapWindowChecked(window).check()
+        return window, pixmap, context
+
+    def _no_pointer(self) -> int:
+        """A mouse pointer of one pixel that is not drawn."""
+        core = self._connection.core
+        bitmap, context, cursor = (self._connection.generate_id() for _ in range(3))
+        core.CreatePixmapChecked(1, bitmap, self._screen.root, 1, 1).check()
+        core.CreateGCChecked(context, bitmap, xproto.GC.Foreground, [0]).check()
+        core.PolyFillRectangleChecked(bitmap, context, 1, [xproto.RECTANGLE.synthetic(0, 0, 1, 1)]).check()
+        core.CreateCursorChecked(cursor, bitmap, bitmap, 0, 0, 0, 0, 0, 0, 0, 0).check()
+        return int(cursor)
+
+    def _keep_awake(self) -> None:
+        """Hold back screen saver and power saving; the server does so no longer when this process ends."""
+        name = screensaver.key.name
+        if self._connection.core.QueryExtension(len(name), name).reply().present:
+            saver = self._connection(screensaver.key)
+            saver.QueryVersion(1, 1).reply()
+            saver.SuspendChecked(1).check()
+
+
+def _connect(settings: ScreenSettings) -> Any:
+    display = settings.x_display or os.environ.get("DISPLAY", "")
+    if not display:
+        raise SourceError("screen", "no name of an X display", "one in x_display, or in the variable DISPLAY")
+    try:
+        return xcffib.connect(display)
+    except xcffib.ConnectionException as error:
+        raise SourceError(
+            "screen",
+            f"no connection to X display {display} ({str(error).rstrip('.')})",
+            "an X server that runs and lets this user in",
+        ) from None

@@ -1,0 +1,145 @@
+"""The one owner of a serial line to an SCPI device: a thread does all input and output, callers wait with a deadline.
+
+A caller that gives up takes nothing with it: the answer that may still come belongs to its message alone.
+"""
+
+from __future__ import annotations
+
+import queue
+import re
+import threading
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+
+from lightpage.clock import SYSTEM, Clock
+from lightpage.errors import InvalidInputError, LostShotError, Reason
+from lightpage.runtime.device.trigger.scpi_port import LineTimes, ScpiPort
+
+_DONE = re.compile("ok", re.IGNORECASE)
+_STOP_S = 2.0
+"""Longest wait for the thread at `close`."""
+_GRACE_S = 0.5
+"""A caller waits so much longer than the thread, whose error says more."""
+
+
+@dataclass(frozen=True)
+class _Request:
+    """A message that a caller waits for; its result is the answer and the middle of its sending."""
+
+    message: str
+    answer: re.Pattern[str]
+    twice: bool
+    session: int | None
+    deadline: float
+    result: Future[tuple[str, float]] = field(default_factory=Future)
+
+
+class ScpiLine:
+    """Messages to an SCPI device, one after another. Its methods may be called from many threads.
+
+    The line is opened by the first message, and again after it was unplugged: by the same name, which may be a link
+    that has come to point to another port (``/dev/serial/by-id/...``).
+
+    Args:
+        port: device path, e.g. ``/dev/ttyUSB0``, or pyserial URL, e.g. ``socket://127.0.0.1:2101``.
+        baud: bits per second of a serial port.
+        times: how long is waited.
+        clock: by which it is waited.
+    """
+
+    def __init__(self, port: str, baud: int = 115200, times: LineTimes | None = None, clock: Clock = SYSTEM) -> None:
+        self._times = times or LineTimes()
+        self._clock = clock
+        self._port = ScpiPort(port, baud, self._times, clock)
+        self.name = self._port.name
+        self._requests: queue.SimpleQueue[_Request | None] = queue.SimpleQueue()
+        self._lock = threading.Lock()
+        """Guards the thread's start and end."""
+        self._thread: threading.Thread | None = None
+
+    @property
+    def session(self) -> int:
+        """Grows when the line is opened or synchronised; 0 before. In between, every message has been answered."""
+        return self._port.session
+
+    @property
+    def identity(self) -> str | None:
+        """What the device answered to ``*IDN?``, last time; None before."""
+        return self._port.identity
+
+    def send(self, command: str, session: int | None = None, timeout_s: float | None = None) -> float:
+        """Send a command, wait for its ``ok``, return the middle of its sending by the clock.
+
+        Args:
+            command: without line end.
+            session: send it only if the line was not interrupted since this session; None connects where needed.
+            timeout_s: longest wait; None for as long as connecting and synchronising may take.
+
+        Raises:
+            LostShotError: `Reason.TRIGGER_GONE`: no ``ok``, and it may or may not have been done;
+                `Reason.TRIGGER_REFUSED`: the device answers that it cannot.
+            SourceError: the port's name or the baud rate makes no sense.
+            InvalidInputError: this is no single line of ASCII.
+        """
+        return self._wait(command, _DONE, False, session, timeout_s)[1]
+
+    def query(
+        self, question: str, answer: re.Pattern[str], session: int | None = None, timeout_s: float | None = None
+    ) -> str:
+        """Ask and return the answer. It is asked twice, so that an answer that the line altered is seen.
+
+        Args:
+            question: without line end.
+            answer: what an answer looks like, all of it; anything else is none.
+            session, timeout_s: see `send`.
+
+        Raises:
+            LostShotError, SourceError, InvalidInputError: see `send`.
+        """
+        return self._wait(question, answer, True, session, timeout_s)[0]
+
+    def close(self) -> None:
+        """Let go of the line and end the thread; the next message opens it again."""
+        with self._lock:
+            thread = self._thread
+            if thread is None:
+                return
+            self._requests.put(None)
+            thread.join(_STOP_S)
+            if not thread.is_alive():
+                self._thread = None
+
+    def _wait(
+        self, message: str, answer: re.Pattern[str], twice: bool, session: int | None, timeout_s: float | None
+    ) -> tuple[str, float]:
+        if not (message.isascii() and message.isprintable() and message):
+            raise InvalidInputError(f"{self.name}: message", repr(message), "one line of printable ASCII")
+        timeout_s = self._times.longest_s if timeout_s is None else timeout_s
+        request = _Request(message, answer, twice, session, self._clock.now() + timeout_s)
+        with self._lock:
+            if self._thread is None or not self._thread.is_alive():
+                self._thread = threading.Thread(target=self._own, name=self.name, daemon=True)
+                self._thread.start()
+            self._requests.put(request)
+        answered = threading.Event()
+        request.result.add_done_callback(lambda _: answered.set())
+        if not self._clock.wait(answered, timeout_s + _GRACE_S):
+            request.result.cancel()
+            raise LostShotError(
+                self.name, f"{message} not answered within {timeout_s:g} s", "an answer", Reason.TRIGGER_GONE
+            )
+        return request.result.result()
+
+    def _own(self) -> None:
+        """Serve callers until told to stop; only this thread touches the port."""
+        while (request := self._requests.get()) is not None:
+            if not request.result.set_running_or_notify_cancel():
+                continue
+            ask = request.message, request.answer, request.session, request.deadline
+            try:
+                done = (self._port.ask_twice(*ask), 0.0) if request.twice else self._port.ask(*ask)
+            except BaseException as error:  # noqa: BLE001, RUF100 — whatever it is, it is the caller's
+                request.result.set_exception(error)
+            else:
+                request.result.set_result(done)
+        self._port.close()

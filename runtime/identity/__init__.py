@@ -1,1 +1,0 @@
-"""Who calls: certificates, roles, and what each of them may do."""

@@ -1,0 +1,170 @@
+"""Reads the files of a bundle, a flat folder or one zip, into memory, trusting no name, size or link in it."""
+
+from __future__ import annotations
+
+import io
+import os
+import stat
+import struct
+import zipfile
+import zlib
+from pathlib import Path
+from typing import IO
+
+from lightpage.errors import BundleError
+from lightpage.failures import os_failure
+from lightpage.runtime.model.bundle.manifest import MANIFEST
+
+MAX_FILES = 32
+"""A bundle has a handful of files; more is something else."""
+
+MAX_BYTES = 1 << 30
+"""All files together, unpacked: a full-scale decoder with two float32 reference frames needs about 200 MB."""
+
+_LITTER = frozenset(
+    {
+        "__macosx",
+        "icon\r",
+        "thumbs.db",
+        "desktop.ini",
+        "$recycle.bin",
+        "system volume information",
+        "@eadir",
+        "lost+found",
+    }
+)
+"""Names that systems put beside files, in lower case; names that begin with a dot are litter too."""
+
+_MAX_LITTER = 4 * MAX_FILES
+
+_DAMAGE = (
+    zipfile.BadZipFile,
+    zlib.error,
+    struct.error,
+    NotImplementedError,
+    RuntimeError,
+    EOFError,
+    ValueError,
+)
+"""What zipfile raises on damaged, encrypted or exotic archives."""
+
+
+def read_files(path: Path, max_bytes: int = MAX_BYTES, content: bytes | None = None) -> dict[str, bytes]:
+    """All files of the folder or zip at `path`, by their plain names.
+
+    Args:
+        path: a folder or a zip file.
+        max_bytes: most bytes taken into memory.
+        content: of the zip, where it has been read.
+
+    Raises:
+        BundleError: nothing there, not a zip, a name that is a path, a link, a folder inside, or too much data.
+    """
+    if content is not None:
+        return _read_zip(path, max_bytes, io.BytesIO(content))
+    expected = "a folder or a zip file"
+    try:
+        if path.is_dir():
+            return _read_folder(path, max_bytes)
+        if path.is_file():
+            return _read_zip(path, max_bytes, path)
+    except OSError as error:
+        raise os_failure(f"bundle {path}", error, expected, BundleError) from None
+    raise BundleError(f"bundle {path}", "nothing", expected)
+
+
+def check_name(name: str, subject: str) -> None:
+    """Refuse a name that could lead out of a bundle.
+
+    Raises:
+        BundleError: empty, with a separator, a drive or a NUL, or hidden.
+    """
+    if not name or name.startswith(".") or any(mark in name for mark in "/\\:\0"):
+        raise BundleError(f"{subject}: file name", repr(name), "a plain file name without a path")
+
+
+def is_litter(name: str) -> bool:
+    """Whether a name is one that systems put beside files, e.g. `.DS_Store`, or `..data` of a mounted ConfigMap."""
+    hidden = name.startswith(".") and name not in (".", "..") and not any(mark in name for mark in "\\:\0")
+    return hidden or name.lower() in _LITTER
+
+
+def _read_folder(path: Path, max_bytes: int) -> dict[str, bytes]:
+    subject, real = f"bundle {path}", os.path.realpath(path)
+    there = sorted(os.listdir(path))
+    _check_count(len(there), subject, _MAX_LITTER)
+    names = [name for name in there if not is_litter(name)]
+    if MANIFEST not in names:
+        raise BundleError(subject, f"a folder without {MANIFEST}", "a bundle: a folder that has one, or a zip file")
+    _check_count(len(names), subject)
+    files: dict[str, bytes] = {}
+    left = max_bytes
+    for name in names:
+        check_name(name, subject)
+        try:
+            # Kubernetes mounts files as links into a hidden folder beside them. O_NOFOLLOW: any other link is refused
+            # by the kernel, with no gap between a check and the use.
+            target = os.path.realpath(path / name)
+            inside = os.path.dirname(os.path.dirname(target)) == real and is_litter(Path(target).parent.name)
+            descriptor = os.open(target if inside else path / name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+            with os.fdopen(descriptor, "rb") as file:
+                if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                    raise BundleError(f"{subject}: {name}", "no plain file", "a plain file")
+                files[name] = file.read(left + 1)
+        except OSError as error:
+            expected = "a readable plain file, no link or folder"
+            raise os_failure(f"{subject}: {name}", error, expected, BundleError) from None
+        left -= len(files[name])
+        _check_left(left, max_bytes, subject)
+    return files
+
+
+def _read_zip(path: Path, max_bytes: int, source: Path | IO[bytes]) -> dict[str, bytes]:
+    subject = f"bundle {path}"
+    files: dict[str, bytes] = {}
+    left = max_bytes
+    try:
+        with zipfile.ZipFile(source) as archive:
+            entries = archive.infolist()
+            _check_count(len(entries), subject, _MAX_LITTER)
+            # orig_filename is what was written; zipfile cuts filename at a NUL and makes it portable.
+            entries = [entry for entry in entries if not any(map(is_litter, entry.orig_filename.split("/")))]
+            top = _top_folder([entry.orig_filename for entry in entries])
+            entries = [entry for entry in entries if entry.orig_filename != top]
+            _check_count(len(entries), subject, MAX_FILES)
+            for entry in entries:
+                name = entry.filename.removeprefix(top)
+                check_name(entry.orig_filename.removeprefix(top), subject)
+                check_name(name, subject)
+                if name in files:
+                    raise BundleError(f"{subject}: {name}", "the same name twice", "one file of each name")
+                kind = stat.S_IFMT(entry.external_attr >> 16)
+                if kind not in (0, stat.S_IFREG):
+                    raise BundleError(f"{subject}: {entry.filename}", "a link or special file", "a plain file")
+                # The size in the header may lie: read at most what is left, whatever it says.
+                with archive.open(entry) as file:
+                    files[name] = file.read(left + 1)
+                left -= len(files[name])
+                _check_left(left, max_bytes, subject)
+    except OSError as error:
+        raise os_failure(subject, error, "a sound zip file", BundleError) from None
+    except _DAMAGE as error:
+        raise BundleError(subject, error, "a sound zip file") from None
+    return files
+
+
+def _top_folder(names: list[str]) -> str:
+    """The folder, with a slash, that holds a bundle packed with its folder; empty where there is none."""
+    top = next((name.partition("/")[0] + "/" for name in names if name.endswith(f"/{MANIFEST}")), "")
+    whole = MANIFEST not in names and all(name.startswith(top) for name in names)
+    return top if whole and not top.startswith("/") else ""
+
+
+def _check_count(count: int, subject: str, most: int = MAX_FILES) -> None:
+    if count > most:
+        raise BundleError(subject, f"{count} files", f"at most {most}")
+
+
+def _check_left(left: int, max_bytes: int, subject: str) -> None:
+    if left < 0:
+        raise BundleError(subject, f"more than {max_bytes} bytes unpacked", f"at most {max_bytes}")

@@ -1,0 +1,337 @@
+"""Decodes frame pairs with a bundle: checks, one ONNX run, piston from the pilots, decision with confidence."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.calibration.sampling_table import SamplingTable
+from lightpage.errors import (
+    BundleError,
+    FrameError,
+    FramesDisagreeError,
+    InvalidInputError,
+    NoCodeError,
+    ProviderError,
+    SurroundingsError,
+)
+from lightpage.failures import short_resource
+from lightpage.metrics.information import decide_with_confidence
+from lightpage.page.levels import MAX_LEVELS
+from lightpage.page.pilots import Pilots, read_pilots, remove_piston
+from lightpage.page.symbols import check_levels, symbol_phases
+from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.bundle.manifest import DECODER, FIELD, FLOAT16, FLOAT32, GOLDEN
+from lightpage.runtime.model.decoding.field_solver import BundleFieldSolver
+from lightpage.runtime.model.decoding.frames import check_pair
+from lightpage.runtime.model.decoding.page import DecodedPage, Inference, Timings
+from lightpage.runtime.model.decoding.phase_refit import PhaseRefit
+from lightpage.runtime.model.execution.constant_table import GraphFile
+from lightpage.runtime.model.execution.providers import ON_CPU, Provider
+from lightpage.runtime.model.execution.session import Port
+from lightpage.runtime.model.execution.table_graph import TableGraph
+
+if TYPE_CHECKING:
+    from lightpage.codec.page_codec import PageCodec
+
+OUTPUTS = ("p", "phase", "concentration")
+PAGE_INPUTS = frozenset(["registration"])
+"""Table inputs that may differ from page to page, as the image shifts. All others are built into the graph."""
+GOLDEN_TOLERANCE = {FLOAT32: 1e-3, FLOAT16: 1e-2}
+"""Largest error of p on the golden page, relative to its norm, by precision: room for another processor's rounding, not
+for another net."""
+
+
+@contextmanager
+def _table_of(bundle: Bundle) -> Iterator[None]:
+    """What does not fit in a bundle's table is the bundle's fault."""
+    try:
+        yield
+    except InvalidInputError as error:
+        raise BundleError(f"{bundle.subject}: {error.subject}", error.got, error.expected) from None
+
+
+def open_graph(bundle: Bundle, threads: int | None = None, provider: Provider = ON_CPU) -> TableGraph:
+    """The graph of a bundle's decoder with the bundle's table.
+
+    Raises:
+        BundleError: no ONNX model, or its table is not the one of the manifest, or does not fit.
+        ProviderError: there is no such provider here.
+    """
+    subject = f"{bundle.subject}: {DECODER}"
+    file = GraphFile(bundle.files[DECODER], subject)
+    if set(file.table_inputs) != set(bundle.manifest.table_inputs):
+        raise BundleError(f"{subject}: table inputs", sorted(file.table_inputs), sorted(bundle.manifest.table_inputs))
+    with _table_of(bundle):
+        return TableGraph(file, subject, PAGE_INPUTS, threads, bundle.table, provider=provider)
+
+
+class Decoder:
+    """The decoder of one bundle. Its methods may be called from many threads at once.
+
+    Args:
+        bundle: an opened bundle.
+        threads: threads of one inference; by default the cores that this process may use.
+        graph: of the bundle, where it is open already; then neither it nor the golden page is looked at.
+        provider: what pages are computed with; all else is computed on the CPU.
+
+    Raises:
+        ProviderError: there is no such provider here.
+        BundleError: the graph is not a decoder of this profile, table or pilots do not fit it, or the golden page
+            comes out differently.
+    """
+
+    def __init__(
+        self,
+        bundle: Bundle,
+        threads: int | None = None,
+        graph: TableGraph | None = None,
+        provider: Provider = ON_CPU,
+    ) -> None:
+        self.bundle, self.threads = bundle, threads
+        self.graph = graph or open_graph(bundle, threads, provider)
+        residual = bundle.manifest.residual_output
+        self._outputs = [*OUTPUTS, *([residual] if residual else [])]
+        self._pilots: dict[int, Pilots] = {}
+        if graph is None:
+            self._check_graph()
+            self.pilots(MAX_LEVELS)  # damaged pilots are noticed now, not with the first page
+            if bundle.code is not None:
+                _ = self.page_codec
+            self._check_golden()
+
+    @classmethod
+    def load(cls, path: str | Path, threads: int | None = None, provider: Provider = ON_CPU) -> Decoder:
+        """Open the bundle at `path` and its decoder; raises as `Bundle.open` and the constructor do."""
+        return cls(Bundle.open(path), threads, provider=provider)
+
+    def of_another(self, bundle: Bundle) -> Decoder:
+        """The decoder of another bundle, on the same threads and provider; raises as the constructor does."""
+        return Decoder(bundle, self.threads, provider=self.graph.provider)
+
+    def with_table(self, table: SamplingTable) -> Decoder:
+        """This decoder with other tensors in its table, by name; those left out stay. The golden page is not looked at.
+
+        Raises:
+            InvalidInputError: a table that does not fit.
+        """
+        return Decoder(self.bundle, self.threads, self.graph.with_table(table))
+
+    def of_bundle(self, bundle: Bundle) -> Decoder:
+        """This decoder with the table of a bundle of the same graphs, whose golden page is not looked at.
+
+        Raises:
+            BundleError: its table does not fit.
+        """
+        with _table_of(bundle):
+            return Decoder(bundle, self.threads, self.graph.with_table(bundle.table))
+
+    @property
+    def references(self) -> FramePair:
+        """The reference-only frames that this decoder decodes with.
+
+        Raises:
+            InvalidInputError: its table holds none.
+        """
+        in_phase, quadrature = (self.graph.value(f"reference_{name}") for name in ("in_phase", "quadrature"))
+        return FramePair(in_phase, quadrature)
+
+    @property
+    def version(self) -> str:
+        """The bundle's version."""
+        return self.bundle.version
+
+    def pilots(self, levels: int, mask: NDArray[np.bool_] | None = None) -> Pilots:
+        """The pilots that this device's pages carry at `levels` levels.
+
+        The device's own phases where the bundle holds them, whatever `levels` is, else the profile's seeded pattern.
+
+        Args:
+            levels: M.
+            mask: where a page's pilots are, bool [ny, nx], if not where the bundle has them: then the pattern holds.
+        """
+        if mask is not None and not np.array_equal(mask, self.bundle.pilot_mask):
+            return Pilots.of_profile(self.bundle.profile, levels, mask)
+        if levels not in self._pilots:
+            # Two threads may both do this; the results are equal and either may stay.
+            own, phases = self.bundle.pilot_mask, self.bundle.pilot_phases
+            self._pilots[levels] = (
+                Pilots.of_profile(self.bundle.profile, levels, own)
+                if phases is None
+                else Pilots(own, phases.astype(np.float64))
+            )
+        return self._pilots[levels]
+
+    def check(self, pair: FramePair) -> None:
+        """Check a frame pair against the camera of this bundle.
+
+        Raises:
+            FrameError: wrong size, type or bit depth, black or saturated.
+        """
+        manifest = self.bundle.manifest
+        check_pair(pair, self.bundle.profile.frame_shape, manifest.frame_dtype, manifest.camera_bit_depth)
+
+    def infer(self, pair: FramePair, table: SamplingTable | None = None) -> Inference:
+        """Run the graph on a checked pair.
+
+        Args:
+            pair: both frames, as `check` accepts them.
+            table: tensors for this page alone, of `PAGE_INPUTS`; all others take `with_table`.
+
+        Raises:
+            InvalidInputError: a table that does not fit.
+            FrameError: the frames contradict the homodyne equations beyond the bundle's limit (then it is a
+                `FramesDisagreeError`), or show no page.
+        """
+        table = table or {}
+        self.graph.check(table)
+        if others := set(table) - PAGE_INPUTS:
+            raise InvalidInputError("table of a page", ", ".join(sorted(others)), f"only {', '.join(PAGE_INPUTS)}")
+        feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **table}
+        p, phase, concentration, *rest = self.graph.run(self._outputs, feeds)
+        limit, residual = self.bundle.manifest.residual_limit, float(np.max(rest[0])) if rest else 0.0
+        if limit is not None and not residual <= limit:
+            seen = np.isfinite(residual)
+            got = f"frames that contradict each other (residual {residual:.3g})"
+            raise (FramesDisagreeError if seen else FrameError)(
+                "frame pair",
+                got if seen else "no light of a page over the reference beam",
+                f"an in-phase and a quadrature frame of one shot, not swapped, cameras and exposure as they were "
+                f"calibrated (residual up to {limit:.3g}; where frames are right, recalibrate)",
+            )
+        return Inference(p, phase, concentration, residual)
+
+    @cached_property
+    def field_solver(self) -> BundleFieldSolver:
+        """Recovers fields as this bundle does.
+
+        Raises:
+            BundleError: no graph of the bundle shows the field.
+        """
+        return BundleFieldSolver(self.bundle, self.graph, self.threads)
+
+    @cached_property
+    def phase_refit(self) -> PhaseRefit:
+        """Takes smooth phase errors off this device's pages."""
+        positions = self.graph.value("positions") if "positions" in self.graph.ports else None
+        return PhaseRefit(self.bundle.profile.page_shape, positions)
+
+    @cached_property
+    def page_codec(self) -> PageCodec:
+        """Takes user bytes off this device's pages.
+
+        Raises:
+            BundleError: the bundle has no code, or one that does not fit its page.
+        """
+        from lightpage.codec.page_codec import PageCodec
+
+        if self.bundle.code is None:
+            raise NoCodeError(f"{self.bundle.subject}: code", "none", "one, as `lightpage code --out-bundle` adds it")
+        try:
+            return PageCodec(self.bundle.code, self.bundle.pilot_mask)
+        except InvalidInputError as error:
+            raise BundleError(f"{self.bundle.subject}: {error.subject}", error.got, error.expected) from None
+
+    def written_pilots(self, levels: int) -> Pilots:
+        """The pilots of pages that were written at `levels` levels, each on one of them.
+
+        Raises:
+            PageError: a level count outside 2..256.
+        """
+        return Pilots(self.bundle.pilot_mask, symbol_phases(self.bundle.written_pilots(levels), levels))
+
+    @property
+    def has_field_graph(self) -> bool:
+        """Whether `field_solver` runs the field alone, and not all of the decoder."""
+        return FIELD in self.bundle.files
+
+    def decode(
+        self, pair: FramePair, levels: int = 256, table: SamplingTable | None = None, pilots: Pilots | None = None
+    ) -> DecodedPage:
+        """Decode a frame pair into symbols of `levels` levels.
+
+        Args:
+            pair: both frames.
+            levels: M, 2..256.
+            table: as for `infer`.
+            pilots: the known symbols of this page, where they differ from this device's pattern.
+
+        Raises:
+            FrameError, PageError, InvalidInputError: see `check`, `check_levels` and `infer`.
+        """
+        start = time.perf_counter()
+        check_levels(levels)
+        self.check(pair)
+        checked = time.perf_counter()
+        inference = self.infer(pair, table)
+        inferred = time.perf_counter()
+        page = self.post_process(inference, levels, pilots)
+        return replace(page, timings=Timings(checked - start, inferred - checked, time.perf_counter() - inferred))
+
+    def post_process(self, inference: Inference, levels: int, pilots: Pilots | None = None) -> DecodedPage:
+        """Piston, smooth phase error, trust and decision: all that is behind the graph, timings left at zero."""
+        known = pilots or self.pilots(levels)
+        reading = read_pilots(inference.p, known)
+        phase = remove_piston(inference.phase, reading.piston.angle_rad)
+        error = self.phase_refit.error(phase, inference.concentration, levels, known)
+        phase = remove_piston(phase, error)
+        concentration = inference.concentration * np.float32(reading.trust)
+        symbols, confidence = decide_with_confidence(phase, concentration, levels)
+        return DecodedPage(
+            symbols=symbols,
+            confidence=confidence,
+            concentration=concentration,
+            phase=phase,
+            levels=levels,
+            piston_rad=reading.piston.angle_rad,
+            pilot_coherence=reading.piston.coherence,
+            pilot_trust=reading.trust,
+            check=reading.check,
+            timings=Timings(0.0, 0.0, 0.0),
+            phase_error=error,
+        )
+
+    def _check_graph(self) -> None:
+        """Check names, types and shapes of the frames and of what the graph says of them."""
+        manifest, profile, subject = self.bundle.manifest, self.bundle.profile, f"{self.bundle.subject}: {DECODER}"
+        inputs = self.graph.inputs
+        if set(inputs) != {"in_phase", "quadrature"}:
+            raise BundleError(f"{subject}: inputs", sorted(inputs), "in_phase and quadrature")
+        for name, port in inputs.items():
+            if not port.admits(manifest.frame_dtype, profile.frame_shape):
+                expected = f"{manifest.frame_dtype} {profile.frame_shape}"
+                raise BundleError(f"{subject}: input {name}", f"{port.dtype} {port.shape}", expected)
+        outputs = {node.name: Port.of(node) for node in self.graph.session.get_outputs()}
+        shapes = {"p": (2, *profile.page_shape), "phase": profile.page_shape, "concentration": profile.page_shape}
+        for name, shape in shapes.items():
+            if name not in outputs or not outputs[name].admits("float32", shape):
+                got = f"{outputs[name].dtype} {outputs[name].shape}" if name in outputs else "nothing"
+                raise BundleError(f"{subject}: output {name}", got, f"float32 {shape}")
+        if manifest.residual_output is not None and manifest.residual_output not in outputs:
+            raise BundleError(f"{subject}: output {manifest.residual_output}", "nothing", "a scalar residual")
+
+    def _check_golden(self) -> None:
+        golden, subject = self.bundle.golden, f"{self.bundle.subject}: {GOLDEN}"
+        try:
+            self.check(golden.pair)
+            p = self.infer(golden.pair).p
+        except (BundleError, ProviderError, SurroundingsError):
+            raise
+        except Exception as error:  # onnxruntime's errors share no base class
+            raise short_resource(subject, error) or BundleError(subject, error, "a golden page that decodes") from None
+        if golden.p.shape != p.shape:
+            raise BundleError(f"{subject}: p", f"shape {golden.p.shape}", f"shape {p.shape}")
+        error_norm = float(np.linalg.norm(p - golden.p) / max(float(np.linalg.norm(golden.p)), 1e-30))
+        if not error_norm <= (tolerance := GOLDEN_TOLERANCE[self.bundle.manifest.precision]):
+            raise BundleError(
+                subject, f"an answer off by {error_norm:.3g} of its norm", f"the expected p within {tolerance:g}"
+            )

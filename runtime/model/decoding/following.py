@@ -1,0 +1,59 @@
+"""A decoder that follows its device's image from page to page, for who calls it from Python."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+from lightpage.calibration.sampling_table import SamplingTable
+from lightpage.page.pilots import Pilots
+from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.image_tracker import tracker_for
+from lightpage.runtime.model.decoding.page import DecodedPage
+from lightpage.runtime.model.decoding.tracking import NoTracker, Tracker
+from lightpage.runtime.model.execution.providers import ON_CPU, Provider
+
+
+class FollowingDecoder(Decoder):
+    """The decoder of a bundle that gives out no page that its pilots contradict, as the service does.
+
+    Pages of one device are decoded best in the order in which they were recorded. Where the image is lost, it is looked
+    for, so another order or another recording of the device costs time alone.
+
+    Args:
+        bundle, threads, provider: see `Decoder`.
+        tracking: whether the image is followed; else each page is decoded where calibration saw it.
+
+    Raises:
+        ProviderError, BundleError: see `Decoder`.
+    """
+
+    def __init__(
+        self, bundle: Bundle, threads: int | None = None, provider: Provider = ON_CPU, *, tracking: bool = True
+    ) -> None:
+        super().__init__(bundle, threads, provider=provider)
+        self._tracking = tracking
+
+    @cached_property
+    def tracker(self) -> Tracker:
+        """What follows the image."""
+        decoder = Decoder(self.bundle, self.threads, self.graph)
+        return tracker_for(decoder) if self._tracking else NoTracker(decoder)
+
+    def decode(
+        self, pair: FramePair, levels: int = 256, table: SamplingTable | None = None, pilots: Pilots | None = None
+    ) -> DecodedPage:
+        """Decode a frame pair into symbols of `levels` levels.
+
+        Args:
+            pair, levels, pilots: see `Decoder.decode`.
+            table: tensors for this page alone; then the image is not followed, and the page is given out in any case.
+
+        Raises:
+            UnconfirmedPageError: the page's pilots contradict what was decoded.
+            FrameError, PageError, InvalidInputError: see `Decoder.decode`.
+        """
+        if table is not None:
+            return super().decode(pair, levels, table, pilots)
+        return self.tracker.decode(pair, levels, pilots)

@@ -1,0 +1,224 @@
+"""Reads the image's drift from decoded phases: moved light is demodulated with the wrong phase, symbol by symbol.
+
+Drift is the vector (shift x, shift y, tilt x, tilt y): of the image on both cameras, camera pixels, and of the signal
+against the reference, radians at the right and lower edge of the page's image. A reference beam that stays where it is
+while the image moves over it shows as a tilt, for its wavefront is curved.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from lightpage.calibration.coherence import branch_shares
+from lightpage.calibration.interfaces import BRANCHES, Twin
+from lightpage.calibration.sampling_table import shifted, symbol_centres
+from lightpage.device.profile import Profile
+from lightpage.errors import BundleError, FrameError
+from lightpage.page.pilots import Pilots, read_pilots
+from lightpage.runtime.model.bundle.calibrated import calibration_of
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.page import Inference
+
+Real = NDArray[np.float64]
+
+SHIFT, TILT = slice(0, 2), slice(2, 4)
+"""Parts of a drift vector."""
+
+PROBE_PX = 0.25
+"""Half of the shift over which the sensitivity is read: linear there, and far above the arithmetic's noise."""
+
+SMOOTHING = 5
+"""Side of the median filter over the sensitivity, symbols: another page shows the same map to a few percent (their
+correlation rises from 0.95 to 0.995), and the zones' borders stay sharp."""
+
+LEAST_COHERENCE = 0.6
+"""Agreement of the pilots below which a page says nothing of drift: pilots that are not this page's give 0.2, a
+decoder that is lost hardly more."""
+
+SAFE_DEVIATIONS = 2.5
+"""A decision serves like a pilot where the nearest wrong one lies this many standard deviations away."""
+
+_CAP = 1500.0
+"""Largest concentration that counts as such: no symbol shall outvote the rest."""
+
+_OUTLIER = 3.0
+"""Residual in standard deviations from which a symbol's weight falls."""
+
+_MOST_OVER_CLAIM = 3.0
+"""Variance that decisions may leave over what pilots alone leave; decisions among too few levels leave far more."""
+
+_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A drift with what is known of it.
+
+    Attributes:
+        drift: [4], see the module.
+        covariance: [4, 4].
+        constant_rad: phase common to all symbols.
+        over_claim: variance of what the drift leaves of the phases over what their concentrations promise, at least 1.
+    """
+
+    drift: Real
+    covariance: Real
+    constant_rad: float
+    over_claim: float = 1.0
+
+    @property
+    def deviations(self) -> Real:
+        """Standard deviations, [4]."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def gained_nats(self, prior: Real) -> float:
+        """What fitting to a page gains by chance: the volume of drifts that `prior` [4, 4] allows over that left."""
+        return max(0.0, float(np.linalg.slogdet(prior)[1] - np.linalg.slogdet(self.covariance)[1]) / 2)
+
+
+class DriftModel:
+    """What drift does to decoded phases.
+
+    Args:
+        slopes: change of each symbol's decoded phase with the image's drift, [4, ny, nx], radians a unit of drift;
+            or the promise of it.
+    """
+
+    def __init__(self, slopes: Real | Future[Real]) -> None:
+        self._measured = slopes
+
+    @property
+    def slopes(self) -> Real:
+        """See the constructor; waits for it if it is still being measured."""
+        return self._measured.result() if isinstance(self._measured, Future) else self._measured
+
+    @classmethod
+    def of_decoder(cls, decoder: Decoder, twin: Twin) -> DriftModel:
+        """Measure the slopes on a thread of its own: a service is ready before that ends, and its first page waits.
+
+        Args:
+            decoder: of a bundle.
+            twin: of that bundle.
+
+        Raises:
+            CalibrationError: the bundle holds no calibration.
+        """
+        parameters = calibration_of(decoder.bundle).vector
+        thread = ThreadPoolExecutor(1, thread_name_prefix="lightpage-drift")
+        slopes = thread.submit(drift_slopes, decoder, twin, parameters)
+        thread.shutdown(wait=False)
+        return cls(slopes)
+
+    def phase_change(self, drift: Real) -> Real:
+        """What `drift` [4] adds to decoded phases [ny, nx], radians, first order."""
+        return np.asarray(np.tensordot(drift, self.slopes, 1))
+
+    def estimate(self, inference: Inference, levels: int, pilots: Pilots, prior: Real) -> Estimate | None:
+        """Drift that a page still shows, from its pilots and then from safe decisions too; None where pilots disagree.
+
+        The 54 pilots of a bench page show shift to 0.01 px per axis; with the safe decisions of 16 levels it is 0.005.
+
+        Args:
+            inference: what the graph says of the page.
+            levels: M.
+            pilots: its known symbols.
+            prior: covariance [4, 4] of the drift about zero before the page was seen.
+        """
+        concentration = inference.concentration.astype(np.float64)
+        phase = inference.phase - read_pilots(inference.p, pilots).piston.angle_rad
+        at = pilots.mask
+        residual, weight = _wrapped(phase[at] - pilots.phases), np.minimum(concentration[at], _CAP)
+        if not weight.sum() > 0 or abs(np.sum(weight * np.exp(1j * residual))) < LEAST_COHERENCE * weight.sum():
+            return None
+        coarse = _solve(residual, self.slopes[:, at], weight, prior)
+        if coarse is None:
+            return None
+        concentration /= coarse.over_claim
+        freed = phase - coarse.constant_rad - self.phase_change(coarse.drift)
+        step = 2 * np.pi / levels
+        safe = SAFE_DEVIATIONS / np.sqrt(np.maximum(concentration, 1e-9)) < np.pi / levels
+        decided = np.rint(freed / step) * step
+        decided[at] = pilots.phases
+        chosen = safe | at
+        weight = np.minimum(concentration[chosen], _CAP)
+        fine = _solve(_wrapped(phase - decided)[chosen], self.slopes[:, chosen], weight, prior)
+        # a page of more levels than it is read with is decided wrongly throughout
+        return coarse if fine is None or fine.over_claim > _MOST_OVER_CLAIM else fine
+
+
+def drift_slopes(decoder: Decoder, twin: Twin, parameters: Real) -> Real:
+    """Change of each symbol's decoded phase with drift, [4, ny, nx], radians a unit of drift.
+
+    What shift does shows on the golden page, with four runs of the graph; what tilt does follows from the twin.
+
+    Args:
+        decoder: of a bundle.
+        twin, parameters: of its device.
+
+    Raises:
+        BundleError: the golden page is refused when its image is looked for a little off its place.
+    """
+    registration = decoder.graph.value("registration")
+    pair, profile = decoder.bundle.golden.pair, decoder.bundle.profile
+
+    def phase(shift_px: Real) -> NDArray[np.float32]:
+        try:
+            return decoder.infer(pair, {"registration": shifted(registration, shift_px)}).phase
+        except FrameError as error:
+            subject = f"{decoder.bundle.subject}: golden page, moved by {PROBE_PX} px"
+            raise BundleError(subject, error.got, error.expected) from None
+
+    moved = [[phase(sign * PROBE_PX * axis) for sign in (1, -1)] for axis in np.eye(2)]
+    by_table = [np.angle(np.exp(1j * (plus - minus))) / (2 * PROBE_PX) for plus, minus in moved]
+    by_shift = [-scipy.ndimage.median_filter(slope, SMOOTHING).astype(np.float64) for slope in by_table]
+    return np.stack([*by_shift, *tilt_slopes(twin, parameters, profile)])
+
+
+def tilt_slopes(twin: Twin, parameters: Real, profile: Profile) -> Real:
+    """Change of each symbol's decoded phase with a tilt of the signal against the reference, [2, ny, nx].
+
+    A tilt adds phase where light lands, and a symbol's light lands in one place along each branch: their mean, weighted
+    by the power that goes there.
+
+    Args:
+        twin, parameters: the device.
+        profile: the nominal device.
+    """
+    rays = twin.trace(parameters, symbol_centres(profile))
+    power = branch_shares(rays.positions, BRANCHES) ** 2
+    middle = np.sum(power[..., None] * rays.places, axis=0) / np.maximum(power.sum(axis=0), 1e-12)[:, None]
+    edges = np.array([profile.page_width_m, profile.page_height_m]) / 2
+    return np.asarray((middle / edges).T.reshape(2, *profile.page_shape))
+
+
+def _solve(residual: Real, slopes: Real, weight: Real, prior: Real) -> Estimate | None:
+    """Robust weighted least squares of residual = constant + slopes . drift; weights are inverse variances."""
+    columns = np.concatenate([np.ones((1, len(residual))), slopes]).T
+    precision = np.zeros((5, 5))
+    precision[1:, 1:] = np.linalg.inv(prior)
+    trusted: Real = weight
+    off: Real = residual
+    solution: Real = np.zeros(5)
+    for _ in range(_ROUNDS):
+        # a network that is too sure of itself shows in the residual
+        excess = max(1.0, float(np.sum(trusted * off**2) / len(off))) if solution.any() else 1.0
+        normal = columns.T @ (columns * trusted[:, None]) / excess + precision
+        if not np.isfinite(normal).all():
+            return None
+        solution = np.asarray(
+            np.linalg.solve(normal, columns.T @ (trusted * (off + columns @ solution)) / excess), np.float64
+        )
+        off = _wrapped(residual - columns @ solution)
+        trusted = weight / (1 + off**2 * weight / _OUTLIER**2)
+    excess = max(1.0, float(np.sum(trusted * off**2) / len(off)))
+    covariance: Real = np.linalg.inv(columns.T @ (columns * trusted[:, None]) / excess + precision).astype(np.float64)
+    return Estimate(solution[1:], covariance[1:, 1:], float(solution[0]), excess)
+
+
+def _wrapped(angle: Real) -> Real:
+    return np.asarray(angle - 2 * np.pi * np.rint(angle / (2 * np.pi)))

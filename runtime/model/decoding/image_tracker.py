@@ -1,0 +1,442 @@
+"""Follows the image from page to page, and finds it again where it was lost."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.calibration.image_search import FEWEST_SEARCHED, FoundImage
+from lightpage.calibration.sampling_table import SamplingTable
+from lightpage.page.pilots import PilotCheck, Pilots, read_pilots
+from lightpage.page.symbols import check_levels
+from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.drift_tables import BundleTables, DriftTables
+from lightpage.runtime.model.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate
+from lightpage.runtime.model.decoding.image_position import ImagePosition
+from lightpage.runtime.model.decoding.image_search import BundleSearch, PageSearch
+from lightpage.runtime.model.decoding.page import DecodedPage, Inference, Timings
+from lightpage.runtime.model.decoding.tracking import NoTracker, Tracker, TrackerMemory, confirmed
+from lightpage.runtime.model.execution.twin import TWIN_THREADS, OnnxTwin
+
+Real = NDArray[np.float64]
+
+_log = logging.getLogger(__name__)
+
+JUMP_PX = 0.06
+"""Shift of a page from which it is decoded again, where noise (0.01 px on a bench page) does not explain it. Phases put
+right to first order lose 0.03 bit here, and 0.17 at 0.15 px."""
+
+CORRECTIONS = 2
+"""Times that a page is decoded again where it shows that its image lies, before and after a search: each is good to a
+tenth of what is left."""
+
+WALK = np.array([0.02, 0.02, 0.001, 0.001])
+"""Standard deviation of the drift from one page to the next of a quiet device."""
+
+WALK_MEMORY = 0.2
+"""Weight of the last page in what is known of a device's walk: it is learnt within some five pages."""
+
+LARGEST_WALK_PX = 0.3
+"""A step beyond this says nothing of the walk."""
+
+WIDEST = np.array([3.0, 3.0, 0.03, 0.03])
+"""Standard deviation of a jump, as far as phases can show it."""
+
+SEARCHED_PX = 0.03
+"""Correction of a found image's place from which the page is decoded again: half a percent of the AIR is worth it."""
+
+SEARCH_ERROR_PX = 0.15
+"""Standard deviation of a found image's place, three times what it is on a bench page's 54 pilots."""
+
+TILT_PER_PX = 0.0007
+"""Standard deviation of the tilt that comes with a shift, beside what follows if the reference stays, radians a camera
+pixel: a tenth of what the most curved reference in the capture range gives."""
+
+START_TILT = 0.002
+"""Standard deviation of the tilt of a device that was not looked at for long, radians."""
+
+RETRACE_RAD = 0.015
+"""Tilt from which the table is traced again: branches of one symbol then differ by twice as much, which the network
+takes for noise; below, turning the decoded phases costs less than 0.02 bit."""
+
+SIGNIFICANT_DEVIATIONS = 4.0
+"""A shift of so many standard deviations is there, however large they are: the further off a page is, the less exactly
+it says by how much, until it has been decoded where it lies."""
+
+LARGEST_ERROR_PX = 0.15
+"""Standard deviation of the estimate, per axis, above which a page is left out unless its shift is significant."""
+
+NEARBY_PX = 0.3
+"""A search that ends so near to where the page was decoded has found nothing new."""
+
+WORSE = 0.9
+"""A later attempt at a page replaces an earlier one unless its pilots confirm less than this share of what they did."""
+
+DROP = 0.85
+"""A page is searched for where its pilots confirm less than this share of what they lately did, and the device is not
+sound. So a device that has changed for good is searched for once."""
+
+SHARE_MEMORY = 0.2
+"""Weight of the last page in the share that pilots lately confirmed."""
+
+FEWEST_PILOTS = 12
+"""Pilots of a page from which drift is read: four numbers can be fitted to fewer whatever they are."""
+
+
+@dataclass(frozen=True)
+class ImageState:
+    """What a page is decoded with.
+
+    Attributes:
+        drift: estimate since calibration, [4], see `lightpage.runtime.model.decoding.image_drift`.
+        covariance: of the drift of the next page about it, [4, 4].
+        decoder: whose table holds `traced_tilt` of it.
+        table: tensors that are fed for the page.
+        traced_tilt: [2].
+        walk: variance of the drift from one page to the next, as the last pages showed it, [4].
+        settled: whether a page was confirmed yet. Until then the image is looked for before anything is decoded.
+        jump_px: shift since the last page, (x, y), of which it is not known whether the reference has come along.
+        share: of the claimed information, what pilots lately confirmed; 1 before any page.
+    """
+
+    drift: Real
+    covariance: Real
+    decoder: Decoder
+    table: SamplingTable
+    traced_tilt: Real
+    walk: Real
+    settled: bool = False
+    jump_px: Real = field(default_factory=lambda: np.zeros(2))
+    share: float = 1.0
+
+    @property
+    def untraced(self) -> Real:
+        """Drift that the table does not hold, [4]."""
+        return np.concatenate([np.zeros(2), self.drift[TILT] - self.traced_tilt])
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """One decode of a page.
+
+    Attributes:
+        state: what it was decoded with.
+        after: what it shows of where the image lies.
+        inference: its phases freed from all that is known of drift by now.
+        check: what its pilots confirm.
+        prior: covariance of the drift before the page was read, [4, 4].
+        again: whether the image lies far enough from where it was looked at for another decode to pay.
+        step: drift as the page alone shows it, None where it does not.
+    """
+
+    state: ImageState
+    after: ImageState
+    inference: Inference
+    check: PilotCheck
+    prior: Real
+    again: bool = False
+    step: Estimate | None = None
+
+    @property
+    def correction_px(self) -> float:
+        """How far from where it was looked at the image is now taken to lie, along the worse axis."""
+        return float(np.abs(self.after.drift - self.state.drift)[SHIFT].max())
+
+
+class ImageTracker:
+    """Kalman filter of the image's drift, which walks from page to page, with a search where that is lost.
+
+    Args:
+        decoder: of the bundle as it is.
+        model: reads drift from decoded phases.
+        tables: applies it.
+        search: finds an image that was lost, None where the bundle cannot.
+        memory: what another tracker of this device has learnt, None to start anew.
+    """
+
+    def __init__(
+        self,
+        decoder: Decoder,
+        model: DriftModel,
+        tables: DriftTables,
+        search: PageSearch | None,
+        memory: TrackerMemory | None = None,
+    ) -> None:
+        self._decoder, self._model, self._tables, self._search = decoder, model, tables, search
+        start = np.diag([SEARCH_ERROR_PX, SEARCH_ERROR_PX, START_TILT, START_TILT]) ** 2
+        self._lock = threading.Lock()
+        """Guards the state; never held while anything is computed."""
+        self._state = ImageState(np.zeros(4), start, decoder, {}, np.zeros(2), WALK**2)
+        if memory is not None:
+            self._state = self._remembered(memory)
+
+    @property
+    def state(self) -> ImageState:
+        """What the next page is decoded with."""
+        with self._lock:
+            return self._state
+
+    @property
+    def image_px(self) -> tuple[float, float]:
+        """See `Tracker`."""
+        x, y = map(float, self.state.drift[SHIFT])
+        return x, y
+
+    def memory(self) -> TrackerMemory:
+        """See `Tracker`."""
+        state = self.state
+        numbers = {
+            "drift": state.drift,
+            "covariance": state.covariance,
+            "walk": state.walk,
+            "traced_tilt_rad": state.traced_tilt,
+            "jump_px": state.jump_px,
+        }
+        plain = {name: values.tolist() for name, values in numbers.items()}
+        return TrackerMemory.model_validate({**plain, "settled": state.settled, "share": state.share})
+
+    def _remembered(self, memory: TrackerMemory) -> ImageState:
+        """The state that another tracker was in."""
+        drift, traced = np.array(memory.drift), np.array(memory.traced_tilt_rad)
+        return ImageState(
+            drift=drift,
+            covariance=np.array(memory.covariance),
+            decoder=self._tables.traced(traced) if traced.any() else self._decoder,
+            table=self._tables.shifted(drift[SHIFT]),
+            traced_tilt=traced,
+            walk=np.array(memory.walk),
+            settled=memory.settled,
+            jump_px=np.array(memory.jump_px),
+            share=memory.share,
+        )
+
+    def anew(self) -> ImageTracker:
+        """See `Tracker`."""
+        return ImageTracker(self._decoder, self._model, self._tables, self._search)
+
+    def fork(self) -> ImageTracker:
+        """See `Tracker`."""
+        other = ImageTracker(self._decoder, self._model, self._tables, self._search)
+        other._state = self.state
+        return other
+
+    def refitted(self, decoder: Decoder) -> ImageTracker:
+        """See `Tracker`: what drift does to phases is taken to be as before."""
+        twin = OnnxTwin(decoder.bundle, TWIN_THREADS)
+        search = None if self._search is None else BundleSearch(decoder, twin)
+        return ImageTracker(decoder, self._model, BundleTables(decoder, twin), search)
+
+    def decode(self, pair: FramePair, levels: int, pilots: Pilots | None = None) -> DecodedPage:
+        """Decode a page where its image lies.
+
+        The image is looked for before anything is decoded at the start, and later where the pilots confirm too little.
+        What is learnt counts for the next page only where this one's pilots confirm it: a page that is not this
+        device's moves nothing.
+        """
+        _ = self._model.slopes  # of a new tracker still being measured; two inferences at once may not fit the memory
+        begun, clock = self.state, _Clock()
+        check_levels(levels)
+        self._decoder.check(pair)
+        pilots = pilots or self._decoder.pilots(levels)
+        clock.add("check_s")
+        state, found = begun, None
+        if not begun.settled and self._search is not None and len(pilots.phases) >= FEWEST_SEARCHED:
+            found = self._search.find(pair, pilots, self._around(begun))
+            state = self._moved_to(found, begun)
+            clock.add("search_s")
+        best = self._attempts(pair, state, levels, pilots, found, clock)
+        step = best.step if found is None else None
+        if found is None and self._search is not None and _search_may_pay(best.check, begun):
+            found = self._search.find(pair, pilots, self._around(begun))
+            moved = self._moved_to(found, best.after)
+            clock.add("search_s")
+            if moved is not best.after:
+                there = self._attempts(pair, moved, levels, pilots, found, clock)
+                if not _worse(there, best):
+                    best, step = there, None
+        page = self._decoder.post_process(best.inference, levels, pilots)
+        self._learn(begun, best, step, searched=found is not None)
+        clock.add("decision_s")
+        page = replace(page, check=best.check, image=_position(best.after, found), timings=clock.timings)
+        return confirmed(page, found)
+
+    def _attempts(
+        self,
+        pair: FramePair,
+        state: ImageState,
+        levels: int,
+        pilots: Pilots,
+        found: FoundImage | None,
+        clock: _Clock,
+    ) -> _Attempt:
+        """Decode at a place, and again where the page shows that its image lies: the best one, with the first step."""
+        enough = SEARCHED_PX if found is not None and found.found else np.inf
+        best: _Attempt | None = None
+        for _ in range(1 + CORRECTIONS):
+            inference = state.decoder.infer(pair, state.table)
+            clock.add("inference_s")
+            attempt = self._read(inference, state, levels, pilots)
+            clock.add("decision_s")
+            if best is not None and _worse(attempt, best):
+                break
+            best = attempt if best is None else replace(attempt, step=best.step)
+            if not attempt.again and attempt.correction_px <= enough:
+                break
+            # the same page once more: what it has taught already is no knowledge from before it
+            state, enough = replace(attempt.after, covariance=attempt.prior), np.inf
+        assert best is not None  # at least one attempt
+        return best
+
+    def _read(self, inference: Inference, state: ImageState, levels: int, pilots: Pilots) -> _Attempt:
+        """Take in what a decoded page shows of drift beyond what its state knows."""
+        known = inference.turned(-self._model.phase_change(state.untraced))
+        many = len(pilots.phases) >= FEWEST_PILOTS
+        step = self._model.estimate(known, levels, pilots, np.diag(WIDEST**2)) if many else None
+        unread = _Attempt(state, state, known, read_pilots(known.p, pilots).check, state.covariance)
+        if step is None:
+            return unread
+        shift, error = step.drift[SHIFT], step.deviations[SHIFT]
+        significant = bool(np.linalg.norm(shift / error) > SIGNIFICANT_DEVIATIONS)
+        if not (significant or error.max() <= LARGEST_ERROR_PX):
+            return unread
+        jumped = significant and bool(np.abs(shift).max() > JUMP_PX)
+        prior = _after_jump(state.covariance, shift) if jumped else state.covariance
+        # after a jump the pilots say whether the reference has come along
+        jump = state.jump_px + (shift if jumped else 0)
+        tilts = [np.zeros(2), self._tables.tilt_of(jump)] if np.any(jump) else [np.zeros(2)]
+        read = [self._freed(known, tilt, levels, pilots, prior) for tilt in tilts]
+        freed, drift, covariance, check = max(read, key=lambda each: each[3].confirmed_bits)
+        after = self._state_at(state.drift + drift, covariance, replace(state, jump_px=np.zeros(2)))
+        return _Attempt(state, after, freed, check, prior, jumped or after.decoder is not state.decoder, step)
+
+    def _freed(
+        self, known: Inference, tilt: Real, levels: int, pilots: Pilots, prior: Real
+    ) -> tuple[Inference, Real, Real, PilotCheck]:
+        """A page freed from a tilt and from what drift it shows then; all of that drift, its covariance, the check."""
+        guess = np.concatenate([np.zeros(2), tilt])
+        tilted = known.turned(-self._model.phase_change(guess)) if tilt.any() else known
+        rest = self._model.estimate(tilted, levels, pilots, prior)
+        if rest is None:
+            return tilted, guess, prior, read_pilots(tilted.p, pilots).check
+        freed = tilted.turned(-self._model.phase_change(rest.drift))
+        check = read_pilots(freed.p, pilots, rest.gained_nats(prior)).check
+        return freed, guess + rest.drift, rest.covariance, check
+
+    def _state_at(self, drift: Real, covariance: Real, like: ImageState) -> ImageState:
+        """The state of a drift: its shift in the table that is fed, its tilt traced where it is large and certain."""
+        away, error = np.abs(drift[TILT] - like.traced_tilt), np.sqrt(np.diag(covariance)[TILT])
+        decoder, traced = like.decoder, like.traced_tilt
+        if np.any((away > RETRACE_RAD) & (away > SIGNIFICANT_DEVIATIONS * error)):
+            decoder, traced = self._tables.traced(drift[TILT]), drift[TILT].copy()
+        return replace(
+            like,
+            drift=drift,
+            covariance=covariance,
+            decoder=decoder,
+            table=self._tables.shifted(drift[SHIFT]),
+            traced_tilt=traced,
+        )
+
+    def _moved_to(self, found: FoundImage, state: ImageState) -> ImageState:
+        """The state where the image was found; the same one where that is nothing new."""
+        away = found.shift_px - state.drift[SHIFT]
+        if not found.found or np.abs(away).max() < NEARBY_PX:
+            return state
+        tilt = START_TILT + TILT_PER_PX * float(np.linalg.norm(away))
+        covariance = np.diag([SEARCH_ERROR_PX, SEARCH_ERROR_PX, tilt, tilt]) ** 2
+        moved = replace(state, jump_px=state.jump_px + away)
+        return self._state_at(np.concatenate([found.shift_px, state.drift[TILT]]), covariance, moved)
+
+    def _learn(self, begun: ImageState, best: _Attempt, step: Estimate | None, *, searched: bool) -> None:
+        """Keep what a page showed for the next one, unless another page has been learnt from in the meantime.
+
+        Args:
+            begun: what the page began with.
+            best: the attempt that counts.
+            step: drift from where the image was expected, None where that says nothing of the walk.
+            searched: whether the image was looked for.
+        """
+        after = begun
+        if best.check.confirmed:
+            walk = begun.walk if step is None else _walked(begun.walk, step)
+            share = min(1.0, best.check.share)
+            lately = share if searched else begun.share + SHARE_MEMORY * (share - begun.share)
+            after = replace(best.after, settled=True, walk=walk, share=lately)
+        after = replace(after, covariance=after.covariance + np.diag(after.walk))
+        with self._lock:
+            if self._state is begun:
+                self._state = after
+
+    @staticmethod
+    def _around(state: ImageState) -> Real:
+        """Where to look: where calibration saw the image, and where it was last."""
+        last = state.drift[SHIFT]
+        return np.stack([np.zeros(2), last]) if np.abs(last).max() > NEARBY_PX else np.zeros((1, 2))
+
+
+def tracker_for(decoder: Decoder, memory: TrackerMemory | None = None) -> Tracker:
+    """The tracker that a bundle's decoder is run with, in service and in evaluation.
+
+    Args:
+        decoder: of the bundle.
+        memory: what another tracker of the same bundle has learnt, None to start anew.
+
+    Raises:
+        BundleError, CalibrationError: see `DriftModel.of_decoder`.
+    """
+    if "registration" not in decoder.graph.ports:
+        return NoTracker(decoder)
+    twin, search = OnnxTwin(decoder.bundle, TWIN_THREADS), None
+    if decoder.has_field_graph:
+        search = BundleSearch(decoder, twin)
+    else:
+        _log.warning("%s: no field graph, so an image that is lost is not looked for", decoder.bundle.subject)
+    return ImageTracker(decoder, DriftModel.of_decoder(decoder, twin), BundleTables(decoder, twin), search, memory)
+
+
+def _search_may_pay(check: PilotCheck, begun: ImageState) -> bool:
+    """Whether the pilots disagree, or confirm much less than they lately did, and are not only too few."""
+    return not check.agrees or (not check.sound and check.share < DROP * begun.share)
+
+
+def _walked(walk: Real, step: Estimate) -> Real:
+    """What is known of the walk, variances [4], after a page that has moved by `step`."""
+    quiet, last = WALK**2, np.maximum(step.drift**2 - np.diag(step.covariance), 0)
+    slow = np.abs(step.drift) <= LARGEST_WALK_PX
+    slow[TILT] = False  # a page shows too little of it
+    return np.asarray(np.where(slow, np.maximum(quiet, walk + WALK_MEMORY * (last - walk)), walk))
+
+
+def _after_jump(covariance: Real, shift_px: Real) -> Real:
+    """Covariance [4, 4] of the drift after a jump: the shift may be anything, and its tilt comes with it."""
+    tilt = covariance[TILT, TILT] + np.eye(2) * (TILT_PER_PX * float(np.linalg.norm(shift_px))) ** 2
+    return np.block([[np.diag(WIDEST[SHIFT] ** 2), np.zeros((2, 2))], [np.zeros((2, 2)), tilt]])
+
+
+def _worse(attempt: _Attempt, earlier: _Attempt) -> bool:
+    return attempt.check.confirmed_bits < WORSE * earlier.check.confirmed_bits
+
+
+def _position(state: ImageState, found: FoundImage | None) -> ImagePosition:
+    x, y, tilt_x, tilt_y = map(float, state.drift)
+    return ImagePosition(x, y, tilt_x, tilt_y, found is not None, found is not None and found.found)
+
+
+class _Clock:
+    """Adds up how long the parts of a page take."""
+
+    def __init__(self) -> None:
+        self._last = time.perf_counter()
+        self.timings = Timings(0.0, 0.0, 0.0)
+
+    def add(self, part: str) -> None:
+        """Count the time since the last call as one of `Timings`' parts."""
+        now = time.perf_counter()
+        self.timings = replace(self.timings, **{part: getattr(self.timings, part) + now - self._last})
+        self._last = now

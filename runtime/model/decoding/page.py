@@ -1,0 +1,85 @@
+"""What a page becomes on its way through the decoder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.page.pilots import PilotCheck
+from lightpage.runtime.model.decoding.image_position import ImagePosition
+
+
+@dataclass(frozen=True)
+class Inference:
+    """What the graph says of a page: p float32 [2, ny, nx], its angle and its length [ny, nx]; piston still in it.
+
+    `residual` is the power that is left of the homodyne equations over the field's, zero where the graph tells none.
+    """
+
+    p: NDArray[np.float32]
+    phase: NDArray[np.float32]
+    concentration: NDArray[np.float32]
+    residual: float = 0.0
+
+    def turned(self, by: NDArray[np.floating]) -> Inference:
+        """The same with `by` (radians [ny, nx]) added to the phases."""
+        phase = (self.phase + by).astype(np.float32)
+        p = self.concentration * np.stack([np.cos(phase), np.sin(phase)])
+        return Inference(p, phase, self.concentration, self.residual)
+
+
+@dataclass(frozen=True)
+class Timings:
+    """Wall-clock seconds of one page, every attempt at it counted.
+
+    Attributes:
+        check_s: checks of the frames.
+        inference_s: runs of the graph.
+        decision_s: piston, tracking and decision.
+        search_s: looking for the image.
+    """
+
+    check_s: float
+    inference_s: float
+    decision_s: float
+    search_s: float = 0.0
+
+    @property
+    def total_s(self) -> float:
+        """All of it."""
+        return self.check_s + self.inference_s + self.decision_s + self.search_s
+
+
+@dataclass(frozen=True)
+class DecodedPage:
+    """A page of symbols with what is known about each.
+
+    Attributes:
+        symbols: uint8 [ny, nx], 0..levels-1.
+        confidence: float32 [ny, nx], posterior probability of each symbol among the levels.
+        concentration: float32 [ny, nx], von Mises kappa as far as the pilots bear it out.
+        phase: float32 [ny, nx], radians, piston removed.
+        levels: M.
+        piston_rad: what was removed.
+        pilot_coherence: how far the pilots agree on it, 0..1.
+        pilot_trust: share of the network's claimed concentration that they bear out, 0..1; low after a drift.
+        check: information that is claimed of the pilots, and what of it they confirm.
+        timings: seconds.
+        phase_error: float32 [ny, nx], smooth error that was taken off `phase`, radians.
+        image: where the image lies as this page shows it, None where it is not followed.
+    """
+
+    symbols: NDArray[np.uint8]
+    confidence: NDArray[np.float32]
+    concentration: NDArray[np.float32]
+    phase: NDArray[np.float32]
+    levels: int
+    piston_rad: float
+    pilot_coherence: float
+    pilot_trust: float
+    check: PilotCheck
+    timings: Timings
+    phase_error: NDArray[np.float32]
+    image: ImagePosition | None = None

@@ -1,0 +1,250 @@
+"""The only importer of onnxruntime: telemetry is off before it loads, and sessions are opened in one way."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+# onnxruntime reads this once, on import, and would otherwise send usage data from 1.29 on.
+os.environ["ORT_DISABLE_TELEMETRY"] = "1"
+
+import onnxruntime  # type: ignore[import-untyped]
+
+from lightpage.errors import BundleError, ProviderError
+from lightpage.failures import short_resource
+from lightpage.runtime.model.execution.cpus import available_cpus
+from lightpage.runtime.model.execution.providers import ON_CPU, Provider
+
+
+class Node(Protocol):
+    """An input or output of a graph; `shape` holds a name or None for a free dimension."""
+
+    name: str
+    type: str
+    shape: Sequence[int | str | None]
+
+
+_TYPES = {
+    "tensor(float)": "float32",
+    "tensor(float16)": "float16",
+    "tensor(double)": "float64",
+    "tensor(int32)": "int32",
+    "tensor(int64)": "int64",
+    "tensor(uint8)": "uint8",
+    "tensor(uint16)": "uint16",
+}
+
+
+@dataclass(frozen=True)
+class Port:
+    """Numpy type and shape of a graph's input or output; None stands for a free dimension."""
+
+    dtype: str
+    shape: tuple[int | None, ...]
+
+    @classmethod
+    def of(cls, node: Node) -> Port:
+        """As a session describes it."""
+        shape = tuple(size if isinstance(size, int) else None for size in node.shape)
+        return cls(_TYPES.get(node.type, node.type), shape)
+
+    def admits(self, dtype: str, shape: tuple[int, ...]) -> bool:
+        """Whether an array of this type and shape fits."""
+        return (
+            self.dtype == dtype
+            and len(self.shape) == len(shape)
+            and all(own in (None, other) for own, other in zip(self.shape, shape, strict=True))
+        )
+
+
+class Session(Protocol):
+    """The part of onnxruntime's session that Lightpage uses; `run` may be called from many threads at once."""
+
+    def get_inputs(self) -> Sequence[Node]:
+        """Inputs that must be fed."""
+
+    def get_outputs(self) -> Sequence[Node]:
+        """Outputs."""
+
+    def run(self, output_names: Sequence[str], input_feed: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
+        """Outputs of the names asked for."""
+
+    def io_binding(self) -> Any:
+        """Where one run takes its inputs from and puts its outputs, see `BoundSession`."""
+
+    def run_with_iobinding(self, iobinding: Any) -> None:
+        """One run of what is bound."""
+
+    def get_providers(self) -> Sequence[str]:
+        """Execution providers that it was opened with, the preferred one first."""
+
+    def end_profiling(self) -> str:
+        """Path of the profile, where one is kept, with all runs so far."""
+
+
+VERSION: str = onnxruntime.__version__
+_USABLE = "a GPU of that number with room for the model, its driver and its libraries"
+_VERSION_DIGITS = 16
+_FATAL_ONLY = 4
+_NOWHERE = os.path.join(os.sep, "nonexistent", "lightpage")
+
+
+def open_session(
+    model: bytes,
+    subject: str,
+    threads: int | None = None,
+    *,
+    once: bool = False,
+    profile: Path | None = None,
+    provider: Provider = ON_CPU,
+) -> Session:
+    """Open an ONNX model held in memory.
+
+    Args:
+        model: the serialised model; weights in other files are not looked for.
+        subject: what it is, for the error, e.g. ``"bundle B: decoder.onnx"``.
+        threads: threads for one run on the CPU; by default as many as this process has cores.
+        once: whether it will run a single time: then it is not worth while to prepare much.
+        profile: beginning of the path of a file in which the runtime notes how long each node takes.
+        provider: what it runs on.
+
+    Raises:
+        BundleError: the bytes are no ONNX model that this onnxruntime can run.
+        ProviderError: there is no such provider here.
+        SurroundingsError: memory or threads are short.
+    """
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = available_cpus() if threads is None else threads
+    options.inter_op_num_threads = 1
+    options.log_severity_level = _FATAL_ONLY  # errors are raised
+    # Between two runs its threads would go on looking for work, on cores that receive frames and recalibrate meanwhile.
+    options.add_session_config_entry("session.force_spinning_stop", "1")
+    # A plan of its memory saves one run in forty of a page's time, and takes a quarter more of it.
+    options.enable_mem_pattern = False
+    if once:
+        options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+        options.enable_cpu_mem_arena = False
+    if profile is not None:
+        options.enable_profiling, options.profile_file_prefix = True, str(profile)
+    # A model that names an outside file for its weights must not read this machine's files.
+    options.add_session_config_entry("session.model_external_initializers_file_folder_path", _NOWHERE)
+    check_provider(provider)
+    if provider.memory != ON_CPU.memory:
+        os.environ.setdefault("NVIDIA_TF32_OVERRIDE", "0")  # TensorRT would round float32, and has no option against it
+        onnxruntime.preload_dlls()  # they may be packages of this environment, where no linker looks
+    version = sha256(model).hexdigest()[:_VERSION_DIGITS]
+    try:
+        # by default it would print the cause, and compute elsewhere
+        session: Session = onnxruntime.InferenceSession(
+            model, options, providers=provider.chain(version), enable_fallback=0
+        )
+    except Exception as error:  # onnxruntime's errors share no base class
+        if provider != ON_CPU:
+            raise _of_provider(provider, error) from None
+        got = short_resource(subject, error)
+        raise got or BundleError(subject, _cause(error), "an ONNX model of a Lightpage bundle") from None
+    if (found := session.get_providers()[0]) != provider.runtime_name:
+        raise ProviderError(f"provider {provider}", f"{found} in its place", _USABLE)
+    return session
+
+
+@contextmanager
+def running(subject: str, provider: Provider = ON_CPU) -> Iterator[None]:
+    """While a session runs: a short resource and a GPU's failures by name; other failures on the CPU are the graph's.
+
+    Raises:
+        ProviderError: a GPU failed, or has no room.
+        SurroundingsError: memory or threads are short.
+    """
+    try:
+        yield
+    except Exception as error:  # onnxruntime's errors share no base class
+        if provider != ON_CPU:
+            raise _of_provider(provider, error) from None
+        if (short := short_resource(subject, error)) is not None:
+            raise short from None
+        raise
+
+
+def _of_provider(provider: Provider, error: Exception) -> ProviderError:
+    return ProviderError(f"provider {provider}", _cause(error), _USABLE)
+
+
+def _cause(error: Exception) -> str:
+    """The first line of what onnxruntime says."""
+    return next(iter(str(error).splitlines()), type(error).__name__)
+
+
+def check_provider(provider: Provider) -> None:
+    """Check that this onnxruntime was built for a provider.
+
+    Raises:
+        ProviderError: it was not.
+    """
+    available = onnxruntime.get_available_providers()
+    if provider.runtime_name not in available:
+        raise ProviderError(
+            f"provider {provider}",
+            f"an onnxruntime with {', '.join(available)}",
+            "onnxruntime-gpu in place of onnxruntime (docs/gpu.md), or provider cpu",
+        )
+
+
+class BoundSession:
+    """A session and tensors that it is run with every time: they lie where it computes, and are not sent again.
+
+    It never changes; `run` may be called from many threads at once.
+
+    Args:
+        session: opened with this provider.
+        provider: what it runs on.
+        constants: by input.
+        subject: what it is, for errors.
+
+    Raises:
+        ProviderError: a GPU has no room for them.
+        SurroundingsError: memory is short.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        provider: Provider,
+        constants: Mapping[str, NDArray[Any]],
+        subject: str = "onnxruntime",
+    ) -> None:
+        self.session, self._subject, self._provider = session, subject, provider
+        with running(subject, provider):
+            self._constants = {
+                name: onnxruntime.OrtValue.ortvalue_from_numpy(
+                    np.asarray(value, order="C"), provider.memory, provider.device
+                )
+                for name, value in constants.items()
+            }
+
+    def run(self, outputs: Iterable[str], feeds: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
+        """Outputs of the names asked for; `feeds` holds the other inputs, and may stand in for constants.
+
+        Raises:
+            ProviderError: a GPU failed, or has no room.
+            SurroundingsError: memory or threads are short.
+        """
+        with running(self._subject, self._provider):
+            binding = self.session.io_binding()
+            for name, value in self._constants.items():
+                if name not in feeds:
+                    binding.bind_ortvalue_input(name, value)
+            for name, array in feeds.items():
+                binding.bind_cpu_input(name, np.asarray(array, order="C"))
+            for name in outputs:
+                binding.bind_output(name, "cpu")
+            self.session.run_with_iobinding(binding)
+            return [np.asarray(value) for value in binding.copy_outputs_to_cpu()]

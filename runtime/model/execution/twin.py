@@ -1,0 +1,74 @@
+"""The exported twin: the device's geometry as an ONNX function from parameters to places, phases and pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.calibration.interfaces import Rays
+from lightpage.calibration.parameters import NAMES
+from lightpage.errors import BundleError
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.bundle.manifest import TWIN
+from lightpage.runtime.model.execution.session import open_session, running
+
+Real = NDArray[np.float64]
+
+INPUTS = {"parameters": 1, "points": 2, "anchors": 2, "camera_places": 2}
+"""Inputs of the graph, all float64, with their number of axes."""
+TWIN_THREADS = 1
+"""For few points at a time, where a second thread would only spin."""
+OUTPUTS = ("places", "phases", "positions", "pixels")
+
+
+class OnnxTwin:
+    """twin.onnx of a bundle behind the interface that registration takes (`lightpage.calibration.interfaces.Twin`).
+
+    Args:
+        bundle: an opened bundle.
+        threads: threads of one run; by default the cores that this process may use.
+
+    Raises:
+        BundleError: the graph is no twin with the parameters of `lightpage.calibration.parameters`.
+    """
+
+    def __init__(self, bundle: Bundle, threads: int | None = None) -> None:
+        self._subject = subject = f"{bundle.subject}: {TWIN}"
+        self._session = open_session(bundle.files[TWIN], subject, threads)
+        inputs = self._session.get_inputs()
+        found = {node.name: (node.type, len(node.shape)) for node in inputs}
+        if found != (expected := {name: ("tensor(double)", axes) for name, axes in INPUTS.items()}):
+            raise BundleError(f"{subject}: inputs", found, expected)
+        size = next(node.shape for node in inputs if node.name == "parameters")[0]
+        if isinstance(size, int) and size != len(NAMES):
+            raise BundleError(f"{subject}: parameters", size, f"{len(NAMES)}: {', '.join(NAMES)}")
+        if missing := set(OUTPUTS) - {node.name for node in self._session.get_outputs()}:
+            raise BundleError(f"{subject}: outputs", f"no {', '.join(sorted(missing))}", ", ".join(OUTPUTS))
+
+    def trace(self, parameters: Real, points: Real, anchors: Real | None = None) -> Rays:
+        """See `lightpage.calibration.interfaces.Twin`."""
+        if parameters.ndim == 2:
+            rays = [self.trace(one, points, anchors) for one in parameters]
+            return Rays(*(np.stack(part) for part in zip(*rays, strict=True)))
+        feeds = {
+            "parameters": _doubles(parameters),
+            "points": _doubles(points),
+            "anchors": _doubles(points if anchors is None else anchors),
+            "camera_places": _doubles(points[:1]),
+        }
+        with running(self._subject):
+            return Rays(*self._session.run(OUTPUTS[:3], feeds))
+
+    def pixels(self, parameters: Real, places: Real) -> Real:
+        """See `lightpage.calibration.interfaces.Twin`."""
+        if parameters.ndim == 2:
+            return np.stack([self.pixels(one, places) for one in parameters])
+        one = _doubles(places[:1])
+        feeds = {"parameters": _doubles(parameters), "points": one, "anchors": one, "camera_places": _doubles(places)}
+        with running(self._subject):
+            pixels: Real = self._session.run(OUTPUTS[3:], feeds)[0]
+        return pixels
+
+
+def _doubles(values: Real) -> Real:
+    return np.ascontiguousarray(values, np.float64)

@@ -1,0 +1,1 @@
+"""What the device shows: pages that a controller uploads, the display that it watches, and shutters."""

@@ -1,0 +1,201 @@
+"""Recalibrates the model in service by itself when the monitor says that it is due."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self
+
+from lightpage.clock import SYSTEM, Clock
+from lightpage.errors import (
+    BusyError,
+    CallerLeft,
+    InvalidInputError,
+    LightpageError,
+    LimitError,
+    RecalibrationRefusedError,
+    StoppingError,
+)
+from lightpage.runtime.recalibration.known_pages import MIN_PAGES
+from lightpage.runtime.recalibration.outcome import RecalibrationOutcome
+from lightpage.runtime.service.caller import Actor, Caller
+from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.jobs.recalibrator import Recalibrator
+from lightpage.runtime.service.monitoring.monitor import Monitor
+
+_log = logging.getLogger(__name__)
+
+WORTH_BITS = 0.02
+"""Information a symbol that a recalibration must bring for the next one to come as soon. Those of a simulated week of a
+bench device bring 0.03 and more. One that brings less cures nothing that the monitor complains of."""
+
+
+@dataclass(frozen=True)
+class SelfCalibrationSettings:
+    """When and with what a service recalibrates itself.
+
+    Attributes:
+        pages: fully known pages of the source; where there are none, the next two that it shows.
+        least_s: shortest time between two recalibrations, seconds: a device that drifts faster needs a mechanic.
+        longest_s: to which that time is doubled by one refusal or failure after another, or by recalibrations that
+            bring next to nothing. What was refused once will hardly be better a minute later, and each try costs reads
+            a few pages' time.
+        busy_s: time after which it is looked again whether a recalibration that somebody else runs has ended.
+    """
+
+    pages: tuple[int, ...] = ()
+    least_s: float = 60.0
+    longest_s: float = 3600.0
+    busy_s: float = 5.0
+
+    def __post_init__(self) -> None:
+        """Check the pages.
+
+        Raises:
+            InvalidInputError: one page alone, or the same one twice.
+        """
+        if self.pages and (len(self.pages) < MIN_PAGES or len(set(self.pages)) < len(self.pages)):
+            expected = f"at least {MIN_PAGES} that differ: one to fit, one to judge by"
+            raise InvalidInputError("calibration pages", ", ".join(map(str, self.pages)), expected)
+
+
+class SelfCalibration:
+    """A thread that recalibrates when the monitor says so; to be used in a `with` statement, or started and stopped.
+
+    A recalibration that is refused or fails changes nothing, and no request fails because of one. Its pages are
+    photographed between those that are read.
+
+    Args:
+        plane: of the service.
+        monitor: says when it is due.
+        recalibrator: of the service.
+        settings: when and with what.
+        clock: by which it waits.
+    """
+
+    def __init__(
+        self,
+        plane: DataPlane,
+        monitor: Monitor,
+        recalibrator: Recalibrator,
+        settings: SelfCalibrationSettings | None = None,
+        clock: Clock = SYSTEM,
+    ) -> None:
+        self._plane, self._monitor, self._recalibrator = plane, monitor, recalibrator
+        self._settings, self._clock = settings or SelfCalibrationSettings(), clock
+        if (count := len(self._settings.pages)) > (most := plane.limits.recalibration_pages):
+            raise LimitError("calibration pages", count, f"at most {most}")
+        _check_pages(plane, self._settings.pages)
+        self._interval_s, self._not_before = self._settings.least_s, -float("inf")
+        self._wake, self._stopping = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._run, name="lightpage-self-calibration", daemon=True)
+        self._caller = Caller(actor=Actor("self-calibration"))
+        self._pinned = False
+        """Whether it was said that the model in service is pinned."""
+        monitor.listen(self._wake.set)
+
+    def start(self) -> Self:
+        """Begin to wait for the monitor."""
+        self._thread.start()
+        return self
+
+    def stop(self, wait_s: float | None = None) -> None:
+        """Drop a recalibration that runs, and end the thread, which is waited for at most `wait_s`, as calls are."""
+        wait_s = self._plane.limits.grace_s if wait_s is None else wait_s
+        self._stopping.set()
+        self._caller.leave()
+        self._wake.set()
+        self._thread.join(wait_s)
+        if self._thread.is_alive():
+            _log.warning("self-calibration: not stopped after %.1f s, left to itself", wait_s)
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def _run(self) -> None:
+        while True:
+            self._clock.wait(self._wake, self._pause_s())
+            self._wake.clear()
+            if self._stopping.is_set():
+                return
+            self.look()
+
+    def look(self) -> None:
+        """Recalibrate if the monitor says that it is due, and the last time was long enough ago."""
+        if self._monitor.due and self._clock.now() >= self._not_before:
+            self._try_once()
+
+    def _pause_s(self) -> float:
+        """How long to sleep where nobody wakes: until it is looked again where a try is due, else for ever."""
+        left = max(0.0, self._not_before - self._clock.now())
+        return min(left, self._settings.busy_s) if self._monitor.due else threading.TIMEOUT_MAX
+
+    def _try_once(self) -> None:
+        """Recalibrate, and decide when the next time may be; not while the model in service is pinned."""
+        if self._plane.models.current_pinned:
+            if not self._pinned:
+                _log.info("self-calibration: put off, since the model in service is pinned")
+            self._pinned = True
+            self._wait(self._settings.busy_s)
+            return
+        self._pinned = False
+        reasons = "; ".join(self._monitor.state().reasons) or "the monitor says so"
+        _log.info("self-calibration: begins, since %s", reasons)
+        try:
+            outcome = self._recalibrated()
+        except (CallerLeft, StoppingError):
+            _log.info("self-calibration: dropped, the service stops")
+            self._wait(self._settings.busy_s)
+        except BusyError as error:
+            _log.info("self-calibration: put off by %.0f s: %s", self._settings.busy_s, error)
+            self._wait(self._settings.busy_s)
+        except Exception as error:
+            self._back_off(error)
+        else:
+            cured = outcome.air_after - outcome.air_before >= WORTH_BITS
+            least_s, longest_s = self._settings.least_s, self._settings.longest_s
+            self._interval_s = least_s if cured else min(2 * self._interval_s, longest_s)
+            self._wait(self._interval_s)
+            _log.info(
+                "self-calibration: %s in service after %.1f s, %.3f instead of %.3f bit a symbol",
+                outcome.version,
+                outcome.seconds,
+                outcome.air_after,
+                outcome.air_before,
+            )
+
+    def _recalibrated(self) -> RecalibrationOutcome:
+        pages = self._settings.pages
+        *_, last = self._recalibrator.from_source(len(pages) or MIN_PAGES, pages, self._caller)
+        assert isinstance(last, RecalibrationOutcome)  # the last thing that it tells
+        return last
+
+    def _back_off(self, error: Exception) -> None:
+        self._interval_s = min(2 * self._interval_s, self._settings.longest_s)
+        self._wait(self._interval_s)
+        end = "refused" if isinstance(error, RecalibrationRefusedError) else "failed"
+        unforeseen = None if isinstance(error, LightpageError) else error
+        _log.warning("self-calibration: %s, next in %.0f s: %s", end, self._interval_s, error, exc_info=unforeseen)
+
+    def _wait(self, seconds: float) -> None:
+        self._not_before = self._clock.now() + seconds
+
+
+def _check_pages(plane: DataPlane, pages: Sequence[int]) -> None:
+    """See that a source that is given no more pages has these.
+
+    Raises:
+        InvalidInputError: it has not.
+    """
+    count = plane.source.page_count() if pages and plane.has_source and plane.source.pages is None else None
+    if count is not None and max(pages) >= count:
+        expected = f"pages of {plane.source.name}, which has 0..{count - 1}"
+        raise InvalidInputError("calibration pages", max(pages), expected)

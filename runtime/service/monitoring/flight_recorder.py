@@ -1,0 +1,218 @@
+"""Keeps the frames of pages that went wrong, so that an engineer can look at them later: a bounded ring of files."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from lightpage.errors import LightpageError, Reason
+from lightpage.page.levels import MAX_LEVELS
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.layout import frame_type
+from lightpage.recording.writer import RecordingWriter
+from lightpage.runtime.service.limits import GRACE_S
+from lightpage.runtime.service.models.registry import Model, ModelRegistry
+from lightpage.runtime.service.monitoring.file_ring import FileRing
+from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
+from lightpage.runtime.service.monitoring.monitor import Monitor
+from lightpage.runtime.service.monitoring.observation import Observation
+
+_log = logging.getLogger(__name__)
+
+NOTE = "flight"
+"""Group of a kept page's recording whose attributes say why it was kept."""
+
+PAGES = 64
+"""Pages kept: those around a fault, and of some faults before it."""
+
+RING_BYTES = 1 << 30
+"""On disk: 64 pages of a bench device take 160 MB, 25 of a 20-megapixel device all of it."""
+
+_WAITING = 4
+"""Pages that wait for the disk; each lies in memory."""
+
+
+@dataclass(frozen=True)
+class FlightSettings:
+    """What is kept.
+
+    Attributes:
+        pages: files at most.
+        ring_bytes: of them all.
+        low_margin_bits: pages with less margin are kept, bits a symbol: one in ten thousand of a quiet bench device.
+        read_every_s: of pages that were read, with a low margin or while a recalibration is due, one is kept in this
+            time, seconds: more would push out the pages that show how it began.
+    """
+
+    pages: int = PAGES
+    ring_bytes: int = RING_BYTES
+    low_margin_bits: float = 0.05
+    read_every_s: float = 60.0
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """A page on its way to the disk, and the model that decoded it."""
+
+    observation: Observation
+    reason: str
+    detail: str
+    model: Model
+
+
+class FlightRecorder:
+    """Writes pages that went wrong to a folder, an `Observer`; to be used in a `with` statement.
+
+    Pages are written by a thread of its own. Whatever the disk does, no read waits for it.
+
+    Args:
+        folder: made if absent; what an earlier service kept there counts.
+        registry: the models, whose device the pages are of.
+        settings: what is kept.
+        monitor: says whether a recalibration is due, None for never.
+        metrics: what is counted.
+
+    Raises:
+        InvalidInputError: the folder cannot be made.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        registry: ModelRegistry,
+        settings: FlightSettings | None = None,
+        monitor: Monitor | None = None,
+        metrics: ServiceMetrics | None = None,
+    ) -> None:
+        self._registry, self._settings, self._monitor = registry, settings or FlightSettings(), monitor
+        self._metrics, self._ring = (
+            metrics or ServiceMetrics(),
+            FileRing(folder, self._settings.pages, self._settings.ring_bytes),
+        )
+        self._waiting: queue.Queue[_Kept | None] = queue.Queue(_WAITING)
+        self._lock = threading.Lock()
+        """Guards the time below."""
+        self._read_at = -float("inf")
+        self._well = True
+        self._thread = threading.Thread(target=self._write_all, name="lightpage-flight-recorder", daemon=True)
+
+    def start(self) -> Self:
+        """Begin to write."""
+        self._thread.start()
+        return self
+
+    def stop(self, wait_s: float = GRACE_S) -> None:
+        """Write what waits, and end the thread, which is waited for at most `wait_s`."""
+        try:
+            self._waiting.put(None, timeout=wait_s)
+        except queue.Full:
+            _log.warning("flight recorder: not stopped after %.1f s, left to itself", wait_s)
+            return
+        self._thread.join(wait_s)
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def observe(self, observation: Observation) -> None:
+        """See `Observer`."""
+        if observation.pair is None or (why := self._why(observation)) is None:
+            return
+        held = [model for model in self._registry.models if model.version == observation.model_version]
+        kept = _Kept(observation, *why, held[0] if held else self._registry.current)
+        try:
+            self._waiting.put_nowait(kept)
+        except queue.Full:
+            self._metrics.flight_pages.labels("dropped").inc()
+
+    def _why(self, seen: Observation) -> tuple[str, str] | None:
+        """A word and a sentence why a page is kept; None where it is not."""
+        if seen.lost is not None:
+            word = "FRAMES_DISAGREE" if seen.lost is Reason.UNSPECIFIED else seen.lost.value
+            return word, seen.detail
+        data = seen.user_data
+        if data is not None and data.loss is not None:
+            return f"{data.loss.value}_lost".upper(), f"{data.failed_blocks} of {data.blocks} blocks failed"
+        if data is not None and data.margin_bits < self._settings.low_margin_bits:
+            why = "LOW_MARGIN", f"margin {data.margin_bits:.4f} bit a symbol"
+        elif seen.of_device and self._monitor is not None and self._monitor.due:
+            why = "RECALIBRATION_DUE", "; ".join(self._monitor.state().reasons)
+        else:
+            return None
+        with self._lock:
+            if seen.time_s - self._read_at < self._settings.read_every_s:
+                return None
+            self._read_at = seen.time_s
+        return why
+
+    def _write_all(self) -> None:
+        while (kept := self._waiting.get()) is not None:
+            try:
+                self._ring.add(kept.observation.time_s, kept.reason, partial(_write, kept))
+            except Exception as error:
+                self._metrics.flight_pages.labels("failed").inc()
+                if self._well:
+                    unforeseen = None if isinstance(error, LightpageError | OSError) else error
+                    _log.warning("flight recorder: pages are not kept: %s", error, exc_info=unforeseen)
+                self._well = False
+            else:
+                self._metrics.flight_pages.labels("kept").inc()
+                if not self._well:
+                    _log.info("flight recorder: pages are kept again")
+                self._well = True
+
+
+def _write(kept: _Kept, path: Path) -> None:
+    """Write a page as a recording of its own, with the reference frames of the model that decoded it.
+
+    Raises:
+        RecordingError: it cannot be written, or is not of the model's device.
+        InvalidInputError: the model holds no reference frames.
+    """
+    seen, decoder = kept.observation, kept.model.decoder
+    assert seen.pair is not None  # pages without frames are not kept
+    bit_depth = decoder.bundle.manifest.camera_bit_depth
+    own = MAX_LEVELS if seen.page is None else seen.page.levels
+    levels = own if seen.levels is None else seen.levels
+    references = _counts(decoder.references, bit_depth)
+    with RecordingWriter(path, decoder.bundle.profile, levels, bit_depth, references, seen.pilot_mask) as writer:
+        writer.append(seen.symbols, seen.pair, infos=seen.infos)
+        writer.add_note(NOTE, _note(kept))
+
+
+def _note(kept: _Kept) -> dict[str, str | float]:
+    """Why a page was kept, and what is known of it."""
+    seen = kept.observation
+    note: dict[str, str | float] = {
+        "reason": kept.reason,
+        "detail": kept.detail,
+        "subject": seen.subject,
+        "model_version": seen.model_version,
+        "time_s": seen.time_s,
+    }
+    if seen.page_index is not None:
+        note["page_index"] = seen.page_index
+    if seen.margin_bits is not None:
+        note["margin_bits"] = seen.margin_bits
+    if seen.page is not None:
+        note |= {"pilot_share": seen.page.check.share, "pilot_trust": seen.page.pilot_trust}
+    return note
+
+
+def _counts(frames: FramePair, bit_depth: int) -> FramePair:
+    """Frames of a table, which are floating-point numbers, as camera counts."""
+    most, kind = 2**bit_depth - 1, frame_type(bit_depth)
+    arrays = [np.clip(np.rint(frame), 0, most).astype(kind) for frame in (frames.in_phase, frames.quadrature)]
+    return FramePair(*arrays)

@@ -1,0 +1,188 @@
+"""Traces of calls for whoever collects them by OTLP: a span of each call, and within it one of each stage.
+
+OpenTelemetry is an extra, and is imported only where somebody has named an endpoint. Spans are made when a call has
+ended, from what was timed anyway; another thread sends them. Where nobody takes them, they are dropped.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import version as installed_version
+from typing import Any, Self
+from urllib.parse import urlsplit
+
+import grpc
+
+from lightpage.errors import InvalidInputError
+from lightpage.runtime.service.monitoring.logs import MOST_TEXT
+from lightpage.runtime.service.monitoring.stages import Lap, Stages
+
+MOST_PAGES = 64
+"""Pages of a call that have spans, the first ones: a range may have thousands."""
+_QUEUED_SPANS = 2048
+"""Spans that wait to be sent, a few kB each, since texts of a caller are cut; further ones are dropped."""
+_SEND_S = 5.0
+"""For a batch of spans, tries again included."""
+_END_S = 1.0
+"""At a stop, for what waits to be sent."""
+_FAULTS = frozenset(
+    [
+        grpc.StatusCode.UNKNOWN,
+        grpc.StatusCode.DEADLINE_EXCEEDED,
+        grpc.StatusCode.UNIMPLEMENTED,
+        grpc.StatusCode.INTERNAL,
+        grpc.StatusCode.UNAVAILABLE,
+        grpc.StatusCode.DATA_LOSS,
+    ]
+)
+"""Statuses that make a server's span an error, by OpenTelemetry's conventions for RPC."""
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class EndedCall:
+    """A call that has ended.
+
+    Attributes:
+        service, method: of gRPC.
+        peer: address that it came from.
+        correlation_id: the caller's own text.
+        code: its status.
+        reason: of an error, as callers read it, else empty.
+        begun, ended: `time.perf_counter` seconds.
+        pages: its pages, the first ones.
+        count: of all its pages.
+    """
+
+    service: str
+    method: str
+    peer: str
+    correlation_id: str
+    code: grpc.StatusCode
+    reason: str
+    begun: float
+    ended: float
+    pages: tuple[Stages, ...] = ()
+    count: int = 0
+
+
+class Traces:
+    """Sends spans to an endpoint until it is closed; use it in a `with` statement.
+
+    Args:
+        endpoint: http://HOST:PORT or https://HOST:PORT of a collector that takes OTLP over gRPC.
+        share: of the calls that are traced, 0..1. A caller that has decided for its own trace has decided for this too.
+
+    Raises:
+        InvalidInputError: the extra `traces` is not installed, or the endpoint is no such address.
+    """
+
+    def __init__(self, endpoint: str, share: float = 1.0) -> None:
+        try:
+            from opentelemetry.exporter.otlp.proto.grpc.trace_exporter import OTLPSpanExporter
+            from opentelemetry.sdk.resources import Resource
+            from opentelemetry.sdk.trace import TracerProvider
+            from opentelemetry.sdk.trace.export import BatchSpanProcessor
+            from opentelemetry.sdk.trace.sampling import ParentBased, TraceIdRatioBased
+            from opentelemetry.trace import SpanKind, Status, StatusCode, set_span_in_context
+            from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
+        except ImportError as error:
+            expected = "the extra `traces`: pip install 'lightpage[traces]'"
+            raise InvalidInputError("traces.endpoint", f"{endpoint}, but {error}", expected) from None
+        check_endpoint(endpoint)
+        version = installed_version("lightpage")
+        about = Resource.create({"service.name": "lightpage", "service.version": version})
+        self._exporter = OTLPSpanExporter(endpoint, endpoint.startswith("http://"), timeout=_SEND_S)
+        self._provider = TracerProvider(ParentBased(TraceIdRatioBased(share)), about, shutdown_on_exit=False)
+        self._provider.add_span_processor(BatchSpanProcessor(self._exporter, max_queue_size=_QUEUED_SPANS))
+        self._tracer = self._provider.get_tracer("lightpage", version)
+        self._propagator = TraceContextTextMapPropagator()
+        self._server, self._inside = SpanKind.SERVER, set_span_in_context
+        self._status, self._error = Status, StatusCode.ERROR
+
+    def ended(self, call: EndedCall, headers: Mapping[str, Any]) -> None:
+        """Make the spans of a call.
+
+        Args:
+            call: that has ended.
+            headers: of it; `traceparent` names the span of its caller.
+        """
+        try:
+            self._make(call, headers)
+        except Exception:  # whatever becomes of its trace, a call has its answer
+            _log.exception("no trace of %s", call.method)
+
+    def _make(self, call: EndedCall, headers: Mapping[str, Any]) -> None:
+        before = time.time_ns() - round(1e9 * time.perf_counter())
+        parent = self._propagator.extract({key: value for key, value in headers.items() if isinstance(value, str)})
+        attributes: dict[str, Any] = {
+            "rpc.system": "grpc",
+            "rpc.service": call.service,
+            "rpc.method": call.method,
+            "rpc.grpc.status_code": call.code.value[0],
+            "lightpage.peer": call.peer,
+            "lightpage.pages": call.count,
+        }
+        named = {"lightpage.correlation_id": call.correlation_id, "lightpage.reason": call.reason}
+        attributes |= {name: text[:MOST_TEXT] for name, text in named.items() if text}
+
+        def at(seconds: float) -> int:
+            return before + round(1e9 * seconds)
+
+        def laps(within: Any, laps: Iterable[Lap]) -> None:
+            for lap in laps:
+                self._tracer.start_span(lap.stage.value, within, start_time=at(lap.start)).end(at(lap.end))
+
+        span = self._tracer.start_span(
+            f"{call.service}/{call.method}", parent, self._server, attributes, start_time=at(call.begun)
+        )
+        if call.code in _FAULTS:
+            span.set_status(self._status(self._error, call.code.name))
+        if span.is_recording():
+            inside = self._inside(span)
+            if call.count == 1:
+                for page in call.pages:
+                    laps(inside, page.laps)
+            else:
+                for page in call.pages:
+                    own = self._tracer.start_span("page", inside, start_time=at(page.start))
+                    laps(self._inside(own), page.laps)
+                    own.end(at(page.start + page.elapsed_s))
+        span.end(at(call.ended))
+
+    def close(self) -> None:
+        """Send what waits, for a limited time."""
+        ending = threading.Thread(target=self._provider.shutdown, name="lightpage-traces", daemon=True)
+        ending.start()
+        ending.join(_END_S)
+        if ending.is_alive():
+            self._exporter.shutdown()  # whoever still tries gives up
+            ending.join(_END_S)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def check_endpoint(endpoint: str) -> str:
+    """The address of a collector, if it is one.
+
+    Raises:
+        InvalidInputError: it is none.
+    """
+    try:
+        parts = urlsplit(endpoint)
+        right = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port is not None
+        right = right and parts.path in ("", "/") and not parts.query and not parts.fragment and parts.username is None
+    except ValueError:
+        right = False
+    if not right:
+        raise InvalidInputError("traces.endpoint", endpoint, "http://HOST:PORT or https://HOST:PORT")
+    return endpoint

@@ -1,0 +1,1 @@
+"""Pages that the service reads from its own source, and the bytes on them."""

@@ -1,0 +1,120 @@
+"""Pages of the service's own source: ReadPage, ReadPages, ReadData."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+
+from lightpage.errors import CallerLeft, InvalidInputError, LimitError, SlotsTakenError
+from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
+from lightpage.runtime.client.wire.requests import check_options
+from lightpage.runtime.client.wire.status import refusal_of
+from lightpage.runtime.service.caller import Caller
+from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.monitoring.stages import Stage, Stages
+from lightpage.runtime.service.pages.user_data import read_data
+from lightpage.runtime.service.replies import data_reply, read_reply
+from lightpage.runtime.service.server.call import Call
+from lightpage.runtime.service.server.call_log import reason_told
+
+_MOST_PAGES = 1 << 32
+"""Of a source: their numbers travel in 32 bits."""
+
+
+class PageCalls:
+    """Handlers of the calls that read pages.
+
+    Args:
+        plane: reads and decodes.
+        clock: seconds that never go back.
+    """
+
+    def __init__(self, plane: DataPlane, clock: Callable[[], float] = time.monotonic) -> None:
+        self._plane, self._clock = plane, clock
+
+    def ReadPage(self, request: pb.ReadPageRequest, call: Call) -> pb.ReadPageReply:
+        """Read a page from the source and decode it; with a request id at most once."""
+        stages = call.times.page()
+        stages.begin(Stage.QUEUE)
+        check_options(request.options)
+        caller = _caller(request.options, call)
+        if not request.request_id:
+            return self._read(request, caller, stages)
+        limit_s = self._plane.limits.deadline_s
+
+        def work() -> bytes:
+            # The answer is wanted even where its caller leaves meanwhile, and asks again.
+            until = self._clock() + limit_s
+            detached = Caller(lambda: until - self._clock(), caller.session, caller.stateless, caller.actor)
+            return self._read(request, detached, stages).SerializeToString()
+
+        same = pb.ReadPageRequest()
+        same.CopyFrom(request)
+        same.correlation_id = ""
+        asked = same.SerializeToString(deterministic=True)
+        answer, replayed = self._plane.replays.once(call.own(request.request_id), asked, caller, work)
+        stages.begin(Stage.RESPOND)
+        reply = pb.ReadPageReply.FromString(answer)
+        reply.replayed, reply.decoded.correlation_id = replayed, request.correlation_id
+        return reply
+
+    def ReadPages(self, request: pb.ReadPagesRequest, call: Call) -> Iterator[pb.ReadPagesReply]:
+        """Read several pages; a lost one ends nothing."""
+        check_options(request.options)
+        self._check_count("pages" if request.pages else "count", len(request.pages) or request.count)
+        caller = _caller(request.options, call)
+        numbers: list[int | None] = list(request.pages) or [None] * request.count
+        for number in numbers:
+            one = pb.ReadPageRequest(options=request.options, want_written=request.want_written)
+            one.correlation_id = request.correlation_id
+            if number is not None:
+                one.page = number
+            stages = call.times.page()
+            try:
+                with self._plane.ranges.held(caller):  # not while the caller takes its time to read the reply
+                    reply = pb.ReadPagesReply(read=self._read(one, caller, stages))
+            except (CallerLeft, SlotsTakenError):
+                raise
+            except Exception as error:
+                stages.begin(Stage.RESPOND)
+                self._plane.metrics.rejected(reason_told(error))
+                refused = refusal_of(error)
+                refused.page, refused.correlation_id = number or 0, request.correlation_id
+                reply = pb.ReadPagesReply(refused=refused)
+            yield reply
+            call.times.done(stages)
+
+    def ReadData(self, request: pb.ReadDataRequest, call: Call) -> Iterator[pb.ReadDataReply]:
+        """Read the bytes of a range of pages."""
+        self._check_count("pages", request.pages)
+        if request.first_page + request.pages > _MOST_PAGES:
+            raise InvalidInputError("first_page", request.first_page, f"less than {_MOST_PAGES} with all")
+        pages = read_data(self._plane, request.first_page, request.pages, call.caller, call.times.page)
+        while True:
+            with self._plane.ranges.held(call.caller):  # not while the caller takes its time to read the reply
+                page = next(pages, None)
+            if page is None:
+                return
+            if page.error is not None:
+                self._plane.metrics.rejected(reason_told(page.error))
+            yield data_reply(page)
+            if page.stages is not None:
+                call.times.done(page.stages)
+
+    def _read(self, request: pb.ReadPageRequest, caller: Caller, stages: Stages) -> pb.ReadPageReply:
+        page, options = request.page if request.HasField("page") else None, request.options
+        levels, user_data = options.levels or None, options.want_user_data
+        read = self._plane.read_page(page, levels, caller, user_data=user_data, stages=stages)
+        return read_reply(read, request)
+
+    def _check_count(self, subject: str, count: int) -> None:
+        most = self._plane.limits.range_pages
+        if count < 1:
+            raise InvalidInputError(subject, count, "at least 1")
+        if count > most:
+            raise LimitError(subject, count, f"at most {most}")
+
+
+def _caller(options: pb.DecodeOptions, call: Call) -> Caller:
+    """The caller with its session; without one, the pages are those of the device."""
+    return call.caller.in_session(call.session(options.session), options.tracking == pb.TRACKING_STATELESS)

@@ -1,0 +1,452 @@
+"""One call from its first byte to its status: parsed, counted, handed to whoever answers it, and ended.
+
+A handler is a method named as the RPC, of one of the classes in this package. It takes the request, or an asynchronous
+iterator of requests, and the `Call`; it returns the reply, or is a generator of replies. A plain `def` runs in a thread
+and may block; an `async def` runs on the server's loop and must not. A handler of a call in `LATER` takes, in place of
+the request, what reads its bytes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import math
+import time
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Generator, Sequence
+from concurrent.futures import Executor, Future
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, TypeVar
+
+import grpc
+from google.protobuf.descriptor import ServiceDescriptor
+from google.protobuf.message import DecodeError, Message
+from google.protobuf.message_factory import GetMessageClass
+
+from lightpage.errors import CallerLeft, MalformedError, OverloadedError, StalledError, StoppingError, let_go
+from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
+from lightpage.runtime.client.wire.frame_parts import parsed_part
+from lightpage.runtime.client.wire.status import status_of, told, trailers
+from lightpage.runtime.service.caller import Actor, Caller
+from lightpage.runtime.service.limits import Limits
+from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
+from lightpage.runtime.service.monitoring.stages import CallTimes
+from lightpage.runtime.service.monitoring.traces import MOST_PAGES, EndedCall, Traces
+from lightpage.runtime.service.server.call_log import CallLog, reason_told
+from lightpage.runtime.service.server.roles import LOCAL, NEEDED, NOBODY, Identity, Role, identity_of
+from lightpage.runtime.service.sessions import named_session, own_name
+
+SERVICE = pb.DESCRIPTOR.services_by_name["Lightpage"]
+
+ENDLESS = frozenset(["WatchDisplay", "WatchJob"])
+"""Calls that last as long as their callers like: they hold no thread, are no load, and end with the service."""
+
+UPLOADS = frozenset(["UploadPages", "RecalibrateFrames", "UploadModel"])
+"""Calls that change something once their callers have closed their streams."""
+
+LATER = frozenset(["inference/ModelInfer"])
+"""Calls whose one message is so large that it is not read before there is time for what it asks."""
+
+_EARLY_S = 0.05
+"""A caller whose call ends so long before its deadline has run out of time too: its clock is its own."""
+
+_GONE_S = 0.05
+"""From the end of a stream to the word that its caller has gone, rather than closed it, at most."""
+
+T = TypeVar("T")
+
+
+@dataclass
+class Call:
+    """What a handler knows of its call beside the request.
+
+    Attributes:
+        method: name of the RPC.
+        caller: who waits for the answer.
+        pool: threads for what blocks.
+        peer: address and connection that it came from.
+        correlation_id: the caller's own text for the log, empty where it gave none.
+        begun: when its first byte came, by `time.perf_counter`.
+        times: of its pages.
+        identity: who calls.
+    """
+
+    method: str
+    caller: Caller
+    pool: Executor
+    peer: str = ""
+    correlation_id: str = ""
+    begun: float = field(default_factory=time.perf_counter)
+    times: CallTimes = field(default_factory=CallTimes)
+    identity: Identity = LOCAL
+
+    @property
+    def actor(self) -> Actor:
+        """Who calls, for records."""
+        return Actor(f"{self.identity.name} at {self.peer}" if self.identity.name else self.peer, self.correlation_id)
+
+    def own(self, name: str) -> str:
+        """A name that the caller gave to a session or a request, where other callers' are others; empty for none."""
+        return name and own_name(name, self.identity.name)
+
+    def session(self, name: str) -> str:
+        """Where the pages of a session that the caller named are followed; empty for none."""
+        return name and named_session(name, self.identity.name)
+
+    @property
+    def connection_session(self) -> str:
+        """Where the pages of its connection are followed; empty where gRPC has one name for all connections."""
+        return "" if self.peer.startswith("unix:") else f"connection {self.own(self.peer)}"
+
+    @property
+    def is_watch(self) -> bool:
+        """Whether it lasts as long as its caller likes."""
+        return self.method in ENDLESS
+
+    async def in_thread(self, work: Callable[[], T], otherwise: Callable[[], None] | None = None) -> T:
+        """Do in a thread what blocks or computes; when the call ends before, the work goes on by itself.
+
+        Args:
+            work: what.
+            otherwise: called if the call ends before the work has begun, which it then never does.
+        """
+        future = self.pool.submit(work)
+        if otherwise is not None:
+            future.add_done_callback(lambda done: otherwise() if done.cancelled() else None)
+        return await asyncio.wrap_future(future)
+
+
+@dataclass(frozen=True)
+class Served:
+    """A service that is served.
+
+    Attributes:
+        descriptor: of it.
+        handlers: objects whose methods answer; of two with the same method the first counts.
+        prefix: of its methods' names in metrics and logs.
+    """
+
+    descriptor: ServiceDescriptor
+    handlers: Sequence[object]
+    prefix: str = ""
+
+    def handler(self, method: str) -> Callable[..., Any] | None:
+        """What answers a method."""
+        return next((found for one in self.handlers if (found := getattr(one, method, None))), None)
+
+
+class Dispatcher:
+    """Hands calls to their handlers. Lives on one event loop.
+
+    Args:
+        services: that are served.
+        pool: threads for handlers that block, as many as there may be calls.
+        limits: of the service.
+        metrics: what is counted.
+        traces: are told of every call, None for none.
+        secured: whether callers have certificates; then one without has no role.
+    """
+
+    def __init__(
+        self,
+        services: Sequence[Served],
+        pool: Executor,
+        limits: Limits,
+        metrics: ServiceMetrics,
+        traces: Traces | None = None,
+        secured: bool = False,
+    ) -> None:
+        self._secured = secured
+        self._services, self._pool, self._limits = tuple(services), pool, limits
+        self._metrics, self._traces, self._log = metrics, traces, CallLog()
+        self._full_names: dict[str, tuple[str, str]] = {}
+        """Of each name in metrics and logs that of the service and of the method."""
+        self._active: set[asyncio.Task[Any]] = set()
+        self._watching: set[asyncio.Task[Any]] = set()
+        self._told: set[asyncio.Task[Any]] = set()
+        """Of both those that were told to end."""
+        self._refuses = False
+        self._longest_s = {"ReadData": limits.range_s, "ReadPages": limits.range_s}
+
+    def rpc_handlers(self) -> tuple[grpc.GenericRpcHandler[Any, Any], ...]:
+        """All RPCs of the services that have a handler, for the server.
+
+        Messages come as bytes: the library answers those that it cannot parse with INTERNAL and a traceback, and keeps
+        20 kB of each. They come as streams, even where there is but one: the library would read it before anybody could
+        refuse the call. They go as bytes, so that serialising them is a part of the call, and timed with it.
+        """
+        return tuple(map(self._rpc_handler, self._services))
+
+    def _rpc_handler(self, service: Served) -> grpc.GenericRpcHandler[Any, Any]:
+        methods = {}
+        for method in service.descriptor.methods:
+            if (handler := service.handler(method.name)) is None:
+                continue
+            make, serve = {
+                False: (grpc.stream_unary_rpc_method_handler, self._unary),
+                True: (grpc.stream_stream_rpc_method_handler, self._stream),
+            }[method.server_streaming]
+            name, message = f"{service.prefix}{method.name}", GetMessageClass(method.input_type)
+            self._full_names[name] = service.descriptor.full_name, method.name
+            parse = parsed_part if message is pb.DecodeFramesRequest else message.FromString
+            serialise = GetMessageClass(method.output_type).SerializeToString
+            serving = partial(serve, name, handler, parse, serialise, method.client_streaming)
+            methods[method.name] = make(serving, None, None)
+        return grpc.method_handlers_generic_handler(service.descriptor.full_name, methods)
+
+    def refuse(self) -> None:
+        """Take no more calls: the service stops."""
+        self._refuses = True
+
+    def end_watches(self) -> None:
+        """End the calls that would not end by themselves."""
+        self._end(self._watching)
+
+    def end_all(self) -> None:
+        """End all calls."""
+        self._end(self._active | self._watching)
+
+    async def ended_within(self, seconds: float) -> bool:
+        """Wait for the calls in flight; whether all of them have ended in time."""
+        if self._active:
+            await asyncio.wait(self._active, timeout=seconds)
+        return not self._active
+
+    def _end(self, tasks: set[asyncio.Task[Any]]) -> None:
+        self._told |= tasks
+        for task in tasks:
+            task.cancel()
+
+    async def _unary(
+        self,
+        name: str,
+        handler: Callable[..., Any],
+        parse: Callable[[bytes], Any],
+        serialise: Callable[[Any], bytes],
+        many: bool,
+        data: Any,
+        context: Any,
+    ) -> bytes:
+        async with self._call(name, context) as call:
+            request = self._messages(data, parse, call) if many else await self._one(data, parse, call)
+            if inspect.iscoroutinefunction(handler):
+                return serialise(await handler(request, call))
+            return serialise(await asyncio.wrap_future(self._pool.submit(handler, request, call)))
+
+    async def _stream(
+        self,
+        name: str,
+        handler: Callable[..., Any],
+        parse: Callable[[bytes], Any],
+        serialise: Callable[[Any], bytes],
+        many: bool,
+        data: Any,
+        context: Any,
+    ) -> AsyncIterator[bytes]:
+        async with self._call(name, context) as call:
+            request = self._messages(data, parse, call) if many else await self._one(data, parse, call)
+            if inspect.isasyncgenfunction(handler):
+                replies: AsyncGenerator[Any, None] = handler(request, call)
+            else:
+                replies = self._stepped(handler(request, call), call)
+            longest_s, loop = self._longest_s.get(name), asyncio.get_running_loop()
+            end = None if longest_s is None else loop.time() + longest_s
+            reader = _Reader(replies, partial(self._no_load, asyncio.current_task()))
+            try:
+                while True:
+                    async with asyncio.timeout_at(end):
+                        reply = await anext(replies, None)
+                    if reply is None:
+                        break
+                    waiting = loop.call_later(self._limits.reader_s, reader.stalls)
+                    try:
+                        yield serialise(reply)
+                    finally:
+                        waiting.cancel()
+                    reader.check(name)
+            except TimeoutError:
+                raise _slow(name) from None
+            finally:
+                await reader.close()
+
+    def _no_load(self, task: asyncio.Task[Any] | None) -> None:
+        """From here on the call of a task counts as one that only watches."""
+        if task is not None and task in self._active:
+            self._active.discard(task)
+            self._watching.add(task)
+
+    async def _stepped(self, replies: Generator[Any, None, None], call: Call) -> AsyncGenerator[Any, None]:
+        """The replies of a generator that blocks, each made in a thread."""
+        end = object()
+        step: Future[Any] | None = None
+        try:
+            while True:
+                step = self._pool.submit(next, replies, end)
+                reply = await asyncio.wrap_future(step)
+                if reply is end:
+                    return
+                yield reply
+        finally:
+            call.caller.leave()  # so that a step that waits for something ends
+            if step is not None:
+                step.add_done_callback(lambda _: replies.close())  # one that is at work cannot be closed
+
+    async def _one(self, data: AsyncGenerator[bytes, None], parse: Callable[[bytes], Any], call: Call) -> Any:
+        """The one message of a call, or what reads its bytes."""
+
+        async def receive() -> bytes:
+            if (message := await anext(data, None)) is None:
+                raise MalformedError(f"message of {call.method}", "none", "one")
+            await data.aclose()
+            return message
+
+        return receive if call.method in LATER else _parsed(parse, await receive(), call)
+
+    async def _messages(
+        self, data: AsyncIterator[bytes], parse: Callable[[bytes], Any], call: Call
+    ) -> AsyncIterator[Any]:
+        """The messages of a stream."""
+        async for message in data:
+            yield _parsed(parse, message, call)
+        if call.method in UPLOADS:  # the library ends the stream of one who has gone too, and then cancels it
+            await asyncio.sleep(_GONE_S)
+
+    @asynccontextmanager
+    async def _call(self, name: str, context: Any) -> AsyncIterator[Call]:
+        """Admit a call, count it, and turn what it raises into its status."""
+        caller = Caller(partial(_seconds_left, context))
+        call = Call(name, caller, self._pool, context.peer())
+        call.times = CallTimes(call.begun, partial(self._metrics.timed, name), MOST_PAGES if self._traces else 0)
+        headers = dict(context.invocation_metadata() or ()) if self._traces else {}
+        task = asyncio.current_task()
+        assert task is not None  # calls run in tasks
+        mine = self._watching if call.is_watch else self._active
+        mine.add(task)
+        self._metrics.in_flight.inc()
+        try:
+            if self._refuses:
+                raise _stopping(name)
+            call.identity = self._identity(context)
+            call.identity.check(NEEDED.get(name, Role.ADMIN), f"call {name}", time.time())
+            if not call.is_watch and len(self._active) > self._limits.concurrent_calls:
+                got, expected = f"{len(self._active) - 1} at once", f"at most {self._limits.concurrent_calls}"
+                raise OverloadedError("calls", got, f"{expected}; try again later", retry_s=1.0)
+            yield call
+            self._ended(call, headers, grpc.StatusCode.OK, None)
+        except (asyncio.CancelledError, GeneratorExit) as left:
+            if task in self._told and isinstance(left, asyncio.CancelledError):
+                task.uncancel()
+                error = _stopping(name)
+                self._ended(call, headers, status_of(error), error)
+                await context.abort(status_of(error), told(error), trailers(error))
+            self._ended(call, headers, _code_of_leaving(context), left)
+            raise
+        except Exception as error:
+            code = _code_of_leaving(context) if isinstance(error, CallerLeft) else status_of(error)
+            self._ended(call, headers, code, error)
+            let_go(error)  # the library keeps the error for a while, and so would it all that came
+            await context.abort(code, told(error), trailers(error))
+        finally:
+            call.caller.leave()
+            self._active.discard(task)
+            self._watching.discard(task)
+            self._told.discard(task)
+
+    def _identity(self, context: Any) -> Identity:
+        """Who calls, by the certificate of the connection.
+
+        Raises:
+            NotAllowedError: a certificate that cannot be read.
+        """
+        found = context.auth_context().get("x509_pem_cert")
+        if found:
+            return identity_of(found[0])
+        return NOBODY if self._secured else LOCAL
+
+    def _ended(self, call: Call, headers: dict[str, Any], code: grpc.StatusCode, error: BaseException | None) -> None:
+        """Count a call, before its caller hears of its end."""
+        ended, reason = time.perf_counter(), reason_told(error)
+        call.times.end(ended)
+        self._metrics.in_flight.dec()
+        self._metrics.call_ended(call.method, code.name, reason, None if call.is_watch else ended - call.begun)
+        if self._traces is not None:
+            service, method = self._full_names[call.method]
+            self._traces.ended(
+                EndedCall(
+                    service=service,
+                    method=method,
+                    peer=call.peer,
+                    correlation_id=call.correlation_id,
+                    code=code,
+                    reason=reason,
+                    begun=call.begun,
+                    ended=ended,
+                    pages=call.times.pages,
+                    count=call.times.count,
+                ),
+                headers,
+            )
+        self._log.ended(call, code, error)
+
+
+class _Reader:
+    """The caller of a stream of replies. What is made for one who takes none is dropped.
+
+    What has been handed to gRPC by then stays there until the caller takes it or leaves: no status goes before it.
+
+    Args:
+        replies: the stream.
+        stall: called when the caller has stalled.
+    """
+
+    def __init__(self, replies: AsyncGenerator[Any, None], stall: Callable[[], None]) -> None:
+        self._replies, self._stall = replies, stall
+        self._closing: asyncio.Future[None] | None = None
+
+    def stalls(self) -> None:
+        """Make no more replies; called from the loop while none is being made."""
+        self._stall()
+        self._closing = asyncio.ensure_future(self._replies.aclose())
+
+    def check(self, name: str) -> None:
+        """See that the caller of `name` did not stall.
+
+        Raises:
+            StalledError: it did.
+        """
+        if self._closing is not None:
+            raise _slow(name)
+
+    async def close(self) -> None:
+        """Make no more replies."""
+        await (self._replies.aclose() if self._closing is None else self._closing)
+
+
+def _slow(name: str) -> StalledError:
+    return StalledError(f"answer of {name}", "a reply that is not taken in time", "a faster reader")
+
+
+def _parsed(parse: Callable[[bytes], Any], data: bytes, call: Call) -> Any:
+    try:
+        message: Message = parse(data)
+    except DecodeError as error:
+        raise MalformedError(f"message of {call.method}", str(error), "one that can be parsed") from None
+    call.correlation_id = getattr(message, "correlation_id", "") or call.correlation_id
+    call.caller.actor = call.actor
+    return message
+
+
+def _stopping(name: str) -> StoppingError:
+    return StoppingError(f"call {name}", "a service that stops", "one that serves; call again")
+
+
+def _seconds_left(context: Any) -> float:
+    left = context.time_remaining()
+    return math.inf if left is None else float(left)
+
+
+def _code_of_leaving(context: Any) -> grpc.StatusCode:
+    """A call that is cut off ran out of time, or its caller has gone."""
+    late = _seconds_left(context) <= _EARLY_S
+    return grpc.StatusCode.DEADLINE_EXCEEDED if late else grpc.StatusCode.CANCELLED

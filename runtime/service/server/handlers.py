@@ -1,0 +1,79 @@
+"""All that answers calls, and what the service says of itself."""
+
+from __future__ import annotations
+
+from importlib.metadata import version as installed_version
+
+from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
+from lightpage.runtime.client.wire.messages import PIXEL_CODES
+from lightpage.runtime.client.wire.status import without_folders
+from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.display.display_calls import DisplayCalls
+from lightpage.runtime.service.frames.frame_calls import FrameCalls
+from lightpage.runtime.service.jobs.job_calls import JobCalls
+from lightpage.runtime.service.jobs.recalibrator import Recalibrator
+from lightpage.runtime.service.models.model_calls import ModelCalls
+from lightpage.runtime.service.pages.page_calls import PageCalls
+from lightpage.runtime.service.replies import model_message
+from lightpage.runtime.service.server.call import Call
+
+
+def handlers(plane: DataPlane, recalibrator: Recalibrator) -> tuple[object, ...]:
+    """Objects whose methods are named as the RPCs that they answer; see `lightpage.runtime.service.server.call`."""
+    return (
+        Describing(plane),
+        FrameCalls(plane),
+        PageCalls(plane),
+        DisplayCalls(plane),
+        ModelCalls(plane),
+        JobCalls(plane, recalibrator),
+    )
+
+
+class Describing:
+    """Handler of Describe.
+
+    Args:
+        plane: what is described.
+    """
+
+    def __init__(self, plane: DataPlane) -> None:
+        self._plane = plane
+
+    def Describe(self, request: pb.DescribeRequest, call: Call) -> pb.DescribeReply:
+        """What the service is."""
+        plane, model = self._plane, self._plane.registry.current
+        bundle, limits = model.decoder.bundle, self._plane.limits
+        (rows_px, columns_px), (rows, columns) = bundle.profile.frame_shape, bundle.profile.page_shape
+        return pb.DescribeReply(
+            service_version=installed_version("lightpage"),
+            model=model_message(plane.models.entry(model)),
+            camera=pb.Camera(
+                rows_px=rows_px,
+                columns_px=columns_px,
+                bit_depth=bundle.manifest.camera_bit_depth,
+                pixel_type=PIXEL_CODES[bundle.manifest.frame_dtype],
+            ),
+            page=pb.PageShape(rows=rows, columns=columns),
+            limits=pb.Limits(
+                message_bytes=limits.message_bytes,
+                chunk_bytes=limits.chunk_bytes,
+                pair_bytes=limits.pair_bytes,
+                concurrent_decodes=limits.concurrent_decodes,
+                replay_s=limits.replay_s,
+                replay_bytes=limits.replay_bytes,
+                recalibration_pages=limits.recalibration_pages,
+                model_bytes=limits.model_bytes,
+                range_pages=limits.range_pages,
+                shared_bytes=0 if plane.shared is None else plane.shared.most_bytes,
+            ),
+            source=without_folders(plane.source.name) if plane.has_source else "",
+            source_levels=plane.source.levels if plane.has_source else 0,
+            default_levels=plane.default_levels,
+            profile_toml=bundle.manifest.profile,
+            calibration_toml=bundle.manifest.calibration,
+            pilot_mask=bundle.pilot_mask.astype("uint8").tobytes(),
+            code_toml=bundle.manifest.code or "",
+            user_bytes_per_page=0 if bundle.code is None else model.decoder.page_codec.user_bytes,
+            pilot_phases=() if bundle.pilot_phases is None else bundle.pilot_phases.tolist(),
+        )

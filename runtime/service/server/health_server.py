@@ -1,0 +1,150 @@
+"""Health checks on an address of their own, answered by a process that does nothing else."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from types import TracebackType
+from typing import Self
+
+from lightpage.errors import InvalidInputError
+from lightpage.helper_process import HelperProcess
+from lightpage.runtime.client.wire.address import check_address, check_free, is_local
+from lightpage.runtime.client.wire.tls import TlsFiles
+
+_PROCESS = "lightpage.runtime.service.server.health_process"
+_BEAT_S = 0.5
+_START_S = 20.0
+_SEND_S = 2.0
+_AGAIN_S = 5.0
+"""Between two attempts to start the process again."""
+
+_log = logging.getLogger(__name__)
+
+
+def next_port(address: str) -> str:
+    """Where health checks are answered for a service at `address`: the next port, a free one for port 0.
+
+    Of a service that others reach, the next port of this machine alone.
+    """
+    if address.startswith("unix:"):
+        return f"{address}.health"
+    host, _, port = address.rpartition(":")
+    host = host if is_local(address) else "127.0.0.1"
+    return f"{host}:{int(port) + 1 if 0 < int(port) < 65535 else 0}"
+
+
+class HealthServer:
+    """Runs the process and tells it how the service fares; use it in a `with` statement.
+
+    Args:
+        address: HOST:PORT; port 0 takes a free one.
+        states: called twice a second: each service by name, and whether it serves. Where it hangs, nothing does.
+        tls: with which it answers, whoever asks; None for no TLS.
+    """
+
+    def __init__(self, address: str, states: Callable[[], Mapping[str, bool]], tls: TlsFiles | None = None) -> None:
+        check_address("health address", address, least_port=0)
+        self._address, self._states = address, states
+        self._files = [] if tls is None else [str(path) for path in (tls.ca, tls.certificate, tls.key)]
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._beat, name="lightpage-heartbeat", daemon=True)
+        self._process: HelperProcess | None = None
+        self.port = 0
+
+    @property
+    def target(self) -> str:
+        """Where it is asked on this machine."""
+        if self._address.startswith("unix:"):
+            return self._address
+        host = self._address.rpartition(":")[0]
+        return f"{'127.0.0.1' if host in ('0.0.0.0', '[::]', '') else host}:{self.port}"
+
+    @property
+    def pid(self) -> int | None:
+        """Number of the process, None before there is one."""
+        return None if self._process is None else self._process.pid
+
+    def start(self) -> Self:
+        """Answer health checks.
+
+        Raises:
+            InvalidInputError: the address cannot be listened on.
+        """
+        check_free("health address", self._address)
+        try:
+            self._process, self.port = self._started(self._address)
+        except InvalidInputError:
+            self.stop()
+            raise
+        self._thread.start()
+        return self
+
+    def _started(self, address: str) -> tuple[HelperProcess, int]:
+        """A process that answers at an address, and the port."""
+        subject = f"health address {address}"
+        process: HelperProcess | None = None
+        try:
+            process = HelperProcess(_PROCESS, address, *self._files, subject="the process of health checks")
+            answer = json.loads(process.line(time.monotonic() + _START_S))
+            if "port" in answer:
+                return process, int(answer["port"])
+            got, expected = answer.get("error"), "a free HOST:PORT of this machine"
+        except (OSError, ValueError) as error:
+            got, expected = error, "a process that can be started"
+        if process is not None:
+            process.end()
+        raise InvalidInputError(subject, got, expected)
+
+    def stop(self) -> None:
+        """Answer no more."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join(2 * _SEND_S)
+        if self._process is not None:
+            self._process.end()
+            if self._address.startswith("unix:"):
+                with suppress(OSError):
+                    os.unlink(self._address.removeprefix("unix:"))
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def _beat(self) -> None:
+        while True:
+            try:
+                line = json.dumps(dict(self._states())).encode() + b"\n"
+            except Exception:
+                _log.exception("health checks: the service does not say how it fares")
+            else:
+                self._tell(line)
+            if self._stop.wait(_BEAT_S):
+                return
+
+    def _tell(self, line: bytes) -> None:
+        """Tell the process how the service fares; one that has ended is started again at the same port."""
+        assert self._process is not None  # it was started
+        try:
+            self._process.send(line, time.monotonic() + _SEND_S)
+            return
+        except OSError as error:
+            _log.error("health checks: %s; their process is started again", error or "nobody listens")
+        self._process.end()
+        host = self._address.rpartition(":")[0]
+        try:
+            self._process, _ = self._started(
+                self._address if self._address.startswith("unix:") else f"{host}:{self.port}"
+            )
+        except InvalidInputError as error:
+            _log.error("health checks: %s", error)
+            self._stop.wait(_AGAIN_S)

@@ -1,0 +1,110 @@
+"""The command `lightpage study`: one question about the device or its decoders, answered in a table and a picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import torch
+
+from lightpage.cli.options import FiniteRange
+from lightpage.cli.paths import OutputFile, OutputFolder
+from lightpage.cli.progress_bar import percent_bar
+from lightpage.device.profile import load_profile
+from lightpage.errors import InvalidInputError
+from lightpage.files import replace_file, replace_text, write_json
+from lightpage.study import STUDIES
+from lightpage.study.study import RESULTS, Settings, aligned, measured
+from lightpage.train.fitting.memory import keep_freed_memory
+from lightpage.train.runs import BEGUN, begin, sole_writer
+
+_FULL = "paper"
+_RESULTS = "results"
+
+
+@click.command(epilog="\n\n".join(f"{name}: {study.title} ({study.source})" for name, study in STUDIES.items()))
+@click.argument("name", type=click.Choice(list(STUDIES)))
+@click.option("--out", required=True, type=OutputFolder(), help="Folder of the study; gone on with if it is there.")
+@click.option("--profile", "profile_name", help="Shipped profile or TOML file.  [default: bench]")
+@click.option("--quick", is_flag=True, help="Few and small cases, to see that it works.")
+@click.option("--full", is_flag=True, help=f"At full scale, profile {_FULL}; what trains needs a GPU there.")
+@click.option(
+    "--share",
+    type=FiniteRange(min=0.001, max=1),
+    default=1.0,
+    show_default=True,
+    help="Of the steps that the authors trained for, where a study trains: the whole takes hours for each case.",
+)
+@click.option(
+    "--channels",
+    type=click.IntRange(4, 256),
+    default=Settings.channels,
+    show_default=True,
+    help="Of the published network at sample pitch, where a study trains: half as many take a quarter of the time.",
+)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option("--json", "json_path", type=OutputFile(), help="Write settings and table to this file too.")
+def study(
+    name: str,
+    out: Path,
+    profile_name: str | None,
+    quick: bool,
+    full: bool,
+    share: float,
+    channels: int,
+    seed: int,
+    json_path: Path | None,
+) -> None:
+    """Measure the cases of study NAME, write OUT/table.txt, OUT/figure.png and OUT/study.json, and print the table."""
+    keep_freed_memory()
+    if full and profile_name is not None:
+        raise InvalidInputError("--full", f"--profile {profile_name} beside it", "one of them")
+    chosen = STUDIES[name]
+    if full and chosen.trains and not torch.cuda.is_available():
+        raise InvalidInputError(f"study {name} --full", "no CUDA device", "one: it trains networks at full scale")
+    if share < 1 and not chosen.trains:
+        raise InvalidInputError(f"study {name} --share", f"{share:g} of a study that trains nothing", "no --share")
+    if channels != Settings.channels and (quick or not chosen.trains):
+        got = f"{channels} {'with --quick' if chosen.trains else 'of a study that trains nothing'}"
+        raise InvalidInputError(f"study {name} --channels", got, "no --channels")
+    context = click.get_current_context()
+    context.meta["lightpage.resume"] = "run the same command again; it goes on where it was"
+    settings = Settings(load_profile(_FULL if full else profile_name or "bench"), quick, seed, share, channels)
+    context.with_resource(sole_writer(out))
+    results_folder = out / _RESULTS
+    if results_folder.exists() and not results_folder.is_dir():
+        raise InvalidInputError(f"study {out}: {_RESULTS}", "a file", "a folder, or another --out")
+    if results_folder.exists() and not (out / BEGUN).exists():
+        expected = f"a study that says in {BEGUN} what it was begun with, or another --out"
+        raise InvalidInputError(f"study {out}", "results of unknown origin", expected)
+    begin(out, {"study": name, "results": RESULTS, **settings.key()})
+    results_folder.mkdir(exist_ok=True)
+    cases, results = chosen.cases(settings), []
+    with percent_bar() as progress:
+        for number, case in enumerate(cases):
+            results.append(
+                measured(
+                    chosen,
+                    settings,
+                    case,
+                    results_folder,
+                    lambda what, share, n=number, c=case: progress(f"{c['name']}: {what}", (n + share) / len(cases)),  # type: ignore[misc]
+                )
+            )
+    rows = chosen.rows(cases, results)
+    table = aligned(chosen.header, rows)
+    figure = chosen.plot(settings, cases, results)
+    replace_file(out / "figure.png", lambda file: figure.savefig(file, format="png", dpi=110), "picture of the study")
+    how = "" if share == 1 else f"; {share:.0%} of the authors' steps"
+    how += "" if channels == Settings.channels else f"; network of {channels}/{2 * channels} channels"
+    replace_text(out / "table.txt", f"{chosen.title} ({chosen.source}){how}\n\n{table}\n", "table of the study")
+    figures = {
+        "study": name,
+        **settings.key(),
+        "header": list(chosen.header),
+        "rows": [list(row) for row in rows],
+    }
+    for path in (out / "study.json", json_path):
+        if path is not None:
+            write_json(path, figures)
+    click.echo(f"{table}\n\nwritten to {out}")

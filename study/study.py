@@ -1,0 +1,127 @@
+"""What a study is: cases that are measured one by one and kept, then a table and a picture of all of them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from lightpage.device.profile import Profile
+from lightpage.errors import InvalidInputError
+from lightpage.files import replace_text
+from lightpage.progress import Progress
+from lightpage.train.published.training import PublishedChoices
+from lightpage.train.runs import load_arrays, save_arrays
+
+RESULTS = 4
+"""Raised when results that were kept by an earlier version do not go together with those of this one."""
+Case = Mapping[str, Any]
+"""What is varied, by name; `name` tells it from the others and names its files."""
+Result = Mapping[str, Any]
+"""What was measured, by name: numbers, texts, and arrays."""
+Row = Sequence[object]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What every study is told.
+
+    Attributes:
+        profile: the nominal device.
+        quick: as few and as small cases as show that it works; their figures say little.
+        seed: of everything random.
+        share: of the authors' steps that networks are trained for.
+        channels: of the published network at sample pitch, twice as many below; the authors' if left out.
+    """
+
+    profile: Profile
+    quick: bool = False
+    seed: int = 0
+    share: float = 1.0
+    channels: int = PublishedChoices.channels[0]
+
+    def key(self) -> dict[str, Any]:
+        """The settings as JSON keeps them."""
+        return asdict(self) | {"profile": self.profile.to_toml()}
+
+
+@dataclass(frozen=True)
+class Study:
+    """A question asked of the device.
+
+    Attributes:
+        title: the question, in a line.
+        source: figure or table of the published study that it repeats, or where it goes beyond.
+        cases: what is varied.
+        measure: one case to its result; its work may be kept in the folder given, so that it can be gone on with.
+        header: of the table.
+        rows: of the table, from cases and results.
+        plot: a picture of all results.
+        trains: whether it trains networks, which takes hours without a GPU at full scale.
+    """
+
+    title: str
+    source: str
+    cases: Callable[[Settings], list[Case]]
+    measure: Callable[[Settings, Case, Path, Progress], Result]
+    header: Row
+    rows: Callable[[Sequence[Case], Sequence[Result]], list[Row]]
+    plot: Callable[[Settings, Sequence[Case], Sequence[Result]], Figure]
+    trains: bool = False
+
+
+def measured(study: Study, settings: Settings, case: Case, folder: Path, progress: Progress) -> Result:
+    """The result of a case, kept in `folder` under the case's name; measured if it is not there.
+
+    Raises:
+        InvalidInputError: a result that is there and damaged.
+    """
+    path = folder / f"{case['name']}.json"
+    if path.exists():
+        return _load(path)
+    work = folder / str(case["name"])
+    work.mkdir(parents=True, exist_ok=True)
+    result = study.measure(settings, case, work, progress)
+    _save(path, result)
+    return result
+
+
+def aligned(header: Row, rows: Sequence[Row]) -> str:
+    """A table as text, numbers to four digits, columns lined up."""
+    texts = [[_text(value) for value in row] for row in (header, *rows)]
+    widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
+    lines = ["  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)) for row in texts]
+    return "\n".join(lines)
+
+
+def _text(value: object) -> str:
+    if isinstance(value, float):
+        return "-" if np.isnan(value) else f"{value:.4g}"
+    return str(value)
+
+
+def _save(path: Path, result: Result) -> None:
+    """Arrays beside the rest, and first: a result that is there is whole."""
+    arrays = {name: value for name, value in result.items() if isinstance(value, np.ndarray)}
+    rest = {name: value for name, value in result.items() if name not in arrays}
+    save_arrays(_arrays(path), arrays)
+    replace_text(path, json.dumps({"values": rest, "arrays": list(arrays)}, indent=1), "result of a study")
+
+
+def _load(path: Path) -> Result:
+    try:
+        kept = json.loads(path.read_text())
+        arrays = load_arrays(_arrays(path))
+        return dict(kept["values"]) | {name: arrays[name] for name in kept["arrays"]}
+    except (OSError, ValueError, TypeError, KeyError, InvalidInputError) as error:
+        expected = "a whole one with its arrays; where it is removed, the case is measured again"
+        raise InvalidInputError(f"result {path}", error, expected) from None
+
+
+def _arrays(path: Path) -> Path:
+    return path.with_suffix(".npz")

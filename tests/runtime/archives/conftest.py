@@ -1,0 +1,5 @@
+"""Fixtures of bulk runs."""
+
+from tests.runtime.archives.archive import archive
+
+__all__ = ["archive"]

@@ -1,0 +1,113 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lightpage.device.profile import PageLayout
+from lightpage.errors import InvalidInputError, PageError
+from lightpage.runtime.device.modulator.lookup_table import LookupTable
+from lightpage.runtime.device.modulator.screen.raster import Raster
+from lightpage.runtime.device.modulator.settings import RasterSettings
+from tests.lightpage.small import small_profile
+
+
+def table(tmp_path: Path, text: str, levels: int) -> list[int]:
+    path = tmp_path / "table.csv"
+    path.write_text(text)
+    return [int(grey) for grey in LookupTable.from_file(path, levels).greys]
+
+
+def test_without_a_file_the_levels_lie_evenly_on_one_wave() -> None:
+    assert LookupTable.linear(4).greys.tolist() == [0, 64, 128, 192]
+    assert LookupTable.linear(3).greys.tolist() == [0, 85, 171]
+    assert LookupTable.linear(256).greys.tolist() == list(range(256))
+    with pytest.raises(PageError):
+        LookupTable.linear(1)
+
+
+@pytest.mark.parametrize(
+    ("text", "greys"),
+    [
+        ("0,60,130,200\n", [0, 60, 130, 200]),
+        ("# mine\ngrey\n0\n60 # second\n\n130;200", [0, 60, 130, 200]),
+        ("phase_rad grey\n5 0\n2.5 100\n0 200\n", [200, 137, 74, 12]),  # counts from its lowest phase
+        (f"phase_rad grey\n0 0\n{3 * np.pi / 4} 128\n{3 * np.pi / 2} 255\n", [0, 85, 170, 255]),  # just enough
+        ("phase_rad, grey\n1, 0\n3, 50\n4.4, 100\n1.2, 200\n", [0, 39, 91, 143]),  # wrapped, and not linear
+    ],
+)
+def test_a_file_states_grey_values_or_the_phases_of_some(text: str, greys: list[int], tmp_path: Path) -> None:
+    assert table(tmp_path, text, 4) == greys
+
+
+@pytest.mark.parametrize(
+    ("text", "levels", "line", "got"),
+    [
+        ("", 4, "", "0 grey values"),
+        ("0 1\n2 x", 4, "line 2", "'x'"),
+        ("0 256", 2, "line 1", "256"),
+        ("0 2.5", 2, "line 1", "2.5"),
+        ("0 9 7 9", 4, "", "9 for levels 1 and 3"),
+        ("phase_rad grey\n0 0\n1", 4, "line 3", "1"),
+        ("phase_rad grey\n0 0\n2 100\n1.5 200\n", 4, "", "100 and 200"),
+        ("phase_rad grey\n0 0\n2 100\n4 200\n", 4, "", "4 rad"),
+        ("phase_rad grey\n0 0\n3 1\n6 2\n", 4, "", "levels 1 and 2"),
+    ],
+)
+def test_a_wrong_file_is_told_by_its_line(text: str, levels: int, line: str, got: str, tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError) as raised:
+        table(tmp_path, text, levels)
+    assert raised.value.subject == f"lookup table {tmp_path / 'table.csv'}" + (f", {line}" if line else "")
+    assert got in raised.value.got
+    with pytest.raises(InvalidInputError, match=r"^lookup table .*nowhere"):
+        LookupTable.from_file(tmp_path / "nowhere.csv", 4)
+
+
+def test_symbols_become_grey_values_of_their_own_table_alone() -> None:
+    linear = LookupTable.linear(4)
+    greys = linear.greys_of(np.array([[0, 3], [2, 1]]), 4)
+    assert greys.dtype == np.uint8
+    assert greys.tolist() == [[0, 192], [128, 64]]
+    with pytest.raises(PageError, match="8 levels"):
+        linear.greys_of(np.zeros((2, 2), np.uint8), 8)
+    with pytest.raises(PageError, match="0 to 4"):
+        linear.greys_of(np.array([[0, 4]]), 4)
+    with pytest.raises(PageError, match="float64"):
+        linear.greys_of(np.array([[0.5]]), 4)
+
+
+TINY = small_profile().model_copy(update={"page": PageLayout(columns=3, rows=2, symbol_size_px=2)})
+PAGE = np.array([[10, 20, 30], [40, 50, 60]], np.uint8)
+
+
+def image(**settings: object) -> np.ndarray:
+    values = {"rows_px": 8, "columns_px": 11, "background_grey": 1, **settings}
+    return Raster(TINY, RasterSettings.model_validate(values)).image(PAGE)
+
+
+def test_each_symbol_is_a_square_and_the_page_lies_in_the_middle() -> None:
+    shown = image()
+    assert shown.dtype == np.uint8
+    assert shown.shape == (8, 11)
+    assert shown[2:6, 2:8].tolist() == 2 * [[10, 10, 20, 20, 30, 30]] + 2 * [[40, 40, 50, 50, 60, 60]]
+    shown[2:6, 2:8] = 1
+    assert (shown == 1).all()
+    with pytest.raises(PageError):
+        Raster(TINY, RasterSettings(rows_px=8, columns_px=10)).image(PAGE.T)
+
+
+def test_an_offset_moves_the_page_right_and_down_and_a_flip_mirrors_it_where_it_is() -> None:
+    np.testing.assert_array_equal(image(offset_x_px=3, offset_y_px=-2), np.roll(image(), (-2, 3), (0, 1)))
+    moved = {"columns_px": 10, "offset_x_px": 1}
+    np.testing.assert_array_equal(image(flip_x=True, **moved)[:, 3:9], image(**moved)[:, 8:2:-1])
+    np.testing.assert_array_equal(image(flip_y=True), image()[::-1])
+
+
+@pytest.mark.parametrize(
+    ("settings", "ends"),
+    [({"columns_px": 5}, "-1"), ({"offset_y_px": 3}, "5"), ({"offset_x_px": -3}, "-1")],
+)
+def test_a_page_that_leaves_the_modulator_is_refused(settings: dict[str, int], ends: str) -> None:
+    with pytest.raises(InvalidInputError, match=f"pixels {ends} to"):
+        image(**settings)

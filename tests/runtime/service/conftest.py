@@ -1,0 +1,69 @@
+"""Services for tests."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lightpage.runtime.client.client import LightpageClient
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.recalibration.outcome import Refit
+from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.jobs.recalibrator import Recalibrator
+from lightpage.runtime.service.limits import Limits
+from lightpage.runtime.service.models.audit import AuditLog
+from lightpage.runtime.service.models.registry import ModelRegistry, TrackerFactory, no_tracker
+from lightpage.runtime.service.models.store import ModelStore
+from lightpage.runtime.service.monitoring.monitor import Monitor
+from lightpage.runtime.service.server.server import LightpageServer
+from tests.runtime import toy
+from tests.runtime.service.stage import Running, Start
+
+
+def begun(
+    decoder: Decoder,
+    recordings: Path | None = None,
+    *,
+    limits: Limits | None = None,
+    fit: Refit = toy.fit_references,
+    store: Path | None = None,
+    tracker: TrackerFactory = no_tracker,
+    source: Any = "toy",
+    monitor: Monitor | None = None,
+    audit: AuditLog | None = None,
+    **server: Any,
+) -> Running:
+    """A service, as `lightpage serve` starts one; further arguments are of `LightpageServer`."""
+    shown = toy.ToySource(toy.ToyDevice()) if source == "toy" else source
+    models = ModelStore(store, decoder.bundle) if store is not None else None
+    plane = DataPlane(ModelRegistry(decoder, tracker), shown, models, limits, monitor=monitor, audit=audit)
+    plane.models.resume()
+    recalibrator = Recalibrator(plane, fit, recordings)
+    running = LightpageServer(plane, recalibrator, **server).start()
+    return Running(plane, recalibrator, running, shown, LightpageClient(running.target, timeout_s=20))
+
+
+@pytest.fixture
+def start(decoder: Decoder, tmp_path: Path) -> Iterator[Start]:
+    """Starts services on free loopback ports, whose recordings lie in the test's folder, and ends them."""
+    running: list[Running] = []
+
+    def begin(bundle: Path | None = None, **options: Any) -> Running:
+        made = decoder if bundle is None else Decoder.load(bundle, threads=1)
+        running.append(begun(made, **{"recordings": tmp_path, **options}))
+        return running[-1]
+
+    yield begin
+    for service in running:
+        service.end()
+
+
+@pytest.fixture(scope="session")
+def service(decoder: Decoder) -> Iterator[Running]:
+    """One service for all tests that leave its models, its limits and its source as they are."""
+    running = begun(decoder)
+    yield running
+    running.end()

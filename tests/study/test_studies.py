@@ -1,0 +1,117 @@
+"""`lightpage study`: every study makes its table and picture, is gone on with, and says what arithmetic says."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+from lightpage.device.profile import Profile, load_profile
+from lightpage.errors import InvalidInputError, ProfileError
+from lightpage.study import (
+    STUDIES,
+    angle,
+    cross_section,
+    pipe_length,
+    scaling,
+)
+from lightpage.study.command import study
+from lightpage.study.study import Settings, measured
+from lightpage.study.trained import chosen
+from lightpage.train.published.training import PublishedChoices
+from tests.lightpage.small import small_profile
+
+SMALL, BENCH, PAPER = small_profile(), load_profile("bench"), load_profile("paper")
+SLOW = {name for name, study in STUDIES.items() if study.trains} - {"heads"} | {"drift"}
+"""Four data sets are trained on, or the shipped decoder reads pages; heads trains in the same way, on one."""
+
+
+def run(*arguments: object) -> str:
+    words = [str(word) for word in arguments]
+    return CliRunner().invoke(study, words, standalone_mode=False, catch_exceptions=False).output
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Path:
+    (tmp_path / "small.toml").write_text(SMALL.to_toml())
+    return tmp_path / "small.toml"
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.long] if n in SLOW else []) for n in STUDIES])
+def test_each_makes_a_table_and_a_picture_and_is_gone_on_with(name: str, small: Path, tmp_path: Path) -> None:
+    out, figures = tmp_path / "out", tmp_path / "F.json"
+    arguments = (name, "--quick", "--profile", small, "--out", out)
+    run(*arguments, "--json", figures)
+    written = json.loads(figures.read_text())
+    assert len(written["rows"]) >= 1
+    assert all(len(row) == len(written["header"]) for row in written["rows"])
+    with Image.open(out / "figure.png") as figure:
+        assert min(figure.size) > 200
+    before = {path: path.stat().st_mtime_ns for path in (out / "results").iterdir()}
+    run(*arguments)
+    assert {path: path.stat().st_mtime_ns for path in (out / "results").iterdir()} == before
+
+
+def test_what_cannot_be_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    out = ("--out", tmp_path / "out")
+    for words, named in (
+        (("rays", "--full", "--profile", "bench", *out), "--full"),
+        (("rays", "--out", ""), "--out"),
+        (("rays", "--channels", "16", *out), "--channels"),
+        (("angle", "--full", *out), "CUDA"),
+    ):
+        with pytest.raises(InvalidInputError, match=named):
+            run(*words)
+
+
+def test_a_case_is_measured_once_and_comes_back_with_its_arrays(tmp_path: Path) -> None:
+    case, told = {"name": "square-diagonal", "shape": "square", "centroid": (1, 1)}, list[str]()
+
+    def again() -> Mapping[str, Any]:
+        settings = Settings(SMALL, quick=True)
+        return measured(cross_section.STUDY, settings, case, tmp_path, lambda what, share: told.append(what))
+
+    first = again()
+    np.testing.assert_array_equal(first["landed"], again()["landed"])
+    assert told == ["trace"]
+    (tmp_path / "square-diagonal.npz").unlink()
+    with pytest.raises(InvalidInputError, match=r"square-diagonal\.npz"):
+        again()
+    (tmp_path / "square-diagonal.json").write_text("{}")
+    with pytest.raises(InvalidInputError, match=r"square-diagonal\.json"):
+        again()
+
+
+# ---- what they say --------------------------------------------------------------------------------------------------
+
+
+def test_enlarged_and_shortened_devices_have_the_zones_of_the_full_one() -> None:
+    def ratio(of: Profile) -> float:
+        return of.page_width_m * of.pipe.length_m / of.lens.focal_length_m / of.pipe.width_m
+
+    large = scaling.enlarged(BENCH, 2)
+    assert large.page.columns * large.page.rows == 4 * BENCH.page.columns * BENCH.page.rows
+    assert ratio(large) == pytest.approx(ratio(BENCH))
+    assert ratio(load_profile("analysis/comparison/eighth.toml")) == pytest.approx(ratio(PAPER), rel=0.02)
+    assert pipe_length.scaled_length_m(PAPER, 75) == pytest.approx(0.075)
+    assert pipe_length.scaled_length_m(BENCH, 75) == pytest.approx(0.01875, rel=0.01)
+    for profile, largest in ((BENCH, 8), (PAPER, 2)):
+        assert max(case["factor"] for case in scaling.STUDY.cases(Settings(profile))) == largest
+    with pytest.raises(ProfileError, match="16 times"):
+        scaling.enlarged(PAPER, 16)
+
+
+def test_a_study_trains_as_the_authors_did_unless_told_otherwise() -> None:
+    curve = np.array([[10, 0.0], [20, 0.4], [30, 0.2], [40, 0.6]])
+    assert angle.first_step(curve) == 20
+    assert np.isnan(angle.first_step(curve, 0.7))
+    assert chosen(Settings(SMALL), "ray", SMALL, 450) == PublishedChoices()
+    smaller = chosen(Settings(SMALL, seed=3, share=0.1, channels=16), "mode", SMALL, 450, classes=16)
+    assert smaller == PublishedChoices(channels=(16, 32), steps=1125, seed=3, classes=16)
