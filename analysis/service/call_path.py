@@ -17,7 +17,7 @@ from pathlib import Path
 
 import click
 
-from analysis.service.entered import Entry, Traced, recording
+from analysis.service.entered import Entry, Traced, tracing
 from analysis.service.running import RunningService
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
@@ -32,22 +32,27 @@ from runtime.scaling.task import Operation
 from runtime.scaling.work import Worker
 
 APART = {
-    "*/logs.py": "log",
-    "*/call_log.py": "log",
-    "*/audit.py": "log",
+    "*/logs.py": "log of pages",
+    "*/call_log.py": "log of calls",
+    "*/audit.py": "log of changes",
+    "*/flight_recorder.py": "frames of lost pages, for people",
+    "*/streams.py": "log, on its way to the terminal",
     "*/metrics.py": "metrics",
-    "*/stages.py": "traces",
+    "*/history.py": "figures of the last pages, for the console",
+    "*/stages.py": "times of a page, for metrics, traces and the reply",
     "*/traces.py": "traces",
-    "*/history.py": "metrics",
-    "*/observation.py": "metrics",
-    "*/flight_recorder.py": "log",
+    "*/heart.py": "health: whether a decode hangs",
     "*/errors.py": "errors",
-    "*/failures.py": "errors",
-    "*/status.py": "errors",
+    "*/failures.py": "errors: what those of the system mean",
+    "*/status.py": "errors as gRPC says them",
 }
+"""Files that only record or name what becomes of a call, by pattern, and what: without them a call that succeeds would
+have the same answer but for the times in it."""
 
 _KNOWN_PAGES = 2
 """Of a recalibration, which holds back one more."""
+_DRIFTED = "geometry.pipe_angle_deg=-0.61"
+"""Of the device that is recalibrated: a re-fit that brings nothing would be refused."""
 _CALL_S = 1800.0
 _SHOWN = 4
 """Functions of a file that are printed."""
@@ -85,7 +90,7 @@ def files_of(entries: Entries) -> list[EnteredFile]:
         EnteredFile(
             number,
             file,
-            own[0].caller,
+            own[0].caller if own[0].caller != file else "",
             sum(entry.calls for entry in own),
             tuple(dict.fromkeys(entry.function for entry in own)),
             next((why for pattern, why in APART.items() if fnmatch(file, pattern)), ""),
@@ -94,8 +99,22 @@ def files_of(entries: Entries) -> list[EnteredFile]:
     ]
 
 
-def served(bundle: Bundle, folder: Path, options: Sequence[str], call: Callable[[LightpageClient], object]) -> Entries:
-    """What a service, started with some options, enters while it answers a call."""
+def served(
+    bundle: Bundle,
+    folder: Path,
+    options: Sequence[str],
+    call: Callable[[LightpageClient], object],
+    undo: Callable[[LightpageClient], object] = lambda _: None,
+) -> Entries:
+    """What a service, started with some options, enters while it answers a call for the second time.
+
+    Args:
+        bundle: that it serves.
+        folder: empty.
+        options: of `lightpage serve`.
+        call: of the client's.
+        undo: done after the first time.
+    """
     traced = Traced(folder)
     own = ("--bundle", str(bundle.path), "--health-address", "off")
     with (
@@ -103,6 +122,7 @@ def served(bundle: Bundle, folder: Path, options: Sequence[str], call: Callable[
         LightpageClient(service.target, _CALL_S) as client,
     ):
         call(client)
+        undo(client)
         with traced.entered():
             call(client)
     return traced.entries()
@@ -121,8 +141,10 @@ def read_page(bundle: Bundle, folder: Path) -> Entries:
 
 def recalibration(bundle: Bundle, folder: Path) -> Entries:
     """The service recalibrates with known pages of a recording, and puts the new model in service."""
-    source = ("--source", f"recording:{_recorded(bundle, folder)}", "--store", str(folder / "store"))
-    return served(bundle, folder, source, lambda client: client.recalibrate(count=_KNOWN_PAGES))
+    options = ("--source", f"recording:{_recorded(bundle, folder, _DRIFTED)}", "--store", str(folder / "store"))
+    return served(
+        bundle, folder, options, lambda client: client.recalibrate(count=_KNOWN_PAGES), LightpageClient.rollback
+    )
 
 
 def bulk_page(bundle: Bundle, folder: Path) -> Entries:
@@ -133,7 +155,7 @@ def bulk_page(bundle: Bundle, folder: Path) -> Entries:
     with Ledger(folder / "run") as ledger:
         before, task, *_ = ledger.missing(job)
     list(engine.run([before]))
-    with recording() as recorder:
+    with tracing() as recorder:
         list(engine.run([task]))
     return recorder.entries()
 
@@ -146,12 +168,14 @@ CALLS: dict[str, Callable[[Bundle, Path], Entries]] = {
 }
 
 
-def _recorded(bundle: Bundle, folder: Path) -> Path:
-    """A recording of known pages of a simulated device of the bundle's profile."""
+def _recorded(bundle: Bundle, folder: Path, *settings: str) -> Path:
+    """A recording of known pages of a simulated device of the bundle's profile, some of its numbers changed."""
     (profile := folder / "profile.toml").write_text(bundle.manifest.profile)
     command = [sys.executable, "-m", "lightpage.cli.main", "simulate", "--profile", str(profile)]
     out = folder / "recorded.h5"
-    subprocess.run([*command, "--pages", str(_KNOWN_PAGES + 1), "--out", str(out)], check=True, capture_output=True)
+    changed = [word for setting in settings for word in ("--set", setting)]
+    told = ("--pages", str(_KNOWN_PAGES + 1), "--out", str(out))
+    subprocess.run([*command, *told, *changed], check=True, capture_output=True)
     return out
 
 

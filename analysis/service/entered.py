@@ -1,7 +1,7 @@
-"""Which functions of the project are entered, in this process or in programs that are started with `traced`.
+"""Which functions of the project are entered, in this process (`tracing`) or in programs that are started (`Traced`).
 
 What runs while a module is imported does not count, nor do the bodies of classes, nor comprehensions, which are a part
-of the function around them. A generator or a coroutine counts once, when it is called.
+of the function around them. A generator or a coroutine counts once, when it begins.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ class Traced:
 
 
 @contextmanager
-def recording() -> Iterator[Recorder]:
+def tracing() -> Iterator[Recorder]:
     """Yields what notes the functions that this process enters in the `with` statement."""
     switch = bytearray([1])
     recorder = Recorder(switch)
