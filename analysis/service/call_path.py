@@ -106,7 +106,7 @@ def served(
     call: Callable[[LightpageClient], object],
     undo: Callable[[LightpageClient], object] = lambda _: None,
 ) -> Entries:
-    """What a service, started with some options, enters while it answers a call for the second time.
+    """The functions that a service, started with some options, enters while it answers a call for the second time.
 
     Args:
         bundle: that it serves.
@@ -129,18 +129,18 @@ def served(
 
 
 def decode(bundle: Bundle, folder: Path) -> Entries:
-    """A caller sends a pair of frames."""
+    """The functions that the service enters to decode a pair of frames that a caller sends."""
     return served(bundle, folder, (), lambda client: client.decode(bundle.golden.pair))
 
 
 def read_page(bundle: Bundle, folder: Path) -> Entries:
-    """The service reads a page of a recording, which is its source."""
+    """The functions that the service enters to read a page of a recording, which is its source."""
     source = ("--source", f"recording:{_recorded(bundle, folder)}")
     return served(bundle, folder, source, lambda client: client.read_page())
 
 
 def recalibration(bundle: Bundle, folder: Path) -> Entries:
-    """The service recalibrates with known pages of a recording, and puts the new model in service."""
+    """The functions that the service, and the process it starts, enter until a recalibrated model is in service."""
     options = ("--source", f"recording:{_recorded(bundle, folder, _DRIFTED)}", "--store", str(folder / "store"))
     return served(
         bundle, folder, options, lambda client: client.recalibrate(count=_KNOWN_PAGES), LightpageClient.rollback
@@ -148,7 +148,7 @@ def recalibration(bundle: Bundle, folder: Path) -> Entries:
 
 
 def bulk_page(bundle: Bundle, folder: Path) -> Entries:
-    """A worker of a bulk run decodes a range of one page; what plans ranges and adds up results is left out."""
+    """The functions that a worker of a bulk run enters to decode a range of one page, which it begins to track."""
     choices = Choices(operation=Operation.DECODE, range_pages=1)
     job = of_recordings(choices, [str(_recorded(bundle, folder))], str(bundle.path), None)
     engine = InlineEngine(Worker(threads=1))

@@ -1,4 +1,4 @@
-"""Which functions of the project are entered, in this process (`tracing`) or in programs that are started (`Traced`).
+"""Notes which functions of the project are entered, in this process (`tracing`) or in programs it starts (`Traced`).
 
 What runs while a module is imported does not count, nor do the bodies of classes, nor comprehensions, which are a part
 of the function around them. A generator or a coroutine counts once, when it begins.
@@ -71,7 +71,7 @@ class Recorder:
         sys.setprofile(self._event)
 
     def entries(self) -> list[Entry]:
-        """What was entered, in order of the first time."""
+        """The functions that were entered, in order of the first time."""
         found: dict[tuple[str, str], Entry] = {}
         for moment, code, caller in self._entered:
             key = self._file(code), code.co_qualname.partition(".<locals>.")[0]
@@ -103,7 +103,7 @@ class Recorder:
             self._entered.append((time.monotonic(), code, None if back is None else back.f_code))
 
     def _is_own(self, code: CodeType) -> bool:
-        """Whether it is the project's, and serves."""
+        """True for code of the project that serves."""
         if not code.co_filename.startswith(self._root):
             return False
         file = self._file(code)
@@ -146,14 +146,14 @@ class Traced:
                 switch[0] = 0
 
     def entries(self) -> list[Entry]:
-        """What all of them entered, in order of the first time, once they have ended."""
+        """The functions that all of them entered, in order of the first time, once they have ended."""
         noted = [Entry(*one) for file in self._folder.glob("*.json") for one in json.loads(file.read_text())]
         return sorted(noted, key=lambda entry: entry.moment)
 
 
 @contextmanager
 def tracing() -> Iterator[Recorder]:
-    """Yields what notes the functions that this process enters in the `with` statement."""
+    """Yields a recorder of the functions that this process enters in the `with` statement."""
     switch = bytearray([1])
     recorder = Recorder(switch)
     recorder.install()
