@@ -10,6 +10,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from fnmatch import fnmatch
@@ -189,7 +190,9 @@ def _show(files: Sequence[EnteredFile]) -> None:
             functions = ", ".join(file.functions[:_SHOWN]) + more
             caller = numbers.get(file.entered_from, "-")
             click.echo(f"{file.number:>3} {caller:>4} {file.file:<{width}} {file.calls:>6}  {functions}")
-        click.echo(f"{len(shown)} files {'that only record' if apart else 'on the way'}")
+        folders = Counter(str(Path(file.file).parent) for file in shown)
+        told = ", ".join(f"{folder} {count}" for folder, count in folders.most_common())
+        click.echo(f"{len(shown)} files {'that only record' if apart else 'on the way'}: {told or 'none'}")
 
 
 @click.command()
