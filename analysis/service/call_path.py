@@ -23,14 +23,14 @@ from analysis.service.running import RunningService
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.files import write_json
-from runtime.bundle.bundle import Bundle
-from runtime.bundle.shipped import DEFAULT, bundle_path
-from runtime.client.client import LightpageClient
-from runtime.scaling.inline import InlineEngine
-from runtime.scaling.job import Choices, of_recordings
-from runtime.scaling.ledger import Ledger
-from runtime.scaling.task import Operation
-from runtime.scaling.work import Worker
+from lightpage.runtime.archives.run.job import Choices, of_recordings
+from lightpage.runtime.archives.run.ledger import Ledger
+from lightpage.runtime.archives.run.task import Operation
+from lightpage.runtime.archives.workers.inline import InlineEngine
+from lightpage.runtime.archives.workers.work import Worker
+from lightpage.runtime.client.client import LightpageClient
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 
 APART = {
     "*/logs.py": "log of pages",

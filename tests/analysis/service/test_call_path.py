@@ -11,9 +11,9 @@ from click.testing import CliRunner
 
 from analysis.service.call_path import APART, main
 from analysis.service.entered import ROOT
-from runtime.decoding import decoder
-from runtime.rpc import call_log, frame_calls
-from runtime.service import metrics
+from lightpage.runtime.model.decoding import decoder
+from lightpage.runtime.service.monitoring import metrics
+from lightpage.runtime.service.server import call_log, frame_calls
 
 
 def test_a_decode_enters_its_handler_then_the_decoder_and_never_the_client(toy_zip: Path, tmp_path: Path) -> None:
