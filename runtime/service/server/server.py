@@ -205,6 +205,7 @@ class LightpageServer:
         self._dispatcher.end_watches()
         if not await self._dispatcher.ended_within(grace_s):
             self._dispatcher.end_all()
+            await self._dispatcher.ended_within(_END_S)
         await self._server.stop(_END_S)
 
     def _await(self, work: Coroutine[Any, Any, T]) -> T:
@@ -213,6 +214,10 @@ class LightpageServer:
     def _run(self) -> None:
         asyncio.set_event_loop(self._loop)
         self._loop.run_forever()
+        if left := asyncio.all_tasks(self._loop):  # calls that hear of the end just now
+            for task in left:
+                task.cancel()
+            self._loop.run_until_complete(asyncio.wait(left, timeout=_END_S))
         self._loop.run_until_complete(self._loop.shutdown_asyncgens())
         self._loop.close()
 

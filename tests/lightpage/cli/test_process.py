@@ -78,10 +78,11 @@ def test_sigterm_and_a_hangup_end_a_command_unless_they_are_ignored(
     def called() -> None:
         os.kill(os.getpid(), number)
 
-    before = signal.signal(number, signal.SIG_IGN) if ignored else signal.getsignal(number)
+    handler = signal.SIG_IGN if ignored else signal.SIG_DFL
+    before = signal.signal(number, handler)
     try:
         assert run(called, []) == status
-        assert signal.getsignal(number) == (signal.SIG_IGN if ignored else before)
+        assert signal.getsignal(number) == handler
     finally:
         signal.signal(number, before)
 

@@ -193,11 +193,14 @@ def test_a_thread_that_does_not_end_does_not_keep_the_process(
 
 @pytest.mark.parametrize("kind", [signal.SIGTERM, signal.SIGHUP])
 def test_each_signal_stops_and_leaves_the_handlers_that_were_there(kind: signal.Signals) -> None:
-    before = signal.getsignal(kind)
-    with stop_signals() as wait_for_stop:
-        os.kill(os.getpid(), kind)
-        wait_for_stop()
-    assert signal.getsignal(kind) == before
+    before = signal.signal(kind, signal.SIG_DFL)  # nohup has a hangup ignored
+    try:
+        with stop_signals() as wait_for_stop:
+            os.kill(os.getpid(), kind)
+            wait_for_stop()
+        assert signal.getsignal(kind) == signal.SIG_DFL
+    finally:
+        signal.signal(kind, before)
 
 
 def test_a_hangup_that_was_to_be_ignored_is() -> None:
