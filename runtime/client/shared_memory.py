@@ -5,7 +5,6 @@ from __future__ import annotations
 import mmap
 import os
 import socket
-from types import TracebackType
 from typing import Self
 
 import numpy as np
@@ -105,7 +104,5 @@ class SharedMemory:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from lightpage.codec.page_bytes import PageBytes
 from lightpage.recording.layout import FrameInfo
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.messages import DATA_LOSSES, FLOAT, image_message
+from lightpage.runtime.client.wire.messages import DATA_LOSSES, FLOAT
+from lightpage.runtime.client.wire.requests import image_message
 from lightpage.runtime.client.wire.status import detail_of
 from lightpage.runtime.service.dataplane import Answer, ReadAnswer
 from lightpage.runtime.service.display.display import Wanted

@@ -8,7 +8,7 @@ from typing import Any
 import grpc
 
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.sizes import REPLY_BYTES
+from lightpage.runtime.client.wire.messages import REPLY_BYTES
 from lightpage.runtime.client.wire.tls import TlsFiles
 
 REPEATABLE = ("Describe", "ListModels", "ListJobs", "GetJob", "WatchJob", "WatchDisplay")

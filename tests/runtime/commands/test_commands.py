@@ -21,8 +21,8 @@ from lightpage.errors import LightpageError, SurroundingsError
 from lightpage.page.pilots import Pilots
 from lightpage.recording.decoded_file import DecodedWriter
 from lightpage.recording.reader import Recording, RecordingWriter
+from lightpage.runtime.client.answers import RemotePage
 from lightpage.runtime.client.client import LightpageClient
-from lightpage.runtime.client.wire.pages import RemotePage
 from lightpage.runtime.commands.client import recalibrate as cli_recalibrate
 from lightpage.runtime.device.acquisition.sources import open_source
 from lightpage.runtime.model.bundle.bundle import Bundle
