@@ -24,7 +24,7 @@ from lightpage.runtime.model.decoding.image_position import ImagePosition
 from lightpage.runtime.model.decoding.image_search import BundleSearch
 from lightpage.runtime.model.execution.twin import TWIN_THREADS, OnnxTwin
 from lightpage.runtime.recalibration.known_pages import KnownPages
-from lightpage.runtime.recalibration.outcome import RefitReport, RefitResult
+from lightpage.runtime.recalibration.recalibration import RefitReport, RefitResult
 
 Real = NDArray[np.float64]
 
@@ -114,7 +114,6 @@ def refit(
             coherence_before=fitted.coherence_before,
             coherence_after=fitted.coherence_after,
             image=image,
-            details={"turn_deg": float(np.rad2deg(fitted.turn_rad)), "cost": fitted.cost},
         ),
     )
 

@@ -73,8 +73,7 @@ from lightpage.runtime.model.decoding.page import DecodedPage
 from lightpage.runtime.model.decoding.tracking import NoTracker, Tracker
 from lightpage.runtime.model.execution.providers import Provider
 from lightpage.runtime.recalibration.known_pages import read_recorded
-from lightpage.runtime.recalibration.outcome import RecalibrationOutcome, Refit
-from lightpage.runtime.recalibration.recalibration import next_version, recalibrate
+from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome, Refit, next_version, recalibrate
 from lightpage.runtime.recalibration.refit import refit
 
 T = TypeVar("T")

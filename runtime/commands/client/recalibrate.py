@@ -25,8 +25,7 @@ from lightpage.runtime.model.bundle.manifest import check_version
 from lightpage.runtime.model.bundle.shipped import bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.known_pages import KnownPages, read_recorded
-from lightpage.runtime.recalibration.outcome import RecalibrationOutcome
-from lightpage.runtime.recalibration.recalibration import next_version
+from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome, next_version
 from lightpage.runtime.recalibration.recalibration import recalibrate as recalibrate_bundle
 from lightpage.runtime.recalibration.refit import refit
 

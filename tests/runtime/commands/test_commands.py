@@ -27,7 +27,7 @@ from lightpage.runtime.commands.client import recalibrate as cli_recalibrate
 from lightpage.runtime.device.acquisition.sources import open_source
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.recalibration.outcome import Refit
+from lightpage.runtime.recalibration.recalibration import Refit
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 from lightpage.runtime.service.models.registry import ModelRegistry

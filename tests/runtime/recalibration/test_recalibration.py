@@ -33,8 +33,14 @@ from lightpage.runtime.model.decoding.tracking import NoTracker
 from lightpage.runtime.recalibration import refit as module
 from lightpage.runtime.recalibration.judgement import JudgedPage, judge
 from lightpage.runtime.recalibration.known_pages import KnownPages
-from lightpage.runtime.recalibration.outcome import Refit, RefitReport, RefitResult
-from lightpage.runtime.recalibration.recalibration import next_version, reading_share, recalibrate
+from lightpage.runtime.recalibration.recalibration import (
+    Refit,
+    RefitReport,
+    RefitResult,
+    next_version,
+    reading_share,
+    recalibrate,
+)
 from lightpage.runtime.recalibration.refit import refit
 from lightpage.simulator.simulator import Simulator
 from tests.runtime import toy
