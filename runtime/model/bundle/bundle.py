@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.codec.code import Code, parse_code
 from lightpage.device.profile import Profile, parse_profile
-from lightpage.errors import BundleError, InvalidInputError, ProfileError
+from lightpage.errors import BundleError, CalibrationError, InvalidInputError, ProfileError
 from lightpage.failures import os_failure
 from lightpage.files import move_to_new_name, sync_folder, synchronise
 from lightpage.metrics.information import decide
@@ -42,6 +42,9 @@ from lightpage.runtime.model.bundle.manifest import (
 )
 from lightpage.runtime.model.bundle.signature import BundleKey
 from lightpage.runtime.model.bundle.signature_file import read_signature
+
+if TYPE_CHECKING:
+    from lightpage.calibration.document import Calibration
 
 MAX_ARRAY_BYTES = MAX_BYTES
 """All arrays of one .npz file, unpacked: it is compressed by itself, and may be a bomb inside a small bundle."""
@@ -71,14 +74,11 @@ class Bundle:
     files: Mapping[str, bytes]
 
     @classmethod
-    def open(
-        cls, path: str | Path, max_bytes: int = MAX_BYTES, key: BundleKey | None = None, signature: bytes = b""
-    ) -> Bundle:
+    def open(cls, path: str | Path, key: BundleKey | None = None, signature: bytes = b"") -> Bundle:
         """Read the folder or zip at `path` and check every file against the manifest.
 
         Args:
             path: of it.
-            max_bytes: most bytes taken into memory.
             key: that a zip must be signed with; None for any or none.
             signature: of the zip; empty for that in the file beside it.
 
@@ -87,8 +87,8 @@ class Bundle:
                 key, no zip that is signed with it.
         """
         path = Path(path)
-        content = None if key is None else _signed(path, key, signature or read_signature(path), max_bytes)
-        files = read_files(path, max_bytes, content)
+        content = None if key is None else _signed(path, key, signature or read_signature(path))
+        files = read_files(path, content)
         subject = f"bundle {path}"
         if MANIFEST not in files:
             raise BundleError(subject, f"no {MANIFEST}", f"a bundle with its {MANIFEST}")
@@ -124,6 +124,22 @@ class Bundle:
             return parse_profile(self.manifest.profile, f"{self.subject}: profile")
         except ProfileError as error:
             raise BundleError(error.subject, error.got, error.expected) from None
+
+    @cached_property
+    def calibration(self) -> Calibration:
+        """The calibration that the bundle was made with.
+
+        Raises:
+            CalibrationError: its text is no calibration of its profile.
+        """
+        from lightpage.calibration.document import parse_calibration
+
+        try:
+            calibration = parse_calibration(self.manifest.calibration, f"{self.subject}: calibration")
+            calibration.check_profile(self.profile)
+        except ProfileError as error:
+            raise CalibrationError(error.subject, error.got, error.expected) from None
+        return calibration
 
     @cached_property
     def table(self) -> SamplingTable:
@@ -327,16 +343,16 @@ def _write_file(path: Path, data: bytes) -> None:
         synchronise(file.fileno())
 
 
-def _signed(path: Path, key: BundleKey, signature: bytes, max_bytes: int) -> bytes:
+def _signed(path: Path, key: BundleKey, signature: bytes) -> bytes:
     """The contents of a zip whose signature was checked."""
     subject = f"bundle {path}"
     try:
         with path.open("rb") as file:
-            content = file.read(max_bytes + 1)
+            content = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise BundleError(subject, error, "a zip file: a folder has no signature") from None
-    if len(content) > max_bytes:
-        raise BundleError(subject, f"more than {max_bytes} bytes", f"at most {max_bytes}")
+    if len(content) > MAX_BYTES:
+        raise BundleError(subject, f"more than {MAX_BYTES} bytes", f"at most {MAX_BYTES}")
     key.check(content, signature, subject)
     return content
 

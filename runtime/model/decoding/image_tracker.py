@@ -15,11 +15,10 @@ from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.page.pilots import PilotCheck, Pilots, read_pilots
 from lightpage.page.symbols import check_levels
 from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.model.bundle.manifest import FIELD
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.model.decoding.drift_tables import BundleTables, DriftTables
-from lightpage.runtime.model.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate
+from lightpage.runtime.model.decoding.image_drift import SHIFT, TILT, BundleSearch, BundleTables, DriftModel, Estimate
 from lightpage.runtime.model.decoding.image_position import ImagePosition
-from lightpage.runtime.model.decoding.image_search import BundleSearch, PageSearch
 from lightpage.runtime.model.decoding.page import DecodedPage, Inference, Timings
 from lightpage.runtime.model.decoding.tracking import NoTracker, Tracker, TrackerMemory, confirmed
 from lightpage.runtime.model.execution.twin import TWIN_THREADS, OnnxTwin
@@ -164,8 +163,8 @@ class ImageTracker:
         self,
         decoder: Decoder,
         model: DriftModel,
-        tables: DriftTables,
-        search: PageSearch | None,
+        tables: BundleTables,
+        search: BundleSearch | None,
         memory: TrackerMemory | None = None,
     ) -> None:
         self._decoder, self._model, self._tables, self._search = decoder, model, tables, search
@@ -393,7 +392,7 @@ def tracker_for(decoder: Decoder, memory: TrackerMemory | None = None) -> Tracke
     if "registration" not in decoder.graph.ports:
         return NoTracker(decoder)
     twin, search = OnnxTwin(decoder.bundle, TWIN_THREADS), None
-    if decoder.has_field_graph:
+    if FIELD in decoder.bundle.files:
         search = BundleSearch(decoder, twin)
     else:
         _log.warning("%s: no field graph, so an image that is lost is not looked for", decoder.bundle.subject)

@@ -49,7 +49,7 @@ class Tracker(Protocol):
 
         Raises:
             UnconfirmedPageError: the page's pilots do not bear out what the decoder claims of it.
-            FrameError, PageError, InvalidInputError: see `Decoder.decode`.
+            FrameError, PageError: see `Decoder.decode`.
         """
 
     @property
