@@ -34,8 +34,7 @@ from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.coded_pages import choose_code
 from lightpage.runtime.archives.recordings.evaluation import check_recording
-from lightpage.runtime.model.bundle.bundle import Bundle, npz, write_bundle
-from lightpage.runtime.model.bundle.golden import in_few_counts, shows_page
+from lightpage.runtime.model.bundle.bundle import Bundle, in_few_counts, npz, shows_page, write_bundle
 from lightpage.runtime.model.bundle.manifest import (
     DECODER,
     FIELD,

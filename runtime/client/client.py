@@ -594,14 +594,12 @@ class LightpageClient:
             BundleError: there is none, or the change cannot be noted in the service's store; then nothing changes.
         """
         request = message_of(pb.RollbackRequest, expected_version=expected_version)
-        reply: pb.RollbackReply = self._unary(self._stub.Rollback, request)
-        return reply.model_version, reply.previous_version
+        return self._changed(self._stub.Rollback, request)
 
     def roll_forward(self, expected_version: str = "") -> tuple[str, str]:
         """Go to the later model again, after a roll-back; else as `rollback`."""
         request = message_of(pb.RollForwardRequest, expected_version=expected_version)
-        reply: pb.RollForwardReply = self._unary(self._stub.RollForward, request)
-        return reply.model_version, reply.previous_version
+        return self._changed(self._stub.RollForward, request)
 
     def models(self, stored: bool = False) -> list[ModelInfo]:
         """All models that the service holds loaded, the oldest first; before them those that only its store has.
@@ -659,8 +657,7 @@ class LightpageClient:
             BundleError: there is none, it is damaged, or the change cannot be noted; then nothing changes.
         """
         request = message_of(pb.ActivateModelRequest, version=version, expected_version=expected_version)
-        reply: pb.ActivateModelReply = self._unary(self._stub.ActivateModel, request)
-        return reply.model_version, reply.previous_version
+        return self._changed(self._stub.ActivateModel, request)
 
     def pin_model(self, version: str, pinned: bool = True) -> ModelInfo:
         """See that a model is never deleted, nor replaced by the service itself; or let go of it.
@@ -711,6 +708,11 @@ class LightpageClient:
             raise error_of(error, self.target) from None
         finally:
             call.cancel()
+
+    def _changed(self, method: Callable[..., Any], request: object) -> tuple[str, str]:
+        """Have another model put in service; the versions (now current, before)."""
+        reply = self._unary(method, request)
+        return reply.model_version, reply.previous_version
 
     def _unary(self, method: Callable[..., Any], request: object, timeout_s: float | None = None) -> Any:
         try:

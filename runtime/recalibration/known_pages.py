@@ -57,7 +57,14 @@ class KnownPages:
             check_symbols(symbols, decoder.bundle.profile.page_shape, self.levels, f"known page {number}: symbols")
         if self.references is not None:
             decoder.check(self.references, "reference: ")
-        self._check_different()
+        # A re-fit judged by a page that it was fitted on would praise itself.
+        first: dict[str, int] = {}
+        for number, pair in enumerate(self.pairs):
+            earlier = first.setdefault(hash_frames(pair), number)
+            if earlier != number:
+                raise InvalidInputError(
+                    f"known page {number}", f"the frames of known page {earlier}", "pages that differ: one is judged by"
+                )
 
     def lit(self, bit_depth: int) -> KnownPages:
         """The pages whose frames show light; of each other one is warned.
@@ -81,16 +88,6 @@ class KnownPages:
             raise dark
         pairs, symbols = tuple(self.pairs[n] for n in kept), tuple(self.symbols[n] for n in kept)
         return replace(self, pairs=pairs, symbols=symbols)
-
-    def _check_different(self) -> None:
-        """A re-fit judged by a page that it was fitted on would praise itself."""
-        first: dict[str, int] = {}
-        for number, pair in enumerate(self.pairs):
-            earlier = first.setdefault(hash_frames(pair), number)
-            if earlier != number:
-                raise InvalidInputError(
-                    f"known page {number}", f"the frames of known page {earlier}", "pages that differ: one is judged by"
-                )
 
     def part(self, pages: slice) -> KnownPages:
         """Some of the pages, the rest as it is."""

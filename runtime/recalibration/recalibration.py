@@ -19,8 +19,7 @@ from lightpage.errors import CalibrationError, FrameError, RecalibrationRefusedE
 from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import hash_frames
-from lightpage.runtime.model.bundle.bundle import Bundle, npz, write_bundle
-from lightpage.runtime.model.bundle.golden import in_few_counts, shows_page
+from lightpage.runtime.model.bundle.bundle import Bundle, in_few_counts, npz, shows_page, write_bundle
 from lightpage.runtime.model.bundle.manifest import GOLDEN, TABLE, Manifest, Provenance, check_version
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_position import ImagePosition

@@ -126,18 +126,15 @@ class WorkFolder:
         pairs, symbols, levels = tuple(FramePair(*pair) for pair in frames), tuple(arrays["symbols"]), arrays["levels"]
         return bundle, KnownPages(pairs, symbols, int(levels), references, arrays.get("pilot_mask"), (x, y)), job
 
-    def write_outcome(self, outcome: RecalibrationOutcome) -> None:
-        """Write what the recalibration found."""
-        self._write_result({"outcome": _OUTCOME.dump_python(outcome, mode="json")})
-
-    def write_error(self, error: LightpageError) -> None:
-        """Write why there is no outcome."""
-        told = {"kind": type(error).__name__, **{name: vars(error)[name] for name in ("subject", "got", "expected")}}
-        self._write_result({"error": told})
-
-    def _write_result(self, result: dict[str, Any]) -> None:
+    def write_result(self, result: RecalibrationOutcome | LightpageError) -> None:
+        """Write what the recalibration found, or why there is no outcome."""
+        if isinstance(result, LightpageError):
+            words = {name: vars(result)[name] for name in ("subject", "got", "expected")}
+            told = {"error": {"kind": type(result).__name__, **words}}
+        else:
+            told = {"outcome": _OUTCOME.dump_python(result, mode="json")}
         made = self.path / f"{_RESULT}.made"
-        made.write_text(json.dumps(result))
+        made.write_text(json.dumps(told))
         made.rename(self.path / _RESULT)
 
     def read_result(self) -> RecalibrationOutcome | None:

@@ -50,11 +50,9 @@ def work(folder: WorkFolder, progress: Progress, fit: Refit = refit) -> None:
         bundle, pages, job = folder.read_task()
         decoder = Decoder(bundle, THREADS)
         tracker = NoTracker(decoder) if job.memory is None else tracker_for(decoder, job.memory)
-        outcome = recalibrate(decoder, pages, job.out, job.version, fit, progress, tracker)
+        folder.write_result(recalibrate(decoder, pages, job.out, job.version, fit, progress, tracker))
     except LightpageError as error:
-        folder.write_error(error)
-    else:
-        folder.write_outcome(outcome)
+        folder.write_result(error)
 
 
 def yield_to_reads() -> None:
@@ -66,23 +64,20 @@ def yield_to_reads() -> None:
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
-def yield_more(
-    room: float = ROOM, clock: Clock = SYSTEM, worked: Callable[[], float] = time.process_time
-) -> threading.Thread:
+def yield_more(clock: Clock = SYSTEM, worked: Callable[[], float] = time.process_time) -> threading.Thread:
     """Yield all to reads, from a thread, as soon as they leave room.
 
     There is no way back: who has not the right to it cannot raise a priority. Where reads leave no pause later on, the
     work runs into its limit of time, and the next one begins as this one did.
 
     Args:
-        room: share of a core.
         clock: by which the time passes over which it is taken.
         worked: processor time that this process has had, seconds.
     """
 
     def watch() -> None:
         share = -1.0
-        while share < room:
+        while share < ROOM:
             begun, before = clock.now(), worked()
             clock.sleep(_LOOK_S)
             share = (worked() - before) / (clock.now() - begun)

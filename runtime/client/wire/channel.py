@@ -25,11 +25,6 @@ are all at work takes its time to answer, and a host that is being switched on d
 KEEPALIVE_MS = 30_000
 """A connection silent for so long is asked for a sign of life, so that either end notices that the other has gone."""
 
-_CLIENT_KEEPALIVE = (
-    ("grpc.keepalive_time_ms", KEEPALIVE_MS),
-    ("grpc.keepalive_timeout_ms", 20_000),  # a service whose cores are all at work takes its time
-)
-
 SERVER_KEEPALIVE = (
     ("grpc.keepalive_time_ms", KEEPALIVE_MS),
     ("grpc.keepalive_permit_without_calls", 1),
@@ -57,7 +52,8 @@ def open_channel(target: str, tls: TlsFiles | None = None) -> grpc.Channel:
         ("grpc.max_reconnect_backoff_ms", most_ms),
         ("grpc.min_reconnect_backoff_ms", CONNECT_MS),
         ("grpc.service_config", _service_config()),
-        *_CLIENT_KEEPALIVE,
+        ("grpc.keepalive_time_ms", KEEPALIVE_MS),
+        ("grpc.keepalive_timeout_ms", 20_000),  # a service whose cores are all at work takes its time
     )
     if tls is None:
         return grpc.insecure_channel(target, options=options)

@@ -37,15 +37,7 @@ _LITTER = frozenset(
 
 _MAX_LITTER = 4 * MAX_FILES
 
-_DAMAGE = (
-    zipfile.BadZipFile,
-    zlib.error,
-    struct.error,
-    NotImplementedError,
-    RuntimeError,
-    EOFError,
-    ValueError,
-)
+_DAMAGE = (zipfile.BadZipFile, zlib.error, struct.error, NotImplementedError, RuntimeError, EOFError, ValueError)
 """What zipfile raises on damaged, encrypted or exotic archives."""
 
 

@@ -93,11 +93,7 @@ class Decoder:
     """
 
     def __init__(
-        self,
-        bundle: Bundle,
-        threads: int | None = None,
-        graph: TableGraph | None = None,
-        provider: Provider = ON_CPU,
+        self, bundle: Bundle, threads: int | None = None, graph: TableGraph | None = None, provider: Provider = ON_CPU
     ) -> None:
         self.bundle, self.threads = bundle, threads
         self.graph = graph or open_graph(bundle, threads, provider)
@@ -361,11 +357,7 @@ class BundleFieldSolver:
             raise BundleError(f"{self._subject}: outputs", f"no {', '.join(sorted(missing))}", "a graph with its field")
 
     def __call__(
-        self,
-        pair: FramePair,
-        references: FramePair,
-        registration: NDArray[np.float32],
-        homodyne: NDArray[np.float32],
+        self, pair: FramePair, references: FramePair, registration: NDArray[np.float32], homodyne: NDArray[np.float32]
     ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
         """Field and what is left of the equations, see `FieldSolver`; whatever the page's residual is.
 

@@ -28,6 +28,7 @@ from lightpage.page.pilots import Pilots, read_pilots
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.page import Inference
+from lightpage.runtime.model.decoding.phase_refit import wrapped
 
 Real = NDArray[np.float64]
 
@@ -137,7 +138,7 @@ class DriftModel:
         concentration = inference.concentration.astype(np.float64)
         phase = inference.phase - read_pilots(inference.p, pilots).piston.angle_rad
         at = pilots.mask
-        residual, weight = _wrapped(phase[at] - pilots.phases), np.minimum(concentration[at], _CAP)
+        residual, weight = wrapped(phase[at] - pilots.phases), np.minimum(concentration[at], _CAP)
         if not weight.sum() > 0 or abs(np.sum(weight * np.exp(1j * residual))) < LEAST_COHERENCE * weight.sum():
             return None
         coarse = _solve(residual, self.slopes[:, at], weight, prior)
@@ -151,7 +152,7 @@ class DriftModel:
         decided[at] = pilots.phases
         chosen = safe | at
         weight = np.minimum(concentration[chosen], _CAP)
-        fine = _solve(_wrapped(phase - decided)[chosen], self.slopes[:, chosen], weight, prior)
+        fine = _solve(wrapped(phase - decided)[chosen], self.slopes[:, chosen], weight, prior)
         # a page of more levels than it is read with is decided wrongly throughout
         return coarse if fine is None or fine.over_claim > _MOST_OVER_CLAIM else fine
 
@@ -218,15 +219,11 @@ def _solve(residual: Real, slopes: Real, weight: Real, prior: Real) -> Estimate 
         solution = np.asarray(
             np.linalg.solve(normal, columns.T @ (trusted * (off + columns @ solution)) / excess), np.float64
         )
-        off = _wrapped(residual - columns @ solution)
+        off = wrapped(residual - columns @ solution)
         trusted = weight / (1 + off**2 * weight / _OUTLIER**2)
     excess = max(1.0, float(np.sum(trusted * off**2) / len(off)))
     covariance: Real = np.linalg.inv(columns.T @ (columns * trusted[:, None]) / excess + precision).astype(np.float64)
     return Estimate(solution[1:], covariance[1:, 1:], float(solution[0]), excess)
-
-
-def _wrapped(angle: Real) -> Real:
-    return np.asarray(angle - 2 * np.pi * np.rint(angle / (2 * np.pi)))
 
 
 class BundleTables:

@@ -88,6 +88,10 @@ FEWEST_PILOTS = 12
 """Pilots of a page from which drift is read: four numbers can be fitted to fewer whatever they are."""
 
 
+_LEARNT = ("drift", "covariance", "walk", "traced_tilt", "jump_px")
+"""Arrays of an `ImageState` that another process is told of."""
+
+
 @dataclass(frozen=True)
 class ImageState:
     """What a page is decoded with.
@@ -190,29 +194,19 @@ class ImageTracker:
     def memory(self) -> TrackerMemory:
         """See `Tracker`."""
         state = self.state
-        numbers = {
-            "drift": state.drift,
-            "covariance": state.covariance,
-            "walk": state.walk,
-            "traced_tilt_rad": state.traced_tilt,
-            "jump_px": state.jump_px,
-        }
-        plain = {name: values.tolist() for name, values in numbers.items()}
+        plain = {name: getattr(state, name).tolist() for name in _LEARNT}
         return TrackerMemory.model_validate({**plain, "settled": state.settled, "share": state.share})
 
     def _remembered(self, memory: TrackerMemory) -> ImageState:
         """The state that another tracker was in."""
-        drift, traced = np.array(memory.drift), np.array(memory.traced_tilt_rad)
+        learnt = {name: np.array(getattr(memory, name)) for name in _LEARNT}
+        traced = learnt["traced_tilt"]
         return ImageState(
-            drift=drift,
-            covariance=np.array(memory.covariance),
             decoder=self._tables.traced(traced) if traced.any() else self._decoder,
-            table=self._tables.shifted(drift[SHIFT]),
-            traced_tilt=traced,
-            walk=np.array(memory.walk),
+            table=self._tables.shifted(learnt["drift"][SHIFT]),
             settled=memory.settled,
-            jump_px=np.array(memory.jump_px),
             share=memory.share,
+            **learnt,
         )
 
     def anew(self) -> ImageTracker:
@@ -266,13 +260,7 @@ class ImageTracker:
         return confirmed(page, found)
 
     def _attempts(
-        self,
-        pair: FramePair,
-        state: ImageState,
-        levels: int,
-        pilots: Pilots,
-        found: FoundImage | None,
-        clock: _Clock,
+        self, pair: FramePair, state: ImageState, levels: int, pilots: Pilots, found: FoundImage | None, clock: _Clock
     ) -> _Attempt:
         """Decode at a place, and again where the page shows that its image lies: the best one, with the first step."""
         enough = SEARCHED_PX if found is not None and found.found else np.inf

@@ -215,11 +215,7 @@ class BoundSession:
     """
 
     def __init__(
-        self,
-        session: Session,
-        provider: Provider,
-        constants: Mapping[str, NDArray[Any]],
-        subject: str = "onnxruntime",
+        self, session: Session, provider: Provider, constants: Mapping[str, NDArray[Any]], subject: str = "onnxruntime"
     ) -> None:
         self.session, self._subject, self._provider = session, subject, provider
         with running(subject, provider):

@@ -116,9 +116,7 @@ class GraphFile:
         graph, fixed = model.graph, self.table_inputs.keys() - set(fed)
         inputs = [entry for entry in graph.input if entry.name not in fixed]
         held = [tensor for tensor in graph.initializer if tensor.name not in self.table_inputs.keys() - fixed]
-        for field, values in (("input", inputs), ("initializer", held)):
-            graph.ClearField(field)
-            getattr(graph, field).extend(values)
+        _replace(graph, input=inputs, initializer=held)
         for tensor in graph.initializer:
             if tensor.name in table and tensor.name in fixed:
                 for field in ("float_data", "int32_data", "int64_data", "double_data", "uint64_data"):
@@ -153,9 +151,7 @@ def _cut(model: pb.Model, fixed: Collection[str]) -> CutGraph:
         _keep(first, [*_needed(behind, constants - computed), *before], (), ())
         types = {value.name: value for value in graph.value_info}
         first.graph.output.extend(types.get(name, pb.Value(name=name)) for name in between)
-    held = [tensor for tensor in graph.initializer if tensor.name not in direct]
-    graph.ClearField("initializer")
-    graph.initializer.extend(held)
+    _replace(graph, initializer=[tensor for tensor in graph.initializer if tensor.name not in direct])
     _keep(model, behind, graph.input, graph.output)
     return CutGraph(None if first is None else first.SerializeToString(), model, between, direct)
 
@@ -176,11 +172,14 @@ def _keep(model: pb.Model, nodes: Iterable[pb.Node], inputs: Iterable[pb.Value],
     nodes, inputs, outputs = list(nodes), list(inputs), list(outputs)
     used = {name for node in nodes for name in node.input} | {value.name for value in (*inputs, *outputs)}
     held = [tensor for tensor in graph.initializer if tensor.name in used]
-    parts = (("node", nodes), ("initializer", held), ("input", inputs), ("output", outputs))
-    for field, values in parts:
+    _replace(graph, node=nodes, initializer=held, input=inputs, output=outputs, value_info=[])
+
+
+def _replace(graph: pb.Graph, **parts: list[Any]) -> None:
+    """Put other messages into repeated fields of a graph."""
+    for field, messages in parts.items():
         graph.ClearField(field)
-        getattr(graph, field).extend(values)
-    graph.ClearField("value_info")
+        getattr(graph, field).extend(messages)
 
 
 class TableGraph:

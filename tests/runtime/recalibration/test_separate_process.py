@@ -189,7 +189,7 @@ def test_errors_keep_their_class_and_words(tmp_path: Path) -> None:
     folder = WorkFolder(tmp_path)
     assert folder.read_result() is None
     for error in (WorkerError("a", "b", "c"), BundleError("bundle", 3, 4)):
-        folder.write_error(error)
+        folder.write_result(error)
         with pytest.raises(type(error)) as caught:
             folder.read_result()
         assert str(caught.value) == str(error)

@@ -20,8 +20,7 @@ from lightpage.recording.exposure import check_light
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle import archive
 from lightpage.runtime.model.bundle.archive import read_files
-from lightpage.runtime.model.bundle.bundle import Bundle, npz, write_bundle
-from lightpage.runtime.model.bundle.golden import in_few_counts, shows_page
+from lightpage.runtime.model.bundle.bundle import Bundle, in_few_counts, npz, shows_page, write_bundle
 from lightpage.runtime.model.bundle.manifest import GOLDEN, MANIFEST, PILOTS, TABLE, parse_manifest
 from lightpage.runtime.model.bundle.signature import BundleKey
 from lightpage.runtime.model.bundle.signature_file import signature_path
