@@ -371,10 +371,8 @@ class LightpageClient:
         Raises:
             SourceError: the source's device shows its pages by itself.
         """
-        if page is None:
-            self._unary(self._stub.ReportDisplay, pb.ReportDisplayRequest(withdrawn=True))
-        else:
-            self._unary(self._stub.ReportDisplay, message_of(pb.ReportDisplayRequest, page=page))
+        shown = {"withdrawn": True} if page is None else {"page": page}
+        self._unary(self._stub.ReportDisplay, message_of(pb.ReportDisplayRequest, **shown))
 
     def beams_set(self, *, signal: bool, reference: bool) -> None:
         """Say which beams are let through and have settled.

@@ -6,8 +6,6 @@ import re
 from typing import Any
 
 import grpc
-from google.protobuf.any_pb2 import Any as AnyMessage
-from google.protobuf.duration_pb2 import Duration
 from google.rpc import error_details_pb2 as rpc_details
 from google.rpc import status_pb2 as rpc_status
 
@@ -153,29 +151,24 @@ def trailers(error: BaseException) -> tuple[tuple[str, bytes], ...]:
         if (job := getattr(error, "job", None)) is not None:
             info.metadata["job"] = job
         if (retry_s := getattr(error, "retry_s", _RETRY_S.get(type(error)))) is not None:
-            delay = Duration()
-            delay.FromNanoseconds(int(1e9 * retry_s))
-            details.append(rpc_details.RetryInfo(retry_delay=delay))
+            retry = rpc_details.RetryInfo()
+            retry.retry_delay.FromNanoseconds(int(1e9 * retry_s))
+            details.append(retry)
         if isinstance(error, InvalidInputError):
             field = detail.thing if _FIELD.fullmatch(detail.thing) else ""
             violation = rpc_details.BadRequest.FieldViolation(field=field, description=told(error))
             details.append(rpc_details.BadRequest(field_violations=[violation]))
     status = rpc_status.Status(code=code.value[0], message=told(error))
     for each in details:
-        packed = AnyMessage()
-        packed.Pack(each)
-        status.details.append(packed)
+        status.details.add().Pack(each)
     return (*own, (STATUS_KEY, status.SerializeToString()))
 
 
 def refusal_of(error: BaseException) -> pb.Refusal:
     """How a call would have ended, for one page of many; an unforeseen error tells its class only."""
     error = foreseen(error)
-    code = status_of(error).value[0]
-    if isinstance(error, LightpageError):
-        return pb.Refusal(code=code, detail=detail_of(error), reason=reason_of(error))
-    detail = pb.ErrorDetail(kind="LightpageError", thing="service", got=told(error), wanted="an answer")
-    return pb.Refusal(code=code, detail=detail, reason=reason_of(error))
+    known = error if isinstance(error, LightpageError) else LightpageError("service", told(error), "an answer")
+    return pb.Refusal(code=status_of(error).value[0], detail=detail_of(known), reason=reason_of(error))
 
 
 def error_of(rpc: grpc.RpcError, target: str) -> LightpageError:
