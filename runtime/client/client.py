@@ -41,7 +41,7 @@ from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from lightpage.runtime.client.shared_memory import SharedMemory
 from lightpage.runtime.client.wire.address import check_address
-from lightpage.runtime.client.wire.channel import open_channel
+from lightpage.runtime.client.wire.channel import TlsFiles, open_channel
 from lightpage.runtime.client.wire.messages import (
     CHUNK_BYTES,
     PIXEL_CODES,
@@ -52,7 +52,6 @@ from lightpage.runtime.client.wire.messages import (
     set_fields,
 )
 from lightpage.runtime.client.wire.status import error_from, error_of, is_lost_connection
-from lightpage.runtime.client.wire.tls import TlsFiles
 from lightpage.runtime.model.bundle.signature_file import read_signature
 
 CALL_S = 60.0

@@ -14,7 +14,7 @@ from urllib.request import HTTPSHandler, ProxyHandler, build_opener
 from prometheus_client.parser import text_string_to_metric_families
 
 from lightpage.errors import LightpageError
-from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.client.wire.channel import TlsFiles
 
 WINDOW_S = 60.0
 """Rates and times are those of so many seconds, once it has been scraped for so long."""

@@ -6,6 +6,6 @@ from lightpage_client.recording.frame_pair import FramePair
 from lightpage_client.runtime.client.answers import RemotePage
 from lightpage_client.runtime.client.client import LightpageClient
 from lightpage_client.runtime.client.outgoing import KnownPilots
-from lightpage_client.runtime.client.wire.tls import TlsFiles
+from lightpage_client.runtime.client.wire.channel import TlsFiles
 
 __all__ = ["FramePair", "KnownPilots", "LightpageClient", "LightpageError", "RemotePage", "TlsFiles", "errors"]

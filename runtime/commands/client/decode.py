@@ -27,7 +27,7 @@ from lightpage.runtime.archives.recordings.refused import WORTH_NOTHING, Refused
 from lightpage.runtime.client.answers import RemotePage
 from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.client.outgoing import KnownPilots
-from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.commands.client.connection import TARGET, with_tls
 from lightpage.runtime.model.decoding.image_drift import LEAST_COHERENCE
 

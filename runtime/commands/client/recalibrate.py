@@ -19,7 +19,7 @@ from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.evaluation import check_recording
 from lightpage.runtime.client.answers import JobInfo, Recalibrated
 from lightpage.runtime.client.client import RECALIBRATION_S, LightpageClient
-from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.commands.client.connection import TARGET, with_tls
 from lightpage.runtime.model.bundle.manifest import check_version
 from lightpage.runtime.model.bundle.shipped import bundle_path

@@ -14,6 +14,7 @@ from typing import IO
 from lightpage.errors import BundleError
 from lightpage.failures import os_failure
 from lightpage.runtime.model.bundle.manifest import MANIFEST
+from lightpage.runtime.model.bundle.signature_file import read_plain_file
 
 MAX_FILES = 32
 """A bundle has a handful of files; more is something else."""
@@ -93,15 +94,11 @@ def _read_folder(path: Path) -> dict[str, bytes]:
     for name in names:
         check_name(name, subject)
         try:
-            # Kubernetes mounts files as links into a hidden folder beside them. O_NOFOLLOW: any other link is refused
-            # by the kernel, with no gap between a check and the use.
+            # Kubernetes mounts files as links into a hidden folder beside them. Any other link is refused by the
+            # kernel, with no gap between a check and the use.
             target = os.path.realpath(path / name)
             inside = os.path.dirname(os.path.dirname(target)) == real and is_litter(Path(target).parent.name)
-            descriptor = os.open(target if inside else path / name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-            with os.fdopen(descriptor, "rb") as file:
-                if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-                    raise BundleError(f"{subject}: {name}", "no plain file", "a plain file")
-                files[name] = file.read(left + 1)
+            files[name] = read_plain_file(target if inside else path / name, left + 1, f"{subject}: {name}")
         except OSError as error:
             expected = "a readable plain file, no link or folder"
             raise os_failure(f"{subject}: {name}", error, expected, BundleError) from None
