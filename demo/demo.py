@@ -28,9 +28,8 @@ from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.pages import Pages, PagesWriter
 from lightpage.runtime.archives.recordings.coded_pages import AIR_LEVELS
-from lightpage.runtime.client.answers import Recalibrated
+from lightpage.runtime.client.answers import Recalibrated, RemotePage
 from lightpage.runtime.client.client import LightpageClient
-from lightpage.runtime.client.wire.pages import RemotePage
 from lightpage.runtime.device.acquisition.page_store import PageStore
 from lightpage.runtime.device.acquisition.simulator import SimulatorSource
 from lightpage.runtime.device.acquisition.source import FrameSource

@@ -30,11 +30,11 @@ from lightpage.export.parity import check_parity, torch_answer
 from lightpage.files import write_json
 from lightpage.progress import Progress, note, warn
 from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.coded_pages import choose_code
 from lightpage.runtime.archives.recordings.evaluation import check_recording
-from lightpage.runtime.model.bundle.bundle import Bundle, npz, write_bundle
-from lightpage.runtime.model.bundle.golden import in_few_counts, shows_page
+from lightpage.runtime.model.bundle.bundle import Bundle, in_few_counts, npz, shows_page, write_bundle
 from lightpage.runtime.model.bundle.manifest import (
     DECODER,
     FIELD,
@@ -50,7 +50,6 @@ from lightpage.runtime.model.bundle.manifest import (
     sha256,
 )
 from lightpage.runtime.model.decoding.decoder import GOLDEN_TOLERANCE, PAGE_INPUTS, Decoder
-from lightpage.runtime.model.decoding.frames import narrow
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.execution.session import open_session
 from lightpage.train.models.twin import RayTwin, TorchTwin

@@ -24,8 +24,7 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.recalibration.judgement import JudgedPage, Verdict, judge, judged_pages
 from lightpage.runtime.recalibration.known_pages import KnownPages, read_recorded
-from lightpage.runtime.recalibration.outcome import RecalibrationOutcome, RefitReport
-from lightpage.runtime.recalibration.recalibration import next_version
+from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome, RefitReport, next_version
 from lightpage.runtime.recalibration.refit import refit
 from lightpage.train.fitting.memory import keep_freed_memory
 from lightpage.train.models.field import FieldRecovery, TorchFieldSolver

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from lightpage.recording.reader import Recording, RecordingWriter
     from lightpage.runtime.archives.recordings.evaluation import Evaluation, evaluate
     from lightpage.runtime.client.client import LightpageClient
-    from lightpage.runtime.client.wire.tls import TlsFiles
+    from lightpage.runtime.client.wire.channel import TlsFiles
     from lightpage.runtime.model.bundle.bundle import Bundle
     from lightpage.runtime.model.decoding.decoder import Decoder
     from lightpage.runtime.model.decoding.following import FollowingDecoder
@@ -51,7 +51,7 @@ _HOMES = {
     "Recording": "lightpage.recording.reader",
     "RecordingWriter": "lightpage.recording.reader",
     "Simulator": "lightpage.simulator.simulator",
-    "TlsFiles": "lightpage.runtime.client.wire.tls",
+    "TlsFiles": "lightpage.runtime.client.wire.channel",
     "evaluate": "lightpage.runtime.archives.recordings.evaluation",
     "load_device": "lightpage.device.state",
     "load_profile": "lightpage.device.profile",

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import IO
 
 _RECEIVE_BYTES = 65536
 
@@ -22,6 +23,7 @@ class HelperProcess:
         files: file descriptors that it inherits under the same numbers.
         subject: for errors, e.g. ``the process of its window``.
         environment: its variables; those of this process if left out.
+        log: takes what it prints on its standard error; that of this process if left out.
 
     Raises:
         OSError: it cannot be started.
@@ -34,6 +36,7 @@ class HelperProcess:
         files: Sequence[int] = (),
         subject: str,
         environment: Mapping[str, str] | None = None,
+        log: IO[bytes] | None = None,
     ) -> None:
         self._subject = subject
         self._received = b""
@@ -45,6 +48,7 @@ class HelperProcess:
                     [sys.executable, "-P", "-m", module, *arguments],
                     stdin=other.fileno(),
                     stdout=subprocess.DEVNULL,
+                    stderr=log,
                     start_new_session=True,
                     pass_fds=files,
                     env=environment,

@@ -30,8 +30,7 @@ from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.files import write_json
 from lightpage.progress import track
-from lightpage.runtime.client.wire.channel import open_channel
-from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.client.wire.channel import TlsFiles, open_channel
 from lightpage.runtime.service.frames.inference_calls import INFERENCE, PREFIX
 from lightpage.runtime.service.server.call import SERVICE
 

@@ -39,9 +39,8 @@ from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
-from lightpage.runtime.client.shared_memory import SharedMemory
+from lightpage.runtime.client.shared_memory import HANDLE_BYTES, SIZE, SharedMemory, memory_path
 from lightpage.runtime.client.wire.channel import open_channel
-from lightpage.runtime.client.wire.shared_memory import HANDLE_BYTES, SIZE, memory_path
 
 CALL_S = 30.0
 _CANCEL_S = 15e-3

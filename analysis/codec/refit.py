@@ -19,12 +19,12 @@ from lightpage.metrics.information import achievable_rate
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import symbol_phases
 from lightpage.progress import track
+from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.coded_pages import AIR_LEVELS, phase_errors
 from lightpage.runtime.archives.recordings.evaluation import was_seen
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.model.decoding.frames import narrow
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.decoding.phase_refit import ROUNDS, PhaseRefit
 

@@ -42,7 +42,7 @@ from lightpage.runtime.archives.recordings.coded_pages import air_bits
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
-from lightpage.runtime.recalibration.outcome import RecalibrationOutcome
+from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator, Step

@@ -30,9 +30,9 @@ from lightpage.device.profile import load_profile
 from lightpage.files import write_json
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.client.answers import RemotePage
 from lightpage.runtime.client.client import LightpageClient
-from lightpage.runtime.client.wire.pages import RemotePage
-from lightpage.runtime.client.wire.sizes import CHUNK_BYTES
+from lightpage.runtime.client.wire.messages import CHUNK_BYTES
 
 CALL_S = 60.0
 _WARM = 5

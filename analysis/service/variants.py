@@ -10,7 +10,7 @@ import numpy as np
 from lightpage.runtime.model.bundle.bundle import Bundle, npz, write_bundle
 from lightpage.runtime.model.bundle.manifest import GOLDEN, TABLE
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.model.decoding.drift_tables import BundleTables
+from lightpage.runtime.model.decoding.image_drift import BundleTables
 from lightpage.runtime.model.execution.twin import TWIN_THREADS, OnnxTwin
 
 

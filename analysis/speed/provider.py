@@ -38,11 +38,10 @@ from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import DECODER, FLOAT32, Precision
 from lightpage.runtime.model.decoding.decoder import PAGE_INPUTS, Decoder
 from lightpage.runtime.model.decoding.page import DecodedPage
-from lightpage.runtime.model.execution.constant_table import GraphFile
 from lightpage.runtime.model.execution.memory import share_freed_memory
 from lightpage.runtime.model.execution.providers import ON_CPU, WANTED, Provider
 from lightpage.runtime.model.execution.session import VERSION
-from lightpage.runtime.model.execution.table_graph import TableGraph
+from lightpage.runtime.model.execution.table_graph import GraphFile, TableGraph
 
 _ALONE = 11
 """Pages of a single caller, whose median is told."""

@@ -38,9 +38,8 @@ from lightpage.export.onnx_files import decoder_onnx
 from lightpage.files import write_json
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.decoding.decoder import PAGE_INPUTS
-from lightpage.runtime.model.execution.constant_table import GraphFile
 from lightpage.runtime.model.execution.cpus import available_cpus
-from lightpage.runtime.model.execution.table_graph import TableGraph
+from lightpage.runtime.model.execution.table_graph import GraphFile, TableGraph
 from lightpage.train.models.decoder import SymbolDecoder
 from lightpage.train.models.hyperparameters import Hyperparameters
 from lightpage.train.models.presets import FAST, PRESETS

@@ -52,12 +52,12 @@ from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.evaluation import evaluate, was_seen
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.model.decoding.frames import narrow
-from lightpage.runtime.model.decoding.image_search import BundleSearch
+from lightpage.runtime.model.decoding.image_drift import BundleSearch
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.decoding.tracking import Tracker, unconfirmed_page
 from lightpage.runtime.model.execution.twin import TWIN_THREADS, OnnxTwin

@@ -97,3 +97,16 @@ def _forms(frame: NDArray[np.integer[Any]]) -> list[NDArray[np.integer[Any]]]:
 def frame_type(bit_depth: int) -> np.dtype[np.unsignedinteger[Any]]:
     """The smallest type that holds a camera count of `bit_depth` bits."""
     return np.dtype(np.uint8 if bit_depth == MIN_BIT_DEPTH else np.uint16)
+
+
+def narrow(pair: FramePair, bit_depth: int) -> FramePair:
+    """The pair in the narrowest type for `bit_depth` bits, native byte order, where all counts fit into it.
+
+    A recording may hold 8-bit counts in 16 bits; a camera and a bundle do not.
+    """
+    expected = frame_type(bit_depth)
+    frames = [
+        frame.astype(expected, copy=False) if int(frame.max(initial=0)) <= np.iinfo(expected).max else frame
+        for frame in (pair.in_phase, pair.quadrature)
+    ]
+    return FramePair(frames[0], frames[1])

@@ -1,19 +1,149 @@
-"""What a service says of itself and of a recalibration."""
+"""What a service answers, as a caller of it sees it."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from enum import StrEnum
+from typing import Any, TypeVar
 
 import numpy as np
+from google.protobuf.message import Message
 from numpy.typing import NDArray
 
-from lightpage.codec.page_bytes import PageBytes
+from lightpage.codec.page_bytes import FileFacts, Header, Loss, PageBytes
 from lightpage.errors import LightpageError
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.messages import image_of, user_data_of
+from lightpage.runtime.client.wire.messages import DATA_LOSSES, FLOAT, PIXEL_TYPES
 from lightpage.runtime.client.wire.status import error_from
 from lightpage.runtime.model.decoding.image_position import ImagePosition
+
+D = TypeVar("D")
+
+
+def _filled(kind: Callable[..., D], message: Message, **given: object) -> D:
+    """A dataclass of the fields of a message, but for those `given`; None stands for one that is not set."""
+    named = message.DESCRIPTOR.fields_by_name
+    found = {
+        name: getattr(message, name) if not named[name].has_presence or message.HasField(name) else None
+        for name in (field.name for field in fields(kind))  # type: ignore[arg-type]
+        if name not in given
+    }
+    return kind(**given, **found)
+
+
+@dataclass(frozen=True)
+class RemoteTimings:
+    """Seconds spent in the service."""
+
+    receive_s: float
+    decode_s: float
+    inference_s: float
+    total_s: float
+
+
+@dataclass(frozen=True)
+class RemoteFrame:
+    """What a camera says of a frame.
+
+    Attributes:
+        serial: of the camera.
+        frame_id: its own count, which wraps.
+        device_time_s: by its clock, from any moment.
+        host_time_s: when the frame was complete, seconds since 1970.
+    """
+
+    serial: str
+    frame_id: int
+    device_time_s: float
+    host_time_s: float
+
+
+@dataclass(frozen=True)
+class RemotePage:
+    """A page that a service decoded.
+
+    Attributes:
+        symbols: uint8 [ny, nx], 0..levels-1.
+        confidence: float32 [ny, nx], posterior of each symbol; in steps of 1/255 where quantised.
+        concentration: float32 [ny, nx], or None where not asked for.
+        phase: float32 [ny, nx], radians, piston removed, or None where not asked for.
+        levels: M.
+        piston_rad: what was removed.
+        pilot_coherence: agreement of the pilots, 0..1.
+        pilot_trust: share of the claimed concentration that they bear out, 0..1; in the fields above already.
+        claimed_bits, confirmed_bits: information per pilot that is claimed, and that the pilots confirm.
+        recalibration_due: whether they confirm less than on a device that is as it was calibrated.
+        image: where the image lay, or None where the service does not follow it.
+        model_version: which model decoded it.
+        timings: seconds in the service.
+        page: number of the page in the source, or None where the caller sent the frames.
+        written: what the source knows to have been written, uint8 [ny, nx], or None.
+        pilot_mask: where the pilots are, bool [ny, nx]; given with `written`.
+        user_data: the page's bytes, or None where not asked for.
+        recalibration_reasons: why a recalibration is due, as the contract names it without prefix.
+        frame_id, captured_s, correlation_id: as the caller gave them.
+        frames: of the in-phase and the quadrature camera; empty where the source has none.
+        replayed: whether this is the answer to an earlier call with the same request id.
+    """
+
+    symbols: NDArray[np.uint8]
+    confidence: NDArray[np.float32]
+    concentration: NDArray[np.float32] | None
+    phase: NDArray[np.float32] | None
+    levels: int
+    piston_rad: float
+    pilot_coherence: float
+    model_version: str
+    timings: RemoteTimings
+    page: int | None = None
+    written: NDArray[np.uint8] | None = None
+    pilot_mask: NDArray[np.bool_] | None = None
+    pilot_trust: float = 1.0
+    claimed_bits: float = 0.0
+    confirmed_bits: float = 0.0
+    recalibration_due: bool = False
+    image: ImagePosition | None = None
+    user_data: PageBytes | None = None
+    recalibration_reasons: tuple[str, ...] = ()
+    frame_id: int = 0
+    captured_s: float = 0.0
+    correlation_id: str = ""
+    frames: tuple[RemoteFrame, ...] = ()
+    replayed: bool = False
+
+
+def remote_page(reply: pb.DecodeReply, read: pb.ReadPageReply | None = None) -> RemotePage:
+    """A reply as arrays.
+
+    Raises:
+        LightpageError: arrays whose sizes contradict the reply's own shape.
+    """
+    shape, octets = (reply.rows, reply.columns), np.dtype(np.uint8)
+    if reply.confidence_format == pb.CONFIDENCE_FORMAT_UINT8:
+        confidence = _array(reply.confidence, octets, shape, "confidence") / np.float32(255)
+    else:
+        confidence = _array(reply.confidence, FLOAT, shape, "confidence")
+    of_source = read is not None
+    read = read or pb.ReadPageReply()
+    written = read.written
+    return _filled(
+        RemotePage,
+        reply,
+        symbols=_array(reply.symbols, octets, shape, "symbols"),
+        confidence=confidence.astype(np.float32, copy=False),
+        concentration=_optional(reply.concentration, shape, "concentration"),
+        phase=_optional(reply.phase, shape, "phase"),
+        image=_image(reply),
+        user_data=_user_data(reply.user_data) if reply.HasField("user_data") else None,
+        timings=_filled(RemoteTimings, reply.timings),
+        page=read.page if of_source else None,
+        written=_array(written, octets, shape, "written") if written else None,
+        pilot_mask=_array(read.pilot_mask, octets, shape, "pilot_mask") != 0 if written else None,
+        recalibration_reasons=tuple(map(_reason_name, reply.recalibration_reasons)),
+        frames=tuple(_filled(RemoteFrame, frame) for frame in read.frames),
+        replayed=read.replayed,
+    )
 
 
 @dataclass(frozen=True)
@@ -33,9 +163,9 @@ class ModelInfo:
     created: str
     current: bool
     metrics: dict[str, float]
-    pinned: bool = False
-    loaded: bool = True
-    origin: str = ""
+    pinned: bool
+    loaded: bool
+    origin: str
 
 
 @dataclass(frozen=True)
@@ -64,11 +194,6 @@ class ServiceLimits:
     shared_bytes: int
 
 
-def limits_of(message: pb.Limits) -> ServiceLimits:
-    """Limits from their message."""
-    return ServiceLimits(**{field.name: getattr(message, field.name) for field in fields(ServiceLimits)})
-
-
 @dataclass(frozen=True)
 class Description:
     """What a service is."""
@@ -86,12 +211,29 @@ class Description:
     pilot_mask: NDArray[np.bool_]
     pilot_phases: NDArray[np.float32] | None
     """Radians, one a True of `pilot_mask` in row order; None for the profile's pattern."""
-    code_toml: str = ""
+    code_toml: str
     """How user bytes are protected on this device's pages; empty where the model has no code."""
-    user_bytes_per_page: int = 0
-    default_levels: int = 0
+    user_bytes_per_page: int
+    default_levels: int
     """What `levels` 0 stands for where no user bytes are asked for."""
-    limits: ServiceLimits | None = None
+    limits: ServiceLimits
+
+
+def description(reply: pb.DescribeReply) -> Description:
+    """What a service is, from its message."""
+    shape = (reply.page.rows, reply.page.columns)
+    return _filled(
+        Description,
+        reply,
+        model=model_info(reply.model),
+        frame_shape=(reply.camera.rows_px, reply.camera.columns_px),
+        frame_dtype=PIXEL_TYPES.get(reply.camera.pixel_type, "unknown"),
+        bit_depth=reply.camera.bit_depth,
+        page_shape=shape,
+        pilot_mask=_array(reply.pilot_mask, np.dtype(np.uint8), shape, "pilot_mask") != 0,
+        pilot_phases=np.array(reply.pilot_phases, np.float32) if reply.pilot_phases else None,
+        limits=_filled(ServiceLimits, reply.limits),
+    )
 
 
 @dataclass(frozen=True)
@@ -113,15 +255,14 @@ def remote_data(reply: pb.ReadDataReply) -> RemoteData:
     """A message as a page's bytes."""
     told = reply.error
     error = f"{told.thing}: got {told.got}, wanted {told.wanted}" if reply.HasField("error") else ""
-    return RemoteData(None if reply.restored else reply.page, user_data_of(reply.user_data), error)
+    return RemoteData(None if reply.restored else reply.page, _user_data(reply.user_data), error)
 
 
 @dataclass(frozen=True)
 class Recalibrated:
     """The result of a recalibration: AIR in bits per symbol on held-back pages; None where the fit does not say.
 
-    `air_limit` is the least `air_after` that would have been accepted, `air_standard_error` that of the difference;
-    None from a service of an earlier version.
+    `air_limit` is the least `air_after` that would have been accepted, `air_standard_error` that of the difference.
     """
 
     model_version: str
@@ -134,10 +275,10 @@ class Recalibrated:
     coherence_before: float | None
     coherence_after: float | None
     seconds: float
-    pages_lost_before: int = 0
-    image: ImagePosition | None = None
-    air_limit: float | None = None
-    air_standard_error: float | None = None
+    pages_lost_before: int
+    image: ImagePosition | None
+    air_limit: float
+    air_standard_error: float
 
 
 _ORIGINS = {
@@ -149,40 +290,12 @@ _ORIGINS = {
 
 def model_info(model: pb.Model) -> ModelInfo:
     """A model from its message."""
-    return ModelInfo(
-        name=model.name,
-        version=model.version,
-        created=model.created,
-        current=model.current,
-        metrics=dict(model.metrics),
-        pinned=model.pinned,
-        loaded=model.loaded,
-        origin=_ORIGINS.get(model.origin, ""),
-    )
+    return _filled(ModelInfo, model, metrics=dict(model.metrics), origin=_ORIGINS.get(model.origin, ""))
 
 
 def recalibrated(result: pb.RecalibrationResult) -> Recalibrated:
     """A recalibration from its message."""
-
-    def optional(name: str) -> float | None:
-        return float(getattr(result, name)) if result.HasField(name) else None
-
-    return Recalibrated(
-        model_version=result.model_version,
-        previous_version=result.previous_version,
-        pages_used=result.pages_used,
-        pages_held_back=result.pages_held_back,
-        air_before=result.air_before,
-        air_after=result.air_after,
-        angle_deg=optional("angle_deg"),
-        coherence_before=optional("coherence_before"),
-        coherence_after=optional("coherence_after"),
-        seconds=result.seconds,
-        pages_lost_before=result.pages_lost_before,
-        image=image_of(result.image) if result.HasField("image") else None,
-        air_limit=optional("air_limit"),
-        air_standard_error=optional("air_standard_error"),
-    )
+    return _filled(Recalibrated, result, image=_image(result))
 
 
 class JobState(StrEnum):
@@ -222,26 +335,24 @@ class JobInfo:
     fraction: float
     created_s: float
     pages_of: str
-    ended_s: float | None = None
-    result: Recalibrated | None = None
-    error: LightpageError | None = None
-    correlation_id: str = ""
+    ended_s: float | None
+    result: Recalibrated | None
+    error: LightpageError | None
+    correlation_id: str
 
 
 def job_info(job: pb.Job) -> JobInfo:
     """A job from its message."""
     name = pb.JobState.Name(job.state).removeprefix("JOB_STATE_") if job.state in pb.JobState.values() else ""
-    return JobInfo(
-        id=job.id,
+    return _filled(
+        JobInfo,
+        job,
         state=JobState[name] if name in JobState.__members__ else JobState.UNKNOWN,
         step=job.progress.step,
         fraction=job.progress.fraction,
-        created_s=job.created_s,
-        pages_of=job.pages_of,
         ended_s=job.ended_s or None,
         result=recalibrated(job.result) if job.HasField("result") else None,
         error=error_from(job.refusal.detail) if job.HasField("refusal") else None,
-        correlation_id=job.correlation_id,
     )
 
 
@@ -260,7 +371,44 @@ class DisplayOrder:
 
 def display_order(reply: pb.WatchDisplayReply) -> DisplayOrder:
     """An order from its message."""
-    return DisplayOrder(
-        reply.page if reply.HasField("page") else None,
-        (reply.beams.signal, reply.beams.reference) if reply.HasField("beams") else None,
+    beams = (reply.beams.signal, reply.beams.reference) if reply.HasField("beams") else None
+    return _filled(DisplayOrder, reply, beams=beams)
+
+
+def _image(message: pb.DecodeReply | pb.RecalibrationResult) -> ImagePosition | None:
+    """Where the image of a page lay, as a message says; None where it does not."""
+    return _filled(ImagePosition, message.image) if message.HasField("image") else None
+
+
+def _user_data(message: pb.UserData) -> PageBytes:
+    """A message as what a page gave; a loss that this version does not know counts as one of the body."""
+    told = message.header
+    header = Header(told.code_id, told.volume, told.page, told.volume_bytes) if message.HasField("header") else None
+    loss = next((loss for loss, known in DATA_LOSSES.items() if known == message.loss), Loss.BODY)
+    return PageBytes(
+        header,
+        message.data if loss is None else None,
+        FileFacts(message.data_pages, message.parity_pages, message.file_checksum) if loss is None else None,
+        loss,
+        message.iterations,
+        message.failed_blocks,
+        message.blocks,
+        message.corrected,
+        message.margin_bits,
     )
+
+
+def _reason_name(reason: pb.RecalibrationReason) -> str:
+    """The name of a reason, "OTHER" of one that this version does not know."""
+    known = reason in pb.RecalibrationReason.values()
+    return pb.RecalibrationReason.Name(reason).removeprefix("RECALIBRATION_REASON_") if known else "OTHER"
+
+
+def _optional(data: bytes, shape: tuple[int, int], name: str) -> NDArray[np.float32] | None:
+    return _array(data, FLOAT, shape, name).astype(np.float32, copy=False) if data else None
+
+
+def _array(data: bytes, dtype: np.dtype[Any], shape: tuple[int, int], name: str) -> NDArray[Any]:
+    if len(data) != shape[0] * shape[1] * dtype.itemsize:
+        raise LightpageError(f"reply: {name}", f"{len(data)} bytes", f"{shape[0]}x{shape[1]} of {dtype}")
+    return np.frombuffer(data, dtype).reshape(shape)

@@ -6,8 +6,8 @@ import hashlib
 import os
 import secrets
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self, Unpack
 
 import grpc
@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.clock import SYSTEM, Clock
-from lightpage.errors import FrameError, InvalidInputError, LightpageError, PageError
-from lightpage.page.levels import MAX_LEVELS
+from lightpage.errors import FrameError, InvalidInputError, LightpageError
 from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.client import answers
 from lightpage.runtime.client.answers import (
     Description,
     DisplayOrder,
@@ -25,32 +25,33 @@ from lightpage.runtime.client.answers import (
     ModelInfo,
     Recalibrated,
     RemoteData,
-    display_order,
-    job_info,
-    limits_of,
-    model_info,
-    recalibrated,
-    remote_data,
+    RemotePage,
+)
+from lightpage.runtime.client.outgoing import (
+    KnownPilots,
+    PageOptions,
+    options_message,
+    pair_parts,
+    pilots_message,
+    recalibration_pages,
+    sent_frames,
+    sent_symbols,
 )
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from lightpage.runtime.client.shared_memory import SharedMemory
 from lightpage.runtime.client.wire.address import check_address
-from lightpage.runtime.client.wire.channel import open_channel
-from lightpage.runtime.client.wire.frame_parts import FramePart, chunks_of, serialized_part
+from lightpage.runtime.client.wire.channel import TlsFiles, open_channel
 from lightpage.runtime.client.wire.messages import (
+    CHUNK_BYTES,
     PIXEL_CODES,
-    PIXEL_TYPES,
-    KnownPilots,
+    FramePart,
+    chunks_of,
     message_of,
-    pilots_message,
+    serialized_part,
     set_fields,
 )
-from lightpage.runtime.client.wire.page_options import PageOptions, options_message
-from lightpage.runtime.client.wire.pages import RemotePage, remote_page
-from lightpage.runtime.client.wire.sizes import CHUNK_BYTES
 from lightpage.runtime.client.wire.status import error_from, error_of, is_lost_connection
-from lightpage.runtime.client.wire.tls import TlsFiles
 from lightpage.runtime.model.bundle.signature_file import read_signature
 
 CALL_S = 60.0
@@ -115,9 +116,7 @@ class LightpageClient:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -131,24 +130,7 @@ class LightpageClient:
             LightpageError: no answer.
         """
         reply: pb.DescribeReply = self._unary(self._stub.Describe, pb.DescribeRequest())
-        self._description = Description(
-            service_version=reply.service_version,
-            model=model_info(reply.model),
-            frame_shape=(reply.camera.rows_px, reply.camera.columns_px),
-            frame_dtype=PIXEL_TYPES.get(reply.camera.pixel_type, "unknown"),
-            bit_depth=reply.camera.bit_depth,
-            page_shape=(reply.page.rows, reply.page.columns),
-            source=reply.source,
-            source_levels=reply.source_levels,
-            profile_toml=reply.profile_toml,
-            calibration_toml=reply.calibration_toml,
-            pilot_mask=np.frombuffer(reply.pilot_mask, np.uint8).reshape(reply.page.rows, reply.page.columns) != 0,
-            code_toml=reply.code_toml,
-            user_bytes_per_page=reply.user_bytes_per_page,
-            pilot_phases=np.array(reply.pilot_phases, np.float32) if reply.pilot_phases else None,
-            default_levels=reply.default_levels,
-            limits=limits_of(reply.limits),
-        )
+        self._description = answers.description(reply)
         return self._description
 
     def decode(
@@ -189,9 +171,9 @@ class LightpageClient:
             header.shared.offset = memory.write(pair)
             header.shared.region = memory.handle
             request = pb.DecodeFramesRequest(header=header)
-            return remote_page(self._unary(self._decode_shared, request))
-        reply: pb.DecodeReply = self._unary(self._decode_frames, _parts(header, _sent_frames(pair)))
-        return remote_page(reply)
+            return answers.remote_page(self._unary(self._decode_shared, request))
+        reply: pb.DecodeReply = self._unary(self._decode_frames, pair_parts(header, sent_frames(pair)))
+        return answers.remote_page(reply)
 
     def share_memory(self, size: int = 0) -> SharedMemory:
         """Memory that is shared with a service on this machine, for `decode`, to be closed.
@@ -241,22 +223,20 @@ class LightpageClient:
                 for number, pair in enumerate(pairs):
                     header = self._header(pair, levels, bit_depth, black_level, pilots, correlation_id, options)
                     set_fields(header, frame_id=number)
-                    yield from _parts(header, _sent_frames(pair))
+                    yield from pair_parts(header, sent_frames(pair))
             except Exception as error:  # gRPC would tell of it on stderr, and end the call with UNKNOWN
                 failed.append(error)
 
-        call: Any = self._decode_pages(parts(), timeout=timeout_s)
         try:
-            for reply in call:
-                refused = reply.WhichOneof("outcome") == "refused"
-                yield error_from(reply.refused.detail) if refused else remote_page(reply.decoded)
-        except grpc.RpcError as error:
-            raise (failed[0] if failed else error_of(error, self.target)) from None
-        else:
-            if failed:
-                raise failed[0]
-        finally:
-            call.cancel()
+            with self._stream(self._decode_pages(parts(), timeout=timeout_s)) as replies:
+                for reply in replies:
+                    refused = reply.WhichOneof("outcome") == "refused"
+                    yield error_from(reply.refused.detail) if refused else answers.remote_page(reply.decoded)
+        except LightpageError:
+            if not failed:
+                raise
+        if failed:
+            raise failed[0]
 
     def read_page(
         self,
@@ -295,7 +275,7 @@ class LightpageClient:
             correlation_id=correlation_id,
         )
         reply: pb.ReadPageReply = self._unary(self._stub.ReadPage, request)
-        return remote_page(reply.decoded, reply)
+        return answers.remote_page(reply.decoded, reply)
 
     def read_pages(
         self,
@@ -328,15 +308,12 @@ class LightpageClient:
             want_written=want_written,
             correlation_id=correlation_id,
         )
-        call = self._stub.ReadPages(request, timeout=timeout_s)
-        try:
-            for reply in call:
+        with self._stream(self._stub.ReadPages(request, timeout=timeout_s)) as replies:
+            for reply in replies:
                 refused = reply.WhichOneof("outcome") == "refused"
-                yield error_from(reply.refused.detail) if refused else remote_page(reply.read.decoded, reply.read)
-        except grpc.RpcError as error:
-            raise error_of(error, self.target) from None
-        finally:
-            call.cancel()
+                yield (
+                    error_from(reply.refused.detail) if refused else answers.remote_page(reply.read.decoded, reply.read)
+                )
 
     def read_data(self, first: int, pages: int, timeout_s: float = DATA_S) -> Iterator[RemoteData]:
         """Have the service read the bytes of pages `first` to `first + pages - 1` of its source.
@@ -348,14 +325,11 @@ class LightpageClient:
             SourceError: the service has no source, or one that is damaged or dark.
             PageError: no such page.
         """
-        call = self._stub.ReadData(message_of(pb.ReadDataRequest, first_page=first, pages=pages), timeout=timeout_s)
-        try:
-            for reply in call:
-                yield remote_data(reply)
-        except grpc.RpcError as error:
-            raise error_of(error, self.target) from None
-        finally:
-            call.cancel()
+        with self._stream(
+            self._stub.ReadData(message_of(pb.ReadDataRequest, first_page=first, pages=pages), timeout=timeout_s)
+        ) as replies:
+            for reply in replies:
+                yield answers.remote_data(reply)
 
     def upload_pages(self, symbols: NDArray[np.uint8], levels: int) -> int:
         """Give the source's modulator pages [page, ny, nx] of M levels to show; returns the first one's number.
@@ -386,14 +360,9 @@ class LightpageClient:
         Raises:
             SourceError: the source's device shows its pages, and moves its shutters, by itself.
         """
-        call = self._stub.WatchDisplay(pb.WatchDisplayRequest(), timeout=timeout_s)
-        try:
-            for reply in call:
-                yield display_order(reply)
-        except grpc.RpcError as error:
-            raise error_of(error, self.target) from None
-        finally:
-            call.cancel()
+        with self._stream(self._stub.WatchDisplay(pb.WatchDisplayRequest(), timeout=timeout_s)) as replies:
+            for reply in replies:
+                yield answers.display_order(reply)
 
     def page_shown(self, page: int | None) -> None:
         """Say which page is on display and has settled; None for none from now on.
@@ -401,10 +370,8 @@ class LightpageClient:
         Raises:
             SourceError: the source's device shows its pages by itself.
         """
-        if page is None:
-            self._unary(self._stub.ReportDisplay, pb.ReportDisplayRequest(withdrawn=True))
-        else:
-            self._unary(self._stub.ReportDisplay, message_of(pb.ReportDisplayRequest, page=page))
+        shown = {"withdrawn": True} if page is None else {"page": page}
+        self._unary(self._stub.ReportDisplay, message_of(pb.ReportDisplayRequest, **shown))
 
     def beams_set(self, *, signal: bool, reference: bool) -> None:
         """Say which beams are let through and have settled.
@@ -441,20 +408,15 @@ class LightpageClient:
             StoppingError: the service is being stopped.
             BundleError: the new model cannot be written or noted; the old one stays.
         """
-        pages_of = _pages_of(count, pages, recording)
-        request = message_of(pb.RecalibrateRequest, expected_version=expected_version, **pages_of)
-        call = self._stub.Recalibrate(request, timeout=timeout_s)
-        try:
-            result = None
-            for reply in call:  # to its end: a call that is left early counts as cancelled
+        asked = recalibration_pages(count, pages, recording)
+        request = message_of(pb.RecalibrateRequest, expected_version=expected_version, **asked)
+        result = None
+        with self._stream(self._stub.Recalibrate(request, timeout=timeout_s)) as replies:
+            for reply in replies:  # to its end: a call that is left early counts as cancelled
                 if reply.WhichOneof("step") == "result":
-                    result = recalibrated(reply.result)
+                    result = answers.recalibrated(reply.result)
                 else:
                     progress(reply.progress.step, reply.progress.fraction)
-        except grpc.RpcError as error:
-            raise error_of(error, self.target) from None
-        finally:
-            call.cancel()
         if result is None:
             raise LightpageError(f"service at {self.target}", "an end without a result", "a recalibration's result")
         return result
@@ -488,9 +450,9 @@ class LightpageClient:
             pb.StartRecalibrationRequest,
             expected_version=expected_version,
             correlation_id=correlation_id,
-            **_pages_of(count, pages, recording),
+            **recalibration_pages(count, pages, recording),
         )
-        return job_info(self._unary(self._stub.StartRecalibration, request))
+        return answers.job_info(self._unary(self._stub.StartRecalibration, request))
 
     def recalibrate_frames(
         self,
@@ -531,7 +493,7 @@ class LightpageClient:
         if len(pairs) != len(symbols):
             got = f"{len(pairs)} frame pairs and {len(symbols)} pages of symbols"
             raise InvalidInputError("pages to recalibrate with", got, "as many of both")
-        first = _sent_frames(references, "reference: ")
+        first = sent_frames(references, "reference: ")
         header = message_of(
             pb.RecalibrateFramesHeader,
             rows_px=first[0].shape[0],
@@ -546,7 +508,7 @@ class LightpageClient:
             correlation_id=correlation_id,
         )
         pages = [
-            (_sent_frames(pair, f"known page {number}: "), _sent_symbols(page, f"known page {number}: symbols"))
+            (sent_frames(pair, f"known page {number}: "), sent_symbols(page, f"known page {number}: symbols"))
             for number, (pair, page) in enumerate(zip(pairs, symbols, strict=True))
         ]
         for number, (frames, _) in enumerate(pages):
@@ -563,7 +525,7 @@ class LightpageClient:
                 for chunk in map(bytes, chunks_of(frames)):
                     yield pb.RecalibrateFramesRequest(chunk=chunk)
 
-        return job_info(self._unary(self._stub.RecalibrateFrames, parts(), timeout_s))
+        return answers.job_info(self._unary(self._stub.RecalibrateFrames, parts(), timeout_s))
 
     def jobs(self) -> list[JobInfo]:
         """Jobs that run, and those that ended lately, the newest first.
@@ -572,7 +534,7 @@ class LightpageClient:
             LightpageError: no answer.
         """
         reply: pb.ListJobsReply = self._unary(self._stub.ListJobs, pb.ListJobsRequest())
-        return [job_info(job) for job in reply.jobs]
+        return [answers.job_info(job) for job in reply.jobs]
 
     def job(self, job_id: str) -> JobInfo:
         """A job as it is now.
@@ -580,7 +542,7 @@ class LightpageClient:
         Raises:
             NoSuchJobError: there is no such job, or it ended long ago.
         """
-        return job_info(self._unary(self._stub.GetJob, message_of(pb.GetJobRequest, id=job_id)))
+        return answers.job_info(self._unary(self._stub.GetJob, message_of(pb.GetJobRequest, id=job_id)))
 
     def watch_job(self, job_id: str, timeout_s: float = RECALIBRATION_S) -> Iterator[JobInfo]:
         """A job as it is now, and at each change, until it has ended.
@@ -600,7 +562,7 @@ class LightpageClient:
                 for job in call:
                     if job != last:
                         last = job
-                        yield job_info(job)
+                        yield answers.job_info(job)
                     if job.state != pb.JOB_STATE_RUNNING:
                         return
             except grpc.RpcError as error:
@@ -616,7 +578,7 @@ class LightpageClient:
         Raises:
             NoSuchJobError: there is no such job, or it ended long ago.
         """
-        return job_info(self._unary(self._stub.CancelJob, message_of(pb.CancelJobRequest, id=job_id)))
+        return answers.job_info(self._unary(self._stub.CancelJob, message_of(pb.CancelJobRequest, id=job_id)))
 
     def rollback(self, expected_version: str = "") -> tuple[str, str]:
         """Go back to the model before; returns the versions (now current, before).
@@ -629,14 +591,12 @@ class LightpageClient:
             BundleError: there is none, or the change cannot be noted in the service's store; then nothing changes.
         """
         request = message_of(pb.RollbackRequest, expected_version=expected_version)
-        reply: pb.RollbackReply = self._unary(self._stub.Rollback, request)
-        return reply.model_version, reply.previous_version
+        return self._changed(self._stub.Rollback, request)
 
     def roll_forward(self, expected_version: str = "") -> tuple[str, str]:
         """Go to the later model again, after a roll-back; else as `rollback`."""
         request = message_of(pb.RollForwardRequest, expected_version=expected_version)
-        reply: pb.RollForwardReply = self._unary(self._stub.RollForward, request)
-        return reply.model_version, reply.previous_version
+        return self._changed(self._stub.RollForward, request)
 
     def models(self, stored: bool = False) -> list[ModelInfo]:
         """All models that the service holds loaded, the oldest first; before them those that only its store has.
@@ -648,7 +608,7 @@ class LightpageClient:
             LightpageError: no answer.
         """
         reply: pb.ListModelsReply = self._unary(self._stub.ListModels, pb.ListModelsRequest(stored=stored))
-        return [model_info(model) for model in reply.models]
+        return [answers.model_info(model) for model in reply.models]
 
     def upload_model(self, path: str | Path, timeout_s: float = UPLOAD_S) -> ModelInfo:
         """Give the service a bundle, a zip file. It is kept in the store, not put in service.
@@ -680,7 +640,7 @@ class LightpageClient:
                 reply: pb.UploadModelReply = self._unary(self._stub.UploadModel, parts(), timeout_s)
         except OSError as error:
             raise InvalidInputError(f"bundle {path}", error, "a zip file that can be read") from None
-        return model_info(reply.model)
+        return answers.model_info(reply.model)
 
     def activate_model(self, version: str, expected_version: str = "") -> tuple[str, str]:
         """Put a model in service that the service has; returns the versions (now current, before).
@@ -694,8 +654,7 @@ class LightpageClient:
             BundleError: there is none, it is damaged, or the change cannot be noted; then nothing changes.
         """
         request = message_of(pb.ActivateModelRequest, version=version, expected_version=expected_version)
-        reply: pb.ActivateModelReply = self._unary(self._stub.ActivateModel, request)
-        return reply.model_version, reply.previous_version
+        return self._changed(self._stub.ActivateModel, request)
 
     def pin_model(self, version: str, pinned: bool = True) -> ModelInfo:
         """See that a model is never deleted, nor replaced by the service itself; or let go of it.
@@ -705,7 +664,7 @@ class LightpageClient:
         """
         request = message_of(pb.PinModelRequest, version=version, pinned=pinned)
         reply: pb.PinModelReply = self._unary(self._stub.PinModel, request)
-        return model_info(reply.model)
+        return answers.model_info(reply.model)
 
     def _bit_depth(self) -> int:
         """Of the service's camera."""
@@ -722,7 +681,7 @@ class LightpageClient:
         options: PageOptions,
     ) -> pb.DecodeHeader:
         """What is sent before a pair; raises `FrameError` where that cannot be sent."""
-        frame, asked = _sent_frames(pair)[0], options_message(levels, options)
+        frame, asked = sent_frames(pair)[0], options_message(levels, options)
         if asked.tracking != pb.TRACKING_STATELESS:
             asked.session = asked.session or self._session
         return message_of(
@@ -737,42 +696,23 @@ class LightpageClient:
             correlation_id=correlation_id,
         )
 
+    @contextmanager
+    def _stream(self, call: Any) -> Iterator[Any]:
+        """The replies of a call, which ends with the `with` statement; its errors are our own."""
+        try:
+            yield call
+        except grpc.RpcError as error:
+            raise error_of(error, self.target) from None
+        finally:
+            call.cancel()
+
+    def _changed(self, method: Callable[..., Any], request: object) -> tuple[str, str]:
+        """Have another model put in service; the versions (now current, before)."""
+        reply = self._unary(method, request)
+        return reply.model_version, reply.previous_version
+
     def _unary(self, method: Callable[..., Any], request: object, timeout_s: float | None = None) -> Any:
         try:
             return method(request, timeout=self._timeout if timeout_s is None else timeout_s)
         except grpc.RpcError as error:
             raise error_of(error, self.target) from None
-
-
-def _pages_of(count: int, pages: Sequence[int], recording: str | None) -> dict[str, Any]:
-    """Where the pages of a recalibration come from, as fields of its request."""
-    if recording is not None:
-        return {"recording": recording, "recording_count": count}
-    return {"source": message_of(pb.SourcePages, count=count, pages=pages)}
-
-
-def _parts(header: pb.DecodeHeader, frames: Sequence[NDArray[np.integer]]) -> Iterator[FramePart]:
-    yield pb.DecodeFramesRequest(header=header)
-    yield from chunks_of(frames)
-
-
-def _sent_frames(pair: FramePair, subject: str = "") -> list[NDArray[np.integer]]:
-    """Both frames, in-phase first, if they can be sent."""
-    frames = [np.asarray(pair.in_phase), np.asarray(pair.quadrature)]
-    for name, frame in zip(("in-phase frame", "quadrature frame"), frames, strict=True):
-        if frame.dtype.name not in PIXEL_CODES or frame.ndim != 2 or frame.shape != frames[0].shape:
-            got, expected = f"{frame.dtype} {frame.shape}", "uint8 or uint16, rows and columns, as the other"
-            raise FrameError(subject + name, got, expected)
-    if frames[0].dtype != frames[1].dtype:
-        expected = f"type {frames[0].dtype}, as in-phase"
-        raise FrameError(f"{subject}quadrature frame", f"type {frames[1].dtype}", expected)
-    return frames
-
-
-def _sent_symbols(page: NDArray[np.uint8], subject: str) -> bytes:
-    symbols = np.asarray(page)
-    if symbols.dtype.kind not in "ui" or (
-        symbols.size and not 0 <= int(symbols.min()) <= int(symbols.max()) < MAX_LEVELS
-    ):
-        raise PageError(subject, f"{symbols.dtype}", f"whole numbers from 0 to {MAX_LEVELS - 1}")
-    return symbols.astype(np.uint8).tobytes()

@@ -1,11 +1,16 @@
-"""A region of memory that a client shares with a service on the same machine: frames in it need not be sent."""
+"""A region of memory that a client shares with a service on the same machine: frames in it need not be sent.
+
+A socket beside the service's own gives it out. The client connects to it and sends how many bytes it wants, as 8 bytes,
+little-endian. The answer is a byte: 0, then the region's handle, with a file descriptor of the region beside it
+(SCM_RIGHTS); or 1, then why there is none, in UTF-8. The region lives until the connection ends.
+"""
 
 from __future__ import annotations
 
 import mmap
 import os
 import socket
-from types import TracebackType
+import struct
 from typing import Self
 
 import numpy as np
@@ -14,9 +19,21 @@ from numpy.typing import NDArray
 from lightpage.errors import InvalidInputError, LightpageError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.wire.address import check_socket_path
-from lightpage.runtime.client.wire.shared_memory import GRANTED, HANDLE_BYTES, SIZE, WHY_BYTES, memory_path
+
+SUFFIX = ".memory"
+"""Behind the path of the service's socket, the path of this one."""
+SIZE = struct.Struct("<Q")
+HANDLE_BYTES = 32
+GRANTED, REFUSED = b"\0", b"\1"
+WHY_BYTES = 1000
+"""Of a refusal's text, at most."""
 
 _ANSWER_S = 10.0
+
+
+def memory_path(address: str) -> str:
+    """Path of the socket that goes with a service at ``unix:PATH``."""
+    return address.removeprefix("unix:") + SUFFIX
 
 
 class SharedMemory:
@@ -105,7 +122,5 @@ class SharedMemory:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

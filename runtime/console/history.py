@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -57,8 +57,7 @@ class PageRow:
 
     def to_json(self) -> dict[str, Any]:
         """The figures by name; None for what is not a number."""
-        values = {one.name: getattr(self, one.name) for one in fields(self)}
-        return {name: _number(value) if isinstance(value, float) else value for name, value in values.items()}
+        return {name: _number(value) if isinstance(value, float) else value for name, value in vars(self).items()}
 
 
 @dataclass(frozen=True)

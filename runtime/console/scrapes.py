@@ -1,4 +1,4 @@
-"""What a running service's metrics say: scrapes of them, and what has happened between two of these."""
+"""What a running service says over HTTP: its pages, its metrics, and what has happened between two scrapes of these."""
 
 from __future__ import annotations
 
@@ -7,19 +7,69 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
+from http.client import BadStatusLine, HTTPException
+from urllib.error import HTTPError
+from urllib.request import HTTPSHandler, ProxyHandler, build_opener
 
 from prometheus_client.parser import text_string_to_metric_families
 
 from lightpage.errors import LightpageError
-from lightpage.runtime.client.wire.tls import TlsFiles
-from lightpage.runtime.console.fetch import fetch, wanted
+from lightpage.runtime.client.wire.channel import TlsFiles
 
 WINDOW_S = 60.0
 """Rates and times are those of so many seconds, once it has been scraped for so long."""
 _SERVES = "lightpage_calls_in_flight"
 """A metric that every service has from its start."""
 
+_ANSWER_S = 5.0
+_MOST_BYTES = 16 << 20
+_SAID_BYTES = 200
+"""Of a refusal's text."""
+
 Labels = frozenset[tuple[str, str]]
+
+
+def url_of(address: str, path: str = "", tls: TlsFiles | None = None) -> str:
+    """Where a page is of the service whose `--metrics-port` is at HOST:PORT; `tls` as in `fetch`."""
+    return f"http{'s' if tls else ''}://{address}/{path}"
+
+
+def fetch(subject: str, address: str, path: str, tls: TlsFiles | None = None) -> bytes:
+    """A page of the service whose `--metrics-port` is at HOST:PORT, its first 16 MiB.
+
+    Args:
+        subject: of the error.
+        address: HOST:PORT.
+        path: of the page, without a slash in front.
+        tls: certificates to connect with; None for a service without TLS.
+
+    Raises:
+        InvalidInputError: certificates that are no good.
+        LightpageError: nobody answers there, or not with this page.
+    """
+    opener = build_opener(ProxyHandler({}), *([HTTPSHandler(context=tls.client_context())] if tls else []))
+    got: object
+    try:
+        try:
+            with opener.open(url_of(address, path, tls), timeout=_ANSWER_S) as reply:
+                return bytes(reply.read(_MOST_BYTES))
+        except HTTPError as refusal:
+            with refusal:
+                said = refusal.read(_SAID_BYTES).decode("utf-8", "replace").strip()
+            got = f"{refusal.code} {refusal.reason}: {said}"
+    except OSError as error:
+        got = getattr(error, "reason", error)
+    except BadStatusLine:  # its text is what came, in whatever bytes
+        got = "an answer that is not HTTP"
+    except (HTTPException, ValueError) as error:
+        got = error
+    raise LightpageError(subject, got, wanted(tls))
+
+
+def wanted(tls: TlsFiles | None) -> str:
+    """What an address is to be of, for people."""
+    expected = "a service that runs with --metrics-port: `lightpage serve --metrics-port 9100`"
+    return expected if tls else f"{expected}; if it has TLS, --ca, --certificate and --key too"
 
 
 @dataclass(frozen=True)
@@ -40,8 +90,8 @@ class Scrape:
 
     def values(self, name: str, **labels: str) -> dict[Labels, float]:
         """Those of a name that have at least these labels."""
-        wanted = frozenset(labels.items())
-        return {own: value for (known, own), value in self.samples.items() if known == name and wanted <= own}
+        asked = frozenset(labels.items())
+        return {own: value for (known, own), value in self.samples.items() if known == name and asked <= own}
 
     def by(self, name: str, label: str) -> dict[str, float]:
         """Sums of a name by one of its labels."""

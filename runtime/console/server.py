@@ -55,16 +55,7 @@ POINTS = 600
 RECENT = 50
 """Pages in the table."""
 _IDLE_S = 30.0
-_SERIES = (
-    "margin_bits",
-    "air_bits",
-    "trust",
-    "share",
-    "shift_x_px",
-    "shift_y_px",
-    "piston_rad",
-    "residual_rad",
-)
+_SERIES = ("margin_bits", "air_bits", "trust", "share", "shift_x_px", "shift_y_px", "piston_rad", "residual_rad")
 _MISDIRECTED = "this host name is none of this service's: ask by IP address, or name it in metrics.names"
 _STATIC = {
     "/": ("index.html", "text/html; charset=utf-8"),

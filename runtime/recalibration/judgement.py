@@ -95,8 +95,7 @@ def judged_pages(
 
 
 def _drifted(page: DecodedPage) -> bool:
-    residual = float(np.sqrt(np.mean(np.square(page.phase_error))))
-    if page.image is None or residual >= DRIFTED_RAD:
+    if page.image is None or page.residual_rad >= DRIFTED_RAD:
         return True
     return math.hypot(page.image.shift_x_px, page.image.shift_y_px) >= DRIFTED_PX
 

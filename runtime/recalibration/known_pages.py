@@ -13,9 +13,9 @@ from lightpage.page.symbols import check_symbols
 from lightpage.progress import warn
 from lightpage.recording.exposure import check_pair_light
 from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording, hash_frames
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.model.decoding.frames import named, narrow
 
 MIN_PAGES = 2
 """One to fit on, one to judge by."""
@@ -53,13 +53,18 @@ class KnownPages:
             got = f"{len(self.pairs)} frame pairs and {len(self.symbols)} pages of symbols"
             raise InvalidInputError("pages to recalibrate with", got, f"at least {MIN_PAGES} of both")
         for number, (pair, symbols) in enumerate(zip(self.pairs, self.symbols, strict=True)):
-            with named(f"known page {number}: "):
-                decoder.check(pair)
+            decoder.check(pair, f"known page {number}: ")
             check_symbols(symbols, decoder.bundle.profile.page_shape, self.levels, f"known page {number}: symbols")
         if self.references is not None:
-            with named("reference: "):
-                decoder.check(self.references)
-        self._check_different()
+            decoder.check(self.references, "reference: ")
+        # A re-fit judged by a page that it was fitted on would praise itself.
+        first: dict[str, int] = {}
+        for number, pair in enumerate(self.pairs):
+            earlier = first.setdefault(hash_frames(pair), number)
+            if earlier != number:
+                raise InvalidInputError(
+                    f"known page {number}", f"the frames of known page {earlier}", "pages that differ: one is judged by"
+                )
 
     def lit(self, bit_depth: int) -> KnownPages:
         """The pages whose frames show light; of each other one is warned.
@@ -83,16 +88,6 @@ class KnownPages:
             raise dark
         pairs, symbols = tuple(self.pairs[n] for n in kept), tuple(self.symbols[n] for n in kept)
         return replace(self, pairs=pairs, symbols=symbols)
-
-    def _check_different(self) -> None:
-        """A re-fit judged by a page that it was fitted on would praise itself."""
-        first: dict[str, int] = {}
-        for number, pair in enumerate(self.pairs):
-            earlier = first.setdefault(hash_frames(pair), number)
-            if earlier != number:
-                raise InvalidInputError(
-                    f"known page {number}", f"the frames of known page {earlier}", "pages that differ: one is judged by"
-                )
 
     def part(self, pages: slice) -> KnownPages:
         """Some of the pages, the rest as it is."""

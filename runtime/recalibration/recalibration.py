@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import time
 from collections.abc import Sequence
@@ -10,24 +9,24 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Self
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.errors import CalibrationError, FrameError, RecalibrationRefusedError
 from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import hash_frames
-from lightpage.runtime.model.bundle.bundle import Bundle, npz, write_bundle
-from lightpage.runtime.model.bundle.golden import in_few_counts, shows_page
+from lightpage.runtime.model.bundle.bundle import Bundle, in_few_counts, npz, shows_page, write_bundle
 from lightpage.runtime.model.bundle.manifest import GOLDEN, TABLE, Manifest, Provenance, check_version
 from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.image_position import ImagePosition
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.decoding.tracking import Tracker
 from lightpage.runtime.recalibration.judgement import Verdict, judge, judged_pages
 from lightpage.runtime.recalibration.known_pages import KnownPages
-from lightpage.runtime.recalibration.outcome import RecalibrationOutcome, Refit, RefitResult
 
 _RECALIBRATED = re.compile(r"(.*)\+r(\d+)")
 
@@ -37,6 +36,72 @@ FIT_WORTH, WRITING_WORTH = 20, 1
 
 FIT_PAGES = 1
 """Pages that are fitted on: one has thousands of symbols, and another adds less than what drifts between pages."""
+
+
+@dataclass(frozen=True)
+class RefitReport:
+    """What a fit says of itself; None where it does not know.
+
+    Attributes:
+        angle_deg: fitted pipe angle.
+        coherence_before: of the pages with the old geometry, 0..1.
+        coherence_after: with the new one.
+        image: where the image was found before the fit, against the earlier calibration.
+    """
+
+    angle_deg: float | None = None
+    coherence_before: float | None = None
+    coherence_after: float | None = None
+    image: ImagePosition | None = None
+
+
+@dataclass(frozen=True)
+class RefitResult:
+    """A re-fitted device.
+
+    Attributes:
+        table: re-traced tensors to feed to the decoder, by input name; those left out stay as they are.
+        calibration_toml: the new calibration document.
+        report: the fit's own figures.
+    """
+
+    table: SamplingTable
+    calibration_toml: str
+    report: RefitReport
+
+
+class Refit(Protocol):
+    """Re-fits the geometry with the exported twin and re-traces the table."""
+
+    def __call__(self, bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decoder) -> RefitResult:
+        """Fit on all `pages`.
+
+        Raises:
+            CalibrationError: the pages fit no geometry within the capture range.
+        """
+
+
+@dataclass(frozen=True)
+class RecalibrationOutcome:
+    """A new bundle and why it is better: AIR in bits per symbol on held-back pages, decoded as the service does it.
+
+    `pages_lost_before` of these pages the earlier model would not have given out; they count with no bits. `air_limit`
+    is the least `air_after` that would have been accepted, see `lightpage.runtime.recalibration.judgement.judge`, and
+    `air_standard_error` that of the difference.
+    """
+
+    path: Path
+    version: str
+    previous_version: str
+    report: RefitReport
+    air_before: float
+    air_after: float
+    pages_lost_before: int
+    pages_used: int
+    pages_held_back: int
+    seconds: float
+    air_limit: float
+    air_standard_error: float
 
 
 def recalibrate(
@@ -71,24 +136,26 @@ def recalibrate(
     fitted_count = min(FIT_PAGES, len(pages.pairs) - 1)
     fitted, held_back = pages.part(slice(fitted_count)), pages.part(slice(fitted_count, None))
     tracker = tracker_for(decoder) if tracker is None else tracker.fork()
-    shares = _Shares.of(len(held_back.pairs))
-    measuring = partial(_within, progress, "measure the model in service", 0.0, shares.measured)
+    judged_count = len(held_back.pairs)
+    whole = 2 * judged_count + FIT_WORTH + WRITING_WORTH
+    """Work of all steps, in pages that are decoded."""
+
+    def within(start: int, end: int, step: str, share: float) -> None:
+        progress(step, (start + (end - start) * share) / whole)
+
+    measuring = partial(within, 0, judged_count, "measure the model in service")
     before = judged_pages(tracker, decoder.bundle, held_back, measuring)
     fitted = replace(fitted, image_px=tracker.image_px)
-
-    def fitting(step: str, share: float) -> None:
-        _within(progress, step, shares.measured, shares.fitted, share)
-
     try:
-        result = fit(decoder.bundle, fitted, fitting, decoder)
-        judging = partial(_within, progress, "judge by the held-back pages", shares.fitted, shares.judged)
+        result = fit(decoder.bundle, fitted, partial(within, judged_count, judged_count + FIT_WORTH), decoder)
+        judging = partial(within, judged_count + FIT_WORTH, whole - WRITING_WORTH, "judge by the held-back pages")
         judging(0.0)
         refitted = decoder.of_bundle(_refitted(decoder.bundle, result))
         after = judged_pages(tracker.refitted(refitted), decoder.bundle, held_back, judging)
     except (CalibrationError, FrameError) as error:
         raise RecalibrationRefusedError(error.subject, error.got, error.expected) from error
     verdict = judge(before, after, pages.levels)
-    progress("write the new bundle", shares.judged)
+    within(whole - WRITING_WORTH, whole, "write the new bundle", 0.0)
     bundle = refitted.bundle
     golden, p = _golden(refitted, held_back.pairs[0])
     files = {**bundle.files, GOLDEN: npz(in_phase=golden.in_phase, quadrature=golden.quadrature, p=p)}
@@ -102,7 +169,7 @@ def recalibrate(
         air_after=verdict.after,
         pages_lost_before=sum(page.lost is not None for page in before),
         pages_used=len(pages.pairs),
-        pages_held_back=len(held_back.pairs),
+        pages_held_back=judged_count,
         seconds=time.perf_counter() - start,
         air_limit=verdict.limit,
         air_standard_error=verdict.error,
@@ -130,29 +197,9 @@ def next_version(version: str, taken: Sequence[str] = ()) -> str:
     return f"{base}+r{last + 1}"
 
 
-@dataclass(frozen=True)
-class _Shares:
-    """Shares of the work that are behind after its steps, in proportion to the time that these take."""
-
-    measured: float
-    fitted: float
-    judged: float
-
-    @classmethod
-    def of(cls, pages: int) -> Self:
-        """The shares where so many pages are judged by, twice each."""
-        whole = 2 * pages + FIT_WORTH + WRITING_WORTH
-        return cls(pages / whole, (pages + FIT_WORTH) / whole, (2 * pages + FIT_WORTH) / whole)
-
-
 def reading_share(pages: int) -> float:
     """Share of a recalibration that is behind once so many pages have been read for it; 0 where none need be."""
     return pages / (pages + 2 * (pages - FIT_PAGES) + FIT_WORTH + WRITING_WORTH) if pages else 0.0
-
-
-def _within(progress: Progress, step: str, start: float, end: float, share: float) -> None:
-    """Tell of a share of a step that lies between two shares of the work."""
-    progress(step, start + (end - start) * share)
 
 
 def _refitted(bundle: Bundle, result: RefitResult) -> Bundle:
@@ -164,9 +211,11 @@ def _refitted(bundle: Bundle, result: RefitResult) -> Bundle:
 
 def _new_manifest(manifest: Manifest, pages: KnownPages, version: str, verdict: Verdict) -> Manifest:
     """The manifest of a re-fitted bundle."""
-    figures = {"recalibration_air_bits_per_symbol": verdict.after, "recalibration_pages": len(pages.pairs)}
-    if math.isfinite(verdict.before):
-        figures["recalibration_air_bits_per_symbol_before"] = verdict.before
+    figures = {
+        "recalibration_air_bits_per_symbol": verdict.after,
+        "recalibration_air_bits_per_symbol_before": verdict.before,
+        "recalibration_pages": len(pages.pairs),
+    }
     return manifest.model_copy(
         update={
             "version": version,

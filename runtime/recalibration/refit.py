@@ -18,13 +18,12 @@ from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import hash_frames
 from lightpage.runtime.model.bundle.bundle import Bundle
-from lightpage.runtime.model.bundle.calibrated import calibration_of
 from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.image_drift import BundleSearch
 from lightpage.runtime.model.decoding.image_position import ImagePosition
-from lightpage.runtime.model.decoding.image_search import BundleSearch
 from lightpage.runtime.model.execution.twin import TWIN_THREADS, OnnxTwin
 from lightpage.runtime.recalibration.known_pages import KnownPages
-from lightpage.runtime.recalibration.outcome import RefitReport, RefitResult
+from lightpage.runtime.recalibration.recalibration import RefitReport, RefitResult
 
 Real = NDArray[np.float64]
 
@@ -59,7 +58,7 @@ def refit(
             bundle holds no calibration to start from.
         BundleError: the bundle's graphs do not show the field, or hold a geometry that cannot be fed instead.
     """
-    profile, earlier = bundle.profile, calibration_of(bundle)
+    profile, earlier = bundle.profile, bundle.calibration
     if not _REFITTED & decoder.graph.ports.keys():
         among = f"{' or '.join(sorted(_REFITTED))} among them"
         expected = f"{among}: this decoder holds its geometry itself; calibrate, train and export anew"
@@ -114,7 +113,6 @@ def refit(
             coherence_before=fitted.coherence_before,
             coherence_after=fitted.coherence_after,
             image=image,
-            details={"turn_deg": float(np.rad2deg(fitted.turn_rad)), "cost": fitted.cost},
         ),
     )
 

@@ -1,35 +1,40 @@
-"""Recalibration in a process of its own, at a low priority: reads go on as if nobody recalibrated."""
+"""Recalibration in a process of its own, at a low priority: reads go on as if nobody recalibrated.
+
+What goes into it, and what comes out, are files of one private folder.
+"""
 
 from __future__ import annotations
 
 import glob
+import json
 import logging
 import os
-import queue
 import shutil
-import subprocess
-import sys
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
-from lightpage.errors import BundleError, SurroundingsError, WorkerError
+import numpy as np
+from pydantic import BaseModel, ConfigDict, TypeAdapter
+
+from lightpage.errors import ERRORS, BundleError, LightpageError, SurroundingsError, WorkerError
 from lightpage.failures import short_resource
-from lightpage.helper_process import same_packages
+from lightpage.helper_process import HelperProcess, same_packages
 from lightpage.progress import Progress
+from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.model.bundle.bundle import Bundle, write_bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.model.decoding.tracking import Tracker
+from lightpage.runtime.model.decoding.tracking import Tracker, TrackerMemory
 from lightpage.runtime.recalibration.known_pages import KnownPages
-from lightpage.runtime.recalibration.outcome import RecalibrationOutcome
-from lightpage.runtime.recalibration.work import Job, WorkFolder, heard_step
+from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome
 from lightpage.temporary import temporary_folder
 
 _log = logging.getLogger(__name__)
 
-WORKER = ("-P", "-m", "lightpage.runtime.recalibration.worker")
+WORKER = "lightpage.runtime.recalibration.worker"
 
 SCRATCH = ".recalibration-"
 """How the name of a folder begins in which a recalibration keeps its files."""
@@ -41,12 +46,110 @@ _POLL_S = 0.2
 """How often a silent worker's time and caller are looked at."""
 
 _END_S = 5.0
-"""Time that a worker gets to end once it has been told to."""
+"""Time that a worker gets to end after its last word."""
 
 _SHOWN_BYTES = 2000
 """Of what a worker that broke has printed, for the log."""
 
 _SUBJECT = "recalibration's process"
+
+_BUNDLE, _PAGES, _JOB, _RESULT = "bundle.zip", "pages.npz", "job.json", "result.json"
+
+_OUTCOME = TypeAdapter(RecalibrationOutcome)
+
+
+class Job(BaseModel):
+    """What a recalibration shall do, beside its bundle and its pages.
+
+    Attributes:
+        bundle: where the bundle came from, for messages.
+        out: path of the new bundle.
+        version: of the new bundle.
+        memory: of the service's tracker; None where it follows nothing.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    bundle: Path
+    out: Path
+    version: str
+    memory: TrackerMemory | None
+
+
+@dataclass(frozen=True)
+class WorkFolder:
+    """A private folder that one recalibration is handed over in.
+
+    Attributes:
+        path: that exists, and belongs to nobody else.
+    """
+
+    path: Path
+
+    def write_task(self, bundle: Bundle, pages: KnownPages, job: Job) -> None:
+        """Write all that the worker needs. The bundle is written as it lies in memory: its file may have changed.
+
+        Raises:
+            BundleError, OSError: the folder cannot be written.
+        """
+        write_bundle(self.path / _BUNDLE, bundle.manifest, bundle.files)
+        arrays: dict[str, Any] = {
+            "in_phase": np.stack([pair.in_phase for pair in pages.pairs]),
+            "quadrature": np.stack([pair.quadrature for pair in pages.pairs]),
+            "symbols": np.stack(pages.symbols),
+            "levels": pages.levels,
+            "image_px": pages.image_px,
+        }
+        if pages.references is not None:
+            arrays["reference_in_phase"] = pages.references.in_phase
+            arrays["reference_quadrature"] = pages.references.quadrature
+        if pages.pilot_mask is not None:
+            arrays["pilot_mask"] = pages.pilot_mask
+        np.savez(self.path / _PAGES, **arrays)
+        (self.path / _JOB).write_text(job.model_dump_json())
+
+    def read_task(self) -> tuple[Bundle, KnownPages, Job]:
+        """What the worker needs.
+
+        Raises:
+            BundleError, OSError, ValueError: the folder is none that `write_task` has filled.
+        """
+        job = Job.model_validate_json((self.path / _JOB).read_bytes())
+        bundle = replace(Bundle.open(self.path / _BUNDLE), path=job.bundle)
+        with np.load(self.path / _PAGES, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        frames = zip(arrays["in_phase"], arrays["quadrature"], strict=True)
+        references = None
+        if "reference_in_phase" in arrays:
+            references = FramePair(arrays["reference_in_phase"], arrays["reference_quadrature"])
+        x, y = map(float, arrays["image_px"])
+        pairs, symbols, levels = tuple(FramePair(*pair) for pair in frames), tuple(arrays["symbols"]), arrays["levels"]
+        return bundle, KnownPages(pairs, symbols, int(levels), references, arrays.get("pilot_mask"), (x, y)), job
+
+    def write_result(self, result: RecalibrationOutcome | LightpageError) -> None:
+        """Write what the recalibration found, or why there is no outcome."""
+        if isinstance(result, LightpageError):
+            words = {name: vars(result)[name] for name in ("subject", "got", "expected")}
+            told = {"error": {"kind": type(result).__name__, **words}}
+        else:
+            told = {"outcome": _OUTCOME.dump_python(result, mode="json")}
+        made = self.path / f"{_RESULT}.made"
+        made.write_text(json.dumps(told))
+        made.rename(self.path / _RESULT)
+
+    def read_result(self) -> RecalibrationOutcome | None:
+        """What the recalibration found; None where it came to no end.
+
+        Raises:
+            LightpageError: of the class and with the words that the worker met.
+        """
+        try:
+            result = json.loads((self.path / _RESULT).read_bytes())
+        except FileNotFoundError:
+            return None
+        if (told := result.get("error")) is not None:
+            raise ERRORS[told["kind"]](told["subject"], told["got"], told["expected"])
+        return _OUTCOME.validate_python(result["outcome"])
 
 
 def recalibrate_apart(
@@ -59,7 +162,7 @@ def recalibrate_apart(
     check: Callable[[], None],
     limit_s: float,
     scratch: Path | None = None,
-    worker: Sequence[str] = WORKER,
+    worker: str = WORKER,
     clock: Callable[[], float] = time.monotonic,
 ) -> RecalibrationOutcome:
     """Recalibrate in a process of its own; see `lightpage.runtime.recalibration.recalibration.recalibrate`.
@@ -77,7 +180,7 @@ def recalibrate_apart(
         limit_s: longest time that it may take, seconds.
         scratch: folder for the work's own files, in a hidden folder of it whose name begins with `SCRATCH`; the
             machine's temporary folder if None.
-        worker: arguments of the interpreter that start the worker, before its folder.
+        worker: module that the process runs, with its folder as the argument.
         clock: seconds that never go back, by which `limit_s` is taken.
 
     Raises:
@@ -87,96 +190,62 @@ def recalibrate_apart(
     out = out.absolute()
     if out.exists() or out.is_symlink():
         raise BundleError(f"bundle {out}", "something that exists", "a new path: bundles are never overwritten")
-    with _private_folder(scratch) as path:
-        folder = WorkFolder(path)
-        job = Job(bundle=decoder.bundle.path, out=out, version=version, threads=THREADS, memory=tracker.memory())
+    try:
+        private = temporary_folder(f"{_SUBJECT}, its folder", SCRATCH, scratch)
+    except SurroundingsError as error:
+        raise WorkerError(error.subject, error.got, error.expected) from error
+    with private as name:
+        folder = WorkFolder(Path(name))
+        job = Job(bundle=decoder.bundle.path, out=out, version=version, memory=tracker.memory())
         try:
             folder.write_task(decoder.bundle, pages, job)
         except OSError as error:
             raise WorkerError(f"{_SUBJECT}, its folder", error, "room for the bundle and its pages") from error
-        done = False
         try:
-            with (path / "log").open("w+b") as log:
-                status = _run([sys.executable, *worker, str(path)], log, progress, check, limit_s, clock)
-                outcome = folder.read_result()
-                if outcome is None:
+            with (folder.path / "log").open("w+b") as log:
+                status = _run(worker, folder.path, log, progress, check, limit_s, clock)
+                if (outcome := folder.read_result()) is None:
                     _show(log)
                     raise WorkerError(_SUBJECT, f"its end with status {status}", "an outcome; try again")
-            done = True
             return outcome
-        finally:
-            if not done:
-                _remove_new(out)
-
-
-@contextmanager
-def _private_folder(scratch: Path | None) -> Iterator[Path]:
-    try:
-        folder = temporary_folder(f"{_SUBJECT}, its folder", SCRATCH, scratch)
-    except SurroundingsError as error:
-        raise WorkerError(error.subject, error.got, error.expected) from error
-    with folder as name:
-        yield Path(name)
+        except BaseException:
+            _remove_new(out)
+            raise
 
 
 def _run(
-    command: Sequence[str],
+    worker: str,
+    folder: Path,
     log: IO[bytes],
     progress: Progress,
     check: Callable[[], None],
     limit_s: float,
     clock: Callable[[], float],
-) -> int:
+) -> int | None:
     """Run the worker to its end, hand its steps on, and return its exit status; on an error it is ended."""
     until = clock() + limit_s
-    lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
     try:
-        # Its input is a pipe that nobody writes to: once it is closed, the worker ends.
-        process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, env=same_packages(THREADS)
-        )
+        process = HelperProcess(worker, str(folder), subject=_SUBJECT, environment=same_packages(THREADS), log=log)
     except OSError as error:
         short = short_resource(_SUBJECT, error)
         raise WorkerError(_SUBJECT, error, "one that can be started" if short is None else short.expected) from error
+    grace_s = 0.0
     try:
-        assert process.stdout is not None  # asked for
-        threading.Thread(target=_listen, args=(process.stdout, lines), name="lightpage-worker", daemon=True).start()
         while True:
             check()
             if (left := until - clock()) <= 0:
                 raise WorkerError(_SUBJECT, f"no end within {limit_s:g} s", "one; nothing was changed")
             try:
-                line = lines.get(timeout=min(_POLL_S, left))
-            except queue.Empty:
+                line = process.line(time.monotonic() + min(_POLL_S, left))
+            except TimeoutError:
                 continue
-            if line is None:
-                return process.wait(_END_S)
-            if (step := heard_step(line)) is not None:
-                progress(*step)
-    except subprocess.TimeoutExpired as error:
-        raise WorkerError(_SUBJECT, "no end after its last word", "one; nothing was changed") from error
+            except ConnectionError:
+                grace_s = _END_S
+                break
+            progress(*json.loads(line))
     finally:
-        _end(process)
-
-
-def _listen(stream: IO[bytes], lines: queue.SimpleQueue[bytes | None]) -> None:
-    """Put each line that a worker prints into a queue, and None behind the last one."""
-    with suppress(ValueError, OSError):  # the stream is closed under it where the worker is ended
-        for line in stream:
-            lines.put(line)
-    lines.put(None)
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a worker, however it takes that, and wait for it."""
-    assert process.stdin is not None  # asked for
-    with suppress(OSError):
-        process.stdin.close()
-    if process.poll() is None:
-        process.kill()
-    process.wait()
-    if process.stdout is not None:
-        process.stdout.close()
+        process.end(grace_s)
+    return process.status
 
 
 def _show(log: IO[bytes]) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import socket
 import sys
 import threading
 import time
@@ -12,13 +14,14 @@ from pathlib import Path
 
 from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import LightpageError
+from lightpage.helper_process import parent_link
+from lightpage.progress import Progress
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.decoding.tracking import NoTracker
-from lightpage.runtime.recalibration.outcome import Refit
-from lightpage.runtime.recalibration.recalibration import recalibrate
+from lightpage.runtime.recalibration.recalibration import Refit, recalibrate
 from lightpage.runtime.recalibration.refit import refit
-from lightpage.runtime.recalibration.work import WorkFolder, told_step
+from lightpage.runtime.recalibration.separate_process import THREADS, WorkFolder
 
 NICENESS = 10
 """Beside reads without a pause such a process gets a tenth of a core, and ends. With a higher niceness it would starve,
@@ -35,22 +38,21 @@ _LOOK_S = 1.0
 _PARENT_GONE = 3
 
 
-def work(folder: WorkFolder, fit: Refit = refit) -> None:
-    """Recalibrate as a folder says, tell each step on stdout, and leave the outcome or the error in the folder.
+def work(folder: WorkFolder, progress: Progress, fit: Refit = refit) -> None:
+    """Recalibrate as a folder says, and leave the outcome or the error in the folder.
 
     Args:
         folder: filled by the parent.
+        progress: told of every step.
         fit: how to fit.
     """
     try:
         bundle, pages, job = folder.read_task()
-        decoder = Decoder(bundle, job.threads)
+        decoder = Decoder(bundle, THREADS)
         tracker = NoTracker(decoder) if job.memory is None else tracker_for(decoder, job.memory)
-        outcome = recalibrate(decoder, pages, job.out, job.version, fit, _tell, tracker)
+        folder.write_result(recalibrate(decoder, pages, job.out, job.version, fit, progress, tracker))
     except LightpageError as error:
-        folder.write_error(error)
-    else:
-        folder.write_outcome(outcome)
+        folder.write_result(error)
 
 
 def yield_to_reads() -> None:
@@ -62,23 +64,20 @@ def yield_to_reads() -> None:
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
-def yield_more(
-    room: float = ROOM, clock: Clock = SYSTEM, worked: Callable[[], float] = time.process_time
-) -> threading.Thread:
+def yield_more(clock: Clock = SYSTEM, worked: Callable[[], float] = time.process_time) -> threading.Thread:
     """Yield all to reads, from a thread, as soon as they leave room.
 
     There is no way back: who has not the right to it cannot raise a priority. Where reads leave no pause later on, the
     work runs into its limit of time, and the next one begins as this one did.
 
     Args:
-        room: share of a core.
         clock: by which the time passes over which it is taken.
         worked: processor time that this process has had, seconds.
     """
 
     def watch() -> None:
         share = -1.0
-        while share < room:
+        while share < ROOM:
             begun, before = clock.now(), worked()
             clock.sleep(_LOOK_S)
             share = (worked() - before) / (clock.now() - begun)
@@ -90,31 +89,32 @@ def yield_more(
     return thread
 
 
-def end_with_parent(pipe: int) -> None:
-    """End this process as soon as the other end of `pipe` is closed, as it is when the parent ends or wants so.
+def end_with_parent(link: socket.socket) -> None:
+    """End this process as soon as the other end of `link` is closed, as it is when the parent ends or wants so.
 
-    It is read below Python's buffers, whose lock the interpreter would want at its own end. The kernel's own signal
-    for that (PR_SET_PDEATHSIG) comes when the thread ends that has started the process.
+    The kernel's own signal for that (PR_SET_PDEATHSIG) comes when the thread ends that has started the process.
     """
 
     def watch() -> None:
-        while os.read(pipe, 1):
+        while link.recv(1):
             pass
         os._exit(_PARENT_GONE)
 
     threading.Thread(target=watch, name="lightpage-parent", daemon=True).start()
 
 
-def _tell(name: str, fraction: float) -> None:
-    print(told_step(name, fraction), flush=True)
+def telling(link: socket.socket) -> Progress:
+    """What tells the parent of each step, in a line of JSON."""
+    return lambda name, fraction: link.sendall(json.dumps([name, fraction]).encode() + b"\n")
 
 
 def main(folder: str) -> None:
     """Work at low priority until done, or until the parent is gone."""
-    end_with_parent(sys.stdin.fileno())
+    link = parent_link()
+    end_with_parent(link)
     yield_to_reads()
     yield_more()
-    work(WorkFolder(Path(folder)))
+    work(WorkFolder(Path(folder)), telling(link))
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import ConfigDict, Field
 
 from lightpage.device.profile import TomlTable
-from lightpage.runtime.client.wire.sizes import CHUNK_BYTES, MESSAGE_BYTES, REPLY_BYTES
+from lightpage.runtime.client.wire.messages import CHUNK_BYTES, MESSAGE_BYTES, REPLY_BYTES
 from lightpage.runtime.device.acquisition.page_store import UPLOADED_BYTES
 
 PAIR_BYTES = 256 << 20

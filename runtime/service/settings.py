@@ -29,7 +29,7 @@ from lightpage.device.profile import TomlTable, toml_value
 from lightpage.errors import InvalidInputError
 from lightpage.files import read_text
 from lightpage.runtime.client.wire.address import check_address, is_local
-from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.model.bundle.shipped import DEFAULT
 from lightpage.runtime.model.execution.providers import CPU, Provider
 from lightpage.runtime.recalibration.known_pages import MIN_PAGES

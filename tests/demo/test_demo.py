@@ -16,7 +16,7 @@ from lightpage.demo.picture import picture
 from lightpage.device.state import Device
 from lightpage.errors import BundleError, CalibrationError, InvalidInputError
 from lightpage.page.symbols import pilot_mask, symbol_phases
-from lightpage.runtime.client.wire.pages import RemotePage, RemoteTimings
+from lightpage.runtime.client.answers import RemotePage, RemoteTimings
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.refit import refit
 from tests.runtime import toy

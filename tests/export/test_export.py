@@ -25,8 +25,7 @@ from lightpage.export.operators.operator_list import PROVIDERS
 from lightpage.export.parity import check_parity
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.commands.archives.evaluate import evaluate
-from lightpage.runtime.model.bundle.bundle import Bundle, npz, write_bundle
-from lightpage.runtime.model.bundle.golden import in_few_counts
+from lightpage.runtime.model.bundle.bundle import Bundle, in_few_counts, npz, write_bundle
 from lightpage.runtime.model.bundle.manifest import DECODER, FIELD, TWIN
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.execution.session import open_session

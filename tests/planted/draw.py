@@ -22,9 +22,9 @@ AREAS = {
     "page-code": {"lightpage/codec": "* ldpc/*"},
     "decoder": {
         "lightpage": "page/* metrics/*",
-        "runtime/model/decoding": "decoder page frames phase_refit field_solver",
+        "runtime/model/decoding": "decoder page phase_refit",
     },
-    "tracking": {"runtime/model/decoding": "image_tracker following tracking image_search image_drift"},
+    "tracking": {"runtime/model/decoding": "image_tracker following tracking image_drift"},
     "calibration": {"lightpage/calibration": "*", "train/fitting": "fit fitted"},
     "registry": {"runtime/service": "models/registry models/models pages/replays"},
     "store": {

@@ -22,7 +22,7 @@ from lightpage.report.contents.from_run import levels_of, report_of_run
 from lightpage.report.json_file import JsonFile
 from lightpage.report.tables import geometry, zones
 from lightpage.runtime.commands.archives.evaluate import evaluate
-from lightpage.runtime.model.bundle.golden import in_few_counts
+from lightpage.runtime.model.bundle.bundle import in_few_counts
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.train.runs import load_run
 from tests.lightpage.small import small_profile

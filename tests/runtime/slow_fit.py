@@ -9,7 +9,7 @@ from lightpage.progress import Progress
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.known_pages import KnownPages
-from lightpage.runtime.recalibration.outcome import RefitResult
+from lightpage.runtime.recalibration.recalibration import RefitResult
 from tests.runtime import toy
 
 

@@ -27,7 +27,7 @@ from lightpage.runtime.model.bundle.bundle import Bundle, npz, write_bundle
 from lightpage.runtime.model.bundle.manifest import DECODER, GOLDEN, PILOTS, TWIN, Manifest
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.known_pages import KnownPages
-from lightpage.runtime.recalibration.outcome import RefitReport, RefitResult
+from lightpage.runtime.recalibration.recalibration import RefitReport, RefitResult
 
 PROFILE: Profile = load_profile("bench").model_copy(
     update={

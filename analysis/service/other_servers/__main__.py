@@ -10,7 +10,7 @@ turns, one at a time, in an order that changes. How busy the idle ones keep the 
 shipped bundle. The others run the bundle's ONNX file as it is, by the same ONNX Runtime with the same threads, and
 answer its output p. They do nothing else. The service checks frames and pilots, decides symbols, and answers them with
 their posterior probabilities: that counts as overhead. It has the graph cut in two: what follows from the table alone
-is computed on loading, and not for every page (`runtime/model/execution/constant_table.py`). Image tracking is off.
+is computed on loading, and not for every page (`runtime/model/execution/table_graph.py`). Image tracking is off.
 
 **Overhead** is a call's time, from frames as arrays to an answer as arrays, less the median run of the same ONNX file
 in a process that serves nobody, in the same rounds. With the decoder, the cut takes time off the service's alone. What

@@ -2,7 +2,7 @@
 
 It is a helper process (`BareRuns`). It answers each line, ``whole NAME`` or ``cut NAME``, with the seconds of one run:
 of the graph as the other servers have it, or cut in two as the service has it
-(`runtime/model/execution/constant_table.py`).
+(`runtime/model/execution/table_graph.py`).
 """
 
 from __future__ import annotations

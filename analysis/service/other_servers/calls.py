@@ -17,10 +17,10 @@ from analysis.service.other_servers.graphs import Graph
 from analysis.service.other_servers.onnx_run import OUTPUT
 from lightpage.errors import LightpageError
 from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.client.answers import RemotePage
 from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.client.pb.inference import open_inference_pb2 as oip
-from lightpage.runtime.client.wire.pages import RemotePage
-from lightpage.runtime.client.wire.sizes import REPLY_BYTES
+from lightpage.runtime.client.wire.messages import REPLY_BYTES
 from lightpage.runtime.service.frames.inference_calls import INFERENCE
 from lightpage.runtime.service.frames.tensors import RAW_TYPES
 

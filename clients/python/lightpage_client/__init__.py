@@ -3,9 +3,9 @@
 from lightpage_client import errors
 from lightpage_client.errors import LightpageError
 from lightpage_client.recording.frame_pair import FramePair
+from lightpage_client.runtime.client.answers import RemotePage
 from lightpage_client.runtime.client.client import LightpageClient
-from lightpage_client.runtime.client.wire.messages import KnownPilots
-from lightpage_client.runtime.client.wire.pages import RemotePage
-from lightpage_client.runtime.client.wire.tls import TlsFiles
+from lightpage_client.runtime.client.outgoing import KnownPilots
+from lightpage_client.runtime.client.wire.channel import TlsFiles
 
 __all__ = ["FramePair", "KnownPilots", "LightpageClient", "LightpageError", "RemotePage", "TlsFiles", "errors"]

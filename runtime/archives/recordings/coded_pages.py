@@ -13,12 +13,12 @@ from lightpage.metrics.information import achievable_rate
 from lightpage.page.pilots import Pilots, remove_piston
 from lightpage.page.symbols import symbol_phases
 from lightpage.progress import track, warn
+from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.evaluation import check_recording, was_seen
 from lightpage.runtime.archives.recordings.read_ahead import read_ahead
 from lightpage.runtime.archives.recordings.refused import RefusedPage, refusal
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.model.decoding.frames import narrow
 from lightpage.runtime.model.decoding.page import DecodedPage
 from lightpage.runtime.model.decoding.tracking import Tracker
 

@@ -17,12 +17,12 @@ from lightpage.metrics.reliability import ConcentrationBin, ConfidenceBin
 from lightpage.page.pilots import Pilots, estimate_piston
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording, page_hashes
 from lightpage.runtime.archives.recordings.read_ahead import read_ahead
 from lightpage.runtime.archives.recordings.refused import RefusedPage, refusal, unconfirmed
 from lightpage.runtime.model.bundle.manifest import GOLDEN
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.model.decoding.frames import narrow
 from lightpage.runtime.model.decoding.page import DecodedPage, Timings
 from lightpage.runtime.model.decoding.tracking import Tracker
 

@@ -31,13 +31,13 @@ from lightpage.errors import (
 )
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.coded_pages import air_bits
 from lightpage.runtime.archives.recordings.evaluation import check_recording
 from lightpage.runtime.archives.recordings.read_ahead import read_ahead
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.model.decoding.frames import narrow
 from lightpage.runtime.model.decoding.page import DecodedPage
 from lightpage.runtime.model.decoding.tracking import Tracker
 

@@ -14,7 +14,7 @@ from lightpage.runtime.archives.run.task import FineTuning
 
 if TYPE_CHECKING:
     from lightpage.runtime.model.decoding.decoder import Decoder
-    from lightpage.runtime.recalibration.outcome import RecalibrationOutcome
+    from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome
 
 GROUP, DEEP = "lightpage.recalibrations", "deep"
 

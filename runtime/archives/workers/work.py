@@ -37,6 +37,7 @@ from lightpage.progress import reporting, warn
 from lightpage.recording.decoded_file import DecodedWriter
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.joined import join
+from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.evaluation import check_recording, decode_unseen, pilots_of
 from lightpage.runtime.archives.recordings.read_ahead import read_ahead
@@ -67,14 +68,12 @@ from lightpage.runtime.archives.run.task import (
 )
 from lightpage.runtime.archives.workers.fine_tuning import DeepRecalibration, deep_recalibration
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.model.decoding.frames import narrow
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.decoding.page import DecodedPage
 from lightpage.runtime.model.decoding.tracking import NoTracker, Tracker
 from lightpage.runtime.model.execution.providers import Provider
 from lightpage.runtime.recalibration.known_pages import read_recorded
-from lightpage.runtime.recalibration.outcome import RecalibrationOutcome, Refit
-from lightpage.runtime.recalibration.recalibration import next_version, recalibrate
+from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome, Refit, next_version, recalibrate
 from lightpage.runtime.recalibration.refit import refit
 
 T = TypeVar("T")

@@ -1,15 +1,18 @@
-"""Both ends of a connection, one way for all who call a service and for all that serve."""
+"""Both ends of a connection, one way for all who call a service and for all that serve, and their certificates."""
 
 from __future__ import annotations
 
 import json
+import ssl
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import grpc
 
+from lightpage.errors import InvalidInputError
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.sizes import REPLY_BYTES
-from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.client.wire.messages import REPLY_BYTES
 
 REPEATABLE = ("Describe", "ListModels", "ListJobs", "GetJob", "WatchJob", "WatchDisplay")
 """Calls that change nothing: gRPC repeats them by itself where the service did not answer."""
@@ -25,11 +28,6 @@ are all at work takes its time to answer, and a host that is being switched on d
 KEEPALIVE_MS = 30_000
 """A connection silent for so long is asked for a sign of life, so that either end notices that the other has gone."""
 
-_CLIENT_KEEPALIVE = (
-    ("grpc.keepalive_time_ms", KEEPALIVE_MS),
-    ("grpc.keepalive_timeout_ms", 20_000),  # a service whose cores are all at work takes its time
-)
-
 SERVER_KEEPALIVE = (
     ("grpc.keepalive_time_ms", KEEPALIVE_MS),
     ("grpc.keepalive_permit_without_calls", 1),
@@ -37,6 +35,73 @@ SERVER_KEEPALIVE = (
     ("grpc.http2.min_ping_interval_without_data_ms", 5_000),
 )
 """Of every server of this project: callers may ask for a sign of life every 10 s, with calls or without."""
+
+
+@dataclass(frozen=True)
+class Pem:
+    """The contents of three files, PEM."""
+
+    ca: bytes
+    certificate: bytes
+    key: bytes
+
+
+@dataclass(frozen=True)
+class TlsFiles:
+    """What one end of a connection proves with who it is, and believes the other end by.
+
+    Attributes:
+        ca: certificates of the authorities that the other end's certificate may come from, PEM.
+        certificate: this end's own, PEM, with those between it and its authority behind it.
+        key: its private key, PEM, without a password.
+    """
+
+    ca: Path | str
+    certificate: Path | str
+    key: Path | str
+
+    def read(self) -> Pem:
+        """Read the files.
+
+        Raises:
+            InvalidInputError: one cannot be read, or holds no certificate, or the key belongs to another certificate.
+        """
+        pem = Pem(*(_read(name, Path(path)) for name, path in vars(self).items()))
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        try:
+            context.load_verify_locations(self.ca)
+        except (OSError, ValueError):  # an SSLError is an OSError
+            raise InvalidInputError(f"ca {self.ca}", "no certificate", "certificates of authorities, PEM") from None
+        try:
+            context.load_cert_chain(self.certificate, self.key, password=_no_password)
+        except (OSError, ValueError) as error:  # an SSLError is an OSError
+            got = getattr(error, "reason", None) or error
+            expected = "a certificate and its private key, PEM, without a password"
+            raise InvalidInputError(f"certificate {self.certificate} with key {self.key}", got, expected) from None
+        return pem
+
+    def client_context(self) -> ssl.SSLContext:
+        """What an HTTP client connects with; raises as `read`."""
+        self.read()
+        context = ssl.create_default_context(cafile=str(self.ca))
+        context.load_cert_chain(self.certificate, self.key)
+        return context
+
+    def channel_credentials(self) -> grpc.ChannelCredentials:
+        """What a client connects with; raises as `read`."""
+        pem = self.read()
+        return grpc.ssl_channel_credentials(pem.ca, pem.key, pem.certificate)
+
+
+def _read(name: str, path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InvalidInputError(f"{name} {path}", error, "a file that can be read") from None
+
+
+def _no_password() -> str:
+    raise ValueError("a key with a password")
 
 
 def open_channel(target: str, tls: TlsFiles | None = None) -> grpc.Channel:
@@ -57,7 +122,8 @@ def open_channel(target: str, tls: TlsFiles | None = None) -> grpc.Channel:
         ("grpc.max_reconnect_backoff_ms", most_ms),
         ("grpc.min_reconnect_backoff_ms", CONNECT_MS),
         ("grpc.service_config", _service_config()),
-        *_CLIENT_KEEPALIVE,
+        ("grpc.keepalive_time_ms", KEEPALIVE_MS),
+        ("grpc.keepalive_timeout_ms", 20_000),  # a service whose cores are all at work takes its time
     )
     if tls is None:
         return grpc.insecure_channel(target, options=options)

@@ -1,19 +1,29 @@
-"""Parts of messages that both ends write and read."""
+"""Parts of messages that both ends write and read.
+
+Chunks of frames are written and read without the copies that protobuf makes of each.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
-from typing import TypeVar
+from collections.abc import Callable, Iterator, Sequence
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 from google.protobuf.message import Message
 from numpy.typing import NDArray
 
-from lightpage.codec.page_bytes import FileFacts, Header, Loss, PageBytes
-from lightpage.errors import InvalidInputError, PageError
+from lightpage.codec.page_bytes import Loss
+from lightpage.errors import InvalidInputError
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.model.decoding.image_position import ImagePosition
+
+MESSAGE_BYTES = 4 << 20
+"""One message in: chunks stay far below, so that no single message makes the service hold its breath."""
+
+CHUNK_BYTES = 1 << 20
+"""Chunk that a client sends: larger ones gain nothing, smaller ones cost calls."""
+
+REPLY_BYTES = 64 << 20
+"""One reply: symbols, float32 confidence, concentration and phase of 700 x 450 symbols are 4 MB."""
 
 PIXEL_TYPES = {pb.PIXEL_TYPE_UINT8: "uint8", pb.PIXEL_TYPE_UINT16: "uint16"}
 PIXEL_CODES = {name: code for code, name in PIXEL_TYPES.items()}
@@ -29,6 +39,13 @@ DATA_LOSSES: dict[Loss | None, pb.DataLoss] = {
 FLOAT = np.dtype("<f4")
 """Of confidences, concentrations and phases."""
 
+FramePart: TypeAlias = pb.DecodeFramesRequest | memoryview
+"""A message of frames: a chunk of pixels as a view of bytes, anything else as its message."""
+
+_TAG = bytes([pb.DecodeFramesRequest.CHUNK_FIELD_NUMBER << 3 | 2])
+"""How a field of bytes with the number of a chunk begins. Source: protobuf's encoding, wire type LEN."""
+_LONGEST_VARINT = 5
+"""Bytes of a number below 2^35: no message is as large."""
 
 M = TypeVar("M", bound=Message)
 
@@ -54,61 +71,42 @@ def set_fields(message: Message, **fields: object) -> None:
             raise InvalidInputError(name, repr(value)[:100], expected) from None
 
 
-def pixel_type(code: pb.PixelType) -> str:
-    """numpy's name of a pixel type.
+def parsed_part(data: bytes) -> FramePart:
+    """A message from the wire.
 
     Raises:
-        InvalidInputError: unspecified or unknown.
+        google.protobuf.message.DecodeError: it cannot be parsed.
     """
-    if code not in PIXEL_TYPES:
-        raise InvalidInputError("pixel_type", code, "PIXEL_TYPE_UINT8 or PIXEL_TYPE_UINT16")
-    return PIXEL_TYPES[code]
+    if data.startswith(_TAG):
+        size = 0
+        for place, byte in enumerate(data[1 : 1 + _LONGEST_VARINT]):
+            size |= (byte & 0x7F) << 7 * place
+            if byte < 0x80:
+                if (begin := 2 + place) + size == len(data):  # a chunk, and nothing behind it
+                    return memoryview(data)[begin:]
+                break
+    message = pb.DecodeFramesRequest.FromString(data)
+    return memoryview(message.chunk) if message.WhichOneof("part") == "chunk" else message
 
 
-@dataclass(frozen=True)
-class KnownPilots:
-    """Pilots that a caller knows: bool mask [ny, nx], a page of symbols [ny, nx], and their level count."""
-
-    mask: NDArray[np.bool_]
-    symbols: NDArray[np.uint8]
-    levels: int
+def serialized_part(part: FramePart) -> bytes:
+    """A message for the wire."""
+    if isinstance(part, memoryview):
+        return b"".join((_TAG, _varint(part.nbytes), part))
+    return part.SerializeToString()
 
 
-def pilots_message(pilots: KnownPilots) -> pb.Pilots:
-    """Pilots as their message.
-
-    Raises:
-        PageError: mask and page differ in shape.
-    """
-    if pilots.mask.shape != pilots.symbols.shape:
-        raise PageError("pilots", f"mask {pilots.mask.shape}, page {pilots.symbols.shape}", "two equal shapes")
-    values = pilots.symbols[pilots.mask].tobytes()
-    return pb.Pilots(mask=pilots.mask.astype(np.uint8).tobytes(), values=values, levels=pilots.levels)
+def chunks_of(frames: Sequence[NDArray[np.integer]]) -> Iterator[memoryview]:
+    """The pixels of frames in chunks, little-endian, rows first."""
+    for frame in frames:
+        data = np.ascontiguousarray(frame, frame.dtype.newbyteorder("<")).view(np.uint8).reshape(-1)
+        for start in range(0, data.size, CHUNK_BYTES):
+            yield data[start : start + CHUNK_BYTES].data
 
 
-def user_data_of(message: pb.UserData) -> PageBytes:
-    """A message as what a page gave; a loss that this version does not know counts as one of the body."""
-    told = message.header
-    header = Header(told.code_id, told.volume, told.page, told.volume_bytes) if message.HasField("header") else None
-    loss = next((loss for loss, known in DATA_LOSSES.items() if known == message.loss), Loss.BODY)
-    return PageBytes(
-        header,
-        message.data if loss is None else None,
-        FileFacts(message.data_pages, message.parity_pages, message.file_checksum) if loss is None else None,
-        loss,
-        message.iterations,
-        message.failed_blocks,
-        message.blocks,
-        message.corrected,
-        message.margin_bits,
-    )
-
-
-def image_message(image: ImagePosition) -> pb.ImagePosition:
-    """An image's position as its message."""
-    return pb.ImagePosition(**asdict(image))
-
-
-def image_of(message: pb.ImagePosition) -> ImagePosition:
-    """A message as an image's position."""
-    return ImagePosition(**{field.name: getattr(message, field.name) for field in fields(ImagePosition)})
+def _varint(number: int) -> bytes:
+    found = bytearray()
+    while number > 0x7F:
+        found.append(number & 0x7F | 0x80)
+        number >>= 7
+    return bytes([*found, number])

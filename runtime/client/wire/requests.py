@@ -1,6 +1,8 @@
-"""What the service reads of a request and checks before it does anything."""
+"""What the service reads of a request and checks before it does anything, and parts of its answers."""
 
 from __future__ import annotations
+
+from dataclasses import asdict
 
 import numpy as np
 
@@ -8,6 +10,8 @@ from lightpage.errors import InvalidInputError, PageError
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import check_levels, symbol_phases
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
+from lightpage.runtime.client.wire.messages import PIXEL_TYPES
+from lightpage.runtime.model.decoding.image_position import ImagePosition
 
 _CONFIDENCE_FORMATS = (pb.CONFIDENCE_FORMAT_UNSPECIFIED, pb.CONFIDENCE_FORMAT_FLOAT32, pb.CONFIDENCE_FORMAT_UINT8)
 
@@ -52,3 +56,19 @@ def check_options(options: pb.DecodeOptions) -> None:
         raise InvalidInputError("tracking", options.tracking, "TRACKING_SESSION or TRACKING_STATELESS")
     if (length := len(options.session)) > SESSION_CHARACTERS:
         raise InvalidInputError("session", f"{length} characters", f"at most {SESSION_CHARACTERS}")
+
+
+def pixel_type(code: pb.PixelType) -> str:
+    """numpy's name of a pixel type.
+
+    Raises:
+        InvalidInputError: unspecified or unknown.
+    """
+    if code not in PIXEL_TYPES:
+        raise InvalidInputError("pixel_type", code, "PIXEL_TYPE_UINT8 or PIXEL_TYPE_UINT16")
+    return PIXEL_TYPES[code]
+
+
+def image_message(image: ImagePosition) -> pb.ImagePosition:
+    """An image's position as its message."""
+    return pb.ImagePosition(**asdict(image))

@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from lightpage.errors import InvalidInputError
-from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.client.wire.channel import TlsFiles
 
 TARGET = click.option("--target", metavar="HOST:PORT", required=True, help="The running service.")
 

@@ -6,9 +6,9 @@ import webbrowser
 
 import click
 
-from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.commands.client.connection import with_tls
-from lightpage.runtime.console.fetch import fetch, url_of
+from lightpage.runtime.console.scrapes import fetch, url_of
 
 
 @click.command()

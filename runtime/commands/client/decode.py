@@ -21,14 +21,14 @@ from lightpage.metrics.measures import PageMeasures, measure
 from lightpage.page.symbols import pilot_symbols
 from lightpage.progress import track, warn
 from lightpage.recording.decoded_file import DecodedWriter
+from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.refused import WORTH_NOTHING, RefusedPage, refusal, unconfirmed
+from lightpage.runtime.client.answers import RemotePage
 from lightpage.runtime.client.client import LightpageClient
-from lightpage.runtime.client.wire.messages import KnownPilots
-from lightpage.runtime.client.wire.pages import RemotePage
-from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.client.outgoing import KnownPilots
+from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.commands.client.connection import TARGET, with_tls
-from lightpage.runtime.model.decoding.frames import narrow
 from lightpage.runtime.model.decoding.image_drift import LEAST_COHERENCE
 
 

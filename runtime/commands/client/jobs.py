@@ -12,7 +12,7 @@ from lightpage.cli.progress_bar import percent_bar
 from lightpage.errors import InvalidInputError
 from lightpage.runtime.client.answers import JobInfo, JobState
 from lightpage.runtime.client.client import RECALIBRATION_S, LightpageClient
-from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.commands.client.connection import TARGET, with_tls
 from lightpage.runtime.commands.client.recalibrate import summary, table, watched
 

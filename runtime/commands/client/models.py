@@ -9,7 +9,7 @@ import click
 from lightpage.cli.groups import Group
 from lightpage.runtime.client.answers import ModelInfo
 from lightpage.runtime.client.client import LightpageClient
-from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.commands.client.connection import TARGET, with_tls
 
 _EXPECT = click.option("--expect", metavar="VERSION", default="", help="Only if this version is in service.")

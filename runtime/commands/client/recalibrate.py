@@ -19,14 +19,13 @@ from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.evaluation import check_recording
 from lightpage.runtime.client.answers import JobInfo, Recalibrated
 from lightpage.runtime.client.client import RECALIBRATION_S, LightpageClient
-from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.commands.client.connection import TARGET, with_tls
 from lightpage.runtime.model.bundle.manifest import check_version
 from lightpage.runtime.model.bundle.shipped import bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.known_pages import KnownPages, read_recorded
-from lightpage.runtime.recalibration.outcome import RecalibrationOutcome
-from lightpage.runtime.recalibration.recalibration import next_version
+from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome, next_version
 from lightpage.runtime.recalibration.recalibration import recalibrate as recalibrate_bundle
 from lightpage.runtime.recalibration.refit import refit
 

@@ -21,7 +21,7 @@ from rich.table import Table
 from rich.text import Text
 
 from lightpage.errors import LightpageError
-from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.commands.client.connection import with_tls
 from lightpage.runtime.console.scrapes import WINDOW_S, Change, Scrapes, scrape
 from lightpage.runtime.service.monitoring.stages import Stage

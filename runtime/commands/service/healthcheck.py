@@ -11,8 +11,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from lightpage.cli.main import run
 from lightpage.runtime.client.wire.address import check_address
-from lightpage.runtime.client.wire.channel import open_channel
-from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.client.wire.channel import TlsFiles, open_channel
 from lightpage.runtime.commands.client.connection import tls_options
 
 DEFAULT_TARGET = "127.0.0.1:50052"

@@ -22,8 +22,8 @@ from click.core import ParameterSource
 from lightpage.errors import InvalidInputError, LostShotError, SourceError
 from lightpage.progress import reporting
 from lightpage.recording.pages import Pages
+from lightpage.runtime.client.shared_memory import memory_path
 from lightpage.runtime.client.wire.address import check_free, host_and_port, is_local
-from lightpage.runtime.client.wire.shared_memory import memory_path
 from lightpage.runtime.commands.execution import ENGINE_CACHE, THREADS
 from lightpage.runtime.commands.provider_option import PROVIDER
 from lightpage.runtime.console.actions import Actions

@@ -8,9 +8,9 @@ from pathlib import Path
 from lightpage.device.profile import Profile
 from lightpage.errors import NoSuchPageError, RecordingError, StorageError
 from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording
 from lightpage.runtime.device.acquisition.source import SHOT_S, FrameSource, Shot
-from lightpage.runtime.model.decoding.frames import narrow
 
 
 class RecordingSource(FrameSource):

@@ -14,6 +14,7 @@ from typing import IO
 from lightpage.errors import BundleError
 from lightpage.failures import os_failure
 from lightpage.runtime.model.bundle.manifest import MANIFEST
+from lightpage.runtime.model.bundle.signature_file import read_plain_file
 
 MAX_FILES = 32
 """A bundle has a handful of files; more is something else."""
@@ -37,37 +38,28 @@ _LITTER = frozenset(
 
 _MAX_LITTER = 4 * MAX_FILES
 
-_DAMAGE = (
-    zipfile.BadZipFile,
-    zlib.error,
-    struct.error,
-    NotImplementedError,
-    RuntimeError,
-    EOFError,
-    ValueError,
-)
+_DAMAGE = (zipfile.BadZipFile, zlib.error, struct.error, NotImplementedError, RuntimeError, EOFError, ValueError)
 """What zipfile raises on damaged, encrypted or exotic archives."""
 
 
-def read_files(path: Path, max_bytes: int = MAX_BYTES, content: bytes | None = None) -> dict[str, bytes]:
+def read_files(path: Path, content: bytes | None = None) -> dict[str, bytes]:
     """All files of the folder or zip at `path`, by their plain names.
 
     Args:
         path: a folder or a zip file.
-        max_bytes: most bytes taken into memory.
         content: of the zip, where it has been read.
 
     Raises:
         BundleError: nothing there, not a zip, a name that is a path, a link, a folder inside, or too much data.
     """
     if content is not None:
-        return _read_zip(path, max_bytes, io.BytesIO(content))
+        return _read_zip(path, io.BytesIO(content))
     expected = "a folder or a zip file"
     try:
         if path.is_dir():
-            return _read_folder(path, max_bytes)
+            return _read_folder(path)
         if path.is_file():
-            return _read_zip(path, max_bytes, path)
+            return _read_zip(path, path)
     except OSError as error:
         raise os_failure(f"bundle {path}", error, expected, BundleError) from None
     raise BundleError(f"bundle {path}", "nothing", expected)
@@ -89,7 +81,7 @@ def is_litter(name: str) -> bool:
     return hidden or name.lower() in _LITTER
 
 
-def _read_folder(path: Path, max_bytes: int) -> dict[str, bytes]:
+def _read_folder(path: Path) -> dict[str, bytes]:
     subject, real = f"bundle {path}", os.path.realpath(path)
     there = sorted(os.listdir(path))
     _check_count(len(there), subject, _MAX_LITTER)
@@ -98,31 +90,27 @@ def _read_folder(path: Path, max_bytes: int) -> dict[str, bytes]:
         raise BundleError(subject, f"a folder without {MANIFEST}", "a bundle: a folder that has one, or a zip file")
     _check_count(len(names), subject)
     files: dict[str, bytes] = {}
-    left = max_bytes
+    left = MAX_BYTES
     for name in names:
         check_name(name, subject)
         try:
-            # Kubernetes mounts files as links into a hidden folder beside them. O_NOFOLLOW: any other link is refused
-            # by the kernel, with no gap between a check and the use.
+            # Kubernetes mounts files as links into a hidden folder beside them. Any other link is refused by the
+            # kernel, with no gap between a check and the use.
             target = os.path.realpath(path / name)
             inside = os.path.dirname(os.path.dirname(target)) == real and is_litter(Path(target).parent.name)
-            descriptor = os.open(target if inside else path / name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-            with os.fdopen(descriptor, "rb") as file:
-                if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-                    raise BundleError(f"{subject}: {name}", "no plain file", "a plain file")
-                files[name] = file.read(left + 1)
+            files[name] = read_plain_file(target if inside else path / name, left + 1, f"{subject}: {name}")
         except OSError as error:
             expected = "a readable plain file, no link or folder"
             raise os_failure(f"{subject}: {name}", error, expected, BundleError) from None
         left -= len(files[name])
-        _check_left(left, max_bytes, subject)
+        _check_left(left, subject)
     return files
 
 
-def _read_zip(path: Path, max_bytes: int, source: Path | IO[bytes]) -> dict[str, bytes]:
+def _read_zip(path: Path, source: Path | IO[bytes]) -> dict[str, bytes]:
     subject = f"bundle {path}"
     files: dict[str, bytes] = {}
-    left = max_bytes
+    left = MAX_BYTES
     try:
         with zipfile.ZipFile(source) as archive:
             entries = archive.infolist()
@@ -145,7 +133,7 @@ def _read_zip(path: Path, max_bytes: int, source: Path | IO[bytes]) -> dict[str,
                 with archive.open(entry) as file:
                     files[name] = file.read(left + 1)
                 left -= len(files[name])
-                _check_left(left, max_bytes, subject)
+                _check_left(left, subject)
     except OSError as error:
         raise os_failure(subject, error, "a sound zip file", BundleError) from None
     except _DAMAGE as error:
@@ -165,6 +153,6 @@ def _check_count(count: int, subject: str, most: int = MAX_FILES) -> None:
         raise BundleError(subject, f"{count} files", f"at most {most}")
 
 
-def _check_left(left: int, max_bytes: int, subject: str) -> None:
+def _check_left(left: int, subject: str) -> None:
     if left < 0:
-        raise BundleError(subject, f"more than {max_bytes} bytes unpacked", f"at most {max_bytes}")
+        raise BundleError(subject, f"more than {MAX_BYTES} bytes unpacked", f"at most {MAX_BYTES}")

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.codec.code import Code, parse_code
 from lightpage.device.profile import Profile, parse_profile
-from lightpage.errors import BundleError, InvalidInputError, ProfileError
+from lightpage.errors import BundleError, CalibrationError, InvalidInputError, ProfileError
 from lightpage.failures import os_failure
 from lightpage.files import move_to_new_name, sync_folder, synchronise
 from lightpage.metrics.information import decide
@@ -43,6 +43,9 @@ from lightpage.runtime.model.bundle.manifest import (
 from lightpage.runtime.model.bundle.signature import BundleKey
 from lightpage.runtime.model.bundle.signature_file import read_signature
 
+if TYPE_CHECKING:
+    from lightpage.calibration.document import Calibration
+
 MAX_ARRAY_BYTES = MAX_BYTES
 """All arrays of one .npz file, unpacked: it is compressed by itself, and may be a bomb inside a small bundle."""
 
@@ -53,9 +56,18 @@ _EPOCH = (1980, 1, 1, 0, 0, 0)
 """Fixed time in the zip, so that the same contents give the same bytes."""
 
 
+_SIDE_PX = 2
+"""Side of the blocks of pixels that get one count: a sample of the usual grid, which still has all fringes."""
+_COUNTS = 32
+"""Counts that are left of a camera's. At 15,000 electrons a step is about four times a bright pixel's own noise."""
+
+
 @dataclass(frozen=True)
 class Golden:
-    """A frame pair and the decoder's expected answer p, float32 [2, ny, nx]."""
+    """A frame pair and the decoder's expected answer p, float32 [2, ny, nx].
+
+    Its frames are stored in few counts: they prove what a runtime computes, not how well a page reads.
+    """
 
     pair: FramePair
     p: NDArray[np.float32]
@@ -71,14 +83,11 @@ class Bundle:
     files: Mapping[str, bytes]
 
     @classmethod
-    def open(
-        cls, path: str | Path, max_bytes: int = MAX_BYTES, key: BundleKey | None = None, signature: bytes = b""
-    ) -> Bundle:
+    def open(cls, path: str | Path, key: BundleKey | None = None, signature: bytes = b"") -> Bundle:
         """Read the folder or zip at `path` and check every file against the manifest.
 
         Args:
             path: of it.
-            max_bytes: most bytes taken into memory.
             key: that a zip must be signed with; None for any or none.
             signature: of the zip; empty for that in the file beside it.
 
@@ -87,8 +96,8 @@ class Bundle:
                 key, no zip that is signed with it.
         """
         path = Path(path)
-        content = None if key is None else _signed(path, key, signature or read_signature(path), max_bytes)
-        files = read_files(path, max_bytes, content)
+        content = None if key is None else _signed(path, key, signature or read_signature(path))
+        files = read_files(path, content)
         subject = f"bundle {path}"
         if MANIFEST not in files:
             raise BundleError(subject, f"no {MANIFEST}", f"a bundle with its {MANIFEST}")
@@ -124,6 +133,22 @@ class Bundle:
             return parse_profile(self.manifest.profile, f"{self.subject}: profile")
         except ProfileError as error:
             raise BundleError(error.subject, error.got, error.expected) from None
+
+    @cached_property
+    def calibration(self) -> Calibration:
+        """The calibration that the bundle was made with.
+
+        Raises:
+            CalibrationError: its text is no calibration of its profile.
+        """
+        from lightpage.calibration.document import parse_calibration
+
+        try:
+            calibration = parse_calibration(self.manifest.calibration, f"{self.subject}: calibration")
+            calibration.check_profile(self.profile)
+        except ProfileError as error:
+            raise CalibrationError(error.subject, error.got, error.expected) from None
+        return calibration
 
     @cached_property
     def table(self) -> SamplingTable:
@@ -254,6 +279,43 @@ def read_manifest(path: Path) -> Manifest:
     return parse_manifest(text, f"{subject}: {MANIFEST}")
 
 
+def shows_page(coarse: float, residual: float, limit: float) -> bool:
+    """Whether frames in few counts may stand for a page: how badly they fit the homodyne equations tells.
+
+    Args:
+        coarse: residual of the frames `in_few_counts`.
+        residual: of the page's own frames.
+        limit: largest residual of a pair that the bundle decodes.
+
+    Returns:
+        Whether `coarse` is no nearer to the limit than half way, in ratio: the image is also looked for off its place.
+    """
+    return bool(coarse <= np.sqrt(residual * limit))
+
+
+def in_few_counts(pair: FramePair, bit_depth: int) -> FramePair:
+    """Means of blocks of 2 x 2 pixels, each one of 32 counts: compressed, they take about a sixth of the room.
+
+    Args:
+        pair: counts [H, W].
+        bit_depth: bits of a count, 8 to 16.
+
+    Returns:
+        Frames of the same shapes and types, none of them black or at full scale.
+    """
+    step = (1 << bit_depth) // _COUNTS
+    return FramePair(_coarse(pair.in_phase, step), _coarse(pair.quadrature, step))
+
+
+def _coarse(frame: NDArray[np.integer[Any]], step: int) -> NDArray[np.integer[Any]]:
+    rows, columns = frame.shape
+    whole = np.pad(frame, ((0, -rows % _SIDE_PX), (0, -columns % _SIDE_PX)), mode="edge")
+    blocks = whole.reshape(whole.shape[0] // _SIDE_PX, _SIDE_PX, whole.shape[1] // _SIDE_PX, _SIDE_PX)
+    means = blocks.sum(axis=(1, 3), dtype=np.uint32) // _SIDE_PX**2
+    rounded = np.asarray(means // step * step + step // 2, dtype=frame.dtype)
+    return np.ascontiguousarray(rounded.repeat(_SIDE_PX, 0).repeat(_SIDE_PX, 1)[:rows, :columns])
+
+
 def npz(**arrays: NDArray[Any]) -> bytes:
     """Arrays as the bytes of a compressed .npz file, for `write_bundle`."""
     buffer = io.BytesIO()
@@ -327,16 +389,16 @@ def _write_file(path: Path, data: bytes) -> None:
         synchronise(file.fileno())
 
 
-def _signed(path: Path, key: BundleKey, signature: bytes, max_bytes: int) -> bytes:
+def _signed(path: Path, key: BundleKey, signature: bytes) -> bytes:
     """The contents of a zip whose signature was checked."""
     subject = f"bundle {path}"
     try:
         with path.open("rb") as file:
-            content = file.read(max_bytes + 1)
+            content = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise BundleError(subject, error, "a zip file: a folder has no signature") from None
-    if len(content) > max_bytes:
-        raise BundleError(subject, f"more than {max_bytes} bytes", f"at most {max_bytes}")
+    if len(content) > MAX_BYTES:
+        raise BundleError(subject, f"more than {MAX_BYTES} bytes", f"at most {MAX_BYTES}")
     key.check(content, signature, subject)
     return content
 

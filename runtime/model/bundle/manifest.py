@@ -78,9 +78,6 @@ class Manifest(BaseModel):
     def to_json(self) -> bytes:
         """The manifest as JSON with a hash of itself, so that a damaged manifest is noticed like any other file."""
         data = self.model_dump(mode="json")
-        for key, usual in (("code", None), ("precision", FLOAT32)):
-            if data[key] == usual:  # programs of before know no such key
-                del data[key]
         return (json.dumps(data | {_SELF_HASH: _digest(data)}, indent=2, sort_keys=True) + "\n").encode()
 
 

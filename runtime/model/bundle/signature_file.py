@@ -27,15 +27,24 @@ def read_signature(bundle: Path) -> bytes:
     Raises:
         BundleError: it is no plain file, or cannot be read.
     """
-    path, expected = signature_path(bundle), "a plain file that can be read"
+    path = signature_path(bundle)
     try:
-        # The kernel refuses a link, and nobody waits for whoever writes to a pipe.
-        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-        with os.fdopen(descriptor, "rb") as file:
-            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-                raise BundleError(f"signature {path}", "no plain file", expected)
-            return file.read(MOST_BYTES)
+        return read_plain_file(path, MOST_BYTES, f"signature {path}")
     except FileNotFoundError:
         return b""
     except OSError as error:
-        raise os_failure(f"signature {path}", error, expected, BundleError) from None
+        raise os_failure(f"signature {path}", error, "a plain file that can be read", BundleError) from None
+
+
+def read_plain_file(path: Path | str, most_bytes: int, subject: str) -> bytes:
+    """The first bytes of a file; the kernel refuses a link, and nobody waits for whoever writes to a pipe.
+
+    Raises:
+        BundleError: it is no plain file.
+        OSError: it cannot be read, or is a link.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    with os.fdopen(descriptor, "rb") as file:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise BundleError(subject, "no plain file", "a plain file")
+        return file.read(most_bytes)

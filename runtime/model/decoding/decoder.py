@@ -28,22 +28,24 @@ from lightpage.metrics.information import decide_with_confidence
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.page.pilots import Pilots, read_pilots, remove_piston
 from lightpage.page.symbols import check_levels, symbol_phases
+from lightpage.recording.exposure import check_light
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import DECODER, FIELD, FLOAT16, FLOAT32, GOLDEN
-from lightpage.runtime.model.decoding.field_solver import BundleFieldSolver
-from lightpage.runtime.model.decoding.frames import check_pair
 from lightpage.runtime.model.decoding.page import DecodedPage, Inference, Timings
 from lightpage.runtime.model.decoding.phase_refit import PhaseRefit
-from lightpage.runtime.model.execution.constant_table import GraphFile
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
-from lightpage.runtime.model.execution.session import Port
-from lightpage.runtime.model.execution.table_graph import TableGraph
+from lightpage.runtime.model.execution.session import Port, open_session, running
+from lightpage.runtime.model.execution.table_graph import GraphFile, TableGraph
+from lightpage.waves.grid import field_grid
 
 if TYPE_CHECKING:
     from lightpage.codec.page_codec import PageCodec
 
 OUTPUTS = ("p", "phase", "concentration")
+FIELD_OUTPUTS = ("field", "unexplained")
+"""Outputs of the field graph, or of a decoder that shows them, [2, Gy, Gx] each: the recovered field, and what is left
+of the homodyne equations."""
 PAGE_INPUTS = frozenset(["registration"])
 """Table inputs that may differ from page to page, as the image shifts. All others are built into the graph."""
 GOLDEN_TOLERANCE = {FLOAT32: 1e-3, FLOAT16: 1e-2}
@@ -91,11 +93,7 @@ class Decoder:
     """
 
     def __init__(
-        self,
-        bundle: Bundle,
-        threads: int | None = None,
-        graph: TableGraph | None = None,
-        provider: Provider = ON_CPU,
+        self, bundle: Bundle, threads: int | None = None, graph: TableGraph | None = None, provider: Provider = ON_CPU
     ) -> None:
         self.bundle, self.threads = bundle, threads
         self.graph = graph or open_graph(bundle, threads, provider)
@@ -171,14 +169,20 @@ class Decoder:
             )
         return self._pilots[levels]
 
-    def check(self, pair: FramePair) -> None:
-        """Check a frame pair against the camera of this bundle.
+    def check(self, pair: FramePair, subject: str = "") -> None:
+        """Check a frame pair against the camera of this bundle; `subject` goes before a frame's name in the error.
 
         Raises:
             FrameError: wrong size, type or bit depth, black or saturated.
         """
-        manifest = self.bundle.manifest
-        check_pair(pair, self.bundle.profile.frame_shape, manifest.frame_dtype, manifest.camera_bit_depth)
+        shape, dtype = self.bundle.profile.frame_shape, self.bundle.manifest.frame_dtype
+        for name, frame in (("in-phase frame", pair.in_phase), ("quadrature frame", pair.quadrature)):
+            name = subject + name
+            if not isinstance(frame, np.ndarray) or frame.shape != shape:
+                raise FrameError(name, f"shape {getattr(frame, 'shape', type(frame).__name__)}", f"shape {shape}")
+            if frame.dtype != np.dtype(dtype):
+                raise FrameError(name, f"type {frame.dtype}", dtype)
+            check_light(name, frame, self.bundle.manifest.camera_bit_depth)
 
     def infer(self, pair: FramePair, table: SamplingTable | None = None) -> Inference:
         """Run the graph on a checked pair.
@@ -249,30 +253,22 @@ class Decoder:
         """
         return Pilots(self.bundle.pilot_mask, symbol_phases(self.bundle.written_pilots(levels), levels))
 
-    @property
-    def has_field_graph(self) -> bool:
-        """Whether `field_solver` runs the field alone, and not all of the decoder."""
-        return FIELD in self.bundle.files
-
-    def decode(
-        self, pair: FramePair, levels: int = 256, table: SamplingTable | None = None, pilots: Pilots | None = None
-    ) -> DecodedPage:
+    def decode(self, pair: FramePair, levels: int = 256, pilots: Pilots | None = None) -> DecodedPage:
         """Decode a frame pair into symbols of `levels` levels.
 
         Args:
             pair: both frames.
             levels: M, 2..256.
-            table: as for `infer`.
             pilots: the known symbols of this page, where they differ from this device's pattern.
 
         Raises:
-            FrameError, PageError, InvalidInputError: see `check`, `check_levels` and `infer`.
+            FrameError, PageError: see `check`, `check_levels` and `infer`.
         """
         start = time.perf_counter()
         check_levels(levels)
         self.check(pair)
         checked = time.perf_counter()
-        inference = self.infer(pair, table)
+        inference = self.infer(pair)
         inferred = time.perf_counter()
         page = self.post_process(inference, levels, pilots)
         return replace(page, timings=Timings(checked - start, inferred - checked, time.perf_counter() - inferred))
@@ -335,3 +331,53 @@ class Decoder:
             raise BundleError(
                 subject, f"an answer off by {error_norm:.3g} of its norm", f"the expected p within {tolerance:g}"
             )
+
+
+class BundleFieldSolver:
+    """A bundle's `lightpage.calibration.interfaces.FieldSolver`.
+
+    Runs the field's own graph, which does no more than is asked for; where the bundle has none, all of the decoder.
+
+    Args:
+        bundle: an opened bundle.
+        graph: of its decoder.
+        threads: threads of one run; by default the cores that this process may use.
+
+    Raises:
+        BundleError: no graph shows the field.
+    """
+
+    def __init__(self, bundle: Bundle, graph: TableGraph, threads: int | None = None) -> None:
+        self._graph, self._profile = graph, bundle.profile
+        self._alone = FIELD in bundle.files
+        name = FIELD if self._alone else DECODER
+        self._subject = f"{bundle.subject}: {name}"
+        self._session = open_session(bundle.files[name], self._subject, threads)
+        if missing := set(FIELD_OUTPUTS) - {node.name for node in self._session.get_outputs()}:
+            raise BundleError(f"{self._subject}: outputs", f"no {', '.join(sorted(missing))}", "a graph with its field")
+
+    def __call__(
+        self, pair: FramePair, references: FramePair, registration: NDArray[np.float32], homodyne: NDArray[np.float32]
+    ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
+        """Field and what is left of the equations, see `FieldSolver`; whatever the page's residual is.
+
+        Raises:
+            BundleError: the field is not on the common grid.
+            InvalidInputError: a tensor that does not fit.
+        """
+        table: SamplingTable = {
+            "reference_in_phase": references.in_phase,
+            "reference_quadrature": references.quadrature,
+            "registration": registration,
+            "homodyne": homodyne,
+        }
+        self._graph.check(table)
+        feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **table}
+        if not self._alone:
+            feeds = {**self._graph.table, **feeds}
+        with running(self._subject):
+            (real, imaginary), left = self._session.run(FIELD_OUTPUTS, feeds)
+        if real.shape != (wanted := field_grid(self._profile).shape):
+            expected = f"{wanted}, or a {FIELD} beside it"
+            raise BundleError(f"{self._subject}: output field", f"shape {real.shape}", expected)
+        return np.asarray(real + 1j * imaginary, np.complex64), left

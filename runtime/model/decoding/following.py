@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import cached_property
 
-from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.page.pilots import Pilots
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.bundle import Bundle
@@ -41,19 +40,14 @@ class FollowingDecoder(Decoder):
         decoder = Decoder(self.bundle, self.threads, self.graph)
         return tracker_for(decoder) if self._tracking else NoTracker(decoder)
 
-    def decode(
-        self, pair: FramePair, levels: int = 256, table: SamplingTable | None = None, pilots: Pilots | None = None
-    ) -> DecodedPage:
+    def decode(self, pair: FramePair, levels: int = 256, pilots: Pilots | None = None) -> DecodedPage:
         """Decode a frame pair into symbols of `levels` levels.
 
         Args:
             pair, levels, pilots: see `Decoder.decode`.
-            table: tensors for this page alone; then the image is not followed, and the page is given out in any case.
 
         Raises:
             UnconfirmedPageError: the page's pilots contradict what was decoded.
-            FrameError, PageError, InvalidInputError: see `Decoder.decode`.
+            FrameError, PageError: see `Decoder.decode`.
         """
-        if table is not None:
-            return super().decode(pair, levels, table, pilots)
         return self.tracker.decode(pair, levels, pilots)

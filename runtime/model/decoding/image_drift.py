@@ -1,4 +1,6 @@
-"""Reads the image's drift from decoded phases: moved light is demodulated with the wrong phase, symbol by symbol.
+"""Reads the image's drift from decoded phases, applies it to the tables, and looks for an image that is lost.
+
+Moved light is demodulated with the wrong phase, symbol by symbol.
 
 Drift is the vector (shift x, shift y, tilt x, tilt y): of the image on both cameras, camera pixels, and of the signal
 against the reference, radians at the right and lower edge of the page's image. A reference beam that stays where it is
@@ -15,14 +17,18 @@ import scipy
 from numpy.typing import NDArray
 
 from lightpage.calibration.coherence import branch_shares
+from lightpage.calibration.image_search import FoundImage, ImageSearch
 from lightpage.calibration.interfaces import BRANCHES, Twin
-from lightpage.calibration.sampling_table import shifted, symbol_centres
+from lightpage.calibration.parameters import NAMES
+from lightpage.calibration.phases import tilt_of_shift
+from lightpage.calibration.sampling_table import SamplingTable, sampling_table, shifted, symbol_centres
 from lightpage.device.profile import Profile
 from lightpage.errors import BundleError, FrameError
 from lightpage.page.pilots import Pilots, read_pilots
-from lightpage.runtime.model.bundle.calibrated import calibration_of
+from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.page import Inference
+from lightpage.runtime.model.decoding.phase_refit import wrapped
 
 Real = NDArray[np.float64]
 
@@ -108,7 +114,7 @@ class DriftModel:
         Raises:
             CalibrationError: the bundle holds no calibration.
         """
-        parameters = calibration_of(decoder.bundle).vector
+        parameters = decoder.bundle.calibration.vector
         thread = ThreadPoolExecutor(1, thread_name_prefix="lightpage-drift")
         slopes = thread.submit(drift_slopes, decoder, twin, parameters)
         thread.shutdown(wait=False)
@@ -132,7 +138,7 @@ class DriftModel:
         concentration = inference.concentration.astype(np.float64)
         phase = inference.phase - read_pilots(inference.p, pilots).piston.angle_rad
         at = pilots.mask
-        residual, weight = _wrapped(phase[at] - pilots.phases), np.minimum(concentration[at], _CAP)
+        residual, weight = wrapped(phase[at] - pilots.phases), np.minimum(concentration[at], _CAP)
         if not weight.sum() > 0 or abs(np.sum(weight * np.exp(1j * residual))) < LEAST_COHERENCE * weight.sum():
             return None
         coarse = _solve(residual, self.slopes[:, at], weight, prior)
@@ -146,7 +152,7 @@ class DriftModel:
         decided[at] = pilots.phases
         chosen = safe | at
         weight = np.minimum(concentration[chosen], _CAP)
-        fine = _solve(_wrapped(phase - decided)[chosen], self.slopes[:, chosen], weight, prior)
+        fine = _solve(wrapped(phase - decided)[chosen], self.slopes[:, chosen], weight, prior)
         # a page of more levels than it is read with is decided wrongly throughout
         return coarse if fine is None or fine.over_claim > _MOST_OVER_CLAIM else fine
 
@@ -213,12 +219,77 @@ def _solve(residual: Real, slopes: Real, weight: Real, prior: Real) -> Estimate 
         solution = np.asarray(
             np.linalg.solve(normal, columns.T @ (trusted * (off + columns @ solution)) / excess), np.float64
         )
-        off = _wrapped(residual - columns @ solution)
+        off = wrapped(residual - columns @ solution)
         trusted = weight / (1 + off**2 * weight / _OUTLIER**2)
     excess = max(1.0, float(np.sum(trusted * off**2) / len(off)))
     covariance: Real = np.linalg.inv(columns.T @ (columns * trusted[:, None]) / excess + precision).astype(np.float64)
     return Estimate(solution[1:], covariance[1:, 1:], float(solution[0]), excess)
 
 
-def _wrapped(angle: Real) -> Real:
-    return np.asarray(angle - 2 * np.pi * np.rint(angle / (2 * np.pi)))
+class BundleTables:
+    """The tables of a bundle's device under drift.
+
+    Args:
+        decoder: of the bundle as it is.
+        twin: of the bundle.
+
+    Raises:
+        CalibrationError: the bundle holds no calibration.
+    """
+
+    def __init__(self, decoder: Decoder, twin: Twin) -> None:
+        self._decoder, self._twin, self._calibration = decoder, twin, decoder.bundle.calibration
+        self._registration = decoder.graph.value("registration")
+
+    def shifted(self, shift_px: Real) -> SamplingTable:
+        """Tensors to feed for an image `shift_px` (x, y) from where calibration saw it; empty for no shift."""
+        return {"registration": shifted(self._registration, shift_px)} if np.any(shift_px) else {}
+
+    def tilt_of(self, shift_px: Real) -> Real:
+        """Tilt (x, y) of the signal against a reference that stays while the image shifts, radians."""
+        profile = self._decoder.bundle.profile
+        half = profile.page_width_m / 2, profile.page_height_m / 2
+        return tilt_of_shift(self._calibration.parameters, shift_px * profile.camera.pitch_m, *half)
+
+    def traced(self, tilt_rad: Real) -> Decoder:
+        """The decoder with the table of a device whose signal is tilted so against the reference."""
+        bundle = self._decoder.bundle
+        parameters = self._calibration.vector.copy()
+        for name, tilt in zip(("camera_tilt_x_rad", "camera_tilt_y_rad"), tilt_rad, strict=True):
+            parameters[NAMES.index(name)] += tilt
+        table = sampling_table(self._twin, parameters, self._calibration.turn_rad, bundle.profile)
+        return self._decoder.with_table({n: v for n, v in table.items() if n in self._decoder.graph.ports})
+
+
+class BundleSearch:
+    """The search for the image of a page of one bundle's device; calls come from many threads.
+
+    Args:
+        decoder: of the bundle; its field graph, references and angle between the arms are used.
+        twin: of the bundle.
+
+    Raises:
+        CalibrationError: the bundle holds no calibration.
+    """
+
+    def __init__(self, decoder: Decoder, twin: Twin) -> None:
+        self._decoder, self._references = decoder, decoder.references
+        self._registration, self._homodyne = (decoder.graph.value(name) for name in ("registration", "homodyne"))
+        self._search = ImageSearch(twin, decoder.bundle.calibration.vector, decoder.bundle.profile)
+
+    def find(
+        self, pair: FramePair, pilots: Pilots, around_px: Real | None = None, references: FramePair | None = None
+    ) -> FoundImage:
+        """Look for the image of a page within reach of all of `around_px`.
+
+        Args:
+            pair, pilots: of the page.
+            around_px: [K, 2], shifts (x, y) in camera pixels against calibration; by default where that saw the image.
+            references: reference-only frames taken with the page, if not those that the decoder decodes with.
+
+        Raises:
+            BundleError: no graph of the bundle shows the field.
+        """
+        references = references or self._references
+        field, _ = self._decoder.field_solver(pair, references, self._registration, self._homodyne)
+        return self._search.find(field, pilots, around_px)

@@ -15,11 +15,10 @@ from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.page.pilots import PilotCheck, Pilots, read_pilots
 from lightpage.page.symbols import check_levels
 from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.model.bundle.manifest import FIELD
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.model.decoding.drift_tables import BundleTables, DriftTables
-from lightpage.runtime.model.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate
+from lightpage.runtime.model.decoding.image_drift import SHIFT, TILT, BundleSearch, BundleTables, DriftModel, Estimate
 from lightpage.runtime.model.decoding.image_position import ImagePosition
-from lightpage.runtime.model.decoding.image_search import BundleSearch, PageSearch
 from lightpage.runtime.model.decoding.page import DecodedPage, Inference, Timings
 from lightpage.runtime.model.decoding.tracking import NoTracker, Tracker, TrackerMemory, confirmed
 from lightpage.runtime.model.execution.twin import TWIN_THREADS, OnnxTwin
@@ -87,6 +86,10 @@ SHARE_MEMORY = 0.2
 
 FEWEST_PILOTS = 12
 """Pilots of a page from which drift is read: four numbers can be fitted to fewer whatever they are."""
+
+
+_LEARNT = ("drift", "covariance", "walk", "traced_tilt", "jump_px")
+"""Arrays of an `ImageState` that another process is told of."""
 
 
 @dataclass(frozen=True)
@@ -164,8 +167,8 @@ class ImageTracker:
         self,
         decoder: Decoder,
         model: DriftModel,
-        tables: DriftTables,
-        search: PageSearch | None,
+        tables: BundleTables,
+        search: BundleSearch | None,
         memory: TrackerMemory | None = None,
     ) -> None:
         self._decoder, self._model, self._tables, self._search = decoder, model, tables, search
@@ -191,29 +194,19 @@ class ImageTracker:
     def memory(self) -> TrackerMemory:
         """See `Tracker`."""
         state = self.state
-        numbers = {
-            "drift": state.drift,
-            "covariance": state.covariance,
-            "walk": state.walk,
-            "traced_tilt_rad": state.traced_tilt,
-            "jump_px": state.jump_px,
-        }
-        plain = {name: values.tolist() for name, values in numbers.items()}
+        plain = {name: getattr(state, name).tolist() for name in _LEARNT}
         return TrackerMemory.model_validate({**plain, "settled": state.settled, "share": state.share})
 
     def _remembered(self, memory: TrackerMemory) -> ImageState:
         """The state that another tracker was in."""
-        drift, traced = np.array(memory.drift), np.array(memory.traced_tilt_rad)
+        learnt = {name: np.array(getattr(memory, name)) for name in _LEARNT}
+        traced = learnt["traced_tilt"]
         return ImageState(
-            drift=drift,
-            covariance=np.array(memory.covariance),
             decoder=self._tables.traced(traced) if traced.any() else self._decoder,
-            table=self._tables.shifted(drift[SHIFT]),
-            traced_tilt=traced,
-            walk=np.array(memory.walk),
+            table=self._tables.shifted(learnt["drift"][SHIFT]),
             settled=memory.settled,
-            jump_px=np.array(memory.jump_px),
             share=memory.share,
+            **learnt,
         )
 
     def anew(self) -> ImageTracker:
@@ -267,13 +260,7 @@ class ImageTracker:
         return confirmed(page, found)
 
     def _attempts(
-        self,
-        pair: FramePair,
-        state: ImageState,
-        levels: int,
-        pilots: Pilots,
-        found: FoundImage | None,
-        clock: _Clock,
+        self, pair: FramePair, state: ImageState, levels: int, pilots: Pilots, found: FoundImage | None, clock: _Clock
     ) -> _Attempt:
         """Decode at a place, and again where the page shows that its image lies: the best one, with the first step."""
         enough = SEARCHED_PX if found is not None and found.found else np.inf
@@ -393,7 +380,7 @@ def tracker_for(decoder: Decoder, memory: TrackerMemory | None = None) -> Tracke
     if "registration" not in decoder.graph.ports:
         return NoTracker(decoder)
     twin, search = OnnxTwin(decoder.bundle, TWIN_THREADS), None
-    if decoder.has_field_graph:
+    if FIELD in decoder.bundle.files:
         search = BundleSearch(decoder, twin)
     else:
         _log.warning("%s: no field graph, so an image that is lost is not looked for", decoder.bundle.subject)

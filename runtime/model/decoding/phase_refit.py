@@ -85,7 +85,7 @@ class PhaseRefit:
         for _ in range(rounds):
             left = mu - _at(planes, np.repeat(coefficients.T, self._sizes, axis=1))
             distance = _mean_distance(left, kappa, step)
-            distance[is_known] = _wrapped(left[is_known] - truth[is_known])
+            distance[is_known] = wrapped(left[is_known] - truth[is_known])
             gradient = self._sums(planes * (kappa * distance)).T - coefficients / _PRIOR_RAD**2
             coefficients = coefficients + np.linalg.solve(normal, gradient[..., None])[..., 0]
         of_zones = np.zeros((self._zones.max() + 1, len(planes)))
@@ -114,5 +114,6 @@ def _mean_distance(mu: NDArray[np.float64], kappa: NDArray[np.float64], step: fl
     return np.asarray(away - (offsets * weight).sum(axis=0) / weight.sum(axis=0), np.float64)
 
 
-def _wrapped(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+def wrapped(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The same angles, -pi to pi."""
     return np.asarray(angle - 2 * np.pi * np.rint(angle / (2 * np.pi)))

@@ -21,7 +21,7 @@ class TrackerMemory(BaseModel):
         drift: shift x, y (camera pixels) and tilt x, y (radians) since calibration, [4].
         covariance: of the drift of the next page about it, [4, 4].
         walk: variance of the drift from one page to the next, [4].
-        traced_tilt_rad: tilt that the table was traced with, [2].
+        traced_tilt: radians, tilt that the table was traced with, [2].
         settled: whether a page was confirmed yet.
         jump_px: shift of which it is not known whether the reference has come along, (x, y).
         share: of the claimed information, what pilots lately confirmed.
@@ -32,7 +32,7 @@ class TrackerMemory(BaseModel):
     drift: tuple[float, float, float, float]
     covariance: tuple[tuple[float, float, float, float], ...]
     walk: tuple[float, float, float, float]
-    traced_tilt_rad: tuple[float, float]
+    traced_tilt: tuple[float, float]
     settled: bool
     jump_px: tuple[float, float]
     share: float
@@ -49,7 +49,7 @@ class Tracker(Protocol):
 
         Raises:
             UnconfirmedPageError: the page's pilots do not bear out what the decoder claims of it.
-            FrameError, PageError, InvalidInputError: see `Decoder.decode`.
+            FrameError, PageError: see `Decoder.decode`.
         """
 
     @property

@@ -18,7 +18,7 @@ os.environ["ORT_DISABLE_TELEMETRY"] = "1"
 
 import onnxruntime  # type: ignore[import-untyped]
 
-from lightpage.errors import BundleError, ProviderError
+from lightpage.errors import BundleError, ProviderError, SurroundingsError
 from lightpage.failures import short_resource
 from lightpage.runtime.model.execution.cpus import available_cpus
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
@@ -142,15 +142,15 @@ def open_session(
         onnxruntime.preload_dlls()  # they may be packages of this environment, where no linker looks
     version = sha256(model).hexdigest()[:_VERSION_DIGITS]
     try:
-        # by default it would print the cause, and compute elsewhere
-        session: Session = onnxruntime.InferenceSession(
-            model, options, providers=provider.chain(version), enable_fallback=0
-        )
+        with running(subject, provider):
+            # by default it would print the cause, and compute elsewhere
+            session: Session = onnxruntime.InferenceSession(
+                model, options, providers=provider.chain(version), enable_fallback=0
+            )
+    except (ProviderError, SurroundingsError):
+        raise
     except Exception as error:  # onnxruntime's errors share no base class
-        if provider != ON_CPU:
-            raise _of_provider(provider, error) from None
-        got = short_resource(subject, error)
-        raise got or BundleError(subject, _cause(error), "an ONNX model of a Lightpage bundle") from None
+        raise BundleError(subject, _cause(error), "an ONNX model of a Lightpage bundle") from None
     if (found := session.get_providers()[0]) != provider.runtime_name:
         raise ProviderError(f"provider {provider}", f"{found} in its place", _USABLE)
     return session
@@ -158,7 +158,9 @@ def open_session(
 
 @contextmanager
 def running(subject: str, provider: Provider = ON_CPU) -> Iterator[None]:
-    """While a session runs: a short resource and a GPU's failures by name; other failures on the CPU are the graph's.
+    """While a session is opened or runs: a short resource and a GPU's failures by name.
+
+    Other failures on the CPU are the graph's.
 
     Raises:
         ProviderError: a GPU failed, or has no room.
@@ -168,14 +170,10 @@ def running(subject: str, provider: Provider = ON_CPU) -> Iterator[None]:
         yield
     except Exception as error:  # onnxruntime's errors share no base class
         if provider != ON_CPU:
-            raise _of_provider(provider, error) from None
+            raise ProviderError(f"provider {provider}", _cause(error), _USABLE) from None
         if (short := short_resource(subject, error)) is not None:
             raise short from None
         raise
-
-
-def _of_provider(provider: Provider, error: Exception) -> ProviderError:
-    return ProviderError(f"provider {provider}", _cause(error), _USABLE)
 
 
 def _cause(error: Exception) -> str:
@@ -215,11 +213,7 @@ class BoundSession:
     """
 
     def __init__(
-        self,
-        session: Session,
-        provider: Provider,
-        constants: Mapping[str, NDArray[Any]],
-        subject: str = "onnxruntime",
+        self, session: Session, provider: Provider, constants: Mapping[str, NDArray[Any]], subject: str = "onnxruntime"
     ) -> None:
         self.session, self._subject, self._provider = session, subject, provider
         with running(subject, provider):

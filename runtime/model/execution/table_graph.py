@@ -1,19 +1,185 @@
-"""A decoder's graph opened with one table: what follows from it is computed once, and fed with each page."""
+"""A decoder's graph cut in two: what follows from the table alone is computed once, the rest for every page.
+
+ONNX Runtime would fold constants by itself, but not defaults of inputs that may be fed; and it holds all that it has
+folded on the way until it is done, which for a page of the full size is ten gigabytes.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from lightpage.calibration.sampling_table import SamplingTable
-from lightpage.errors import InvalidInputError
-from lightpage.runtime.model.execution.constant_table import GraphFile
+from lightpage.errors import BundleError, InvalidInputError
+from lightpage.runtime.model.execution.pb.lightpage.onnx import graph_pb2 as pb
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
 from lightpage.runtime.model.execution.session import BoundSession, Port, Session, open_session, running
+
+_DTYPES = {1: "float32", 2: "uint8", 4: "uint16", 6: "int32", 7: "int64", 10: "float16", 11: "float64"}
+"""numpy's names of ONNX's element types."""
+_NUMBERS = {name: number for number, name in _DTYPES.items()} | {"bool": 9}
+_LISTS = {"float32": "float_data", "int64": "int64_data", "float64": "double_data"}
+"""Where values lie that are not stored as bytes, by type; those of all other types share a list."""
+_DEFAULTS_FROM = 4
+"""Version of ONNX's representation from which an input may have a default; before, weights are listed as inputs too."""
+
+
+@dataclass(frozen=True)
+class CutGraph:
+    """A graph in two parts.
+
+    Attributes:
+        before: computes `between` and takes nothing; None where there is nothing to compute.
+        behind: takes frames, what is still fed, `between` and `direct`.
+        between: names of tensors.
+        direct: names of the table's tensors that the second part takes as they are.
+    """
+
+    before: bytes | None
+    behind: pb.Model
+    between: tuple[str, ...]
+    direct: tuple[str, ...]
+
+    def behind_with(self, values: Mapping[str, NDArray[np.generic]]) -> bytes:
+        """The second part, that takes tensors of the types and shapes of these values of `between` and `direct`."""
+        model = pb.Model()
+        model.CopyFrom(self.behind)
+        for name in (*self.between, *self.direct):
+            described = model.graph.input.add(name=name).type.tensor_type
+            described.elem_type = _NUMBERS[str(values[name].dtype)]
+            described.shape.SetInParent()
+            for size in values[name].shape:
+                described.shape.dim.add(dim_value=size)
+        return model.SerializeToString()
+
+
+class GraphFile:
+    """The bytes of an ONNX file, so far as its inputs and their defaults are concerned.
+
+    Args:
+        model: the serialised model.
+        subject: what it is, for the error.
+
+    Attributes:
+        table_inputs: inputs that have a default, by name, of its type and shape.
+
+    Raises:
+        BundleError: the bytes are no ONNX model.
+    """
+
+    def __init__(self, model: bytes, subject: str) -> None:
+        self._model = model
+        expected = "an ONNX model of a Lightpage bundle"
+        try:
+            whole = pb.Model.FromString(model)
+        except DecodeError as error:
+            raise BundleError(subject, error, expected) from None
+        if not whole.HasField("graph"):
+            raise BundleError(subject, "no graph", expected)
+        fed = {entry.name for entry in whole.graph.input} if whole.ir_version >= _DEFAULTS_FROM else set()
+        self.table_inputs = {
+            tensor.name: Port(_DTYPES.get(tensor.data_type, str(tensor.data_type)), tuple(tensor.dims))
+            for tensor in whole.graph.initializer
+            if tensor.name in fed
+        }
+
+    def default(self, name: str) -> NDArray[np.generic]:
+        """The default of a table input, read-only.
+
+        Args:
+            name: one of `table_inputs`.
+        """
+        graph = pb.Model.FromString(self._model).graph
+        tensor = next(tensor for tensor in graph.initializer if tensor.name == name)
+        port = self.table_inputs[name]
+        dtype = np.dtype(port.dtype)
+        if tensor.raw_data:
+            values = np.frombuffer(tensor.raw_data, dtype.newbyteorder("<")).astype(dtype, copy=False)
+        else:
+            values = np.array(getattr(tensor, _LISTS.get(port.dtype, "int32_data")), dtype)
+        return values.reshape([int(size) for size in tensor.dims])
+
+    def cut(self, table: SamplingTable, fed: Collection[str]) -> CutGraph:
+        """The model without table inputs but those `fed`, in two parts.
+
+        Args:
+            table: values instead of the defaults, of their types and shapes.
+            fed: names of table inputs that stay inputs, and have no default any more.
+        """
+        model = pb.Model.FromString(self._model)
+        graph, fixed = model.graph, self.table_inputs.keys() - set(fed)
+        inputs = [entry for entry in graph.input if entry.name not in fixed]
+        held = [tensor for tensor in graph.initializer if tensor.name not in self.table_inputs.keys() - fixed]
+        _replace(graph, input=inputs, initializer=held)
+        for tensor in graph.initializer:
+            if tensor.name in table and tensor.name in fixed:
+                for field in ("float_data", "int32_data", "int64_data", "double_data", "uint64_data"):
+                    tensor.ClearField(field)
+                value = np.asarray(table[tensor.name])
+                tensor.raw_data = value.astype(value.dtype.newbyteorder("<")).tobytes()
+        return _cut(model, fixed)
+
+
+def _cut(model: pb.Model, fixed: Collection[str]) -> CutGraph:
+    """Nodes that depend on initializers alone, some of `fixed` among them, before all others."""
+    graph = model.graph
+    inner = any(attribute.g or attribute.graphs for node in graph.node for attribute in node.attribute)
+    wanted, varying, derived = {value.name for value in graph.output}, {entry.name for entry in graph.input}, set(fixed)
+    before, behind = [], []
+    for node in graph.node:
+        if not inner and not varying.intersection(node.input) and derived.intersection(node.input):
+            derived.update(node.output)
+            before.append(node)
+        else:  # what depends on neither is small, and the runtime folds it; inner graphs see tensors without saying so
+            varying.update(node.output if varying.intersection(node.input) else ())
+            behind.append(node)
+    computed = {name for node in before for name in node.output}
+    taken = {name for node in behind for name in node.input} | wanted
+    between, direct = tuple(sorted(computed & taken)), tuple(sorted(taken.intersection(fixed) if not inner else ()))
+    first = None
+    if between:
+        first = pb.Model()
+        first.CopyFrom(model)
+        constants = {name for node in before for name in node.input}
+        # what neither part alone depends on is made in both
+        _keep(first, [*_needed(behind, constants - computed), *before], (), ())
+        types = {value.name: value for value in graph.value_info}
+        first.graph.output.extend(types.get(name, pb.Value(name=name)) for name in between)
+    _replace(graph, initializer=[tensor for tensor in graph.initializer if tensor.name not in direct])
+    _keep(model, behind, graph.input, graph.output)
+    return CutGraph(None if first is None else first.SerializeToString(), model, between, direct)
+
+
+def _needed(nodes: list[pb.Node], names: set[str]) -> list[pb.Node]:
+    """Those of some nodes that tensors follow from, in order."""
+    found = []
+    for node in reversed(nodes):
+        if names.intersection(node.output):
+            names = names | set(node.input)
+            found.append(node)
+    return found[::-1]
+
+
+def _keep(model: pb.Model, nodes: Iterable[pb.Node], inputs: Iterable[pb.Value], outputs: Iterable[pb.Value]) -> None:
+    """Leave only these nodes, inputs and outputs in a model, and the initializers that they use."""
+    graph = model.graph
+    nodes, inputs, outputs = list(nodes), list(inputs), list(outputs)
+    used = {name for node in nodes for name in node.input} | {value.name for value in (*inputs, *outputs)}
+    held = [tensor for tensor in graph.initializer if tensor.name in used]
+    _replace(graph, node=nodes, initializer=held, input=inputs, output=outputs, value_info=[])
+
+
+def _replace(graph: pb.Graph, **parts: list[Any]) -> None:
+    """Put other messages into repeated fields of a graph."""
+    for field, messages in parts.items():
+        graph.ClearField(field)
+        getattr(graph, field).extend(messages)
 
 
 class TableGraph:

@@ -17,9 +17,8 @@ from lightpage.recording.black_level import without_black
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import frame_type
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.frame_parts import FramePart
-from lightpage.runtime.client.wire.messages import pixel_type
-from lightpage.runtime.client.wire.requests import check_options, pilots_of
+from lightpage.runtime.client.wire.messages import FramePart
+from lightpage.runtime.client.wire.requests import check_options, pilots_of, pixel_type
 from lightpage.runtime.client.wire.status import refusal_of
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane, levels_for

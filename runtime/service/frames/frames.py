@@ -14,7 +14,8 @@ from lightpage.errors import CallerLeft, FrameError, LimitError
 from lightpage.page.pilots import Pilots
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.messages import DATA_LOSSES, FLOAT, image_message
+from lightpage.runtime.client.wire.messages import DATA_LOSSES, FLOAT
+from lightpage.runtime.client.wire.requests import image_message
 from lightpage.runtime.service.admission import Bytes, ReceiveBudget
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import Answer, DataPlane, Seen, levels_for, observed

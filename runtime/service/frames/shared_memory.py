@@ -19,8 +19,8 @@ from types import TracebackType
 from typing import Any, Self
 
 from lightpage.errors import InvalidInputError, LightpageError, LimitError, OverloadedError
+from lightpage.runtime.client.shared_memory import GRANTED, HANDLE_BYTES, REFUSED, SIZE, WHY_BYTES
 from lightpage.runtime.client.wire.address import check_free
-from lightpage.runtime.client.wire.shared_memory import GRANTED, HANDLE_BYTES, REFUSED, SIZE, WHY_BYTES
 
 _SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
 """Nobody changes the size of a region any more: reading beyond the end of a shrunken one would end the service."""

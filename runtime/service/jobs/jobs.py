@@ -27,7 +27,7 @@ from lightpage.errors import (
 from lightpage.files import replace_text
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.status import refusal_of
-from lightpage.runtime.recalibration.outcome import RecalibrationOutcome
+from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.jobs.messages import result_message
 from lightpage.runtime.service.limits import JOBS_KEPT

@@ -37,8 +37,13 @@ from lightpage.runtime.device.acquisition.source import FrameSource, own_fault
 from lightpage.runtime.model.bundle.archive import check_name
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.recalibration.known_pages import KnownPages, read_recorded
-from lightpage.runtime.recalibration.outcome import RecalibrationOutcome, Refit
-from lightpage.runtime.recalibration.recalibration import next_version, reading_share, recalibrate
+from lightpage.runtime.recalibration.recalibration import (
+    RecalibrationOutcome,
+    Refit,
+    next_version,
+    reading_share,
+    recalibrate,
+)
 from lightpage.runtime.recalibration.separate_process import recalibrate_apart
 from lightpage.runtime.service.caller import NOBODY, Actor, Caller
 from lightpage.runtime.service.dataplane import DataPlane

@@ -20,7 +20,7 @@ from lightpage.errors import (
     StoppingError,
 )
 from lightpage.runtime.recalibration.known_pages import MIN_PAGES
-from lightpage.runtime.recalibration.outcome import RecalibrationOutcome
+from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome
 from lightpage.runtime.service.caller import Actor, Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator

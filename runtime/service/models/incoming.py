@@ -11,7 +11,7 @@ from typing import Self
 
 from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import BusyError, CallerLeft, LightpageError, StoreError
-from lightpage.runtime.client.wire.sizes import CHUNK_BYTES
+from lightpage.runtime.client.wire.messages import CHUNK_BYTES
 from lightpage.runtime.model.bundle.signature_file import read_signature, signature_path
 from lightpage.runtime.service.caller import Actor, Caller
 from lightpage.runtime.service.dataplane import DataPlane

@@ -26,7 +26,7 @@ from google.protobuf.message_factory import GetMessageClass
 
 from lightpage.errors import CallerLeft, MalformedError, OverloadedError, StalledError, StoppingError, let_go
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.frame_parts import parsed_part
+from lightpage.runtime.client.wire.messages import parsed_part
 from lightpage.runtime.client.wire.status import status_of, told, trailers
 from lightpage.runtime.service.caller import LOCAL, STRANGER, Actor, Caller, Identity, Role, named_session, own_name
 from lightpage.runtime.service.limits import Limits

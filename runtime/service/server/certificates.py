@@ -15,7 +15,7 @@ from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from lightpage.errors import InvalidInputError
-from lightpage.runtime.client.wire.tls import Pem, TlsFiles
+from lightpage.runtime.client.wire.channel import Pem, TlsFiles
 
 _log = logging.getLogger(__name__)
 

@@ -18,8 +18,7 @@ from grpc_health.v1 import health_pb2_grpc
 
 from lightpage.errors import InvalidInputError
 from lightpage.helper_process import parent_link
-from lightpage.runtime.client.wire.channel import SERVER_KEEPALIVE, add_port
-from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.client.wire.channel import SERVER_KEEPALIVE, TlsFiles, add_port
 from lightpage.runtime.service.server.certificates import Certificates
 from lightpage.runtime.service.server.health_servicer import HealthServicer
 

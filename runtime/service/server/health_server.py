@@ -15,7 +15,7 @@ from typing import Self
 from lightpage.errors import InvalidInputError
 from lightpage.helper_process import HelperProcess
 from lightpage.runtime.client.wire.address import check_address, check_free, is_local
-from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.client.wire.channel import TlsFiles
 
 _PROCESS = "lightpage.runtime.service.server.health_process"
 _BEAT_S = 0.5

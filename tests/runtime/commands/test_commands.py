@@ -21,13 +21,13 @@ from lightpage.errors import LightpageError, SurroundingsError
 from lightpage.page.pilots import Pilots
 from lightpage.recording.decoded_file import DecodedWriter
 from lightpage.recording.reader import Recording, RecordingWriter
+from lightpage.runtime.client.answers import RemotePage
 from lightpage.runtime.client.client import LightpageClient
-from lightpage.runtime.client.wire.pages import RemotePage
 from lightpage.runtime.commands.client import recalibrate as cli_recalibrate
 from lightpage.runtime.device.acquisition.sources import open_source
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.recalibration.outcome import Refit
+from lightpage.runtime.recalibration.recalibration import Refit
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 from lightpage.runtime.service.models.registry import ModelRegistry

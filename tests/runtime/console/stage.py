@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 from lightpage.errors import LostPageError, LostShotError, Reason
-from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.console.actions import Actions
 from lightpage.runtime.console.history import History
 from lightpage.runtime.console.server import Console, ConsoleServer

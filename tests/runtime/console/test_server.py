@@ -23,9 +23,9 @@ from lightpage.cli import main as cli_main
 from lightpage.cli.main import EXIT_ERROR, lightpage
 from lightpage.errors import Reason
 from lightpage.runtime.console.actions import Actions
-from lightpage.runtime.console.fetch import fetch
 from lightpage.runtime.console.history import History
 from lightpage.runtime.console.pictures import SIDE_PX, confidence_png, frame_png
+from lightpage.runtime.console.scrapes import fetch
 from lightpage.runtime.console.server import IDENTITY, POINTS, RECENT, Console, ConsoleServer
 from lightpage.runtime.device.acquisition.source import Shot
 from lightpage.runtime.model.decoding.decoder import Decoder

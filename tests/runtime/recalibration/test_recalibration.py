@@ -25,7 +25,6 @@ from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import hash_frames
 from lightpage.runtime.model.bundle.bundle import Bundle, npz
-from lightpage.runtime.model.bundle.calibrated import calibration_of
 from lightpage.runtime.model.bundle.manifest import TABLE
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
@@ -33,8 +32,14 @@ from lightpage.runtime.model.decoding.tracking import NoTracker
 from lightpage.runtime.recalibration import refit as module
 from lightpage.runtime.recalibration.judgement import JudgedPage, judge
 from lightpage.runtime.recalibration.known_pages import KnownPages
-from lightpage.runtime.recalibration.outcome import Refit, RefitReport, RefitResult
-from lightpage.runtime.recalibration.recalibration import next_version, reading_share, recalibrate
+from lightpage.runtime.recalibration.recalibration import (
+    Refit,
+    RefitReport,
+    RefitResult,
+    next_version,
+    reading_share,
+    recalibrate,
+)
 from lightpage.runtime.recalibration.refit import refit
 from lightpage.simulator.simulator import Simulator
 from tests.runtime import toy
@@ -296,8 +301,8 @@ def test_a_re_fit_starts_where_the_image_is_found(refined: Refined, bench: Decod
     found = refined()
     assert found.report.image is not None
     assert (found.report.image.shift_x_px, found.report.image.shift_y_px) == pytest.approx((-2, 18), abs=0.3)
-    old = calibration_of(bench.bundle)
-    new = calibration_of(with_calibration(bench.bundle, found.calibration_toml))
+    old = bench.bundle.calibration
+    new = with_calibration(bench.bundle, found.calibration_toml).calibration
     changed = {name: new.parameters[name] - old.parameters[name] for name in old.parameters}
     for camera in ("in_phase", "quadrature"):
         shifts = [changed.pop(f"{camera}_shift_{axis}_px") for axis in "xy"]
@@ -312,11 +317,11 @@ def test_a_re_fit_starts_where_the_image_is_found(refined: Refined, bench: Decod
 
 def test_small_losses_do_not_add_up_unseen(refined: Refined, bench: Decoder) -> None:
     """A re-fit is measured by the first calibration, and not by the one before."""
-    late = calibration_of(bench.bundle).model_copy(update={"coherence_at_first": 1.0})
+    late = bench.bundle.calibration.model_copy(update={"coherence_at_first": 1.0})
     bundle = with_calibration(bench.bundle, late.to_toml())
     found = refined(coherence=LEAST_KEPT, bundle=bundle)
     assert found.report.coherence_after == LEAST_KEPT
-    assert calibration_of(with_calibration(bundle, found.calibration_toml)).reference_coherence == 1.0
+    assert with_calibration(bundle, found.calibration_toml).calibration.reference_coherence == 1.0
     with pytest.raises(CalibrationError, match="re-fit, outcome"):
         refined(coherence=LEAST_KEPT - 1e-3, bundle=bundle)
 

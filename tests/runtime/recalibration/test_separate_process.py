@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import socket
 import subprocess
 import sys
 import tempfile
@@ -18,23 +19,25 @@ import pytest
 from lightpage.errors import BundleError, CallerLeft, RecalibrationRefusedError, WorkerError
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.tracking import NoTracker
-from lightpage.runtime.recalibration.outcome import RecalibrationOutcome
-from lightpage.runtime.recalibration.recalibration import recalibrate
-from lightpage.runtime.recalibration.separate_process import recalibrate_apart
-from lightpage.runtime.recalibration.work import Job, WorkFolder, heard_step, told_step
+from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome, recalibrate
+from lightpage.runtime.recalibration.separate_process import Job, WorkFolder, recalibrate_apart
 from lightpage.runtime.recalibration.worker import LOWEST, NICENESS, ROOM, work, yield_more
 from tests.clock import HandClock
 from tests.runtime import toy
 from tests.runtime.recalibration.toy_worker import known, quiet, shuffled
 
-SOUND = ("-m", "tests.runtime.recalibration.toy_worker")
-_STEP = """print('{"step": "fit in %d", "fraction": 0.5}' % os.getpid(), flush=True)"""
-SILENT = ("-c", f"import os, signal; {_STEP}; signal.pause()")
+SOUND = "tests.runtime.recalibration.toy_worker"
+SILENT = (
+    "import os, signal\n"
+    "from lightpage.helper_process import parent_link\n"
+    "from lightpage.runtime.recalibration.worker import telling\n"
+    "telling(parent_link())(f'fit in {os.getpid()}', 0.5)\n"
+    "signal.pause()\n"
+)
 REFUSING = (
-    "-c",
     "import json, pathlib, sys\n"
     "told = {'kind': 'RecalibrationRefusedError', 'subject': 'fit', 'got': 'worse', 'expected': 'better'}\n"
-    "(pathlib.Path(sys.argv[1]) / 'result.json').write_text(json.dumps({'error': told}))\n",
+    "(pathlib.Path(sys.argv[1]) / 'result.json').write_text(json.dumps({'error': told}))\n"
 )
 
 
@@ -51,7 +54,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 class Apart:
     decoder: Decoder
     out: Path
-    worker: tuple[str, ...] = SOUND
+    worker: str = SOUND
     check: Callable[[], None] = lambda: None
     steps: list[tuple[str, float]] = field(default_factory=list)
     clock: HandClock = field(default_factory=HandClock)
@@ -96,24 +99,29 @@ def test_it_finds_what_this_process_finds_and_leaves_the_bundle_alone(
     ("worker", "limit_s", "error", "told"),
     [
         (REFUSING, 60.0, RecalibrationRefusedError, "fit: got worse"),
-        (("-c", "import os; os.kill(os.getpid(), 9)"), 60.0, WorkerError, "status -9"),
-        (("-c", "print(1, flush=True); 1 / 0"), 60.0, WorkerError, "status 1"),
+        ("import os; os.kill(os.getpid(), 9)", 60.0, WorkerError, "status -9"),
+        ("print(1, flush=True); 1 / 0", 60.0, WorkerError, "status 1"),
         (SILENT, 60.0, WorkerError, "60 s"),
         (SILENT, 1000.0, CallerLeft, None),
     ],
     ids=["refused", "killed", "broken", "too long", "nobody waits"],
 )
 def test_a_process_that_comes_to_no_good_end_changes_nothing(
-    worker: tuple[str, ...],
+    worker: str,
     limit_s: float,
     error: type[BaseException],
     told: str | None,
     decoder: Decoder,
     tmp_path: Path,
+    tmp_path_factory: pytest.TempPathFactory,
     folder: Path,
     caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    apart, times = Apart(decoder, tmp_path / "new.zip", worker), accumulate([0.9 * limit_s, 0.2 * limit_s])
+    modules = tmp_path_factory.mktemp("modules")
+    (modules / "bad_worker.py").write_text(worker)
+    monkeypatch.setenv("PYTHONPATH", str(modules), prepend=os.pathsep)
+    apart, times = Apart(decoder, tmp_path / "new.zip", "bad_worker"), accumulate([0.9 * limit_s, 0.2 * limit_s])
     (tmp_path / ".new.zip-half").mkdir()  # as far as the worker had come
 
     def check() -> None:
@@ -126,45 +134,44 @@ def test_a_process_that_comes_to_no_good_end_changes_nothing(
         apart.run(limit_s)
     assert not apart.process or gone(apart.process)
     assert bool(apart.process) == (worker == SILENT)
-    assert ["ZeroDivisionError" in record.getMessage() for record in caplog.records] == [True] * ("1 / 0" in worker[-1])
+    assert ["ZeroDivisionError" in record.getMessage() for record in caplog.records] == [True] * ("1 / 0" in worker)
     assert list(tmp_path.iterdir()) == [folder]
     assert list(folder.iterdir()) == []
 
 
-def test_the_worker_leaves_its_refusal_in_its_folder(
-    decoder: Decoder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_worker_leaves_its_refusal_in_its_folder(decoder: Decoder, tmp_path: Path) -> None:
+    steps: list[tuple[str, float]] = []
     pages, folder = shuffled(known(), slice(None)), WorkFolder(tmp_path)
-    job = Job(bundle=decoder.bundle.path, out=tmp_path / "n.zip", version="toy-1+r1", threads=1, memory=None)
+    job = Job(bundle=decoder.bundle.path, out=tmp_path / "n.zip", version="toy-1+r1", memory=None)
     folder.write_task(decoder.bundle, pages, job)
-    work(folder, toy.fit_references)
+    work(folder, lambda *step: steps.append(step), toy.fit_references)
     with pytest.raises(RecalibrationRefusedError, match="re-fitted geometry"):
         folder.read_result()
     assert not (tmp_path / "n.zip").exists()
-    steps = [heard_step(line) for line in capsys.readouterr().out.encode().splitlines()]
     assert steps[0] == ("measure the model in service", 0.0)
 
 
 def test_it_ends_with_its_parent() -> None:
     worker = (
-        "import sys, threading\n"
+        "import threading\n"
+        "from lightpage.helper_process import parent_link\n"
         "from lightpage.runtime.recalibration.worker import end_with_parent\n"
-        "end_with_parent(sys.stdin.fileno())\n"
-        "print(1, flush=True)\n"
+        "link = parent_link()\n"
+        "end_with_parent(link)\n"
+        "link.sendall(b'1')\n"
         "threading.Event().wait()\n"
     )
-    with subprocess.Popen([sys.executable, "-c", worker], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
-        assert child.stdin is not None
-        assert child.stdout is not None
-        assert child.stdout.readline()
+    own, other = socket.socketpair()
+    with other, subprocess.Popen([sys.executable, "-c", worker], stdin=other) as child:
+        assert own.recv(1)
         assert child.poll() is None
-        child.stdin.close()  # as when its parent is killed
+        own.close()  # as when its parent is killed
         assert child.wait(60) != 0
 
 
 def test_all_that_is_known_of_the_pages_comes_over(decoder: Decoder, tmp_path: Path) -> None:
     mask = np.zeros(toy.PAGE, bool)
-    job = Job(bundle=tmp_path / "b.zip", out=tmp_path / "n.zip", version="v", threads=2, memory=None)
+    job = Job(bundle=tmp_path / "b.zip", out=tmp_path / "n.zip", version="v", memory=None)
     for pages in (replace(known(), pilot_mask=mask, image_px=(1.5, -2.0)), replace(known(), references=None)):
         (folder := WorkFolder(tmp_path / str(pages.image_px))).path.mkdir()
         folder.write_task(decoder.bundle, pages, job)
@@ -182,16 +189,10 @@ def test_errors_keep_their_class_and_words(tmp_path: Path) -> None:
     folder = WorkFolder(tmp_path)
     assert folder.read_result() is None
     for error in (WorkerError("a", "b", "c"), BundleError("bundle", 3, 4)):
-        folder.write_error(error)
+        folder.write_result(error)
         with pytest.raises(type(error)) as caught:
             folder.read_result()
         assert str(caught.value) == str(error)
-
-
-def test_a_step_is_told_from_other_lines() -> None:
-    assert heard_step(told_step("fit", 0.25).encode()) == ("fit", 0.25)
-    for other in (b"", b"a warning", b"3", b"[]", b'{"step": "fit"}', b'{"step": "fit", "fraction": "x"}', b"\xff"):
-        assert heard_step(other) is None
 
 
 @pytest.mark.parametrize(("shares", "looks"), [([ROOM], 1), ([0.1, ROOM - 0.01, ROOM + 0.01, 0.1], 3), ([1.0], 1)])

@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
+from lightpage.helper_process import parent_link
 from lightpage.progress import Progress
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.known_pages import KnownPages
-from lightpage.runtime.recalibration.outcome import RefitResult
-from lightpage.runtime.recalibration.work import WorkFolder
-from lightpage.runtime.recalibration.worker import end_with_parent, work, yield_to_reads
+from lightpage.runtime.recalibration.recalibration import RefitResult
+from lightpage.runtime.recalibration.separate_process import WorkFolder
+from lightpage.runtime.recalibration.worker import end_with_parent, telling, work, yield_to_reads
 from tests.runtime import toy
 
 DRIFTED = (150.0, 62.0)
@@ -46,6 +47,7 @@ def fit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decoder)
 
 
 if __name__ == "__main__":
-    end_with_parent(sys.stdin.fileno())
+    link = parent_link()
+    end_with_parent(link)
     yield_to_reads()
-    work(WorkFolder(Path(sys.argv[1])), fit)
+    work(WorkFolder(Path(sys.argv[1])), telling(link), fit)

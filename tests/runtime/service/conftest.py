@@ -10,7 +10,7 @@ import pytest
 
 from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.recalibration.outcome import Refit
+from lightpage.runtime.recalibration.recalibration import Refit
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 from lightpage.runtime.service.limits import Limits

@@ -22,7 +22,7 @@ from lightpage.errors import (
     Reason,
 )
 from lightpage.recording.frame_pair import FramePair
-from lightpage.runtime.client.wire.pages import RemotePage
+from lightpage.runtime.client.answers import RemotePage
 from lightpage.runtime.device.acquisition.source import Shot
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane

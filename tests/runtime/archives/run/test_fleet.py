@@ -24,8 +24,7 @@ from lightpage.runtime.commands.archives import bulk as command
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.known_pages import read_recorded
-from lightpage.runtime.recalibration.outcome import RecalibrationOutcome
-from lightpage.runtime.recalibration.recalibration import next_version, recalibrate
+from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome, next_version, recalibrate
 from tests.clock import HandClock
 from tests.runtime import toy
 

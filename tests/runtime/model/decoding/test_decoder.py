@@ -140,7 +140,7 @@ def test_the_table_in_a_bundle_is_used_and_its_golden_page_belongs_to_it(decoder
 def test_a_table_that_does_not_fit_is_refused(
     table: dict[str, np.ndarray], named: str, decoder: Decoder, tmp_path: Path
 ) -> None:
-    for use in (decoder.with_table, lambda table: decoder.decode(pair_of()[1], 16, table)):
+    for use in (decoder.with_table, lambda table: decoder.infer(pair_of()[1], table)):
         with pytest.raises(InvalidInputError, match=named):
             use(table)
     if "homodyne" in table:

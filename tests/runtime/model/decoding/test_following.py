@@ -16,8 +16,7 @@ from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.model.decoding.drift_tables import BundleTables
-from lightpage.runtime.model.decoding.image_drift import SHIFT, TILT
+from lightpage.runtime.model.decoding.image_drift import SHIFT, TILT, BundleTables
 from lightpage.runtime.model.decoding.image_tracker import RETRACE_RAD, ImageTracker, tracker_for
 from lightpage.runtime.model.decoding.tracking import NoTracker
 from lightpage.runtime.model.execution.twin import OnnxTwin

@@ -19,8 +19,8 @@ import pytest
 from lightpage.errors import FrameError, InvalidInputError, LightpageError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
+from lightpage.runtime.client.shared_memory import HANDLE_BYTES, SIZE, memory_path
 from lightpage.runtime.client.shared_memory import SharedMemory as ClientMemory
-from lightpage.runtime.client.wire.shared_memory import HANDLE_BYTES, SIZE, memory_path
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.frames.frames import PairReceiver
 from lightpage.runtime.service.frames.shared_memory import Region, SharedMemory

@@ -35,7 +35,7 @@ from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.recalibration.known_pages import KnownPages, read_recorded
-from lightpage.runtime.recalibration.outcome import RefitResult
+from lightpage.runtime.recalibration.recalibration import RefitResult
 from lightpage.runtime.service.jobs.job_calls import JobCalls
 from lightpage.runtime.service.limits import Limits
 from tests.runtime import toy

@@ -22,7 +22,7 @@ from lightpage.errors import (
 )
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.recalibration.outcome import RecalibrationOutcome, Refit, RefitReport
+from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome, Refit, RefitReport
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.jobs import DAMAGED, FILE, Jobs
@@ -34,7 +34,9 @@ from tests.lightpage.full_disk import full_disk
 from tests.runtime import toy
 from tests.runtime.slow_fit import SlowFit
 
-OUTCOME = RecalibrationOutcome(Path("x.zip"), "toy-1+r1", "toy-1", RefitReport(angle_deg=0.5), 1.0, 3.5, 1, 3, 2, 4.0)
+OUTCOME = RecalibrationOutcome(
+    Path("x.zip"), "toy-1+r1", "toy-1", RefitReport(angle_deg=0.5), 1.0, 3.5, 1, 3, 2, 4.0, 0.9, 0.1
+)
 
 
 def ended(jobs: Jobs, end: RecalibrationOutcome | BaseException = OUTCOME) -> str:

@@ -20,7 +20,7 @@ from lightpage.runtime.device.acquisition.source import SHOT_S, Shot
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_position import ImagePosition
 from lightpage.runtime.model.decoding.page import DecodedPage
-from lightpage.runtime.recalibration.outcome import Refit, RefitResult
+from lightpage.runtime.recalibration.recalibration import Refit, RefitResult
 from lightpage.runtime.service.caller import Caller, named_session
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.frames.frames import decode

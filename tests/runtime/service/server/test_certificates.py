@@ -13,7 +13,7 @@ import pytest
 
 from analysis.attacks.identity import commands_of, documented
 from lightpage.errors import InvalidInputError, NotAllowedError
-from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.service.caller import LOCAL, Identity, Role
 from lightpage.runtime.service.frames.inference_calls import INFERENCE, PREFIX
 from lightpage.runtime.service.server.call import SERVICE

@@ -20,8 +20,7 @@ from lightpage.errors import BundleError, NotAllowedError
 from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.client.pb.inference import open_inference_pb2_grpc as oip_grpc
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
-from lightpage.runtime.client.wire.channel import open_channel
-from lightpage.runtime.client.wire.tls import TlsFiles
+from lightpage.runtime.client.wire.channel import TlsFiles, open_channel
 from lightpage.runtime.commands.service.healthcheck import is_serving
 from lightpage.runtime.service.caller import Role
 from lightpage.runtime.service.frames.inference_calls import INFERENCE, PREFIX

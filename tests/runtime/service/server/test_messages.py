@@ -15,8 +15,7 @@ from google.protobuf.message import DecodeError
 from lightpage.errors import LimitError, MalformedError
 from lightpage.runtime.client.pb.inference import open_inference_pb2 as oip
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.frame_parts import chunks_of, parsed_part, serialized_part
-from lightpage.runtime.client.wire.sizes import CHUNK_BYTES
+from lightpage.runtime.client.wire.messages import CHUNK_BYTES, chunks_of, parsed_part, serialized_part
 from lightpage.runtime.service.frames.infer_message import MOST_FIELDS, take_apart
 
 MOST = 10_000

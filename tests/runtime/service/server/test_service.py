@@ -17,8 +17,8 @@ import pytest
 
 from lightpage.errors import InvalidInputError, NoSourceError, Reason, StoreError, UnconfirmedPageError
 from lightpage.page.symbols import pilot_mask
+from lightpage.runtime.client.outgoing import KnownPilots
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.messages import KnownPilots
 from lightpage.runtime.device.acquisition.source import Shot
 from lightpage.runtime.device.acquisition.sources import open_source
 from lightpage.runtime.model.decoding.decoder import Decoder

@@ -927,19 +927,17 @@ class ListModelsReply(_message.Message):
     def __init__(self, models: _Optional[_Iterable[_Union[Model, _Mapping]]] = ...) -> None: ...
 
 class ErrorDetail(_message.Message):
-    __slots__ = ("kind", "thing", "got", "wanted", "reason", "recalibration_due", "exact_kind")
+    __slots__ = ("kind", "thing", "got", "wanted", "reason", "recalibration_due")
     KIND_FIELD_NUMBER: _ClassVar[int]
     THING_FIELD_NUMBER: _ClassVar[int]
     GOT_FIELD_NUMBER: _ClassVar[int]
     WANTED_FIELD_NUMBER: _ClassVar[int]
     REASON_FIELD_NUMBER: _ClassVar[int]
     RECALIBRATION_DUE_FIELD_NUMBER: _ClassVar[int]
-    EXACT_KIND_FIELD_NUMBER: _ClassVar[int]
     kind: str
     thing: str
     got: str
     wanted: str
     reason: LossReason
     recalibration_due: bool
-    exact_kind: str
-    def __init__(self, kind: _Optional[str] = ..., thing: _Optional[str] = ..., got: _Optional[str] = ..., wanted: _Optional[str] = ..., reason: _Optional[_Union[LossReason, str]] = ..., recalibration_due: _Optional[bool] = ..., exact_kind: _Optional[str] = ...) -> None: ...
+    def __init__(self, kind: _Optional[str] = ..., thing: _Optional[str] = ..., got: _Optional[str] = ..., wanted: _Optional[str] = ..., reason: _Optional[_Union[LossReason, str]] = ..., recalibration_due: _Optional[bool] = ...) -> None: ...

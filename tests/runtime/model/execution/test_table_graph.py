@@ -9,9 +9,8 @@ import pytest
 from onnx import helper
 
 from lightpage.errors import BundleError
-from lightpage.runtime.model.execution.constant_table import GraphFile
 from lightpage.runtime.model.execution.session import open_session
-from lightpage.runtime.model.execution.table_graph import TableGraph
+from lightpage.runtime.model.execution.table_graph import GraphFile, TableGraph
 from tests.runtime import toy
 
 FRAMES = {"in_phase", "quadrature"}

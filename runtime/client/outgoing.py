@@ -1,0 +1,123 @@
+"""What a caller asks of the service, and how its frames and symbols are sent."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, TypedDict
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.errors import FrameError, PageError
+from lightpage.page.levels import MAX_LEVELS
+from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
+from lightpage.runtime.client.wire.messages import PIXEL_CODES, FramePart, chunks_of, message_of
+
+
+class PageOptions(TypedDict, total=False):
+    """What a caller wants to have of a page, and whose pages it is followed with. All may be left out.
+
+    Attributes:
+        want_concentration: also get kappa.
+        want_phase: also get the phase.
+        quantised: get the confidence in one byte a symbol.
+        user_data: also get the page's bytes; the level count must then be that of the model's code, or 0.
+        session: of the pages that this one is followed with; by default those of the connection, at a Unix socket those
+            of the client, or of the device where the service reads the page.
+        stateless: decode the page as if it were the first, so that the same frames give the same answer.
+    """
+
+    want_concentration: bool
+    want_phase: bool
+    quantised: bool
+    user_data: bool
+    session: str
+    stateless: bool
+
+
+def options_message(levels: int, options: PageOptions) -> pb.DecodeOptions:
+    """The message; `levels` 0 stands for the default.
+
+    Raises:
+        InvalidInputError: values that no message can hold.
+        TypeError: an option that there is not.
+    """
+    if unknown := sorted(options.keys() - PageOptions.__annotations__.keys()):
+        raise TypeError(f"unexpected option {', '.join(unknown)}: there are {', '.join(PageOptions.__annotations__)}")
+    quantised, stateless = options.get("quantised", False), options.get("stateless", False)
+    return message_of(
+        pb.DecodeOptions,
+        levels=levels,
+        confidence_format=pb.CONFIDENCE_FORMAT_UINT8 if quantised else pb.CONFIDENCE_FORMAT_FLOAT32,
+        want_concentration=options.get("want_concentration", False),
+        want_phase=options.get("want_phase", False),
+        want_user_data=options.get("user_data", False),
+        session=options.get("session", ""),
+        tracking=pb.TRACKING_STATELESS if stateless else pb.TRACKING_SESSION,
+    )
+
+
+@dataclass(frozen=True)
+class KnownPilots:
+    """Pilots that a caller knows: bool mask [ny, nx], a page of symbols [ny, nx], and their level count."""
+
+    mask: NDArray[np.bool_]
+    symbols: NDArray[np.uint8]
+    levels: int
+
+
+def pilots_message(pilots: KnownPilots) -> pb.Pilots:
+    """Pilots as their message.
+
+    Raises:
+        PageError: mask and page differ in shape.
+    """
+    if pilots.mask.shape != pilots.symbols.shape:
+        raise PageError("pilots", f"mask {pilots.mask.shape}, page {pilots.symbols.shape}", "two equal shapes")
+    values = pilots.symbols[pilots.mask].tobytes()
+    return pb.Pilots(mask=pilots.mask.astype(np.uint8).tobytes(), values=values, levels=pilots.levels)
+
+
+def recalibration_pages(count: int, pages: Sequence[int], recording: str | None) -> dict[str, Any]:
+    """Where the pages of a recalibration come from, as fields of its request."""
+    if recording is not None:
+        return {"recording": recording, "recording_count": count}
+    return {"source": message_of(pb.SourcePages, count=count, pages=pages)}
+
+
+def pair_parts(header: pb.DecodeHeader, frames: Sequence[NDArray[np.integer]]) -> Iterator[FramePart]:
+    """The messages that send a pair."""
+    yield pb.DecodeFramesRequest(header=header)
+    yield from chunks_of(frames)
+
+
+def sent_frames(pair: FramePair, subject: str = "") -> list[NDArray[np.integer]]:
+    """Both frames, in-phase first.
+
+    Raises:
+        FrameError: they cannot be sent.
+    """
+    frames = [np.asarray(pair.in_phase), np.asarray(pair.quadrature)]
+    first = frames[0]
+    for name, frame in zip(("in-phase frame", "quadrature frame"), frames, strict=True):
+        alike = (frame.shape, frame.dtype) == (first.shape, first.dtype)
+        if frame.dtype.name not in PIXEL_CODES or frame.ndim != 2 or not alike:
+            got, expected = f"{frame.dtype} {frame.shape}", "uint8 or uint16, rows and columns, as the other"
+            raise FrameError(subject + name, got, expected)
+    return frames
+
+
+def sent_symbols(page: NDArray[np.uint8], subject: str) -> bytes:
+    """A page of symbols, a byte each.
+
+    Raises:
+        PageError: they do not fit into bytes.
+    """
+    symbols = np.asarray(page)
+    if symbols.dtype.kind not in "ui" or (
+        symbols.size and not 0 <= int(symbols.min()) <= int(symbols.max()) < MAX_LEVELS
+    ):
+        raise PageError(subject, f"{symbols.dtype}", f"whole numbers from 0 to {MAX_LEVELS - 1}")
+    return symbols.astype(np.uint8).tobytes()
