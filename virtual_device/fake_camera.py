@@ -9,7 +9,6 @@ import ctypes
 import socket
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -18,8 +17,9 @@ from numpy.typing import NDArray
 from lightpage.errors import FrameError, LightpageError, SourceError
 from lightpage.runtime.device.cameras.aravis_library import FILL, AravisLibrary, aravis
 from lightpage.runtime.device.cameras.gige_network import PORT
-from lightpage.runtime.device.cameras.pixel_formats import pack, pixel_format, pixel_format_of
+from lightpage.runtime.device.cameras.pixel_formats import FORMATS, pixel_format
 from lightpage.temporary import temporary_folder
+from lightpage.virtual_device.packing import pack
 
 Picture = Callable[[], NDArray[np.unsignedinteger[Any]]]
 
@@ -76,9 +76,7 @@ class FakeCamera:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def start(self) -> None:
@@ -165,7 +163,8 @@ class FakeCamera:
             image = self._picture()
             if image.shape != self._shape:
                 raise FrameError(f"picture of fake camera {self.serial}", image.shape, self._shape)
-            sent = pack(image[y : y + rows, x : x + columns], pixel_format_of(code).name)
+            name = next(known.name for known in FORMATS.values() if known.code == code)
+            sent = pack(image[y : y + rows, x : x + columns], name)
             ctypes.memmove(self._library("arv_buffer_get_data", buffer, None), sent.ctypes.data, sent.nbytes)
         except Exception as error:
             self._error = self._error or error

@@ -33,13 +33,14 @@ from lightpage.runtime.device.acquisition.camera_source import CameraSource, Exp
 from lightpage.runtime.device.acquisition.pairing import PairingSettings
 from lightpage.runtime.device.cameras.aravis import AravisCamera
 from lightpage.runtime.device.cameras.camera import Camera, Frame, FrameStatus
-from lightpage.runtime.device.cameras.pixel_formats import bit_depth, pack, unpack
+from lightpage.runtime.device.cameras.pixel_formats import bit_depth, unpack
 from lightpage.runtime.device.cameras.settings import CameraSettings
 from lightpage.runtime.device.modulator.operator import OperatorBeams
 from lightpage.runtime.device.trigger.software import SoftwareTrigger
 from lightpage.runtime.device.trigger.trigger import Trigger
 from lightpage.virtual_device.fake_camera import FakeCamera
 from lightpage.virtual_device.namespace import ADDRESSES, go_on_inside
+from lightpage.virtual_device.packing import pack
 
 Counts = NDArray[np.unsignedinteger[Any]]
 
@@ -103,10 +104,10 @@ def stale_frames(changes: int) -> dict[str, int]:
     with cameras(_SMALL, "Mono8", 9000, 1) as ((fake, camera, eye),):
         for change in track(range(changes), "free run to trigger", total=changes):
             eye.image = np.zeros(_SMALL, np.uint8)
-            before = camera.statistics.completed
+            before = camera.whole_frames
             fake.run_freely(_FREE_RUN_S)
             end = time.monotonic() + _FRAME_S
-            while camera.statistics.completed < before + _LEFTOVERS and time.monotonic() < end:
+            while camera.whole_frames < before + _LEFTOVERS and time.monotonic() < end:
                 time.sleep(_FREE_RUN_S)
             camera.arm()
             number = change % 255 + 1

@@ -9,7 +9,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.errors import LostShotError, Reason, SourceError
 from lightpage.recording.layout import FrameInfo
+from lightpage.runtime.device.cameras.pixel_formats import bit_depth
+from lightpage.runtime.device.cameras.settings import CameraSettings
 
 
 class FrameStatus(StrEnum):
@@ -40,25 +43,14 @@ class Frame:
 class Camera(Protocol):
     """A camera that is triggered. One thread at a time uses it."""
 
-    @property
-    def name(self) -> str:
-        """For people, e.g. ``in-phase camera (FLIR-12345678)``."""
-
-    @property
-    def frame_shape(self) -> tuple[int, int]:
-        """(rows, columns) of its frames; from `arm` on."""
-
-    @property
-    def bit_depth(self) -> int:
-        """Bits of a count."""
-
-    @property
-    def frame_numbers(self) -> int:
-        """After this number of a frame comes 1: 65535 where numbers have 16 bits and leave out 0."""
-
-    @property
-    def opened(self) -> int:
-        """How often it was opened. A camera that was opened anew begins with other numbers and another clock."""
+    name: str
+    """For people, e.g. ``in-phase camera (FLIR-12345678)``."""
+    bit_depth: int
+    """Bits of a count."""
+    frame_numbers: int
+    """After this number of a frame comes 1: 65535 where numbers have 16 bits and leave out 0."""
+    opened: int
+    """How often it was opened. A camera that was opened anew begins with other numbers and another clock."""
 
     def arm(self) -> None:
         """Open it unless it is open, set it up, drop frames from before; from here on a trigger makes a frame.
@@ -87,3 +79,31 @@ class Camera(Protocol):
 
     def close(self) -> None:
         """Let go of it; `arm` opens it again."""
+
+
+class DrivenCamera:
+    """What the drivers of `Camera` have in common.
+
+    Args:
+        settings: which camera, and how it is set up.
+        frame_shape: (rows, columns) of the region that is read.
+        role: for people, e.g. ``in-phase camera``.
+    """
+
+    def __init__(self, settings: CameraSettings, frame_shape: tuple[int, int], role: str = "camera") -> None:
+        self._settings, self._shape, self._role = settings, frame_shape, role
+        self.name = f"{role} ({settings.label})"
+        self.bit_depth = bit_depth(settings.pixel_format)
+        self.frame_numbers = 2**64 - 1
+        self.opened = 0
+
+    def _absent(self, was_there: bool, got: str, expected: str, setting: str = "") -> SourceError | LostShotError:
+        """The error of a camera that is not there: it has gone away only if it was there."""
+        subject = f"{self.name}: {setting}" if setting else self.name
+        if was_there:
+            return LostShotError(subject, got, expected, Reason.CAMERA_GONE)
+        return SourceError(subject, got, expected)
+
+    def _unarmed(self, is_open: bool) -> SourceError | LostShotError:
+        was_there = self.opened > 0 and not is_open
+        return self._absent(was_there, "a camera that is not armed", "`arm` before it is used")
