@@ -34,8 +34,7 @@ from lightpage.runtime.device.modulator.settings import ScreenSettings
 from lightpage.runtime.device.modulator.shutters import Shutter, ShutterBeams
 from lightpage.runtime.device.modulator.simulated import SimulatedModulator
 from lightpage.runtime.device.trigger.pulse_generator import PulseGenerator, PulseGeneratorSettings
-from lightpage.runtime.device.trigger.software import SoftwareTrigger
-from lightpage.runtime.device.trigger.trigger import Trigger
+from lightpage.runtime.device.trigger.trigger import SoftwareTrigger, Trigger
 
 ROLES = ("in_phase", "quadrature")
 KEYS = "docs/cameras.md, all keys"
@@ -154,12 +153,17 @@ class DeviceTable(TomlTable):
 
     @model_validator(mode="after")
     def _shutters_on_spare_channels(self) -> Self:
-        if isinstance(self.beams, ShuttersTable) and isinstance(self.trigger, PulseGeneratorTable):
-            others = f"none of the cameras' ({', '.join(map(str, self.trigger.channels))})"
-            for beam in ("signal", "reference"):
-                channel = getattr(self.beams, beam).channel
-                if channel in self.trigger.channels:
-                    raise ValueError(f"beams.{beam}.channel = {channel}, wanted {others}")
+        if not isinstance(self.beams, ShuttersTable):
+            return self
+        if not isinstance(self.trigger, PulseGeneratorTable):
+            raise ValueError('beams: shutters without a pulse generator, wanted trigger kind = "pulse_generator"')
+        signal, reference = self.beams.signal.channel, self.beams.reference.channel
+        for beam, channel in (("signal", signal), ("reference", reference)):
+            if channel in self.trigger.channels:
+                others = f"none of the cameras' ({', '.join(map(str, self.trigger.channels))})"
+                raise ValueError(f"beams.{beam}.channel = {channel}, wanted {others}")
+        if signal == reference:
+            raise ValueError(f"beams: channel {signal} for both shutters, wanted two")
         return self
 
 
@@ -253,8 +257,7 @@ class _Builder:
             return ExternalBeams(table.timeout_s)
         if isinstance(table, SimulatedTable):
             return SimulatedModulator(self.folder / table.address)
-        if not isinstance(trigger, PulseGenerator):
-            raise InvalidInputError("beams", "shutters without a pulse generator", 'trigger kind = "pulse_generator"')
+        assert isinstance(trigger, PulseGenerator)  # as the table has checked
         return ShutterBeams(trigger, table.signal, table.reference)
 
 

@@ -62,18 +62,12 @@ class ScpiLine:
         """Grows when the line is opened or synchronised; 0 before. In between, every message has been answered."""
         return self._port.session
 
-    @property
-    def identity(self) -> str | None:
-        """What the device answered to ``*IDN?``, last time; None before."""
-        return self._port.identity
-
-    def send(self, command: str, session: int | None = None, timeout_s: float | None = None) -> float:
+    def send(self, command: str, session: int | None = None) -> float:
         """Send a command, wait for its ``ok``, return the middle of its sending by the clock.
 
         Args:
             command: without line end.
             session: send it only if the line was not interrupted since this session; None connects where needed.
-            timeout_s: longest wait; None for as long as connecting and synchronising may take.
 
         Raises:
             LostShotError: `Reason.TRIGGER_GONE`: no ``ok``, and it may or may not have been done;
@@ -81,22 +75,20 @@ class ScpiLine:
             SourceError: the port's name or the baud rate makes no sense.
             InvalidInputError: this is no single line of ASCII.
         """
-        return self._wait(command, _DONE, False, session, timeout_s)[1]
+        return self._wait(command, _DONE, False, session)[1]
 
-    def query(
-        self, question: str, answer: re.Pattern[str], session: int | None = None, timeout_s: float | None = None
-    ) -> str:
+    def query(self, question: str, answer: re.Pattern[str], session: int | None = None) -> str:
         """Ask and return the answer. It is asked twice, so that an answer that the line altered is seen.
 
         Args:
             question: without line end.
             answer: what an answer looks like, all of it; anything else is none.
-            session, timeout_s: see `send`.
+            session: see `send`.
 
         Raises:
             LostShotError, SourceError, InvalidInputError: see `send`.
         """
-        return self._wait(question, answer, True, session, timeout_s)[0]
+        return self._wait(question, answer, True, session)[0]
 
     def close(self) -> None:
         """Let go of the line and end the thread; the next message opens it again."""
@@ -109,12 +101,10 @@ class ScpiLine:
             if not thread.is_alive():
                 self._thread = None
 
-    def _wait(
-        self, message: str, answer: re.Pattern[str], twice: bool, session: int | None, timeout_s: float | None
-    ) -> tuple[str, float]:
+    def _wait(self, message: str, answer: re.Pattern[str], twice: bool, session: int | None) -> tuple[str, float]:
         if not (message.isascii() and message.isprintable() and message):
             raise InvalidInputError(f"{self.name}: message", repr(message), "one line of printable ASCII")
-        timeout_s = self._times.longest_s if timeout_s is None else timeout_s
+        timeout_s = self._times.longest_s
         request = _Request(message, answer, twice, session, self._clock.now() + timeout_s)
         with self._lock:
             if self._thread is None or not self._thread.is_alive():
@@ -125,9 +115,8 @@ class ScpiLine:
         request.result.add_done_callback(lambda _: answered.set())
         if not self._clock.wait(answered, timeout_s + _GRACE_S):
             request.result.cancel()
-            raise LostShotError(
-                self.name, f"{message} not answered within {timeout_s:g} s", "an answer", Reason.TRIGGER_GONE
-            )
+            told = f"{message} not answered within {timeout_s:g} s"
+            raise LostShotError(self.name, told, "an answer", Reason.TRIGGER_GONE)
         return request.result.result()
 
     def _own(self) -> None:

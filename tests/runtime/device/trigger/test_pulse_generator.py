@@ -11,7 +11,7 @@ import pytest
 from lightpage.errors import InvalidInputError, Reason, SourceError
 from lightpage.runtime.device.modulator.shutters import Shutter, ShutterBeams
 from lightpage.runtime.device.trigger.pulse_generator import PulseGenerator, PulseGeneratorSettings
-from lightpage.runtime.device.trigger.software import SoftwareTrigger
+from lightpage.runtime.device.trigger.trigger import SoftwareTrigger
 from lightpage.virtual_device.pulse_generator import IDENTITY, PulseGeneratorEmulator
 from lightpage.virtual_device.serial_port import Fault
 from tests.clock import HandClock
