@@ -36,8 +36,7 @@ from lightpage.runtime.device.cameras.camera import Camera, Frame, FrameStatus
 from lightpage.runtime.device.cameras.pixel_formats import bit_depth, unpack
 from lightpage.runtime.device.cameras.settings import CameraSettings
 from lightpage.runtime.device.modulator.operator import OperatorBeams
-from lightpage.runtime.device.trigger.trigger import SoftwareTrigger
-from lightpage.runtime.device.trigger.trigger import Trigger
+from lightpage.runtime.device.trigger.trigger import SoftwareTrigger, Trigger
 from lightpage.virtual_device.fake_camera import FakeCamera
 from lightpage.virtual_device.namespace import ADDRESSES, go_on_inside
 from lightpage.virtual_device.packing import pack
