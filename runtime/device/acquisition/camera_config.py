@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Annotated, Literal, Self
 from urllib.parse import parse_qsl
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from lightpage.device.problems import Problem, problems_of
@@ -25,12 +27,12 @@ from lightpage.runtime.device.cameras.aravis import AravisCamera
 from lightpage.runtime.device.cameras.camera import Camera
 from lightpage.runtime.device.cameras.gentl import GenTLCamera
 from lightpage.runtime.device.cameras.settings import CameraSettings
+from lightpage.runtime.device.modulator.beam_state import OperatorBeams
 from lightpage.runtime.device.modulator.external import ExternalBeams, ExternalModulator
-from lightpage.runtime.device.modulator.lookup_table import LookupTable
+from lightpage.runtime.device.modulator.lookup_table import linear_table, read_table
 from lightpage.runtime.device.modulator.modulator import Beams, Modulator
-from lightpage.runtime.device.modulator.operator import OperatorBeams
+from lightpage.runtime.device.modulator.screen.raster import ScreenSettings
 from lightpage.runtime.device.modulator.screen.screen import ScreenModulator
-from lightpage.runtime.device.modulator.settings import ScreenSettings
 from lightpage.runtime.device.modulator.shutters import Shutter, ShutterBeams
 from lightpage.runtime.device.modulator.simulated import SimulatedModulator
 from lightpage.runtime.device.trigger.pulse_generator import PulseGenerator, PulseGeneratorSettings
@@ -237,16 +239,16 @@ class _Builder:
             return SimulatedModulator(self.folder / table.address)
         return ScreenModulator(table, self.profile, self._greys(table, levels))
 
-    def _greys(self, table: ScreenTable, levels: int | None) -> Callable[[int], LookupTable]:
+    def _greys(self, table: ScreenTable, levels: int | None) -> Callable[[int], NDArray[np.uint8]]:
         """What makes a lookup table for the levels of the pages that are shown; tried with those that are known."""
         if table.lookup_table is None:
-            return LookupTable.linear
+            return linear_table
         path = self.folder / table.lookup_table
         if levels is not None:
-            LookupTable.from_file(path, levels)
+            read_table(path, levels)
         elif not path.is_file():
             raise InvalidInputError(f"lookup table {path}", "no such file", "a readable text file")
-        return partial(LookupTable.from_file, path)
+        return partial(read_table, path)
 
     def beams(self, trigger: Trigger) -> Beams:
         """What blocks them."""

@@ -16,7 +16,7 @@ from lightpage.runtime.commands.service.serve import _take_dark_frames
 from lightpage.runtime.device.acquisition.beam_keeper import BeamKeeper
 from lightpage.runtime.device.acquisition.camera_source import CameraSource, View
 from lightpage.runtime.device.acquisition.page_store import PageStore
-from lightpage.runtime.device.modulator.operator import OperatorBeams
+from lightpage.runtime.device.modulator.beam_state import OperatorBeams
 from tests.clock import HandClock
 from tests.runtime import toy
 from tests.runtime.device.acquisition.lab import PAIRING, Lab, pages_of, reason_of, source_of
