@@ -33,8 +33,7 @@ from lightpage.clock import SYSTEM, Clock
 from lightpage.device.profile import TomlTable
 from lightpage.errors import LostShotError, Reason
 from lightpage.progress import note
-from lightpage.recording.layout import FrameInfo
-from lightpage.runtime.device.cameras.camera import Camera, Frame, FrameStatus
+from lightpage.runtime.device.cameras.camera import BrokenFrame, Camera, Frame
 from lightpage.runtime.device.trigger.trigger import Trigger
 from lightpage.words import counted
 
@@ -111,7 +110,7 @@ class _Channel:
     opened: int = -1
     came: int = 0
 
-    def frame(self, timeout_s: float) -> Frame | None:
+    def frame(self, timeout_s: float) -> Frame | BrokenFrame | None:
         """The camera's next frame, counted."""
         frame = self.camera.frame(timeout_s)
         self.came += frame is not None
@@ -298,25 +297,23 @@ class Pairing:
         fired = self.trigger.fire()
         self._next_at = self.clock.now() + settings.spacing_s
         end = self.clock.now() + settings.frame_s
-        frames, ids = list[Frame](), list[int]()
-        for channel in self._channels:
-            frame = channel.frame(max(1e-3, end - self.clock.now()))
-            frames.append(frame := self._checked(channel, frame))
-            ids.append(_info(frame).frame_id)
+        frames = [
+            self._checked(channel, channel.frame(max(1e-3, end - self.clock.now()))) for channel in self._channels
+        ]
         if self._drain():
             raise LostShotError("frame", "one more than the trigger asked for", "two", Reason.STRAY_FRAME)
-        for channel, number in zip(self._channels, ids, strict=True):
-            channel.last_id = number
-        return _Taken(tuple(frames), tuple(_info(frame).device_time_s - fired for frame in frames))
+        for channel, frame in zip(self._channels, frames, strict=True):
+            channel.last_id = frame.info.frame_id
+        return _Taken(tuple(frames), tuple(frame.info.device_time_s - fired for frame in frames))
 
-    def _checked(self, channel: _Channel, frame: Frame | None) -> Frame:
+    def _checked(self, channel: _Channel, frame: Frame | BrokenFrame | None) -> Frame:
         """A frame that came, by rules 2 and 3."""
         name = channel.camera.name
         if frame is None:
             wanted = f"one within {self.settings.frame_s:g} s of the trigger"
             raise LostShotError(f"{name}: frame", "none", wanted, Reason.MISSING_FRAME)
-        if frame.status is not FrameStatus.COMPLETE or frame.info is None or frame.pixels is None:
-            raise LostShotError(f"{name}: frame", frame.detail or "parts of it", "all of it", Reason.INCOMPLETE_FRAME)
+        if isinstance(frame, BrokenFrame):
+            raise LostShotError(f"{name}: frame", frame.detail, "all of it", Reason.INCOMPLETE_FRAME)
         if channel.last_id is not None:
             number, last = frame.info.frame_id, channel.last_id
             step = (number - last) % channel.camera.frame_numbers
@@ -359,8 +356,3 @@ class Pairing:
 
 def _no_time_left() -> LostShotError:
     return LostShotError("shot", "no time left", "a longer wait", Reason.MISSING_FRAME)
-
-
-def _info(frame: Frame) -> FrameInfo:
-    assert frame.info is not None  # of a complete frame
-    return frame.info

@@ -8,11 +8,6 @@ from importlib.metadata import EntryPoint, entry_points
 from lightpage.errors import InvalidInputError
 from lightpage.runtime.device.acquisition.source import FrameSource
 
-GROUP = "lightpage.sources"
-
-Opener = Callable[[str], FrameSource]
-"""Opens a source; called with what follows the colon in its name."""
-
 
 def open_source(spec: str, points: Iterable[EntryPoint] | None = None) -> FrameSource:
     """Open a source by its name.
@@ -25,10 +20,10 @@ def open_source(spec: str, points: Iterable[EntryPoint] | None = None) -> FrameS
     Raises:
         InvalidInputError: another kind, or one whose recording, profile or device does not validate.
     """
-    kinds = {point.name: point for point in (entry_points(group=GROUP) if points is None else points)}
+    kinds = {point.name: point for point in (entry_points(group="lightpage.sources") if points is None else points)}
     kind, colon, rest = spec.partition(":")
     if not (colon and rest and kind in kinds):
         expected = f"KIND:REST, KIND being one of {', '.join(sorted(kinds))}, e.g. recording:FILE or simulator:PROFILE"
         raise InvalidInputError("source", repr(spec), expected)
-    opener: Opener = kinds[kind].load()
+    opener: Callable[[str], FrameSource] = kinds[kind].load()
     return opener(rest)

@@ -23,7 +23,7 @@ from lightpage.runtime.device.cameras.aravis_library import (
     AravisLibrary,
     aravis,
 )
-from lightpage.runtime.device.cameras.camera import DrivenCamera, Frame, FrameStatus
+from lightpage.runtime.device.cameras.camera import BrokenFrame, DrivenCamera, Frame
 from lightpage.runtime.device.cameras.gige_network import receive_buffer_problem
 from lightpage.runtime.device.cameras.pixel_formats import pixel_format, unpack, without_padding
 from lightpage.runtime.device.cameras.settings import CameraSettings
@@ -75,7 +75,7 @@ class AravisCamera(DrivenCamera):
             aravis()("arv_camera_software_trigger", connection.handle)
         self._answered_at = time.monotonic()
 
-    def frame(self, timeout_s: float) -> Frame | None:
+    def frame(self, timeout_s: float) -> Frame | BrokenFrame | None:
         """See `Camera`."""
         connection, stream = self._armed()
         library = aravis()
@@ -151,7 +151,7 @@ class AravisCamera(DrivenCamera):
                 return
             library("arv_stream_push_buffer", self._stream, buffer)
 
-    def _read(self, library: AravisLibrary, buffer: int, serial: str) -> Frame:
+    def _read(self, library: AravisLibrary, buffer: int, serial: str) -> Frame | BrokenFrame:
         """The frame in a buffer. Of one that is not whole, number and time may be those of an earlier frame.
 
         Raises:
@@ -161,7 +161,7 @@ class AravisCamera(DrivenCamera):
         if status == SIZE_MISMATCH:
             raise self._changed(BUFFER_STATUS[status], "no more than its PayloadSize")
         if status != SUCCESS:
-            return Frame(FrameStatus.INCOMPLETE, detail=self._explained(BUFFER_STATUS.get(status, f"status {status}")))
+            return BrokenFrame(self._explained(BUFFER_STATUS.get(status, f"status {status}")))
         rows, columns = self._shape
         expected = (columns, rows, pixel_format(self._settings.pixel_format).code)
         got = tuple(library(f"arv_buffer_get_image_{what}", buffer) for what in ("width", "height", "pixel_format"))
@@ -173,7 +173,7 @@ class AravisCamera(DrivenCamera):
             raw = without_padding(_bytes(library, buffer), self._shape, name, _padding(library, buffer))
             pixels = unpack(raw, self._shape, name)
         except FrameError as error:
-            return Frame(FrameStatus.INCOMPLETE, detail=f"{error.got} in place of {error.expected}")
+            return BrokenFrame(f"{error.got} in place of {error.expected}")
         info = FrameInfo(
             serial=serial,
             frame_id=library("arv_buffer_get_frame_id", buffer),
@@ -182,7 +182,7 @@ class AravisCamera(DrivenCamera):
             pixel_format=name,
             exposure_s=self._exposure_s,
         )
-        return Frame(FrameStatus.COMPLETE, pixels, info)
+        return Frame(pixels, info)
 
     def _explained(self, detail: str) -> str:
         if self._hint:

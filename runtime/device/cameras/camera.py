@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,29 +14,28 @@ from lightpage.runtime.device.cameras.pixel_formats import bit_depth
 from lightpage.runtime.device.cameras.settings import CameraSettings
 
 
-class FrameStatus(StrEnum):
-    """How a frame arrived."""
-
-    COMPLETE = "COMPLETE"
-    INCOMPLETE = "INCOMPLETE"
-    """Parts of it were lost on the way; nothing of it can be used, its number and time included."""
-
-
 @dataclass(frozen=True)
 class Frame:
     """One frame as a camera delivered it.
 
     Attributes:
-        status: only of a complete frame the rest is there.
         pixels: counts [row, column], uint8 or uint16, right-aligned, native byte order.
         info: number, times, format, camera and exposure.
-        detail: what is wrong with an incomplete one, for people.
     """
 
-    status: FrameStatus
-    pixels: NDArray[np.unsignedinteger[Any]] | None = None
-    info: FrameInfo | None = None
-    detail: str = ""
+    pixels: NDArray[np.unsignedinteger[Any]]
+    info: FrameInfo
+
+
+@dataclass(frozen=True)
+class BrokenFrame:
+    """A frame of which parts were lost on the way; nothing of it can be used, its number and time included.
+
+    Attributes:
+        detail: what is wrong with it, for people.
+    """
+
+    detail: str
 
 
 class Camera(Protocol):
@@ -67,7 +65,7 @@ class Camera(Protocol):
             LostShotError: `Reason.CAMERA_GONE`.
         """
 
-    def frame(self, timeout_s: float) -> Frame | None:
+    def frame(self, timeout_s: float) -> Frame | BrokenFrame | None:
         """The next frame, or None where none comes within `timeout_s`; 0 takes what is there already.
 
         Raises:

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from lightpage.errors import LostShotError, Reason, SourceError
 from lightpage.helper_process import HelperProcess
-from lightpage.runtime.device.cameras.camera import DrivenCamera, Frame, FrameStatus
+from lightpage.runtime.device.cameras.camera import BrokenFrame, DrivenCamera, Frame
 from lightpage.runtime.device.cameras.gentl_link import Answer, Do, Request, Task
 from lightpage.runtime.device.cameras.pixel_formats import pixel_format, unpack
 from lightpage.runtime.device.cameras.settings import CameraSettings
@@ -49,17 +49,17 @@ class GenTLCamera(DrivenCamera):
         self._check_armed()
         self._ask(Do.FIRE)
 
-    def frame(self, timeout_s: float) -> Frame | None:
+    def frame(self, timeout_s: float) -> Frame | BrokenFrame | None:
         """See `Camera`."""
         self._check_armed()
         answer = self._ask(Do.FRAME, timeout_s)
         if answer.fault:
-            return Frame(FrameStatus.INCOMPLETE, detail=answer.fault)
+            return BrokenFrame(answer.fault)
         if answer.info is None:
             return None
         assert self._memory is not None  # of a camera that is open
         raw = np.frombuffer(self._memory, np.uint8)
-        return Frame(FrameStatus.COMPLETE, unpack(raw, self._shape, self._settings.pixel_format), answer.info)
+        return Frame(unpack(raw, self._shape, self._settings.pixel_format), answer.info)
 
     def disarm(self) -> None:
         """See `Camera`."""

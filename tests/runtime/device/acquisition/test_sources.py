@@ -234,5 +234,3 @@ def test_levels_of_an_empty_store_are_those_of_the_first_upload_unless_it_was_to
     assert store.levels == 8
     with pytest.raises(InvalidInputError):
         PageStore(toy.PROFILE, levels=16).append(toy.symbols_of(8, 1), 8)
-    with pytest.raises(PageError):
-        PageStore(toy.PROFILE, levels=1)
