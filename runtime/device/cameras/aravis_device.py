@@ -74,7 +74,7 @@ class AravisConnection:
             raise
         self._lost = threading.Event()
         self._on_lost = SIGNAL(lambda *_: self._lost.set())  # as long as it is connected it must live
-        self._connected = library.connect(self._device, "control-lost", self._on_lost)
+        self._connected = library("g_signal_connect_data", self._device, b"control-lost", self._on_lost, None, None, 0)
 
     @property
     def control_lost(self) -> bool:
@@ -90,7 +90,7 @@ class AravisConnection:
 
         The driver takes its leave of a camera, and waits for the answer of one that is gone for 2.5 s each time.
         """
-        self._library.disconnect(self._device, self._connected)
+        self._library("g_signal_handler_disconnect", self._device, self._connected)
         handles = [self.handle] if stream is None else [stream, self.handle]
         if gone:
             threading.Thread(target=self._unref, args=(handles,), name="release-camera", daemon=True).start()
@@ -208,7 +208,7 @@ class AravisSetup:
         with self._setting("stream", "one"):
             stream: int = self._do("create_stream", None, None, None)
         if self.connection.is_gige:
-            self._library.set_property(stream, "socket-buffer", SOCKET_BUFFER_AUTO)
+            self._library("g_object_set", stream, b"socket-buffer", c_int(SOCKET_BUFFER_AUTO), None)
         for _ in range(self.settings.buffers):
             self._library("arv_stream_push_buffer", stream, self._library("arv_buffer_new_allocate", payload))
         return stream
