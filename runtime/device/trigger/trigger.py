@@ -12,9 +12,8 @@ from lightpage.runtime.device.cameras.camera import Camera
 class Trigger(Protocol):
     """Fires both cameras. One thread at a time uses it."""
 
-    @property
-    def name(self) -> str:
-        """For people, e.g. ``pulse generator /dev/ttyUSB0``."""
+    name: str
+    """For people, e.g. ``pulse generator /dev/ttyUSB0``."""
 
     def arm(self) -> None:
         """Connect unless that is done, and set it up; nothing is fired.

@@ -46,18 +46,14 @@ class ScreenModulator:
         window: Callable[[ScreenSettings], WindowProcess] = WindowProcess,
         clock: Clock = SYSTEM,
     ) -> None:
+        display = settings.x_display or os.environ.get("DISPLAY", "without DISPLAY")
+        self.name = f"screen {display}, monitor {settings.monitor}"
         self._settings, self._make_window, self._clock = settings, window, clock
         self._raster = Raster(profile, settings)
         self._table_of = cache(table_of)
         self._window: WindowProcess | None = None
         self._was_open = False
         self._has_page = False
-
-    @property
-    def name(self) -> str:
-        """For people, e.g. ``screen :0.1, monitor 0``."""
-        display = self._settings.x_display or os.environ.get("DISPLAY", "without DISPLAY")
-        return f"screen {display}, monitor {self._settings.monitor}"
 
     def open(self, timeout_s: float, levels: int | None = None) -> None:
         """Open the window unless it is open; see `Modulator`.
