@@ -16,7 +16,7 @@ from pydantic import ConfigDict, Field
 
 from lightpage.clock import SYSTEM, Clock
 from lightpage.device.profile import Profile, TomlTable
-from lightpage.errors import FrameError, LostShotError, Reason, SourceError
+from lightpage.errors import LostShotError, Reason, SourceError
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.progress import warn
 from lightpage.recording.alignment import describe, greatest_count, unused_low_bits
@@ -27,7 +27,7 @@ from lightpage.recording.layout import frame_type
 from lightpage.runtime.device.acquisition.beam_keeper import BeamKeeper
 from lightpage.runtime.device.acquisition.page_store import PageStore
 from lightpage.runtime.device.acquisition.pairing import Pairing, PairingSettings
-from lightpage.runtime.device.acquisition.source import SHOT_S, FrameSource, Shot
+from lightpage.runtime.device.acquisition.source import SHOT_S, FrameSource, Shot, own_fault
 from lightpage.runtime.device.cameras.camera import Camera, Frame
 from lightpage.runtime.device.modulator.modulator import Beams, Modulator
 from lightpage.runtime.device.trigger.trigger import Trigger
@@ -258,10 +258,8 @@ class CameraSource(FrameSource):
             stacks = self._stacks(self._exposures.reference_frames, self._cleaned)
             means = [np.rint(stack.mean(axis=0)).astype(stack.dtype) for stack in stacks]
         pair = FramePair(means[0], means[1])
-        try:
+        with own_fault():
             check_pair_light(f"{self.name}: reference ", pair, self.bit_depth)
-        except FrameError as error:
-            raise SourceError(error.subject, error.got, error.expected) from None
         return pair
 
     def dark_frames(self) -> tuple[DarkFrame, DarkFrame]:
@@ -273,13 +271,11 @@ class CameraSource(FrameSource):
         """
         with self._lock, self._keeper.blocked(signal=False, reference=False):
             stacks = self._stacks(self._exposures.dark_frames, self._upright)
-            try:
+            with own_fault():
                 first, second = (
                     DarkFrame.of(stack, self.bit_depth, f"{camera.name}: dark frames")
                     for stack, camera in zip(stacks, self.cameras, strict=True)
                 )
-            except FrameError as error:
-                raise SourceError(error.subject, error.got, error.expected) from None
             self._dark = (first, second)
             self._repairs = tuple(PixelRepair(self.frame_shape, dark.hot) for dark in self._dark)
             for camera, dark in zip(self.cameras, self._dark, strict=True):

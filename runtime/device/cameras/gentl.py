@@ -37,7 +37,7 @@ class GenTLCamera(DrivenCamera):
     def arm(self) -> None:
         """See `Camera`."""
         if self._process is not None and self._process.ended():
-            self._release()
+            self.close()
         if self._process is None:
             self._open()
         self._armed = False
@@ -69,34 +69,32 @@ class GenTLCamera(DrivenCamera):
         try:
             self._ask(Do.DISARM)
         except (LostShotError, SourceError):
-            self._release()
+            self.close()
 
     def close(self) -> None:
-        """See `Camera`."""
-        self._release()
+        """See `Camera`: ends the process, which lets go of the camera."""
+        process, self._process, self._memory, self._armed = self._process, None, None, False
+        if process is not None:
+            process.end(_CLOSE_S)
 
     def _open(self) -> None:
         rows, columns = self._shape
         size = pixel_format(self._settings.pixel_format).nbytes(rows * columns)
         try:
             # Without a name: whatever ends either process, nothing of it is left.
-            descriptor = os.memfd_create("lightpage-frame")
-            try:
-                os.truncate(descriptor, size)
-                self._memory = mmap.mmap(descriptor, size)
-                task = Task(
-                    settings=self._settings, frame_shape=self._shape, memory=descriptor, memory_bytes=size
-                ).model_dump_json(exclude_unset=True)
-                self._process = HelperProcess(_PROCESS, task, files=[descriptor], subject="its process")
-            finally:
-                os.close(descriptor)
+            with os.fdopen(os.memfd_create("lightpage-frame"), "r+b", buffering=0) as memory:
+                memory.truncate(size)
+                self._memory = mmap.mmap(memory.fileno(), size)
+                task = Task(settings=self._settings, frame_shape=self._shape, memory=memory.fileno())
+                told = task.model_dump_json(exclude_unset=True)
+                self._process = HelperProcess(_PROCESS, told, files=[memory.fileno()], subject="its process")
             opening = Answer.model_validate_json(self._process.line(time.monotonic() + _OPEN_S))
         except (OSError, ValidationError) as error:
-            self._release()
+            self.close()
             told = str(error) or f"no word within {_OPEN_S:g} s"
             raise self._absent(self.opened > 0, told, "one that opens it") from None
         if (failure := opening.failure) is not None:
-            self._release()
+            self.close()
             raise self._absent(self.opened > 0, failure.got, failure.expected, failure.setting)
         self.opened += 1
 
@@ -130,11 +128,5 @@ class GenTLCamera(DrivenCamera):
         raise self._absent(False, failure.got, failure.expected, failure.setting)
 
     def _lose(self, got: str) -> LostShotError:
-        self._release()
+        self.close()
         return LostShotError(self.name, got, "a camera that answers", Reason.CAMERA_GONE)
-
-    def _release(self) -> None:
-        """End the process, which lets go of the camera."""
-        process, self._process, self._memory, self._armed = self._process, None, None, False
-        if process is not None:
-            process.end(_CLOSE_S)

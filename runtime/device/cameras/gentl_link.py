@@ -25,13 +25,11 @@ class Task(_Message):
         settings: of its camera.
         frame_shape: (rows, columns) of the region that is read.
         memory: file descriptor of the shared memory that takes one frame as the camera packs it.
-        memory_bytes: its size.
     """
 
     settings: CameraSettings
     frame_shape: tuple[int, int]
     memory: int
-    memory_bytes: int
 
 
 class Do(StrEnum):

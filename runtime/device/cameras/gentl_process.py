@@ -355,7 +355,7 @@ def _plain(error: BaseException) -> str:
 def main(task_json: str) -> int:
     """Do what comes over the socket until its other end is closed."""
     task = Task.model_validate_json(task_json)
-    with parent_link() as link, mmap.mmap(task.memory, task.memory_bytes) as memory:
+    with parent_link() as link, mmap.mmap(task.memory, 0) as memory:
         try:
             device = GenTLDevice(task)
         except CameraError as error:

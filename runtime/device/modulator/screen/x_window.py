@@ -51,28 +51,6 @@ _events: dict[int, Any] = present._events
 _events[_COMPLETE_NOTIFY] = CompleteNotifyEvent
 
 
-def put_rows(connection: Any, pixmap: int, context: int, depth: int, columns: int, row: int, pixels: bytes) -> None:
-    """Draw whole rows of 32-bit pixels into a pixmap, from `row` on."""
-    rows = len(pixels) // (4 * columns)
-    head = struct.pack("=xB2xIIHHhhBB2x", xproto.ImageFormat.ZPixmap, pixmap, context, columns, rows, 0, row, 0, depth)
-    connection.core.send_request(_PUT_IMAGE, io.BytesIO(head + pixels))
-
-
-def present_pixmap(connection: Any, window: int, pixmap: int, serial: int) -> None:
-    """Copy a pixmap to a window at the display's next refresh; a `CompleteNotifyEvent` says when."""
-    options, target, divisor, remainder = present.Option.Copy, 0, 0, 0
-    request = struct.pack(
-        "=xx2xIIIIIhhIIII4xQQQ", window, pixmap, serial, 0, 0, 0, 0, 0, 0, 0, options, target, divisor, remainder
-    )
-    connection(present.key).send_request(_PRESENT_PIXMAP, io.BytesIO(request))
-
-
-def notify_msc(connection: Any, window: int, serial: int, msc: int) -> None:
-    """Ask for a `CompleteNotifyEvent` at refresh number `msc`."""
-    request = struct.pack("=xx2xII4xQQQ", window, serial, msc, 0, 0)
-    connection(present.key).send_request(_NOTIFY_MSC, io.BytesIO(request))
-
-
 class Monitor(NamedTuple):
     """Where a monitor lies on the X server's screen, pixels."""
 
@@ -123,29 +101,41 @@ class XWindow:
         pixels = np.frombuffer(image, np.uint8).repeat(4).tobytes()
         strip = _ROWS_AT_ONCE * columns * 4
         for start in range(0, len(pixels), strip):
-            put_rows(
-                self._connection,
-                self._pixmap,
-                self._context,
-                self._screen.root_depth,
-                columns,
-                start // (4 * columns),
-                pixels[start : start + strip],
-            )
+            self._put_rows(start // (4 * columns), pixels[start : start + strip])
         core = self._connection.core
         # With this the server itself repairs what something has covered for a while.
         core.ChangeWindowAttributes(self._window, xproto.CW.BackPixmap, [self._pixmap])
         core.ConfigureWindow(self._window, xproto.ConfigWindow.StackMode, [xproto.StackMode.Above])
         self._serial += 1
-        present_pixmap(self._connection, self._window, self._pixmap, self._serial)
+        self._present()
         shown = self._complete(present.CompleteKind.Pixmap)
-        notify_msc(self._connection, self._window, self._serial, shown.msc + 1)
+        self._notify_at(shown.msc + 1)
         self._complete(present.CompleteKind.NotifyMSC)
 
     def look(self) -> None:
         """Take note of what the server has said meanwhile."""
         while (event := self._connection.poll_for_event()) is not None:
             self._note(event)
+
+    def _put_rows(self, row: int, pixels: bytes) -> None:
+        """Draw whole rows of 32-bit pixels into the pixmap, from `row` on."""
+        columns, depth = self._monitor.columns, self._screen.root_depth
+        place = self._pixmap, self._context, columns, len(pixels) // (4 * columns), 0, row
+        head = struct.pack("=xB2xIIHHhhBB2x", xproto.ImageFormat.ZPixmap, *place, 0, depth)
+        self._connection.core.send_request(_PUT_IMAGE, io.BytesIO(head + pixels))
+
+    def _present(self) -> None:
+        """Copy the pixmap to the window at the display's next refresh; a `CompleteNotifyEvent` says when."""
+        whole = 7 * (0,)  # no regions, offset, output or fences
+        options, target, divisor, remainder = present.Option.Copy, 0, 0, 0
+        what = self._window, self._pixmap, self._serial, *whole, options, target, divisor, remainder
+        request = struct.pack("=xx2xIIIIIhhIIII4xQQQ", *what)
+        self._connection(present.key).send_request(_PRESENT_PIXMAP, io.BytesIO(request))
+
+    def _notify_at(self, msc: int) -> None:
+        """Ask for a `CompleteNotifyEvent` at refresh number `msc`."""
+        request = struct.pack("=xx2xII4xQQQ", self._window, self._serial, msc, 0, 0)
+        self._connection(present.key).send_request(_NOTIFY_MSC, io.BytesIO(request))
 
     def _complete(self, kind: int) -> CompleteNotifyEvent:
         """Wait for the server's word that the last request of this kind is done."""
@@ -204,30 +194,15 @@ class XWindow:
         """Make the window, the pixmap to draw in and its graphics context."""
         connection, core, monitor, screen = self._connection, self._connection.core, self._monitor, self._screen
         window, pixmap, context, events = (connection.generate_id() for _ in range(4))
-        mask, values = xproto.CW, xproto.EventMask
-        core.CreateWindowChecked(
-            screen.root_depth,
-            window,
-            screen.root,
-            monitor.x,
-            monitor.y,
-            monitor.columns,
-            monitor.rows,
-            0,
-            xproto.WindowClass.InputOutput,
-            screen.root_visual,
-            mask.BackPixel | mask.OverrideRedirect | mask.EventMask | mask.Cursor,
-            [
-                self._settings.background_grey * _GREY,
-                1,
-                values.StructureNotify | values.VisibilityChange,
-                self._no_pointer(),
-            ],
-        ).check()
+        mask, selected = xproto.CW, xproto.EventMask
+        attributes = mask.BackPixel | mask.OverrideRedirect | mask.EventMask | mask.Cursor
+        seen = selected.StructureNotify | selected.VisibilityChange
+        values = [self._settings.background_grey * _GREY, 1, seen, self._no_pointer()]
+        of, kind = (screen.root_depth, window, screen.root), xproto.WindowClass.InputOutput
+        core.CreateWindowChecked(*of, *monitor, 0, kind, screen.root_visual, attributes, values).check()
         core.CreatePixmapChecked(screen.root_depth, pixmap, window, monitor.columns, monitor.rows).check()
         core.CreateGCChecked(context, pixmap, 0, []).check()
-        selected = present.EventMask.CompleteNotify
-        connection(present.key).SelectInputChecked(events, window, selected).check()
+        connection(present.key).SelectInputChecked(events, window, present.EventMask.CompleteNotify).check()
         core.MapWindowChecked(window).check()
         return window, pixmap, context
 

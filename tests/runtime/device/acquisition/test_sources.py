@@ -30,8 +30,7 @@ from lightpage.recording.reader import Recording
 from lightpage.runtime.device.acquisition.page_store import PageStore
 from lightpage.runtime.device.acquisition.recording import RecordingSource
 from lightpage.runtime.device.acquisition.simulator import SimulatorSource
-from lightpage.runtime.device.acquisition.source import own_fault
-from lightpage.runtime.device.acquisition.sources import open_source
+from lightpage.runtime.device.acquisition.source import open_source, own_fault
 from tests.runtime import toy
 from tests.runtime.device.acquisition.lab import pages_of, reason_of
 
