@@ -66,9 +66,8 @@ class AravisConnection:
             self.is_gige = bool(library("arv_camera_is_gv_device", self.handle))
             if self.is_gige and not library("arv_gv_device_is_controller", self._device):
                 raise SourceError(name, "another program that controls it", "the only one")
-            self.serial = settings.serial or (
-                library("arv_camera_get_device_serial_number", self.handle) or device_id.encode()
-            ).decode("utf-8", "replace")
+            number = library.text("arv_camera_get_device_serial_number", self.handle)
+            self.serial = settings.serial or number or device_id
         except BaseException:
             library.unref(self.handle)
             raise
@@ -113,29 +112,18 @@ def _locate(library: AravisLibrary, settings: CameraSettings, name: str, known: 
         raise SourceError(name, "no answer", f"a camera at {settings.address}")
     found = _found(library)
     for device_id, serial, address in found:
-        if settings.serial is not None and serial == settings.serial:
+        if serial == settings.serial:
             return device_id, address
     wanted = f"serial {settings.serial}" if settings.serial is not None else f"a camera at {settings.address}"
     told = ", ".join(f"{serial} at {address or 'USB'}" for _, serial, address in found)
     raise SourceError(name, told or "no camera at all", wanted)
 
 
-def _found(library: AravisLibrary) -> list[tuple[str, str, str]]:
+def _found(library: AravisLibrary) -> list[tuple[str, ...]]:
     """Id, serial number and address of every camera that answers within a second."""
     library("arv_update_device_list")
-
-    def text(name: str, number: int) -> str:
-        value: Any = library(name, number)
-        return (value or b"").decode("utf-8", "replace")
-
-    return [
-        (
-            text("arv_get_device_id", number),
-            text("arv_get_device_serial_nbr", number),
-            text("arv_get_device_address", number),
-        )
-        for number in range(library("arv_get_n_devices"))
-    ]
+    told = ("arv_get_device_id", "arv_get_device_serial_nbr", "arv_get_device_address")
+    return [tuple(library.text(name, number) for name in told) for number in range(library("arv_get_n_devices"))]
 
 
 @dataclass
@@ -235,8 +223,8 @@ class AravisSetup:
         wanted = {**self._trigger, "AcquisitionMode": "Continuous", "PixelFormat": self.settings.pixel_format}
         for feature, expected in wanted.items():
             with self._setting(feature, expected):
-                got = self._do("get_string", feature.encode())
-            self._compare(feature, (got or b"").decode("utf-8", "replace"), expected)
+                got = self._library.text("arv_camera_get_string", self._camera, feature.encode())
+            self._compare(feature, got, expected)
         corners = [c_int() for _ in range(4)]
         with self._setting("region", self._region()):
             self._do("get_region", *map(byref, corners))

@@ -175,6 +175,10 @@ class AravisLibrary:
         """Whether this version of it has a function."""
         return name in self._functions
 
+    def text(self, name: str, *arguments: Any) -> str:
+        """Text that a function returns, empty where it returns none; see `__call__`."""
+        return (self(name, *arguments) or b"").decode("utf-8", "replace")
+
     def unref(self, instance: int) -> None:
         """Let go of an object."""
         self("g_object_unref", instance)
@@ -184,7 +188,7 @@ class AravisLibrary:
         result = function(*arguments, ctypes.byref(error))
         if error:
             told = error.contents
-            domain = (self("g_quark_to_string", told.domain) or b"").decode()
+            domain = self.text("g_quark_to_string", told.domain)
             raised = AravisError(domain, told.code, told.message.decode("utf-8", "replace"))
             self("g_error_free", error)
             raise raised

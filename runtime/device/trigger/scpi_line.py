@@ -13,7 +13,7 @@ from contextlib import suppress
 from typing import TypeVar
 
 from lightpage.clock import SYSTEM, Clock
-from lightpage.errors import InvalidInputError, LostShotError, Reason
+from lightpage.errors import LostShotError, Reason
 from lightpage.runtime.device.trigger.scpi_port import LineTimes, ScpiPort
 
 T = TypeVar("T")
@@ -55,14 +55,13 @@ class ScpiLine:
         """Send a command, wait for its ``ok``, return the middle of its sending by the clock.
 
         Args:
-            command: without line end.
+            command: a line of ASCII without its end.
             session: send it only if the line was not interrupted since this session; None connects where needed.
 
         Raises:
             LostShotError: `Reason.TRIGGER_GONE`: no ``ok``, and it may or may not have been done;
                 `Reason.TRIGGER_REFUSED`: the device answers that it cannot.
             SourceError: the port's name or the baud rate makes no sense.
-            InvalidInputError: this is no single line of ASCII.
         """
         return self._wait(self._port.ask, command, _DONE, session)[1]
 
@@ -75,7 +74,7 @@ class ScpiLine:
             session: see `send`.
 
         Raises:
-            LostShotError, SourceError, InvalidInputError: see `send`.
+            LostShotError, SourceError: see `send`.
         """
         return self._wait(self._port.ask_twice, question, answer, session)
 
@@ -91,8 +90,6 @@ class ScpiLine:
         answer: re.Pattern[str],
         session: int | None,
     ) -> T:
-        if not (message.isascii() and message.isprintable() and message):
-            raise InvalidInputError(f"{self.name}: message", repr(message), "one line of printable ASCII")
         timeout_s = self._times.longest_s
         result = self._owner.submit(ask, message, answer, session, self._clock.now() + timeout_s)
         answered = threading.Event()

@@ -14,6 +14,7 @@ import os
 import re
 import termios
 from collections import Counter
+from contextlib import suppress
 from typing import TYPE_CHECKING, Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -160,10 +161,8 @@ class ScpiPort:
         self._buffer.clear()
         self._given_up, self._due = self._given_up + self._due, 0
         if port is not None:
-            try:
+            with suppress(*GONE):
                 port.close()
-            except GONE:
-                return
 
     def _ready(self, session: int | None) -> Serial:
         """The open port, synchronised."""

@@ -14,7 +14,7 @@ from unittest.mock import Mock
 import pytest
 from serial.tools import list_ports
 
-from lightpage.errors import InvalidInputError, LostShotError, Reason, SourceError
+from lightpage.errors import LostShotError, Reason, SourceError
 from lightpage.runtime.device.trigger.scpi_line import ScpiLine
 from lightpage.runtime.device.trigger.scpi_port import LineTimes, ScpiPort
 from lightpage.virtual_device.pulse_generator import IDENTITY, PulseGeneratorEmulator
@@ -376,9 +376,3 @@ def test_callers_wait_no_longer_than_the_line_may_take(monkeypatch: pytest.Monke
     line.send(":PULSE3:STATE ON")
     assert [device.value(channel, "STATe") for channel in (1, 2, 3)] == ["0", "1", "1"]
     line.close()
-
-
-@pytest.mark.parametrize("message", ["", "*RST\r\n*TRG", "µ"])
-def test_messages_are_one_line_of_ascii(message: str) -> None:
-    with pytest.raises(InvalidInputError):
-        ScpiLine("socket://127.0.0.1:1").send(message)
