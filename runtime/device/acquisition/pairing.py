@@ -122,14 +122,6 @@ class _Channel:
         self.opened = self.camera.opened
 
 
-@dataclass(frozen=True)
-class _Taken:
-    """Two frames of one trigger, and each one's device time less the trigger's."""
-
-    frames: tuple[Frame, ...]
-    offsets_s: tuple[float, ...]
-
-
 @dataclass
 class Pairing:
     """Takes pairs of frames. One thread at a time uses it.
@@ -201,8 +193,8 @@ class Pairing:
             if not self.synchronised:
                 self._synchronise(deadline)
             numbered = all(channel.last_id is not None for channel in self._channels)
-            taken = self._take(deadline)
-            self._check_times(taken)
+            frames, offsets_s = self._take(deadline)
+            self._check_times(offsets_s)
             if displayed is not None and not displayed():
                 raise LostShotError(
                     "page", "no longer on display", "there until both frames are in", Reason.NOT_ON_DISPLAY
@@ -218,13 +210,12 @@ class Pairing:
         self._contradictions = 0
         if numbered:
             self._skips = 0
-        return taken.frames
+        return frames
 
-    def _check_times(self, taken: _Taken) -> None:
+    def _check_times(self, offsets_s: tuple[float, ...]) -> None:
         """Rule 4; the references follow where it holds."""
         deviations = [
-            offset - (channel.reference_s or 0.0)
-            for channel, offset in zip(self._channels, taken.offsets_s, strict=True)
+            offset - (channel.reference_s or 0.0) for channel, offset in zip(self._channels, offsets_s, strict=True)
         ]
         if max(map(abs, deviations)) > self.settings.tolerance_s:
             told = ", ".join(
@@ -253,7 +244,7 @@ class Pairing:
                 offsets = []
                 for gap in _GAPS:
                     self._next_at += gap * tolerance
-                    offsets.append(self._take(deadline).offsets_s)
+                    offsets.append(self._take(deadline)[1])
                 each = [sorted(of_one) for of_one in zip(*offsets, strict=True)]
                 spread = max(ordered[-1] - ordered[0] for ordered in each)
                 if spread <= tolerance:
@@ -285,8 +276,12 @@ class Pairing:
             Reason.MISSING_FRAME,
         )
 
-    def _take(self, deadline: float) -> _Taken:
-        """Fire once, and take both frames by rules 1 to 3, the page on display for long enough before."""
+    def _take(self, deadline: float) -> tuple[tuple[Frame, ...], tuple[float, ...]]:
+        """Fire once, and take both frames by rules 1 to 3, the page on display for long enough before.
+
+        Returns:
+            The frames, and each one's device time less the trigger's, seconds.
+        """
         settings = self.settings
         earliest = max(self._next_at, self._displayed_at + settings.tolerance_s)
         if earliest > deadline or self.clock.now() > deadline:
@@ -304,7 +299,7 @@ class Pairing:
             raise LostShotError("frame", "one more than the trigger asked for", "two", Reason.STRAY_FRAME)
         for channel, frame in zip(self._channels, frames, strict=True):
             channel.last_id = frame.info.frame_id
-        return _Taken(tuple(frames), tuple(frame.info.device_time_s - fired for frame in frames))
+        return tuple(frames), tuple(frame.info.device_time_s - fired for frame in frames)
 
     def _checked(self, channel: _Channel, frame: Frame | BrokenFrame | None) -> Frame:
         """A frame that came, by rules 2 and 3."""

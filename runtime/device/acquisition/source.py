@@ -6,10 +6,10 @@ Sources are entry points of the group `lightpage.sources`, so that another packa
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from typing import Self
 
 import numpy as np
@@ -190,18 +190,17 @@ def own_fault(subject: str = "") -> Iterator[None]:
         raise SourceError(subject + error.subject, error.got, error.expected) from error
 
 
-def open_source(spec: str, points: Iterable[EntryPoint] | None = None) -> FrameSource:
+def open_source(spec: str) -> FrameSource:
     """Open a source by its name.
 
     Args:
         spec: KIND:REST, e.g. ``recording:FILE``, or ``simulator:PROFILE`` (a shipped name or a file), which
             ``?levels=16&seed=0&device=FILE`` may follow.
-        points: kinds of sources, by default those that are installed.
 
     Raises:
         InvalidInputError: another kind, or one whose recording, profile or device does not validate.
     """
-    kinds = {point.name: point for point in (entry_points(group="lightpage.sources") if points is None else points)}
+    kinds = {point.name: point for point in entry_points(group="lightpage.sources")}
     kind, colon, rest = spec.partition(":")
     if not (colon and rest and kind in kinds):
         expected = f"KIND:REST, KIND being one of {', '.join(sorted(kinds))}, e.g. recording:FILE or simulator:PROFILE"

@@ -176,8 +176,9 @@ def test_the_source_of_a_vendor_in_the_documents_works(monkeypatch: pytest.Monke
     ((name, value),) = release["project"]["entry-points"]["lightpage.sources"].items()
     vendor = EntryPoint(name, value, "lightpage.sources")
     monkeypatch.setattr(EntryPoint, "load", lambda self: space[self.attr])
+    monkeypatch.setattr("lightpage.runtime.device.acquisition.source.entry_points", lambda group: [vendor])
     lost: list[int] = []
-    with open_source("vendor:7", [vendor]) as source:
+    with open_source("vendor:7") as source:
         source.on_lost = lambda page, error: lost.append(page)
         shot = source.shot()
         assert shot.infos is not None
@@ -190,7 +191,7 @@ def test_the_source_of_a_vendor_in_the_documents_works(monkeypatch: pytest.Monke
         assert references is not None
         assert references.in_phase[0, 0] == 50
     with pytest.raises(SourceError, match=r"^vendor"):
-        open_source("vendor:7", [vendor]).arm()
+        open_source("vendor:7").arm()
 
 
 def test_uploaded_pages_follow_those_of_the_file(tmp_path: Path) -> None:
