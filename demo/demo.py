@@ -32,8 +32,7 @@ from lightpage.runtime.client.answers import Recalibrated, RemotePage
 from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.device.acquisition.page_store import PageStore
 from lightpage.runtime.device.acquisition.simulator import SimulatorSource
-from lightpage.runtime.device.acquisition.source import FrameSource
-from lightpage.runtime.device.acquisition.sources import open_source
+from lightpage.runtime.device.acquisition.source import FrameSource, open_source
 from lightpage.runtime.device.modulator.simulated import SimulatedModulator
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for

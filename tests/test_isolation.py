@@ -24,7 +24,7 @@ builtins.__import__ = watch
 import lightpage.runtime
 for module in pkgutil.walk_packages(lightpage.runtime.__path__, "lightpage.runtime."):
     importlib.import_module(module.name)
-from lightpage.runtime.device.acquisition.sources import open_source
+from lightpage.runtime.device.acquisition.source import open_source
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.model.decoding.decoder import Decoder

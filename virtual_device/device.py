@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -46,7 +45,6 @@ class VirtualDevice:
         pixel_format: of both cameras.
         black_level: counts that both cameras add.
         hot_pixels: pixels of each camera that are always at full scale.
-        packet_bytes: of the cameras' packets.
 
     Raises:
         InvalidInputError: a bit depth that the pixel format does not have.
@@ -62,7 +60,6 @@ class VirtualDevice:
         pixel_format: str = "Mono8",
         black_level: int = 0,
         hot_pixels: int = 0,
-        packet_bytes: int = 9000,
     ) -> None:
         if bit_depth(pixel_format) != device.sensor.bit_depth:
             got = f"{device.sensor.bit_depth} bits in format {pixel_format}"
@@ -82,7 +79,7 @@ class VirtualDevice:
             self.port = self._stack.enter_context(Pty(self.pulse_generator.answer, folder / _PORT))
             self.socket = self._stack.enter_context(ModulatorSocket(self.light, folder / _SOCKET))
             replace_text(folder / _PROFILE, profile.to_toml())
-            replace_text(folder / CONFIG, _configuration(pixel_format, packet_bytes))
+            replace_text(folder / CONFIG, _configuration(pixel_format))
         except BaseException:
             self._stack.close()
             raise
@@ -104,9 +101,7 @@ class VirtualDevice:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def _edge(self, camera: int) -> None:
@@ -116,7 +111,7 @@ class VirtualDevice:
         return lambda: getattr(self.light.pair(), which)
 
 
-def _configuration(pixel_format: str, packet_bytes: int) -> str:
+def _configuration(pixel_format: str) -> str:
     cameras = "".join(
         f"""
 [{role}]
@@ -125,7 +120,7 @@ address = "{address}"
 pixel_format = "{pixel_format}"
 exposure_us = 200
 trigger_source = "Line1"
-packet_bytes = {packet_bytes}
+packet_bytes = 9000
 buffers = 16
 """
         for role, address in zip(("in_phase", "quadrature"), ADDRESSES, strict=True)

@@ -8,21 +8,36 @@ from __future__ import annotations
 import ctypes
 import socket
 from collections.abc import Callable
+from ctypes import POINTER, c_char_p, c_double, c_int, c_size_t, c_uint32, c_void_p
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.errors import FrameError, LightpageError, SourceError
-from lightpage.runtime.device.cameras.aravis_library import FILL, AravisLibrary, aravis
+from lightpage.runtime.device.cameras.aravis_library import AravisLibrary, Signatures, aravis
 from lightpage.runtime.device.cameras.gige_network import PORT
-from lightpage.runtime.device.cameras.pixel_formats import pack, pixel_format, pixel_format_of
+from lightpage.runtime.device.cameras.pixel_formats import FORMATS, pixel_format
 from lightpage.temporary import temporary_folder
+from lightpage.virtual_device.packing import pack
 
 Picture = Callable[[], NDArray[np.unsignedinteger[Any]]]
 
+_FILL = ctypes.CFUNCTYPE(None, c_void_p, c_void_p, c_uint32, c_uint32, c_uint32)
+"""ArvFakeCameraFillPattern: buffer, data, exposure in microseconds, gain, pixel format."""
+_FUNCTIONS: Signatures = {
+    "arv_fake_camera_new": (c_void_p, (c_char_p,)),
+    "arv_fake_camera_get_genicam_xml": (c_void_p, (c_void_p, POINTER(c_size_t))),
+    "arv_fake_camera_set_fill_pattern": (None, (c_void_p, _FILL, c_void_p)),
+    "arv_fake_camera_set_trigger_frequency": (None, (c_void_p, c_double)),
+    "arv_fake_camera_get_acquisition_status": (c_uint32, (c_void_p,)),
+    "arv_fake_camera_read_register": (c_int, (c_void_p, c_uint32, POINTER(c_uint32))),
+    "arv_fake_camera_write_register": (c_int, (c_void_p, c_uint32, c_uint32)),
+    "arv_gv_fake_camera_new_full": (c_void_p, (c_char_p, c_char_p, c_char_p)),
+    "arv_gv_fake_camera_is_running": (c_int, (c_void_p,)),
+    "arv_gv_fake_camera_get_fake_camera": (c_void_p, (c_void_p,)),
+}
 _ADDED_FORMATS = ("Mono10", "Mono10p", "Mono10Packed", "Mono12", "Mono12p", "Mono12Packed")
 """Beside Mono8 and Mono16, which the library's fake knows by itself."""
 _ROWS, _COLUMNS, _X, _Y = 0x104, 0x100, 0x130, 0x134
@@ -68,7 +83,8 @@ class FakeCamera:
         self.address, self.serial = address, serial
         self._picture, self._shape, self._more_bytes = picture, sensor_shape, more_bytes
         self._library = aravis()
-        self._fill = FILL(self._filled)  # must outlive the camera
+        self._library.declare(_FUNCTIONS)
+        self._fill = _FILL(self._filled)  # must outlive the camera
         self._camera: int | None = None
         self._error: Exception | None = None
         self.start()
@@ -76,9 +92,7 @@ class FakeCamera:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def start(self) -> None:
@@ -149,7 +163,7 @@ class FakeCamera:
     def lose(self, share: float) -> None:
         """Lose this share of the packets on the way from now on; lost ones are never sent again."""
         if self._camera is not None:
-            self._library.set_property(self._camera, "gvsp-lost-ratio", float(share))
+            self._library("g_object_set", self._camera, b"gvsp-lost-ratio", c_double(share), None)
 
     def check(self) -> None:
         """Raise what went wrong with a picture; its frame was sent all the same."""
@@ -165,13 +179,14 @@ class FakeCamera:
             image = self._picture()
             if image.shape != self._shape:
                 raise FrameError(f"picture of fake camera {self.serial}", image.shape, self._shape)
-            sent = pack(image[y : y + rows, x : x + columns], pixel_format_of(code).name)
+            name = next(known.name for known in FORMATS.values() if known.code == code)
+            sent = pack(image[y : y + rows, x : x + columns], name)
             ctypes.memmove(self._library("arv_buffer_get_data", buffer, None), sent.ctypes.data, sent.nbytes)
         except Exception as error:
             self._error = self._error or error
 
     def _read(self, register: int) -> int:
-        value = ctypes.c_uint32()
+        value = c_uint32()
         self._library("arv_fake_camera_read_register", self._inner, register, ctypes.byref(value))
         return value.value
 
@@ -192,7 +207,7 @@ def _description(library: AravisLibrary, more_bytes: int = 0) -> str:
     """The GenICam description of the library's fake, and in it more pixel formats, a second line and its register."""
     plain = library("arv_fake_camera_new", b"description")
     try:
-        size = ctypes.c_size_t()
+        size = c_size_t()
         text = ctypes.string_at(library("arv_fake_camera_get_genicam_xml", plain, ctypes.byref(size)), size.value)
     finally:
         library.unref(plain)

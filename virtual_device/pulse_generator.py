@@ -86,18 +86,12 @@ class PulseGeneratorEmulator:
 
     Args:
         cables: by channel, what is called at every shot while the channel is on.
-        on_state: is told of channel and state whenever a channel is switched on or off.
     """
 
-    def __init__(
-        self,
-        cables: Mapping[int, Callable[[], None]] | None = None,
-        on_state: Callable[[int, bool], None] = lambda channel, on: None,
-    ) -> None:
+    def __init__(self, cables: Mapping[int, Callable[[], None]] | None = None) -> None:
         self._cables = dict(cables or {})
-        self._on_state = on_state
         self._lock = threading.RLock()
-        """Held during a message; callbacks are called under it, one after another."""
+        """Held during a message; cables are called under it, one after another."""
         self._values: dict[tuple[int, str], str] = {}
         self.shots = 0
         self.messages = 0
@@ -106,22 +100,14 @@ class PulseGeneratorEmulator:
     def power_cycle(self) -> None:
         """Switch it off and on: everything is forgotten."""
         with self._lock:
-            on = [channel for channel in range(1, CHANNELS + 1) if self._values.get((channel, "STATe")) == "1"]
             self._values = {(T0, name): setting.default for name, setting in _SETTINGS_OF_T0.items()}
             for channel in range(1, CHANNELS + 1):
                 self._values |= {(channel, name): setting.default for name, setting in _SETTINGS_OF_CHANNEL.items()}
-            for channel in on:
-                self._on_state(channel, False)
 
     def value(self, channel: int, setting: str) -> str:
         """A setting as it is answered, by the manual's name: ``value(1, "WIDTh")``."""
         with self._lock:
             return self._values[channel, setting]
-
-    def external_edge(self) -> None:
-        """An edge at the trigger input."""
-        with self._lock:
-            self._edge()
 
     def answer(self, message: str) -> str:
         """What it answers to a message; both without line end."""
@@ -168,13 +154,9 @@ class PulseGeneratorEmulator:
         return "ok"
 
     def _set(self, channel: int, name: str, value: str) -> None:
-        before, self._values[channel, name] = self._values[channel, name], value
-        if name != "STATe":
-            return
-        if channel:
-            if value != before:
-                self._on_state(channel, value == "1")
-        elif value == "1" and self._is("MODe", "SING") and self._is("TRIGger:MODe", "DIS"):
+        self._values[channel, name] = value
+        started = name == "STATe" and channel == T0 and value == "1"
+        if started and self._is("MODe", "SING") and self._is("TRIGger:MODe", "DIS"):
             self._shoot()
             self._values[T0, "STATe"] = "0"
 

@@ -32,14 +32,14 @@ from lightpage.recording.layout import FrameInfo, frame_type
 from lightpage.runtime.device.acquisition.camera_source import CameraSource, Exposures
 from lightpage.runtime.device.acquisition.pairing import PairingSettings
 from lightpage.runtime.device.cameras.aravis import AravisCamera
-from lightpage.runtime.device.cameras.camera import Camera, Frame, FrameStatus
-from lightpage.runtime.device.cameras.pixel_formats import bit_depth, pack, unpack
+from lightpage.runtime.device.cameras.camera import BrokenFrame, Camera, Frame
+from lightpage.runtime.device.cameras.pixel_formats import bit_depth, unpack
 from lightpage.runtime.device.cameras.settings import CameraSettings
-from lightpage.runtime.device.modulator.operator import OperatorBeams
-from lightpage.runtime.device.trigger.software import SoftwareTrigger
-from lightpage.runtime.device.trigger.trigger import Trigger
+from lightpage.runtime.device.modulator.beam_state import OperatorBeams
+from lightpage.runtime.device.trigger.trigger import SoftwareTrigger, Trigger
 from lightpage.virtual_device.fake_camera import FakeCamera
 from lightpage.virtual_device.namespace import ADDRESSES, go_on_inside
+from lightpage.virtual_device.packing import pack
 
 Counts = NDArray[np.unsignedinteger[Any]]
 
@@ -103,10 +103,10 @@ def stale_frames(changes: int) -> dict[str, int]:
     with cameras(_SMALL, "Mono8", 9000, 1) as ((fake, camera, eye),):
         for change in track(range(changes), "free run to trigger", total=changes):
             eye.image = np.zeros(_SMALL, np.uint8)
-            before = camera.statistics.completed
+            before = camera.whole_frames
             fake.run_freely(_FREE_RUN_S)
             end = time.monotonic() + _FRAME_S
-            while camera.statistics.completed < before + _LEFTOVERS and time.monotonic() < end:
+            while camera.whole_frames < before + _LEFTOVERS and time.monotonic() < end:
                 time.sleep(_FREE_RUN_S)
             camera.arm()
             number = change % 255 + 1
@@ -114,7 +114,7 @@ def stale_frames(changes: int) -> dict[str, int]:
             fired_s = time.time()  # the fake camera's clock is this machine's
             fake.edge()
             frame = camera.frame(_FRAME_S)
-            if frame is None or frame.pixels is None or frame.info is None:
+            if not isinstance(frame, Frame):
                 missing += 1
             else:
                 stale += bool((frame.pixels != number).any()) or frame.info.device_time_s < fired_s - _TICK_S
@@ -122,7 +122,7 @@ def stale_frames(changes: int) -> dict[str, int]:
     return {"changes": changes, "stale": stale, "missing": missing}
 
 
-def take(stage: list[tuple[FakeCamera, AravisCamera, Eye]]) -> list[Frame | None]:
+def take(stage: list[tuple[FakeCamera, AravisCamera, Eye]]) -> list[Frame | BrokenFrame | None]:
     """Fire one edge to all cameras, and return a frame of each."""
     for fake, _, _ in stage:
         fake.edge()
@@ -139,7 +139,7 @@ def equal_frames(pairs: int, pixel_format: str) -> dict[str, int]:
                 eye.image = random.integers(0, 2**depth, _SMALL, dtype=frame_type(depth))
             for frame, (fake, _, eye) in zip(take(stage), stage, strict=True):
                 fake.check()
-                if frame is None or frame.pixels is None:
+                if not isinstance(frame, Frame):
                     incomplete += 1
                 elif (frame.pixels == eye.image).all():
                     equal += 1
@@ -196,7 +196,7 @@ def speed(shots: int, packet_bytes: int) -> dict[str, Any]:
                 frames = take(stage)
                 seconds += time.perf_counter() - started
                 equal += all(
-                    frame is not None and frame.pixels is not None and (frame.pixels == eye.image).all()
+                    isinstance(frame, Frame) and (frame.pixels == eye.image).all()
                     for frame, (_, _, eye) in zip(frames, stage, strict=True)
                 )
         return {
@@ -220,7 +220,7 @@ class InstantCamera:
         """Make a frame."""
         self._number += 1
         info = FrameInfo("INSTANT", self._number, time.monotonic(), time.time(), "Mono8")
-        self._ready.append(Frame(FrameStatus.COMPLETE, self._image.copy(), info))
+        self._ready.append(Frame(self._image.copy(), info))
 
     def frame(self, timeout_s: float) -> Frame | None:
         """The next one."""
@@ -288,7 +288,7 @@ def chain(shots: int, packet_bytes: int, tolerance_s: float) -> dict[str, float]
             eye.image = image
         take(stage)  # the first frame of a fake camera is late
         started = time.perf_counter()
-        whole = sum(all(frame is not None and frame.pixels is not None for frame in take(stage)) for _ in range(shots))
+        whole = sum(all(isinstance(frame, Frame) for frame in take(stage)) for _ in range(shots))
         cameras_alone = whole / (time.perf_counter() - started)
         pair = stage[0][1], stage[1][1]
         together, lost = pairs_per_s(pair, Edges([fake for fake, _, _ in stage]), settings, shots)

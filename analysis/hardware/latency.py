@@ -26,7 +26,7 @@ from lightpage.files import write_json
 from lightpage.progress import track
 from lightpage.recording.pages import PagesWriter
 from lightpage.runtime.device.acquisition.camera_source import CameraSource
-from lightpage.runtime.device.acquisition.sources import open_source
+from lightpage.runtime.device.acquisition.source import open_source
 from lightpage.runtime.device.trigger.trigger import Trigger
 from lightpage.runtime.model.bundle.shipped import bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder

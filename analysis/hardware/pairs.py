@@ -33,7 +33,7 @@ from lightpage.runtime.device.acquisition.camera_source import CameraSource, Exp
 from lightpage.runtime.device.acquisition.page_store import PageStore
 from lightpage.runtime.device.acquisition.pairing import PairingSettings
 from lightpage.runtime.device.cameras.aravis import AravisCamera
-from lightpage.runtime.device.cameras.camera import Frame
+from lightpage.runtime.device.cameras.camera import BrokenFrame, Frame
 from lightpage.runtime.device.cameras.settings import CameraSettings
 from lightpage.runtime.device.trigger.pulse_generator import PulseGenerator, PulseGeneratorSettings
 from lightpage.virtual_device.fake_camera import FakeCamera
@@ -64,9 +64,9 @@ class HeldCamera(AravisCamera):
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         self.hold_s = 0.0
-        self._held: list[tuple[float, Frame]] = []
+        self._held: list[tuple[float, Frame | BrokenFrame]] = []
 
-    def frame(self, timeout_s: float) -> Frame | None:
+    def frame(self, timeout_s: float) -> Frame | BrokenFrame | None:
         """The next frame that is not held back any more."""
         end = time.monotonic() + timeout_s
         while True:

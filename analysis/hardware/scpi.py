@@ -17,7 +17,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -220,7 +220,7 @@ def main(queries: int, fault_rate: float, unplug_every: int, kind: str, seed: in
     click.echo(line(outcome))
     if json_path is not None:
         options = {"fault_rate": fault_rate, "unplug_every": unplug_every, "port": kind, "seed": seed}
-        write_json(json_path, options | {"times": asdict(TIMES)} | outcome.to_json())
+        write_json(json_path, options | {"times": TIMES.model_dump()} | outcome.to_json())
 
 
 if __name__ == "__main__":

@@ -142,7 +142,6 @@ def test_settings_of_pip_are_lent_to_the_build_of_an_image(tmp_path: Path) -> No
 
 
 NEED_AN_EXTRA = {
-    "lightpage.runtime.device.modulator.screen.present": "xcffib",
     "lightpage.runtime.device.modulator.screen.x_window": "xcffib",
 }
 """Modules that the process of a modulator's window alone loads, and what they lack without the extra `screen`."""

@@ -14,7 +14,7 @@ from lightpage.errors import Reason, SourceError
 from lightpage.page.symbols import random_symbols
 from lightpage.recording.pages import PagesWriter
 from lightpage.runtime.device.acquisition.camera_source import CameraSource
-from lightpage.runtime.device.acquisition.sources import open_source
+from lightpage.runtime.device.acquisition.source import open_source
 from lightpage.simulator.simulator import Simulator
 from lightpage.virtual_device.device import VirtualDevice
 from tests.lightpage.small import small_profile

@@ -24,8 +24,7 @@ from lightpage.recording.layout import LostShot
 from lightpage.recording.pages import Pages
 from lightpage.recording.writer import RecordingWriter, Symbols, pages_there, partial_path
 from lightpage.runtime.device.acquisition.page_store import PageStore
-from lightpage.runtime.device.acquisition.source import FrameSource, Shot
-from lightpage.runtime.device.acquisition.sources import open_source
+from lightpage.runtime.device.acquisition.source import FrameSource, Shot, open_source
 from lightpage.words import counted
 
 ATTEMPTS = 5

@@ -30,8 +30,7 @@ from lightpage.runtime.console.actions import Actions
 from lightpage.runtime.console.history import History
 from lightpage.runtime.console.server import Console, ConsoleServer
 from lightpage.runtime.device.acquisition.page_store import PageStore
-from lightpage.runtime.device.acquisition.source import FrameSource
-from lightpage.runtime.device.acquisition.sources import open_source
+from lightpage.runtime.device.acquisition.source import FrameSource, open_source
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 from lightpage.runtime.model.bundle.signature import BundleKey

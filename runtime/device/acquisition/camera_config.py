@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal, Self
 from urllib.parse import parse_qsl
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from lightpage.device.problems import Problem, problems_of
@@ -25,29 +27,23 @@ from lightpage.runtime.device.cameras.aravis import AravisCamera
 from lightpage.runtime.device.cameras.camera import Camera
 from lightpage.runtime.device.cameras.gentl import GenTLCamera
 from lightpage.runtime.device.cameras.settings import CameraSettings
+from lightpage.runtime.device.modulator.beam_state import OperatorBeams
 from lightpage.runtime.device.modulator.external import ExternalBeams, ExternalModulator
-from lightpage.runtime.device.modulator.lookup_table import LookupTable
+from lightpage.runtime.device.modulator.lookup_table import linear_table, read_table
 from lightpage.runtime.device.modulator.modulator import Beams, Modulator
-from lightpage.runtime.device.modulator.operator import OperatorBeams
+from lightpage.runtime.device.modulator.screen.raster import ScreenSettings
 from lightpage.runtime.device.modulator.screen.screen import ScreenModulator
-from lightpage.runtime.device.modulator.settings import ScreenSettings
 from lightpage.runtime.device.modulator.shutters import Shutter, ShutterBeams
 from lightpage.runtime.device.modulator.simulated import SimulatedModulator
 from lightpage.runtime.device.trigger.pulse_generator import PulseGenerator, PulseGeneratorSettings
-from lightpage.runtime.device.trigger.software import SoftwareTrigger
-from lightpage.runtime.device.trigger.trigger import Trigger
+from lightpage.runtime.device.trigger.trigger import SoftwareTrigger, Trigger
 
-ROLES = ("in_phase", "quadrature")
 KEYS = "docs/cameras.md, all keys"
 """Where what a file may say is explained."""
 
 
-class CameraTable(CameraSettings):
+class CameraTable(View, CameraSettings):
     """One camera, and how it sees the image."""
-
-    flip_x: bool = False
-    """It sees left and right the other way round, as behind one more mirror."""
-    flip_y: bool = False
 
 
 class PulseGeneratorTable(PulseGeneratorSettings):
@@ -154,12 +150,17 @@ class DeviceTable(TomlTable):
 
     @model_validator(mode="after")
     def _shutters_on_spare_channels(self) -> Self:
-        if isinstance(self.beams, ShuttersTable) and isinstance(self.trigger, PulseGeneratorTable):
-            others = f"none of the cameras' ({', '.join(map(str, self.trigger.channels))})"
-            for beam in ("signal", "reference"):
-                channel = getattr(self.beams, beam).channel
-                if channel in self.trigger.channels:
-                    raise ValueError(f"beams.{beam}.channel = {channel}, wanted {others}")
+        if not isinstance(self.beams, ShuttersTable):
+            return self
+        if not isinstance(self.trigger, PulseGeneratorTable):
+            raise ValueError('beams: shutters without a pulse generator, wanted trigger kind = "pulse_generator"')
+        signal, reference = self.beams.signal.channel, self.beams.reference.channel
+        for beam, channel in (("signal", signal), ("reference", reference)):
+            if channel in self.trigger.channels:
+                others = f"none of the cameras' ({', '.join(map(str, self.trigger.channels))})"
+                raise ValueError(f"beams.{beam}.channel = {channel}, wanted {others}")
+        if signal == reference:
+            raise ValueError(f"beams: channel {signal} for both shutters, wanted two")
         return self
 
 
@@ -191,71 +192,59 @@ def _told(subject: str, problems: list[Problem]) -> InvalidInputError:
     return InvalidInputError(subject, f"{len(problems)} mistakes: {'; '.join(told)}", f"what {KEYS}, says")
 
 
-@dataclass
-class _Builder:
-    """Makes the devices of a file, whose paths are relative to `folder`."""
+def _camera(table: CameraTable, folder: Path, profile: Profile, role: str) -> Camera:
+    if table.producer is None:
+        return AravisCamera(table, profile.frame_shape, role)
+    producer = str((folder / table.producer).resolve())
+    return GenTLCamera(table.model_copy(update={"producer": producer}), profile.frame_shape, role)
 
-    table: DeviceTable
-    folder: Path
-    profile: Profile
-    ask: Callable[[str], None]
 
-    def cameras(self) -> tuple[Camera, Camera]:
-        """Both, not yet opened."""
-        tables = (self.table.in_phase, self.table.quadrature)
-        first, second = (self._camera(table, role) for table, role in zip(tables, ROLES, strict=True))
-        return first, second
+def _trigger(
+    table: PulseGeneratorTable | SoftwareTriggerTable, folder: Path, cameras: tuple[Camera, Camera]
+) -> Trigger:
+    if isinstance(table, SoftwareTriggerTable):
+        return SoftwareTrigger(cameras)
+    if "://" not in table.port:
+        table = table.model_copy(update={"port": str(folder / table.port)})
+    return PulseGenerator(table)
 
-    def _camera(self, table: CameraTable, role: str) -> Camera:
-        role = f"{role.replace('_', '-')} camera"
-        if table.producer is None:
-            return AravisCamera(table, self.profile.frame_shape, role)
-        producer = str((self.folder / table.producer).resolve())
-        return GenTLCamera(table.model_copy(update={"producer": producer}), self.profile.frame_shape, role)
 
-    def trigger(self, cameras: tuple[Camera, Camera]) -> Trigger:
-        """What fires the cameras."""
-        table = self.table.trigger
-        if isinstance(table, SoftwareTriggerTable):
-            return SoftwareTrigger(cameras)
-        if "://" not in table.port:
-            table = table.model_copy(update={"port": str(self.folder / table.port)})
-        return PulseGenerator(table)
-
-    def modulator(self, levels: int | None) -> Modulator | None:
-        """What shows the pages, of so many levels where that is known yet."""
-        table = self.table.modulator
-        if isinstance(table, NoModulatorTable):
+def _modulator(table: DeviceTable, folder: Path, profile: Profile, levels: int | None) -> Modulator | None:
+    """What shows the pages, of so many levels where that is known yet."""
+    match table.modulator:
+        case NoModulatorTable():
             return None
-        if isinstance(table, ExternalModulatorTable):
+        case ExternalModulatorTable():
             return ExternalModulator()
-        if isinstance(table, SimulatedTable):
-            return SimulatedModulator(self.folder / table.address)
-        return ScreenModulator(table, self.profile, self._greys(table, levels))
+        case SimulatedTable(address=address):
+            return SimulatedModulator(folder / address)
+        case ScreenTable() as screen:
+            return ScreenModulator(screen, profile, _greys(screen, folder, levels))
 
-    def _greys(self, table: ScreenTable, levels: int | None) -> Callable[[int], LookupTable]:
-        """What makes a lookup table for the levels of the pages that are shown; tried with those that are known."""
-        if table.lookup_table is None:
-            return LookupTable.linear
-        path = self.folder / table.lookup_table
-        if levels is not None:
-            LookupTable.from_file(path, levels)
-        elif not path.is_file():
-            raise InvalidInputError(f"lookup table {path}", "no such file", "a readable text file")
-        return partial(LookupTable.from_file, path)
 
-    def beams(self, trigger: Trigger) -> Beams:
-        """What blocks them."""
-        table = self.table.beams
-        if isinstance(table, OperatorTable):
-            return OperatorBeams(self.ask)
-        if isinstance(table, ExternalBeamsTable):
-            return ExternalBeams(table.timeout_s)
-        if isinstance(table, SimulatedTable):
-            return SimulatedModulator(self.folder / table.address)
-        if not isinstance(trigger, PulseGenerator):
-            raise InvalidInputError("beams", "shutters without a pulse generator", 'trigger kind = "pulse_generator"')
-        return ShutterBeams(trigger, table.signal, table.reference)
+def _greys(table: ScreenTable, folder: Path, levels: int | None) -> Callable[[int], NDArray[np.uint8]]:
+    """What makes a lookup table for the levels of the pages that are shown; tried with those that are known."""
+    if table.lookup_table is None:
+        return linear_table
+    path = folder / table.lookup_table
+    if levels is not None:
+        read_table(path, levels)
+    elif not path.is_file():
+        raise InvalidInputError(f"lookup table {path}", "no such file", "a readable text file")
+    return partial(read_table, path)
+
+
+def _beams(table: DeviceTable, folder: Path, trigger: Trigger, ask: Callable[[str], None]) -> Beams:
+    match table.beams:
+        case OperatorTable():
+            return OperatorBeams(ask)
+        case ExternalBeamsTable(timeout_s=timeout_s):
+            return ExternalBeams(timeout_s)
+        case SimulatedTable(address=address):
+            return SimulatedModulator(folder / address)
+        case ShuttersTable(signal=signal, reference=reference):
+            assert isinstance(trigger, PulseGenerator)  # as the table has checked
+            return ShutterBeams(trigger, signal, reference)
 
 
 def open_camera(rest: str) -> CameraSource:
@@ -267,34 +256,31 @@ def open_camera(rest: str) -> CameraSource:
     path_text, _, query = rest.partition("?")
     asked = dict(parse_qsl(query, keep_blank_values=True))
     path = Path(path_text)
-    table = load_device_table(path)
-    profile_path = path.parent / table.profile
+    table, folder = load_device_table(path), path.parent
+    profile_path = folder / table.profile
     profile = load_profile(profile_path if profile_path.is_file() else table.profile)
     if set(asked) - {"pages"}:
         raise InvalidInputError(f"source camera:{rest}", sorted(asked), "pages only")
-    named = asked.get("pages") or (None if table.pages is None else str(path.parent / table.pages))
+    named = asked.get("pages") or (None if table.pages is None else str(folder / table.pages))
     store = PageStore(profile, None if named is None else Pages.open(Path(named)), table.levels)
-    try:
-        source: list[CameraSource] = []
-        builder = _Builder(table, path.parent, profile, lambda text: source[0].operator(text))
-        cameras = builder.cameras()
-        trigger = builder.trigger(cameras)
-        views = [View(each.flip_x, each.flip_y) for each in (table.in_phase, table.quadrature)]
-        source.append(
-            CameraSource(
-                profile,
-                cameras,
-                trigger,
-                builder.modulator(store.levels),
-                builder.beams(trigger),
-                store,
-                table.pairing,
-                table.exposures,
-                (views[0], views[1]),
-                f"camera:{path_text}",
-            )
+    with ExitStack() as stack:
+        stack.callback(store.close)
+        cameras = (
+            _camera(table.in_phase, folder, profile, "in-phase camera"),
+            _camera(table.quadrature, folder, profile, "quadrature camera"),
         )
-    except BaseException:
-        store.close()
-        raise
-    return source[0]
+        trigger = _trigger(table.trigger, folder, cameras)
+        source = CameraSource(
+            profile,
+            cameras,
+            trigger,
+            _modulator(table, folder, profile, store.levels),
+            _beams(table, folder, trigger, lambda text: source.operator(text)),
+            store,
+            table.pairing,
+            table.exposures,
+            (table.in_phase, table.quadrature),
+            f"camera:{path_text}",
+        )
+        stack.pop_all()
+    return source

@@ -7,7 +7,6 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
 
@@ -17,7 +16,7 @@ from pydantic import ConfigDict, Field
 
 from lightpage.clock import SYSTEM, Clock
 from lightpage.device.profile import Profile, TomlTable
-from lightpage.errors import FrameError, LostShotError, Reason, SourceError
+from lightpage.errors import LostShotError, Reason, SourceError
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.progress import warn
 from lightpage.recording.alignment import describe, greatest_count, unused_low_bits
@@ -28,7 +27,7 @@ from lightpage.recording.layout import frame_type
 from lightpage.runtime.device.acquisition.beam_keeper import BeamKeeper
 from lightpage.runtime.device.acquisition.page_store import PageStore
 from lightpage.runtime.device.acquisition.pairing import Pairing, PairingSettings
-from lightpage.runtime.device.acquisition.source import SHOT_S, FrameSource, Shot
+from lightpage.runtime.device.acquisition.source import SHOT_S, FrameSource, Shot, own_fault
 from lightpage.runtime.device.cameras.camera import Camera, Frame
 from lightpage.runtime.device.modulator.modulator import Beams, Modulator
 from lightpage.runtime.device.trigger.trigger import Trigger
@@ -65,8 +64,7 @@ class Exposures(TomlTable):
     shot_s: Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)] = SHOT_S
 
 
-@dataclass(frozen=True)
-class View:
+class View(TomlTable):
     """How a camera sees the image: mirrored or not, as behind one more mirror.
 
     Attributes:
@@ -234,10 +232,8 @@ class CameraSource(FrameSource):
 
             frames = self._persistent(f"page {index}", index, deadline, attempt, self._exposures.repeats)
             pair = FramePair(*(self._cleaned(one, frame) for one, frame in enumerate(frames)))
-            first, second = (frame.info for frame in frames)
-            assert first is not None  # of complete frames
-            assert second is not None
-            return Shot(pair, index, symbols, None, (first, second))
+            first, second = frames
+            return Shot(pair, index, symbols, None, (first.info, second.info))
 
     @contextmanager
     def _in_turn(self, timeout_s: float) -> Iterator[None]:
@@ -259,13 +255,11 @@ class CameraSource(FrameSource):
             SourceError: they are dark or saturated, or this device cannot block its signal beam.
         """
         with self._lock, self._keeper.blocked(signal=False, reference=True):
-            stacks = self._stacks(self._exposures.reference_frames)
+            stacks = self._stacks(self._exposures.reference_frames, self._cleaned)
             means = [np.rint(stack.mean(axis=0)).astype(stack.dtype) for stack in stacks]
         pair = FramePair(means[0], means[1])
-        try:
+        with own_fault():
             check_pair_light(f"{self.name}: reference ", pair, self.bit_depth)
-        except FrameError as error:
-            raise SourceError(error.subject, error.got, error.expected) from None
         return pair
 
     def dark_frames(self) -> tuple[DarkFrame, DarkFrame]:
@@ -276,18 +270,12 @@ class CameraSource(FrameSource):
             SourceError: there was light, or this device cannot block its beams.
         """
         with self._lock, self._keeper.blocked(signal=False, reference=False):
-            before, self._dark = self._dark, None
-            try:
-                stacks = self._stacks(self._exposures.dark_frames)
+            stacks = self._stacks(self._exposures.dark_frames, self._upright)
+            with own_fault():
                 first, second = (
                     DarkFrame.of(stack, self.bit_depth, f"{camera.name}: dark frames")
                     for stack, camera in zip(stacks, self.cameras, strict=True)
                 )
-            except BaseException as error:
-                self._dark = before
-                if isinstance(error, FrameError):
-                    raise SourceError(error.subject, error.got, error.expected) from None
-                raise
             self._dark = (first, second)
             self._repairs = tuple(PixelRepair(self.frame_shape, dark.hot) for dark in self._dark)
             for camera, dark in zip(self.cameras, self._dark, strict=True):
@@ -354,17 +342,17 @@ class CameraSource(FrameSource):
 
     def _cleaned(self, one: int, frame: Frame) -> Counts:
         """The counts of a frame, upright, hot pixels mended, the black level taken off."""
-        pixels = frame.pixels
-        assert pixels is not None  # of a complete frame
-        camera, full_scale = self.cameras[one], 2**self.bit_depth - 1
-        if pixels.shape != self.frame_shape:
-            raise SourceError(f"{camera.name}: frame", f"{pixels.shape}", f"{self.frame_shape}")
-        pixels = self._to_full_scale(one, pixels.astype(frame_type(self.bit_depth), copy=False))
-        self._saturated[camera.name] = float(np.count_nonzero(pixels >= full_scale) / pixels.size)
-        pixels = self.views[one].upright(pixels)
+        pixels = self._upright(one, frame)
         if self._dark is None:
             return pixels
         return without_black(self._repairs[one](pixels), self._dark[one].black_level, self.bit_depth)
+
+    def _upright(self, one: int, frame: Frame) -> Counts:
+        """The counts of a frame, upright, as they are."""
+        pixels = self._to_full_scale(one, frame.pixels.astype(frame_type(self.bit_depth), copy=False))
+        share = float(np.count_nonzero(pixels >= 2**self.bit_depth - 1) / pixels.size)
+        self._saturated[self.cameras[one].name] = share
+        return self.views[one].upright(pixels)
 
     def _to_full_scale(self, one: int, pixels: Counts) -> Counts:
         """The counts of a camera that leaves low bits unused, with its greatest one at full scale; it is told once."""
@@ -380,13 +368,12 @@ class CameraSource(FrameSource):
         clipped = pixels >= greatest_count(self.bit_depth, self._unused[one])
         return np.where(clipped, pixels.dtype.type(2**self.bit_depth - 1), pixels) if clipped.any() else pixels
 
-    def _stacks(self, count: int) -> list[Counts]:
-        """Frames of both cameras [exposure, row, column], whatever is on display."""
+    def _stacks(self, count: int, counts_of: Callable[[int, Frame], Counts]) -> list[Counts]:
+        """Counts of frames of both cameras [exposure, row, column], whatever is on display."""
         shots = []
         for _ in range(count):
             deadline = self._clock.now() + self.shot_s
             # nothing but the light has to stand still, so there is no reason to give up early
             attempt = partial(self._pairing.shot, deadline)
-            taken = self._persistent("frames without a page", -1, deadline, attempt, _MOST_REPEATS)
-            shots.append(taken)
-        return [np.stack([self._cleaned(one, frames[one]) for frames in shots]) for one in (0, 1)]
+            shots.append(self._persistent("frames without a page", -1, deadline, attempt, _MOST_REPEATS))
+        return [np.stack([counts_of(one, frames[one]) for frames in shots]) for one in (0, 1)]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError, LimitError, NoSuchPageError
-from lightpage.page.symbols import check_levels, check_symbols
+from lightpage.page.symbols import check_symbols
 from lightpage.recording.pages import Pages
 
 UPLOADED_BYTES = 256 << 20
@@ -22,23 +22,21 @@ class PageStore:
     Args:
         profile: nominal device.
         written: pages of a file, or None; it is closed with the store.
-        levels: M, where there is no file to say it; None leaves it to the first upload.
+        levels: M, 2 to 256, where there is no file to say it; None leaves it to the first upload.
 
     Attributes:
         most_bytes: of uploaded pages; more are refused.
 
     Raises:
         RecordingError: pages for another profile.
-        PageError: a level count outside 2..256.
     """
 
     def __init__(self, profile: Profile, written: Pages | None = None, levels: int | None = None) -> None:
         if written is not None:
             written.check_against(profile)
             levels = written.levels
-        if levels is not None:
-            check_levels(levels)
         self._shape, self._written, self._levels = profile.page_shape, written, levels
+        self._in_file = 0 if written is None else len(written)
         self.most_bytes = UPLOADED_BYTES
         self._uploaded: list[NDArray[np.uint8]] = []
         self._lock = threading.Lock()
@@ -59,10 +57,6 @@ class PageStore:
         with self._lock:
             return self._in_file + len(self._uploaded)
 
-    @property
-    def _in_file(self) -> int:
-        return 0 if self._written is None else len(self._written)
-
     def __getitem__(self, page: int) -> NDArray[np.uint8]:
         """The symbols [ny, nx] of a page.
 
@@ -75,7 +69,7 @@ class PageStore:
             if not 0 <= page < count:
                 expected = f"0..{count - 1}" if count else "a page: none was given or uploaded"
                 raise NoSuchPageError("page to show", page, expected)
-            if self._written is not None and page < len(self._written):
+            if self._written is not None and page < self._in_file:
                 return self._written[page]
             return self._uploaded[page - self._in_file]
 
@@ -87,7 +81,6 @@ class PageStore:
             InvalidInputError: other levels than the pages that are there.
             LimitError: more than the store holds.
         """
-        check_levels(levels)
         pages = check_symbols(symbols, self._shape, levels, "uploaded pages").reshape(-1, *self._shape)
         with self._lock:
             if self._levels is not None and levels != self._levels:

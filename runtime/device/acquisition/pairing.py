@@ -33,8 +33,7 @@ from lightpage.clock import SYSTEM, Clock
 from lightpage.device.profile import TomlTable
 from lightpage.errors import LostShotError, Reason
 from lightpage.progress import note
-from lightpage.recording.layout import FrameInfo
-from lightpage.runtime.device.cameras.camera import Camera, Frame, FrameStatus
+from lightpage.runtime.device.cameras.camera import BrokenFrame, Camera, Frame
 from lightpage.runtime.device.trigger.trigger import Trigger
 from lightpage.words import counted
 
@@ -111,7 +110,7 @@ class _Channel:
     opened: int = -1
     came: int = 0
 
-    def frame(self, timeout_s: float) -> Frame | None:
+    def frame(self, timeout_s: float) -> Frame | BrokenFrame | None:
         """The camera's next frame, counted."""
         frame = self.camera.frame(timeout_s)
         self.came += frame is not None
@@ -121,14 +120,6 @@ class _Channel:
         """Know nothing any more."""
         self.last_id = self.step = self.reference_s = None
         self.opened = self.camera.opened
-
-
-@dataclass(frozen=True)
-class _Taken:
-    """Two frames of one trigger, and each one's device time less the trigger's."""
-
-    frames: tuple[Frame, ...]
-    offsets_s: tuple[float, ...]
 
 
 @dataclass
@@ -202,8 +193,8 @@ class Pairing:
             if not self.synchronised:
                 self._synchronise(deadline)
             numbered = all(channel.last_id is not None for channel in self._channels)
-            taken = self._take(deadline)
-            self._check_times(taken)
+            frames, offsets_s = self._take(deadline)
+            self._check_times(offsets_s)
             if displayed is not None and not displayed():
                 raise LostShotError(
                     "page", "no longer on display", "there until both frames are in", Reason.NOT_ON_DISPLAY
@@ -219,13 +210,12 @@ class Pairing:
         self._contradictions = 0
         if numbered:
             self._skips = 0
-        return taken.frames
+        return frames
 
-    def _check_times(self, taken: _Taken) -> None:
+    def _check_times(self, offsets_s: tuple[float, ...]) -> None:
         """Rule 4; the references follow where it holds."""
         deviations = [
-            offset - (channel.reference_s or 0.0)
-            for channel, offset in zip(self._channels, taken.offsets_s, strict=True)
+            offset - (channel.reference_s or 0.0) for channel, offset in zip(self._channels, offsets_s, strict=True)
         ]
         if max(map(abs, deviations)) > self.settings.tolerance_s:
             told = ", ".join(
@@ -254,7 +244,7 @@ class Pairing:
                 offsets = []
                 for gap in _GAPS:
                     self._next_at += gap * tolerance
-                    offsets.append(self._take(deadline).offsets_s)
+                    offsets.append(self._take(deadline)[1])
                 each = [sorted(of_one) for of_one in zip(*offsets, strict=True)]
                 spread = max(ordered[-1] - ordered[0] for ordered in each)
                 if spread <= tolerance:
@@ -286,8 +276,12 @@ class Pairing:
             Reason.MISSING_FRAME,
         )
 
-    def _take(self, deadline: float) -> _Taken:
-        """Fire once, and take both frames by rules 1 to 3, the page on display for long enough before."""
+    def _take(self, deadline: float) -> tuple[tuple[Frame, ...], tuple[float, ...]]:
+        """Fire once, and take both frames by rules 1 to 3, the page on display for long enough before.
+
+        Returns:
+            The frames, and each one's device time less the trigger's, seconds.
+        """
         settings = self.settings
         earliest = max(self._next_at, self._displayed_at + settings.tolerance_s)
         if earliest > deadline or self.clock.now() > deadline:
@@ -298,25 +292,23 @@ class Pairing:
         fired = self.trigger.fire()
         self._next_at = self.clock.now() + settings.spacing_s
         end = self.clock.now() + settings.frame_s
-        frames, ids = list[Frame](), list[int]()
-        for channel in self._channels:
-            frame = channel.frame(max(1e-3, end - self.clock.now()))
-            frames.append(frame := self._checked(channel, frame))
-            ids.append(_info(frame).frame_id)
+        frames = [
+            self._checked(channel, channel.frame(max(1e-3, end - self.clock.now()))) for channel in self._channels
+        ]
         if self._drain():
             raise LostShotError("frame", "one more than the trigger asked for", "two", Reason.STRAY_FRAME)
-        for channel, number in zip(self._channels, ids, strict=True):
-            channel.last_id = number
-        return _Taken(tuple(frames), tuple(_info(frame).device_time_s - fired for frame in frames))
+        for channel, frame in zip(self._channels, frames, strict=True):
+            channel.last_id = frame.info.frame_id
+        return tuple(frames), tuple(frame.info.device_time_s - fired for frame in frames)
 
-    def _checked(self, channel: _Channel, frame: Frame | None) -> Frame:
+    def _checked(self, channel: _Channel, frame: Frame | BrokenFrame | None) -> Frame:
         """A frame that came, by rules 2 and 3."""
         name = channel.camera.name
         if frame is None:
             wanted = f"one within {self.settings.frame_s:g} s of the trigger"
             raise LostShotError(f"{name}: frame", "none", wanted, Reason.MISSING_FRAME)
-        if frame.status is not FrameStatus.COMPLETE or frame.info is None or frame.pixels is None:
-            raise LostShotError(f"{name}: frame", frame.detail or "parts of it", "all of it", Reason.INCOMPLETE_FRAME)
+        if isinstance(frame, BrokenFrame):
+            raise LostShotError(f"{name}: frame", frame.detail, "all of it", Reason.INCOMPLETE_FRAME)
         if channel.last_id is not None:
             number, last = frame.info.frame_id, channel.last_id
             step = (number - last) % channel.camera.frame_numbers
@@ -359,8 +351,3 @@ class Pairing:
 
 def _no_time_left() -> LostShotError:
     return LostShotError("shot", "no time left", "a longer wait", Reason.MISSING_FRAME)
-
-
-def _info(frame: Frame) -> FrameInfo:
-    assert frame.info is not None  # of a complete frame
-    return frame.info

@@ -1,4 +1,7 @@
-"""What a frame source is."""
+"""What a frame source is, and how one is opened by its name.
+
+Sources are entry points of the group `lightpage.sources`, so that another package may bring its own.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from types import TracebackType
+from importlib.metadata import entry_points
 from typing import Self
 
 import numpy as np
@@ -166,9 +169,7 @@ class FrameSource(ABC):
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         try:
             self.disarm()
         finally:
@@ -187,3 +188,22 @@ def own_fault(subject: str = "") -> Iterator[None]:
         yield
     except (RecordingError, FrameError) as error:
         raise SourceError(subject + error.subject, error.got, error.expected) from error
+
+
+def open_source(spec: str) -> FrameSource:
+    """Open a source by its name.
+
+    Args:
+        spec: KIND:REST, e.g. ``recording:FILE``, or ``simulator:PROFILE`` (a shipped name or a file), which
+            ``?levels=16&seed=0&device=FILE`` may follow.
+
+    Raises:
+        InvalidInputError: another kind, or one whose recording, profile or device does not validate.
+    """
+    kinds = {point.name: point for point in entry_points(group="lightpage.sources")}
+    kind, colon, rest = spec.partition(":")
+    if not (colon and rest and kind in kinds):
+        expected = f"KIND:REST, KIND being one of {', '.join(sorted(kinds))}, e.g. recording:FILE or simulator:PROFILE"
+        raise InvalidInputError("source", repr(spec), expected)
+    opener: Callable[[str], FrameSource] = kinds[kind].load()
+    return opener(rest)

@@ -7,14 +7,14 @@ import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.errors import FrameError, LostShotError, Reason, SourceError
 from lightpage.recording.layout import FrameInfo
-from lightpage.runtime.device.cameras.aravis_connection import AravisConnection, says_gone
+from lightpage.runtime.device.cameras import sfnc
+from lightpage.runtime.device.cameras.aravis_device import AravisConnection, AravisSetup, says_gone
 from lightpage.runtime.device.cameras.aravis_library import (
     BUFFER_STATUS,
     SIZE_MISMATCH,
@@ -23,12 +23,10 @@ from lightpage.runtime.device.cameras.aravis_library import (
     AravisLibrary,
     aravis,
 )
-from lightpage.runtime.device.cameras.aravis_setup import AravisSetup
-from lightpage.runtime.device.cameras.camera import Frame, FrameStatus
+from lightpage.runtime.device.cameras.camera import BrokenFrame, DrivenCamera, Frame
 from lightpage.runtime.device.cameras.gige_network import receive_buffer_problem
-from lightpage.runtime.device.cameras.pixel_formats import bit_depth, pixel_format, unpack, without_padding
+from lightpage.runtime.device.cameras.pixel_formats import pixel_format, unpack, without_padding
 from lightpage.runtime.device.cameras.settings import CameraSettings
-from lightpage.runtime.device.cameras.sfnc import MOST_DRAINING_S, QUIET_S, SIGN_OF_LIFE_S
 
 _log = logging.getLogger(__name__)
 
@@ -37,83 +35,27 @@ _RECENTLY_S = 0.5
 gone, and asking takes time from the command."""
 
 
-@dataclass(frozen=True)
-class StreamStatistics:
-    """Frames by how they arrived, since the camera was made.
-
-    Attributes:
-        completed: whole ones.
-        failures: with packets lost, late or wrong.
-        underruns: dropped since no buffer was free.
-    """
-
-    completed: int = 0
-    failures: int = 0
-    underruns: int = 0
-
-
-class AravisCamera:
-    """A camera of `lightpage.runtime.device.cameras.camera.Camera`.
-
-    Args:
-        settings: which one, and how it is set up.
-        frame_shape: (rows, columns) of the region that is read.
-        role: for people, e.g. ``in-phase camera``.
-    """
+class AravisCamera(DrivenCamera):
+    """A camera of `lightpage.runtime.device.cameras.camera.Camera`; see `DrivenCamera` for its arguments."""
 
     def __init__(self, settings: CameraSettings, frame_shape: tuple[int, int], role: str = "camera") -> None:
-        self._settings, self._shape, self._role = settings, frame_shape, role
+        super().__init__(settings, frame_shape, role)
         self._connection: AravisConnection | None = None
         self._stream: int | None = None
-        self._serial = settings.label
         self._exposure_s: float | None = None
-        self._frame_numbers = 2**16 - 1
-        self._opened = 0
         self._packet_bytes = 0
         self._hint = ""
-        self._earlier = StreamStatistics()
+        self._earlier = 0
         self._answered_at = -float("inf")
 
     @property
-    def name(self) -> str:
-        """See `Camera`."""
-        return f"{self._role} ({self._serial})"
-
-    @property
-    def frame_shape(self) -> tuple[int, int]:
-        """See `Camera`."""
-        return self._shape
-
-    @property
-    def bit_depth(self) -> int:
-        """See `Camera`."""
-        return bit_depth(self._settings.pixel_format)
-
-    @property
-    def frame_numbers(self) -> int:
-        """See `Camera`."""
-        return self._frame_numbers
-
-    @property
-    def opened(self) -> int:
-        """See `Camera`."""
-        return self._opened
-
-    @property
-    def packet_bytes(self) -> int:
-        """Size of a GigE packet since the last `arm`, headers included; 0 of other cameras."""
-        return self._packet_bytes
-
-    @property
-    def statistics(self) -> StreamStatistics:
-        """Frames so far by how they arrived."""
+    def whole_frames(self) -> int:
+        """Frames that have arrived whole since the camera was made."""
         if self._stream is None:
             return self._earlier
-        counts = [ctypes.c_uint64() for _ in range(3)]
-        aravis()("arv_stream_get_statistics", self._stream, *map(ctypes.byref, counts))
-        completed, failures, underruns = (count.value for count in counts)
-        before = self._earlier
-        return StreamStatistics(before.completed + completed, before.failures + failures, before.underruns + underruns)
+        completed = ctypes.c_uint64()
+        aravis()("arv_stream_get_statistics", self._stream, ctypes.byref(completed), None, None)
+        return self._earlier + completed.value
 
     def arm(self) -> None:
         """See `Camera`."""
@@ -133,7 +75,7 @@ class AravisCamera:
             aravis()("arv_camera_software_trigger", connection.handle)
         self._answered_at = time.monotonic()
 
-    def frame(self, timeout_s: float) -> Frame | None:
+    def frame(self, timeout_s: float) -> Frame | BrokenFrame | None:
         """See `Camera`."""
         connection, stream = self._armed()
         library = aravis()
@@ -142,12 +84,12 @@ class AravisCamera:
         else:
             buffer = library("arv_stream_try_pop_buffer", stream)
         if buffer is None:
-            if connection.control_lost or (timeout_s >= SIGN_OF_LIFE_S and connection.gone()):
+            if connection.control_lost or (timeout_s >= sfnc.SIGN_OF_LIFE_S and connection.gone()):
                 raise self._lose("no answer")
             return None
         self._answered_at = time.monotonic()
         try:
-            return self._read(library, buffer)
+            return self._read(library, buffer, connection.serial)
         finally:
             library("arv_stream_push_buffer", stream, buffer)
 
@@ -171,23 +113,16 @@ class AravisCamera:
         self._release(gone=self._connection is not None and self._connection.gone())
 
     def _open(self) -> None:
-        before = self._opened
         try:
-            self._connection = AravisConnection(self._settings, self.name, known=before > 0)
+            self._connection = AravisConnection(self._settings, self.name, known=self.opened > 0)
         except AravisError as error:
-            raise self._absent(before, error.message, "a camera that can be opened") from None
+            raise self._absent(self.opened > 0, error.message, "a camera that can be opened") from None
         except SourceError as error:
-            if before:
-                raise self._absent(before, error.got, error.expected) from None
+            if self.opened:
+                raise self._absent(True, error.got, error.expected) from None
             raise
-        self._serial = self._connection.serial
-        self._opened = before + 1
-
-    def _absent(self, before: int, got: str, expected: str) -> SourceError | LostShotError:
-        """The error of a camera that is not there: it has gone away only if it was there."""
-        if before:
-            return LostShotError(self.name, got, expected, Reason.CAMERA_GONE)
-        return SourceError(self.name, got, expected)
+        self.name = f"{self._role} ({self._connection.serial})"
+        self.opened += 1
 
     def _set_up(self) -> None:
         assert self._connection is not None
@@ -199,7 +134,7 @@ class AravisCamera:
         self._stream = setup.make_stream(payload)
         setup.set_trigger()
         self._exposure_s = setup.check()
-        self._frame_numbers = setup.frame_numbers()
+        self.frame_numbers = setup.frame_numbers()
         self._packet_bytes = setup.packet_bytes
         self._hint = receive_buffer_problem(payload) if self._connection.is_gige else ""
         if self._hint:
@@ -209,14 +144,14 @@ class AravisCamera:
 
     def _drain(self) -> None:
         """Drop frames from before: those that a free run left would pass for triggered ones."""
-        library, give_up = aravis(), time.monotonic() + MOST_DRAINING_S
+        library, give_up = aravis(), time.monotonic() + sfnc.MOST_DRAINING_S
         while time.monotonic() < give_up:
-            buffer = library("arv_stream_timeout_pop_buffer", self._stream, int(1e6 * QUIET_S))
+            buffer = library("arv_stream_timeout_pop_buffer", self._stream, int(1e6 * sfnc.QUIET_S))
             if buffer is None:
                 return
             library("arv_stream_push_buffer", self._stream, buffer)
 
-    def _read(self, library: AravisLibrary, buffer: int) -> Frame:
+    def _read(self, library: AravisLibrary, buffer: int, serial: str) -> Frame | BrokenFrame:
         """The frame in a buffer. Of one that is not whole, number and time may be those of an earlier frame.
 
         Raises:
@@ -226,7 +161,7 @@ class AravisCamera:
         if status == SIZE_MISMATCH:
             raise self._changed(BUFFER_STATUS[status], "no more than its PayloadSize")
         if status != SUCCESS:
-            return Frame(FrameStatus.INCOMPLETE, detail=self._explained(BUFFER_STATUS.get(status, f"status {status}")))
+            return BrokenFrame(self._explained(BUFFER_STATUS.get(status, f"status {status}")))
         rows, columns = self._shape
         expected = (columns, rows, pixel_format(self._settings.pixel_format).code)
         got = tuple(library(f"arv_buffer_get_image_{what}", buffer) for what in ("width", "height", "pixel_format"))
@@ -238,30 +173,28 @@ class AravisCamera:
             raw = without_padding(_bytes(library, buffer), self._shape, name, _padding(library, buffer))
             pixels = unpack(raw, self._shape, name)
         except FrameError as error:
-            return Frame(FrameStatus.INCOMPLETE, detail=f"{error.got} in place of {error.expected}")
+            return BrokenFrame(f"{error.got} in place of {error.expected}")
         info = FrameInfo(
-            serial=self._serial,
+            serial=serial,
             frame_id=library("arv_buffer_get_frame_id", buffer),
             device_time_s=1e-9 * library("arv_buffer_get_timestamp", buffer),
             host_time_s=1e-9 * library("arv_buffer_get_system_timestamp", buffer),
             pixel_format=name,
             exposure_s=self._exposure_s,
         )
-        return Frame(FrameStatus.COMPLETE, pixels, info)
+        return Frame(pixels, info)
 
     def _explained(self, detail: str) -> str:
         if self._hint:
             return f"{detail}; {self._hint}"
-        if self._packet_bytes and not self.statistics.completed:
-            return (
-                f"{detail}; no frame has come whole yet: does the network carry packets of {self._packet_bytes} bytes?"
-            )
+        if self._packet_bytes and not self.whole_frames:
+            asked = f"does the network carry packets of {self._packet_bytes} bytes?"
+            return f"{detail}; no frame has come whole yet: {asked}"
         return detail
 
     def _armed(self) -> tuple[AravisConnection, int]:
         if self._connection is None or self._stream is None:
-            before = self._opened if self._connection is None else 0
-            raise self._absent(before, "a camera that is not armed", "`arm` before it is used")
+            raise self._unarmed(self._connection is not None)
         if self._connection.control_lost:
             raise self._lose("control of it is lost")
         return self._connection, self._stream
@@ -296,8 +229,8 @@ class AravisCamera:
             aravis().unref(stream)
 
     def _take_stream(self) -> int | None:
-        """The stream, which is no longer this camera's; its statistics stay."""
-        self._earlier = self.statistics
+        """The stream, which is no longer this camera's; its count of frames stays."""
+        self._earlier = self.whole_frames
         stream, self._stream = self._stream, None
         return stream
 

@@ -20,6 +20,7 @@ ENVIRONMENT = "LIGHTPAGE_ARAVIS"
 """Names another file to load."""
 LIBRARY = "libaravis-0.8.so.0"
 PACKAGE = "libaravis-0.8-0"
+_WANTED = f"{LIBRARY}, of the Debian package {PACKAGE}, or its path in {ENVIRONMENT}"
 
 SUCCESS, SIZE_MISMATCH = 0, 5
 BUFFER_STATUS = {
@@ -37,25 +38,20 @@ BUFFER_STATUS = {
 SOCKET_BUFFER_AUTO = 1
 RANGE_CHECK_ENABLE = 1
 
-FILL = ctypes.CFUNCTYPE(None, c_void_p, c_void_p, c_uint32, c_uint32, c_uint32)
-"""ArvFakeCameraFillPattern: buffer, data, exposure in microseconds, gain, pixel format."""
 SIGNAL = ctypes.CFUNCTYPE(None, c_void_p, c_void_p)
 """A handler of a signal without arguments: object, data."""
 
-_G_TYPE_INT, _G_TYPE_DOUBLE = 6 << 2, 15 << 2
+Signatures = dict[str, tuple[Any, tuple[Any, ...]]]
+"""Result and arguments of functions, by name."""
 
 
 class _GError(ctypes.Structure):
     _fields_ = (("domain", c_uint32), ("code", c_int), ("message", c_char_p))
 
 
-class _GValue(ctypes.Structure):
-    _fields_ = (("type", c_size_t), ("data", c_uint64 * 2))
-
-
 _ERROR = POINTER(POINTER(_GError))
 
-_FALLIBLE: dict[str, tuple[Any, tuple[Any, ...]]] = {
+_FALLIBLE: Signatures = {
     "arv_camera_new": (c_void_p, (c_char_p,)),
     "arv_camera_get_device_serial_number": (c_char_p, (c_void_p,)),
     "arv_camera_is_feature_available": (c_int, (c_void_p, c_char_p)),
@@ -86,7 +82,7 @@ _FALLIBLE: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_camera_software_trigger": (None, (c_void_p,)),
 }
 """Result and arguments of what reports an error as its last argument."""
-_PLAIN: dict[str, tuple[Any, tuple[Any, ...]]] = {
+_PLAIN: Signatures = {
     "arv_update_device_list": (None, ()),
     "arv_get_n_devices": (c_uint32, ()),
     "arv_get_device_id": (c_char_p, (c_uint32,)),
@@ -109,18 +105,15 @@ _PLAIN: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_buffer_get_image_height": (c_int, (c_void_p,)),
     "arv_buffer_get_image_pixel_format": (c_uint32, (c_void_p,)),
     "arv_buffer_get_data": (c_void_p, (c_void_p, POINTER(c_size_t))),
-    "arv_fake_camera_new": (c_void_p, (c_char_p,)),
-    "arv_fake_camera_get_genicam_xml": (c_void_p, (c_void_p, POINTER(c_size_t))),
-    "arv_fake_camera_set_fill_pattern": (None, (c_void_p, FILL, c_void_p)),
-    "arv_fake_camera_set_trigger_frequency": (None, (c_void_p, c_double)),
-    "arv_fake_camera_get_acquisition_status": (c_uint32, (c_void_p,)),
-    "arv_fake_camera_read_register": (c_int, (c_void_p, c_uint32, POINTER(c_uint32))),
-    "arv_fake_camera_write_register": (c_int, (c_void_p, c_uint32, c_uint32)),
-    "arv_gv_fake_camera_new_full": (c_void_p, (c_char_p, c_char_p, c_char_p)),
-    "arv_gv_fake_camera_is_running": (c_int, (c_void_p,)),
-    "arv_gv_fake_camera_get_fake_camera": (c_void_p, (c_void_p,)),
+    # GLib's functions too: the loader looks for them in what libaravis itself is linked to.
+    "g_object_unref": (None, (c_void_p,)),
+    "g_object_set": (None, (c_void_p, c_char_p)),  # and a value of the property's own type, and None
+    "g_signal_connect_data": (c_ulong, (c_void_p, c_char_p, SIGNAL, c_void_p, c_void_p, c_int)),
+    "g_signal_handler_disconnect": (None, (c_void_p, c_ulong)),
+    "g_quark_to_string": (c_char_p, (c_uint32,)),
+    "g_error_free": (None, (POINTER(_GError),)),
 }
-_OPTIONAL: dict[str, tuple[Any, tuple[Any, ...]]] = {
+_OPTIONAL: Signatures = {
     "arv_buffer_get_image_padding": (None, (c_void_p, POINTER(c_int), POINTER(c_int))),
 }
 """What earlier versions lack."""
@@ -152,35 +145,23 @@ class AravisLibrary:
 
     def __init__(self, path: str) -> None:
         try:
-            library = ctypes.CDLL(path)
-            self._functions: dict[str, Callable[..., Any]] = {
-                name: _typed(library, name, result, arguments) for name, (result, arguments) in _PLAIN.items()
-            }
-            self._functions |= {
-                name: _typed(library, name, result, arguments)
-                for name, (result, arguments) in _OPTIONAL.items()
-                if hasattr(library, name)
-            }
+            self._library = library = ctypes.CDLL(path)
+            self._functions: dict[str, Callable[..., Any]] = {}
+            self.declare(_PLAIN)
+            self.declare({name: types for name, types in _OPTIONAL.items() if hasattr(library, name)})
             for name, (result, arguments) in _FALLIBLE.items():
                 function = _typed(library, name, result, (*arguments, _ERROR))
                 self._functions[name] = functools.partial(self._checked, function)
             version = tuple(_typed(library, f"arv_get_{part}_version", c_uint32, ())() for part in ("major", "minor"))
-            # GLib's functions too: the loader looks for them in what libaravis itself is linked to.
-            self._unref = _typed(library, "g_object_unref", None, (c_void_p,))
-            self._connect = _typed(
-                library, "g_signal_connect_data", c_ulong, (c_void_p, c_char_p, SIGNAL, c_void_p, c_void_p, c_int)
-            )
-            self._disconnect = _typed(library, "g_signal_handler_disconnect", None, (c_void_p, c_ulong))
-            self._init_value = _typed(library, "g_value_init", c_void_p, (POINTER(_GValue), c_size_t))
-            self._set_int = _typed(library, "g_value_set_int", None, (POINTER(_GValue), c_int))
-            self._set_double = _typed(library, "g_value_set_double", None, (POINTER(_GValue), c_double))
-            self._set_property = _typed(library, "g_object_set_property", None, (c_void_p, c_char_p, POINTER(_GValue)))
-            self._quark = _typed(library, "g_quark_to_string", c_char_p, (c_uint32,))
-            self._free_error = _typed(library, "g_error_free", None, (POINTER(_GError),))
         except (OSError, AttributeError) as error:
-            raise SourceError("camera driver aravis", error, _wanted()) from None
+            raise SourceError("camera driver aravis", error, _WANTED) from None
         if version != (0, 8):
-            raise SourceError(f"camera driver aravis: {path}", f"version {version[0]}.{version[1]}", _wanted())
+            raise SourceError(f"camera driver aravis: {path}", f"version {version[0]}.{version[1]}", _WANTED)
+
+    def declare(self, functions: Signatures) -> None:
+        """Make functions callable that report no error."""
+        for name, (result, arguments) in functions.items():
+            self._functions[name] = _typed(self._library, name, result, arguments)
 
     def __call__(self, name: str, *arguments: Any) -> Any:
         """Call a function by its name.
@@ -194,38 +175,22 @@ class AravisLibrary:
         """Whether this version of it has a function."""
         return name in self._functions
 
-    def set_property(self, instance: int, name: str, value: int | float) -> None:
-        """Set a property: a float where it is a double, an int where it is an integer or an enumeration."""
-        held = _GValue()
-        if isinstance(value, float):
-            self._init_value(held, _G_TYPE_DOUBLE)
-            self._set_double(held, value)
-        else:
-            self._init_value(held, _G_TYPE_INT)
-            self._set_int(held, value)
-        self._set_property(instance, name.encode(), held)
-
-    def connect(self, instance: int, signal: str, handler: Callable[..., None]) -> int:
-        """Have `handler`, a `SIGNAL` that is kept alive, called from the library's thread; returns its number."""
-        return int(self._connect(instance, signal.encode(), handler, None, None, 0))
-
-    def disconnect(self, instance: int, number: int) -> None:
-        """Call a handler no more."""
-        self._disconnect(instance, number)
+    def text(self, name: str, *arguments: Any) -> str:
+        """Text that a function returns, empty where it returns none; see `__call__`."""
+        return (self(name, *arguments) or b"").decode("utf-8", "replace")
 
     def unref(self, instance: int) -> None:
         """Let go of an object."""
-        self._unref(instance)
+        self("g_object_unref", instance)
 
     def _checked(self, function: Callable[..., Any], *arguments: Any) -> Any:
         error = POINTER(_GError)()
         result = function(*arguments, ctypes.byref(error))
         if error:
             told = error.contents
-            raised = AravisError(
-                (self._quark(told.domain) or b"").decode(), told.code, told.message.decode("utf-8", "replace")
-            )
-            self._free_error(error)
+            domain = self.text("g_quark_to_string", told.domain)
+            raised = AravisError(domain, told.code, told.message.decode("utf-8", "replace"))
+            self("g_error_free", error)
             raise raised
         return result
 
@@ -235,10 +200,6 @@ def _typed(library: ctypes.CDLL, name: str, result: Any, arguments: tuple[Any, .
     function.restype, function.argtypes = result, arguments
     typed: Callable[..., Any] = function
     return typed
-
-
-def _wanted() -> str:
-    return f"{LIBRARY}, of the Debian package {PACKAGE}, or its path in {ENVIRONMENT}"
 
 
 def aravis() -> AravisLibrary:

@@ -3,21 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.errors import LostShotError, Reason, SourceError
 from lightpage.recording.layout import FrameInfo
-
-
-class FrameStatus(StrEnum):
-    """How a frame arrived."""
-
-    COMPLETE = "COMPLETE"
-    INCOMPLETE = "INCOMPLETE"
-    """Parts of it were lost on the way; nothing of it can be used, its number and time included."""
+from lightpage.runtime.device.cameras.pixel_formats import bit_depth
+from lightpage.runtime.device.cameras.settings import CameraSettings
 
 
 @dataclass(frozen=True)
@@ -25,40 +19,36 @@ class Frame:
     """One frame as a camera delivered it.
 
     Attributes:
-        status: only of a complete frame the rest is there.
         pixels: counts [row, column], uint8 or uint16, right-aligned, native byte order.
         info: number, times, format, camera and exposure.
-        detail: what is wrong with an incomplete one, for people.
     """
 
-    status: FrameStatus
-    pixels: NDArray[np.unsignedinteger[Any]] | None = None
-    info: FrameInfo | None = None
-    detail: str = ""
+    pixels: NDArray[np.unsignedinteger[Any]]
+    info: FrameInfo
+
+
+@dataclass(frozen=True)
+class BrokenFrame:
+    """A frame of which parts were lost on the way; nothing of it can be used, its number and time included.
+
+    Attributes:
+        detail: what is wrong with it, for people.
+    """
+
+    detail: str
 
 
 class Camera(Protocol):
     """A camera that is triggered. One thread at a time uses it."""
 
-    @property
-    def name(self) -> str:
-        """For people, e.g. ``in-phase camera (FLIR-12345678)``."""
-
-    @property
-    def frame_shape(self) -> tuple[int, int]:
-        """(rows, columns) of its frames; from `arm` on."""
-
-    @property
-    def bit_depth(self) -> int:
-        """Bits of a count."""
-
-    @property
-    def frame_numbers(self) -> int:
-        """After this number of a frame comes 1: 65535 where numbers have 16 bits and leave out 0."""
-
-    @property
-    def opened(self) -> int:
-        """How often it was opened. A camera that was opened anew begins with other numbers and another clock."""
+    name: str
+    """For people, e.g. ``in-phase camera (FLIR-12345678)``."""
+    bit_depth: int
+    """Bits of a count."""
+    frame_numbers: int
+    """After this number of a frame comes 1: 65535 where numbers have 16 bits and leave out 0."""
+    opened: int
+    """How often it was opened. A camera that was opened anew begins with other numbers and another clock."""
 
     def arm(self) -> None:
         """Open it unless it is open, set it up, drop frames from before; from here on a trigger makes a frame.
@@ -75,7 +65,7 @@ class Camera(Protocol):
             LostShotError: `Reason.CAMERA_GONE`.
         """
 
-    def frame(self, timeout_s: float) -> Frame | None:
+    def frame(self, timeout_s: float) -> Frame | BrokenFrame | None:
         """The next frame, or None where none comes within `timeout_s`; 0 takes what is there already.
 
         Raises:
@@ -87,3 +77,31 @@ class Camera(Protocol):
 
     def close(self) -> None:
         """Let go of it; `arm` opens it again."""
+
+
+class DrivenCamera:
+    """What the drivers of `Camera` have in common.
+
+    Args:
+        settings: which camera, and how it is set up.
+        frame_shape: (rows, columns) of the region that is read.
+        role: for people, e.g. ``in-phase camera``.
+    """
+
+    def __init__(self, settings: CameraSettings, frame_shape: tuple[int, int], role: str = "camera") -> None:
+        self._settings, self._shape, self._role = settings, frame_shape, role
+        self.name = f"{role} ({settings.label})"
+        self.bit_depth = bit_depth(settings.pixel_format)
+        self.frame_numbers = 2**64 - 1
+        self.opened = 0
+
+    def _absent(self, was_there: bool, got: str, expected: str, setting: str = "") -> SourceError | LostShotError:
+        """The error of a camera that is not there: it has gone away only if it was there."""
+        subject = f"{self.name}: {setting}" if setting else self.name
+        if was_there:
+            return LostShotError(subject, got, expected, Reason.CAMERA_GONE)
+        return SourceError(subject, got, expected)
+
+    def _unarmed(self, is_open: bool) -> SourceError | LostShotError:
+        was_there = self.opened > 0 and not is_open
+        return self._absent(was_there, "a camera that is not armed", "`arm` before it is used")

@@ -6,6 +6,7 @@ from enum import StrEnum
 
 from pydantic import BaseModel, ConfigDict
 
+from lightpage.recording.layout import FrameInfo
 from lightpage.runtime.device.cameras.settings import CameraSettings
 
 
@@ -24,23 +25,22 @@ class Task(_Message):
         settings: of its camera.
         frame_shape: (rows, columns) of the region that is read.
         memory: file descriptor of the shared memory that takes one frame as the camera packs it.
-        memory_bytes: its size.
     """
 
     settings: CameraSettings
     frame_shape: tuple[int, int]
     memory: int
-    memory_bytes: int
 
 
 class Do(StrEnum):
     """What the process can be asked for."""
 
     ARM = "ARM"
-    """Set it up, or set it up anew: answered by `Ready`."""
+    """Set it up, or set it up anew; the answer has `frame_numbers`."""
     FIRE = "FIRE"
     FRAME = "FRAME"
-    """Answered by `Arrived`, or by nothing more where no frame came."""
+    """The answer has `info` of a whole frame, which lies in the shared memory until the next request, or `fault` of one
+    that is not whole, or neither where none came."""
     DISARM = "DISARM"
 
 
@@ -74,38 +74,19 @@ class Failure(_Message):
     expected: str
 
 
-class Ready(_Message):
-    """A camera that is set up.
-
-    Attributes:
-        serial: of the camera, as the producer has it.
-        exposure_s: as read back; None where the camera knows no exposure.
-        frame_numbers: after this number of a frame comes 1.
-    """
-
-    serial: str
-    exposure_s: float | None
-    frame_numbers: int
-
-
-class Arrived(_Message):
-    """A frame; where it is whole it lies in the shared memory until the next request.
-
-    Attributes:
-        fault: why it is not whole, or empty.
-        frame_id, device_time_s, host_time_s: see `FrameInfo`.
-    """
-
-    fault: str = ""
-    frame_id: int = 0
-    device_time_s: float = 0.0
-    host_time_s: float = 0.0
-
-
 class Answer(_Message):
-    """Answer to a request; number 0 is the word that the camera is open, or why it cannot be."""
+    """Answer to a request.
+
+    Attributes:
+        number: of the request; 0 is the word that the camera is open, or why it cannot be.
+        failure: why it was not done, or None.
+        frame_numbers: of a camera that is set up: after this number of a frame comes 1.
+        fault: why a frame is not whole, or empty.
+        info: of a whole frame.
+    """
 
     number: int
     failure: Failure | None = None
-    ready: Ready | None = None
-    arrived: Arrived | None = None
+    frame_numbers: int = 0
+    fault: str = ""
+    info: FrameInfo | None = None

@@ -15,13 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.errors import FrameError, InvalidInputError
-from lightpage.recording.layout import frame_type
 
 Counts = NDArray[np.unsignedinteger[Any]]
 _Words = NDArray[np.uint64]
 
 _GROUP = 4
-"""Pixels that are packed and unpacked together, in one 64-bit word, 16 bits for each."""
+"""Pixels that are unpacked together, in one 64-bit word, 16 bits for each."""
 _BLOCK = 1 << 13
 """Groups at a time: what is worked on stays in the processor's cache."""
 
@@ -36,7 +35,6 @@ class PixelFormat:
         bit_depth: bits of a count.
         group_bytes: bytes of four pixels.
         spread: four packed pixels in the low bits of each word to 16 bits for each; None where they lie so already.
-        gather: the other way round.
     """
 
     name: str
@@ -44,7 +42,6 @@ class PixelFormat:
     bit_depth: int
     group_bytes: int
     spread: Callable[[_Words], _Words] | None = None
-    gather: Callable[[_Words], _Words] | None = None
 
     def nbytes(self, pixels: int) -> int:
         """Bytes of so many pixels."""
@@ -55,24 +52,18 @@ def _mask(value: int) -> np.uint64:
     return np.uint64(value)
 
 
-def _spread_12p(word: _Words) -> _Words:
-    pairs = word & _mask(0xFFFFFF) | (word & _mask(0xFFFFFF000000)) << _mask(8)
-    return pairs & _mask(0x00000FFF00000FFF) | (pairs & _mask(0x00FFF00000FFF000)) << _mask(4)
+def _spread_p(bits: int) -> Callable[[_Words], _Words]:
+    """Of GenICam's packing, which leaves no gaps between pixels."""
+    pair, first = (1 << 2 * bits) - 1, (1 << bits) - 1
+    pairs_low, pairs_high = _mask(pair), _mask(pair << 2 * bits)
+    firsts, seconds = _mask(first | first << 32), _mask((first | first << 32) << bits)
 
+    def spread(word: _Words) -> _Words:
+        pairs = word & pairs_low | (word & pairs_high) << _mask(32 - 2 * bits)
+        lanes: _Words = pairs & firsts | (pairs & seconds) << _mask(16 - bits)
+        return lanes
 
-def _gather_12p(word: _Words) -> _Words:
-    pairs = word & _mask(0x00000FFF00000FFF) | word >> _mask(4) & _mask(0x00FFF00000FFF000)
-    return pairs & _mask(0xFFFFFF) | pairs >> _mask(8) & _mask(0xFFFFFF000000)
-
-
-def _spread_10p(word: _Words) -> _Words:
-    pairs = word & _mask(0xFFFFF) | (word & _mask(0xFFFFF00000)) << _mask(12)
-    return pairs & _mask(0x000003FF000003FF) | (pairs & _mask(0x000FFC00000FFC00)) << _mask(6)
-
-
-def _gather_10p(word: _Words) -> _Words:
-    pairs = word & _mask(0x000003FF000003FF) | word >> _mask(6) & _mask(0x000FFC00000FFC00)
-    return pairs & _mask(0xFFFFF) | pairs >> _mask(12) & _mask(0xFFFFF00000)
+    return spread
 
 
 def _spread_packed(low_bits: int) -> Callable[[_Words], _Words]:
@@ -89,20 +80,7 @@ def _spread_packed(low_bits: int) -> Callable[[_Words], _Words]:
     return spread
 
 
-def _gather_packed(low_bits: int) -> Callable[[_Words], _Words]:
-    low = (1 << low_bits) - 1
-    first, second = _mask(low | low << 32), _mask(low << 16 | low << 48)
-    high, down = _mask(0x00FF00FF00FF00FF), _mask(low_bits)
-
-    def gather(word: _Words) -> _Words:
-        pairs = word >> down & high | (word & first) << _mask(8) | (word & second) >> _mask(4)
-        packed: _Words = pairs & _mask(0xFFFFFF) | pairs >> _mask(8) & _mask(0xFFFFFF000000)
-        return packed
-
-    return gather
-
-
-_FORMATS = {
+FORMATS = {
     known.name: known
     for known in (
         PixelFormat("Mono8", 0x01080001, 8, 4),
@@ -110,10 +88,10 @@ _FORMATS = {
         PixelFormat("Mono12", 0x01100005, 12, 8),
         PixelFormat("Mono14", 0x01100025, 14, 8),
         PixelFormat("Mono16", 0x01100007, 16, 8),
-        PixelFormat("Mono10Packed", 0x010C0004, 10, 6, _spread_packed(2), _gather_packed(2)),
-        PixelFormat("Mono12Packed", 0x010C0006, 12, 6, _spread_packed(4), _gather_packed(4)),
-        PixelFormat("Mono10p", 0x010A0046, 10, 5, _spread_10p, _gather_10p),
-        PixelFormat("Mono12p", 0x010C0047, 12, 6, _spread_12p, _gather_12p),
+        PixelFormat("Mono10Packed", 0x010C0004, 10, 6, _spread_packed(2)),
+        PixelFormat("Mono12Packed", 0x010C0006, 12, 6, _spread_packed(4)),
+        PixelFormat("Mono10p", 0x010A0046, 10, 5, _spread_p(10)),
+        PixelFormat("Mono12p", 0x010C0047, 12, 6, _spread_p(12)),
     )
 }
 
@@ -124,21 +102,9 @@ def pixel_format(name: str) -> PixelFormat:
     Raises:
         InvalidInputError: there is none that this program reads.
     """
-    if name not in _FORMATS:
-        raise InvalidInputError("pixel format", repr(name), ", ".join(_FORMATS))
-    return _FORMATS[name]
-
-
-def pixel_format_of(code: int) -> PixelFormat:
-    """The format of this code.
-
-    Raises:
-        InvalidInputError: there is none that this program reads.
-    """
-    for known in _FORMATS.values():
-        if known.code == code:
-            return known
-    raise InvalidInputError("pixel format", f"{code:#010x}", ", ".join(_FORMATS))
+    if name not in FORMATS:
+        raise InvalidInputError("pixel format", repr(name), ", ".join(FORMATS))
+    return FORMATS[name]
 
 
 def bit_depth(name: str) -> int:
@@ -219,35 +185,3 @@ def _unpack_words(
         block[: part.size] = part
         words[start : start + count] = spread(over[:count].astype(np.uint64))
     return words.view("<u2")[:pixels].astype(np.uint16, copy=False)
-
-
-def pack(counts: Counts, name: str) -> NDArray[np.uint8]:
-    """Counts as a camera sends them: the inverse of `unpack`.
-
-    Args:
-        counts: [row, column], of the format's bit depth.
-        name: of the pixel format.
-
-    Raises:
-        InvalidInputError: see `pixel_format`.
-        FrameError: a count that has more bits.
-    """
-    known = pixel_format(name)
-    if counts.dtype.kind != "u" or int(counts.max(initial=0)) >> known.bit_depth:
-        raise FrameError(f"frame in {name}", f"{counts.dtype} up to {counts.max(initial=0)}", f"{known.bit_depth} bits")
-    if known.gather is not None:
-        return _pack_words(counts, known.group_bytes, known.gather)
-    stored = np.ascontiguousarray(counts, frame_type(known.bit_depth).newbyteorder("<"))
-    return np.frombuffer(stored.tobytes(), np.uint8)
-
-
-def _pack_words(counts: Counts, group_bytes: int, gather: Callable[[_Words], _Words]) -> NDArray[np.uint8]:
-    groups = -(-counts.size // _GROUP)
-    lanes = np.zeros(groups * _GROUP, "<u2")
-    lanes[: counts.size] = counts.reshape(-1)
-    words = lanes.view("<u8")
-    out = np.empty((groups, group_bytes), np.uint8)
-    for start in range(0, groups, _BLOCK):
-        part = gather(words[start : start + _BLOCK].astype(np.uint64, copy=False)).astype("<u8", copy=False)
-        out[start : start + _BLOCK] = part.view(np.uint8).reshape(-1, 8)[:, :group_bytes]
-    return out.reshape(-1)[: -(-counts.size * group_bytes // _GROUP)]

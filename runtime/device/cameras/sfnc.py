@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Collection, Iterable
+
+from lightpage.runtime.device.cameras.settings import CameraSettings
 
 FRAME_SELECTORS = ("FrameStart", "FrameBurstStart")
 """Triggers that start a frame, the better one first."""
@@ -24,17 +26,52 @@ KEYS = {
 }
 """What is set because a key says so: the key, for errors."""
 
-EXPOSURE_TOLERANCE = 0.05
-"""Relative: cameras expose for whole lines of the sensor."""
-GAIN_TOLERANCE_DB = 0.1
-BLACK_LEVEL_TOLERANCE = 0.5
-
 QUIET_S = 0.02
 """No frame for so long after the start: those from before are out."""
 MOST_DRAINING_S = 0.5
 """A trigger that never rests is not waited for any longer."""
 SIGN_OF_LIFE_S = 0.05
 """A camera that sends no frame for so long is asked whether it is there."""
+
+
+def tolerance(key: str, value: float) -> float:
+    """By how much a number that is read back may differ; a camera exposes for whole lines of its sensor."""
+    return {"exposure_us": 0.05 * value, "gain_db": 0.1, "black_level_counts": 0.5}.get(key, 0.0)
+
+
+def trigger_features(settings: CameraSettings, selectors: Collection[str], knows_activation: bool) -> dict[str, str]:
+    """What a trigger is set to, in this order.
+
+    Args:
+        settings: of the camera.
+        selectors: triggers that it has.
+        knows_activation: a command has no edges, and a camera that knows none is taken at its word unless another one
+            than the usual is wanted.
+    """
+    selector = next((name for name in FRAME_SELECTORS if name in selectors), None)
+    wanted = {} if selector is None else {"TriggerSelector": selector}
+    wanted["TriggerSource"] = settings.trigger_source
+    if settings.trigger_source != "Software" and (settings.trigger_activation != "RisingEdge" or knows_activation):
+        wanted["TriggerActivation"] = settings.trigger_activation
+    return {**wanted, "TriggerMode": "On"}
+
+
+def refusal(
+    setting: str, asked: object, kept: object, told: str, offers: Callable[[], str]
+) -> tuple[str, object, object]:
+    """What an error says of a setting: subject, what came and what was wanted; by its key, where a key says so.
+
+    Args:
+        setting: its feature, or its key.
+        asked: what the camera was asked for.
+        kept: what it made of that, or None where it refused.
+        told: why it refused.
+        offers: what it takes, for people; empty where it does not say.
+    """
+    if setting not in KEYS:
+        return setting, told if kept is None else kept, asked
+    got = asked if kept is None else f"{asked}, of which the camera makes {kept}"
+    return KEYS[setting], got, offers() or f"what the camera knows{f' ({told})' if told else ''}"
 
 
 def describe_region(x: int, y: int, columns: int, rows: int) -> str:
@@ -50,11 +87,6 @@ def one_of(entries: Iterable[str]) -> str:
 def between(least: float, most: float) -> str:
     """The same of a number."""
     return f"{least:.10g} to {most:.10g}"
-
-
-def asked_for(value: object, kept: object = None) -> str:
-    """What a camera was asked for, and what it made of it, where it refused nothing."""
-    return str(value) if kept is None else f"{value}, of which the camera makes {kept}"
 
 
 def frame_numbers(is_gige: bool, extended_ids: bool) -> int:

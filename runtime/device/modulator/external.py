@@ -30,10 +30,9 @@ class Announcement(Generic[T]):
         self._changes = 0
         self._asked = False
 
-    def wanted(self, timeout_s: float = 0.0) -> T | None:
-        """What is being waited for, or None where nothing is, nor comes to be within `timeout_s`."""
+    def wanted(self) -> T | None:
+        """What is being waited for, or None where nothing is."""
         with self._changed:
-            self._clock.wait_for(self._changed, lambda: self._wanted is not None, timeout_s)
             self._asked = self._asked or self._wanted is not None
             return self._wanted
 
@@ -62,7 +61,6 @@ class Announcement(Generic[T]):
         """Ask for something, until it is there, and do not wait for it."""
         with self._changed:
             self._wanted = what
-            self._changed.notify_all()
 
     def wait(self, what: T, timeout_s: float) -> tuple[T | None, int]:
         """Ask for something until it is there or the time is up.
@@ -100,9 +98,9 @@ class ExternalModulator:
         self._pages = Announcement[int](clock)
         self._at_last_show = -1
 
-    def wanted(self, timeout_s: float = 0.0) -> int | None:
-        """The page that is being waited for, or None where none is, nor comes to be within `timeout_s`."""
-        return self._pages.wanted(timeout_s)
+    def wanted(self) -> int | None:
+        """The page that is being waited for, or None where none is."""
+        return self._pages.wanted()
 
     def shown(self, page: int) -> None:
         """The controller says: page number `page` is on display, and its liquid crystal has settled."""
@@ -152,9 +150,9 @@ class ExternalBeams:
         self._timeout_s = timeout_s
         self._states = Announcement[BeamState](clock)
 
-    def wanted(self, timeout_s: float = 0.0) -> BeamState | None:
-        """What is being waited for, or None where nothing is, nor comes to be within `timeout_s`."""
-        return self._states.wanted(timeout_s)
+    def wanted(self) -> BeamState | None:
+        """What is being waited for, or None where nothing is."""
+        return self._states.wanted()
 
     def beams_set(self, *, signal: bool, reference: bool) -> None:
         """The controller says: so are the beams now, and they have settled."""

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from lightpage.errors import InvalidInputError, PageError
+from lightpage.errors import InvalidInputError
 from lightpage.files import read_text
-from lightpage.page.symbols import check_levels
 
 GREYS = 256
 """Grey values of a modulator: 8 bits."""
@@ -23,80 +21,41 @@ _COMMENT = re.compile(r"#.*")
 _SEPARATOR = re.compile(r"[\s,;]+")
 
 
-@dataclass(frozen=True)
-class LookupTable:
-    """Grey value of each level.
+def linear_table(levels: int) -> NDArray[np.uint8]:
+    """Grey values [M] of a modulator whose 256 grey values span one wave evenly: grey = round(256 level / M)."""
+    return (np.arange(levels) * GREYS / levels).round().astype(np.uint8)
 
-    Attributes:
-        greys: uint8 [M], all different.
+
+def read_table(path: Path, levels: int) -> NDArray[np.uint8]:
+    """Grey values [M], all different, of a text file: numbers between commas, semicolons or white space.
+
+    Comments begin with ``#``. The first line says which of two forms the file has:
+
+    - ``phase_rad grey``: a calibration of the modulator. Each line below it has a phase in radians and the grey value
+      that shows it. Phases may be wrapped, and differ by less than pi from one grey value to the next. Level k gets the
+      grey value that lies 2 pi k / M above the lowest phase, interpolated and rounded; a phase that all levels share
+      makes no difference to a page.
+    - ``grey``, or the first number: grey values of level 0, 1, ... M - 1, in lines of any length.
+
+    Args:
+        path: the file.
+        levels: M, 2 to 256.
+
+    Raises:
+        InvalidInputError: a file that cannot be read; not a number; a grey value that is not whole or not in 0..255;
+            another count than M; two levels of one grey value; a calibration whose phase does not rise or fall all
+            along, or that spans too little for M levels.
     """
-
-    greys: NDArray[np.uint8]
-
-    @property
-    def levels(self) -> int:
-        """M."""
-        return self.greys.size
-
-    @classmethod
-    def linear(cls, levels: int) -> LookupTable:
-        """The table of a modulator whose 256 grey values span one wave evenly: grey = round(256 level / M).
-
-        Raises:
-            PageError: a level count outside 2..256.
-        """
-        check_levels(levels)
-        return cls((np.arange(levels) * GREYS / levels).round().astype(np.uint8))
-
-    @classmethod
-    def from_file(cls, path: str | Path, levels: int) -> LookupTable:
-        """Read a table from a text file: numbers separated by commas, semicolons or white space, comments after ``#``.
-
-        The first line says which of two forms it has:
-
-        - ``phase_rad grey``: a calibration of the modulator. Each line below it has a phase in radians and the grey
-          value that shows it. Phases may be wrapped, and differ by less than pi from one grey value to the next. Level
-          k gets the grey value that lies 2 pi k / M above the lowest phase, interpolated and rounded; a phase that all
-          levels share makes no difference to a page.
-        - ``grey``, or the first number: grey values of level 0, 1, ... M - 1, in lines of any length.
-
-        Args:
-            path: the file.
-            levels: M.
-
-        Raises:
-            InvalidInputError: a file that cannot be read; not a number; a grey value that is not whole or not in
-                0..255; another count than M; two levels of one grey value; a calibration whose phase does not rise or
-                fall all along, or that spans too little for M levels.
-            PageError: a level count outside 2..256.
-        """
-        check_levels(levels)
-        subject = f"lookup table {path}"
-        text = read_text(path, subject, "a readable text file")
-        lines = [
-            (number, words)
-            for number, line in enumerate(text.splitlines(), 1)
-            if (words := [word for word in _SEPARATOR.split(_COMMENT.sub("", line)) if word])
-        ]
-        if lines and lines[0][1] == CALIBRATION_HEADER:
-            return cls(_different(_of_calibration(lines[1:], levels, subject), subject))
-        return cls(_different(_of_levels(lines, levels, subject), subject))
-
-    def greys_of(self, symbols: ArrayLike, levels: int) -> NDArray[np.uint8]:
-        """Grey values of `symbols`, uint8 in their shape.
-
-        Raises:
-            PageError: symbols of another number of levels than the table has, or beyond them.
-        """
-        array = np.asarray(symbols)
-        if levels != self.levels:
-            raise PageError("page to show", f"{levels} levels", f"{self.levels} levels, as the lookup table has")
-        if array.dtype.kind not in "ui":
-            raise PageError("page to show", f"type {array.dtype}", "whole numbers")
-        if array.size and not 0 <= int(array.min()) <= int(array.max()) < levels:
-            raise PageError("page to show", f"values from {array.min()} to {array.max()}", f"0 to {levels - 1}")
-        greys: NDArray[np.uint8] = self.greys[array]
-        return greys
+    subject = f"lookup table {path}"
+    text = read_text(path, subject, "a readable text file")
+    lines = [
+        (number, words)
+        for number, line in enumerate(text.splitlines(), 1)
+        if (words := [word for word in _SEPARATOR.split(_COMMENT.sub("", line)) if word])
+    ]
+    if lines and lines[0][1] == CALIBRATION_HEADER:
+        return _different(_of_calibration(lines[1:], levels, subject), subject)
+    return _different(_of_levels(lines, levels, subject), subject)
 
 
 Line = tuple[int, list[str]]

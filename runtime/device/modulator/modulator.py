@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 class Modulator(Protocol):
     """A light modulator. One thread at a time uses it."""
 
-    @property
-    def name(self) -> str:
-        """For people, e.g. ``screen :0.1``."""
+    name: str
+    """For people, e.g. ``screen :0.1``."""
 
     def open(self, timeout_s: float, levels: int | None = None) -> None:
         """Connect, unless that is done: with this, wrong settings show before the first page.
@@ -51,9 +50,8 @@ class Modulator(Protocol):
 class Beams(Protocol):
     """Lets the beams through, or blocks them. One thread at a time uses it."""
 
-    @property
-    def name(self) -> str:
-        """For people, e.g. ``shutters on channels C and D``."""
+    name: str
+    """For people, e.g. ``shutters on channels C and D``."""
 
     def let_through(self, *, signal: bool, reference: bool) -> None:
         """Open and close both; returns once they have moved. After `close` both are open.

@@ -10,7 +10,7 @@ from pydantic import ConfigDict, Field
 
 from lightpage.clock import SYSTEM, Clock
 from lightpage.device.profile import TomlTable
-from lightpage.errors import InvalidInputError, LightpageError, LostShotError, Reason, SourceError
+from lightpage.errors import LightpageError, LostShotError, Reason, SourceError
 from lightpage.runtime.device.trigger.pulse_generator import Channel, PulseGenerator
 
 _log = logging.getLogger(__name__)
@@ -43,14 +43,9 @@ class ShutterBeams:
         generator: whose channels move the shutters; it may be the cameras' trigger as well.
         signal, reference: the shutters.
         clock: by which they settle.
-
-    Raises:
-        InvalidInputError: both are on one channel.
     """
 
     def __init__(self, generator: PulseGenerator, signal: Shutter, reference: Shutter, clock: Clock = SYSTEM) -> None:
-        if signal.channel == reference.channel:
-            raise InvalidInputError("shutters of signal and reference", f"channel {signal.channel} for both", "two")
         self._generator, self._signal, self._reference, self._clock = generator, signal, reference, clock
         self._moved = False
         self.name = f"shutters on channels {signal.channel} and {reference.channel} of {generator.name}"

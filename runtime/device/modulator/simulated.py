@@ -59,14 +59,14 @@ class SimulatedModulator:
         self._ask({"signal": signal, "reference": reference}, b"", ANSWER_S, Reason.BEAM_CONTROL_FAILED)
         self._blocks = not (signal and reference)
 
-    def drift(self, device: Device, timeout_s: float = ANSWER_S) -> None:
+    def drift(self, device: Device) -> None:
         """Let the simulated device drift to another true state; the next page that is shown shows it.
 
         Raises:
             LostShotError: the device has gone.
             SourceError: there is none.
         """
-        self._ask({"device": to_toml(device)}, b"", timeout_s, Reason.NOT_ON_DISPLAY)
+        self._ask({"device": to_toml(device)}, b"", ANSWER_S, Reason.NOT_ON_DISPLAY)
 
     def close(self) -> None:
         """See `Modulator` and `Beams`."""

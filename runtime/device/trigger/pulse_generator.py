@@ -8,12 +8,13 @@ from __future__ import annotations
 import logging
 import re
 import threading
+from collections.abc import Callable
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
 from lightpage.clock import SYSTEM, Clock
-from lightpage.errors import InvalidInputError, LostShotError, Reason, SourceError
+from lightpage.errors import LostShotError, Reason, SourceError
 from lightpage.runtime.device.trigger.scpi_line import ScpiLine
 from lightpage.runtime.device.trigger.scpi_port import LineTimes
 
@@ -33,7 +34,7 @@ _TRIGGER_MODES = {"single": "DIS", "software": "TRIG"}
 Channel = Annotated[int, Field(ge=1, le=CHANNELS)]
 
 
-class PulseGeneratorSettings(BaseModel):
+class PulseGeneratorSettings(LineTimes):
     """How the pulse generator is reached, and what it does.
 
     Attributes:
@@ -46,13 +47,7 @@ class PulseGeneratorSettings(BaseModel):
         fire: ``single``: starting T0, which is in single-shot mode, is the shot; ``software``: T0 waits for an edge,
             and ``*TRG`` stands for one.
         reset: send ``*RST`` before anything is set.
-        answer_s: longest wait for an answer.
-        quiet_s: silence that shows that no answer is on its way.
-        late_s: longest wait for an identification that is late.
-        synchronise_s: longest wait until the line is in order after it was not.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     port: Annotated[str, Field(min_length=1)]
     baud: Annotated[int, Field(ge=1200, le=4_000_000)] = 115200
@@ -62,10 +57,6 @@ class PulseGeneratorSettings(BaseModel):
     polarity: Literal["normal", "inverted"] = "normal"
     fire: Literal["single", "software"] = "single"
     reset: bool = False
-    answer_s: Annotated[float, Field(ge=0.02, le=10.0)] = 0.5
-    quiet_s: Annotated[float, Field(ge=0.005, le=1.0)] = 0.05
-    late_s: Annotated[float, Field(ge=0.02, le=10.0)] = 1.0
-    synchronise_s: Annotated[float, Field(ge=0.2, le=60.0)] = 4.0
 
     @field_validator("channels")
     @classmethod
@@ -73,11 +64,6 @@ class PulseGeneratorSettings(BaseModel):
         if len(set(channels)) != len(channels):
             raise ValueError("a channel twice, wanted each once")
         return channels
-
-    @property
-    def times(self) -> LineTimes:
-        """How long is waited on the line."""
-        return LineTimes(self.answer_s, self.quiet_s, self.late_s, self.synchronise_s)
 
 
 class PulseGenerator:
@@ -93,7 +79,7 @@ class PulseGenerator:
 
     def __init__(self, settings: PulseGeneratorSettings, clock: Clock = SYSTEM) -> None:
         self.settings = settings
-        self._line = ScpiLine(settings.port, settings.baud, settings.times, clock)
+        self._line = ScpiLine(settings.port, settings.baud, settings, clock)
         self.name = self._line.name
         self._lock = threading.RLock()
         """Held during each of the methods: a shot does not come between the steps of a set-up."""
@@ -101,11 +87,6 @@ class PulseGenerator:
         """Session of the line in which the device was set up."""
         self._switched: dict[int, bool] = {}
         """Other channels, as the next `arm` switches them."""
-
-    @property
-    def identity(self) -> str | None:
-        """Maker, model, serial number and versions, once connected."""
-        return self._line.identity
 
     @property
     def reached(self) -> bool:
@@ -170,17 +151,9 @@ class PulseGenerator:
         low while it is off. The device need not be armed.
 
         Raises:
-            InvalidInputError: there is no such channel, or it triggers a camera.
             LostShotError: `Reason.TRIGGER_GONE`, `Reason.TRIGGER_REFUSED`.
             SourceError: the device says `ok` and does something else.
         """
-        if not 1 <= channel <= CHANNELS or channel in self.settings.channels:
-            cameras = ", ".join(map(str, self.settings.channels))
-            raise InvalidInputError(
-                f"{self.name}: channel to switch",
-                channel,
-                f"one of 1 to {CHANNELS} and none of the cameras' ({cameras})",
-            )
         with self._lock:
             self._line.send(f":PULSE{channel}:POL INV")
             self._switch(channel, on, self._line.session)
@@ -191,23 +164,11 @@ class PulseGenerator:
         with self._lock:
             self._switched[channel] = on
 
-    def channel_state(self, channel: int) -> bool:
-        """Whether a channel is on, as the device says; connects if needed.
-
-        Raises:
-            InvalidInputError: there is no such channel.
-            LostShotError: `Reason.TRIGGER_GONE`, `Reason.TRIGGER_REFUSED`.
-        """
-        if not 1 <= channel <= CHANNELS:
-            raise InvalidInputError(f"{self.name}: channel", channel, f"1 to {CHANNELS}")
-        with self._lock:
-            return self._line.query(f":PULSE{channel}:STATE?", _STATE).upper() in _ON
-
     def _switch(self, channel: int, on: bool, session: int) -> None:
         prefix = f":PULSE{channel}"
-        self._set_words({f"{prefix}:POL": "INV"}, session)
-        self._set_times({f"{prefix}:WIDT": RESOLUTION_S}, session)
-        self._set_states({f"{prefix}:STATE": on}, session)
+        self._set_word(f"{prefix}:POL", "INV", session)
+        self._set_time(f"{prefix}:WIDT", RESOLUTION_S, session)
+        self._set_state(f"{prefix}:STATE", on, session)
 
     def _set_up(self) -> int:
         """Set everything and read it back; returns the session in which that was."""
@@ -216,13 +177,15 @@ class PulseGenerator:
         session = self._line.session
         if settings.reset:
             self._line.send("*RST", session)
-        self._set_words({":PULSE0:MODE": "SING", ":PULSE0:TRIG:MODE": _TRIGGER_MODES[settings.fire]}, session)
+        self._set_word(":PULSE0:MODE", "SING", session)
+        self._set_word(":PULSE0:TRIG:MODE", _TRIGGER_MODES[settings.fire], session)
         for channel in settings.channels:
             prefix = f":PULSE{channel}"
-            self._set_words({f"{prefix}:POL": _POLARITIES[settings.polarity]}, session)
+            self._set_word(f"{prefix}:POL", _POLARITIES[settings.polarity], session)
             self._pulse_at_each_shot(prefix, session)
-            self._set_times({f"{prefix}:WIDT": settings.width_s, f"{prefix}:DELAY": settings.delay_s}, session)
-            self._set_states({f"{prefix}:STATE": True}, session)
+            self._set_time(f"{prefix}:WIDT", settings.width_s, session)
+            self._set_time(f"{prefix}:DELAY", settings.delay_s, session)
+            self._set_state(f"{prefix}:STATE", True, session)
         for channel, on in self._switched.items():
             self._switch(channel, on, session)
         return session
@@ -230,32 +193,25 @@ class PulseGenerator:
     def _pulse_at_each_shot(self, prefix: str, session: int) -> None:
         """Take back a divider or a burst of a channel; a device that knows neither refuses, and has none."""
         try:
-            self._set_words({f"{prefix}:CMOD": "NORM"}, session)
+            self._set_word(f"{prefix}:CMOD", "NORM", session)
         except LostShotError as error:
             if error.reason is not Reason.TRIGGER_REFUSED:
                 raise
 
-    def _set_words(self, values: dict[str, str], session: int) -> None:
-        """Keywords, of which the device may answer the long form or the short one."""
-        for setting, value in values.items():
-            self._line.send(f"{setting} {value}", session)
-            found = self._line.query(f"{setting}?", _WORD, session)
-            if not found.upper().startswith(value):
-                raise SourceError(f"{self.name}: {setting}", f"{found} after {value} was set", value)
+    def _set_word(self, setting: str, value: str, session: int) -> None:
+        """Set a keyword, of which the device may answer the long form or the short one."""
+        self._set(setting, value, _WORD, lambda found: found.upper().startswith(value), session)
 
-    def _set_times(self, values: dict[str, float], session: int) -> None:
-        for setting, value in values.items():
-            self._line.send(f"{setting} {value:.11f}", session)
-            found = self._line.query(f"{setting}?", _NUMBER, session)
-            if abs(float(found) - value) > RESOLUTION_S:
-                raise SourceError(
-                    f"{self.name}: {setting}", f"{found} s after {value:.11f} s was set", f"{value:.11f} s"
-                )
+    def _set_time(self, setting: str, value: float, session: int) -> None:
+        self._set(setting, f"{value:.11f}", _NUMBER, lambda found: abs(float(found) - value) <= RESOLUTION_S, session)
 
-    def _set_states(self, values: dict[str, bool], session: int) -> None:
-        for setting, value in values.items():
-            word = "ON" if value else "OFF"
-            self._line.send(f"{setting} {word}", session)
-            found = self._line.query(f"{setting}?", _STATE, session)
-            if (found.upper() in _ON) != value:
-                raise SourceError(f"{self.name}: {setting}", f"{found} after {word} was set", word)
+    def _set_state(self, setting: str, on: bool, session: int) -> None:
+        self._set(setting, "ON" if on else "OFF", _STATE, lambda found: (found.upper() in _ON) == on, session)
+
+    def _set(
+        self, setting: str, value: str, answer: re.Pattern[str], holds: Callable[[str], bool], session: int
+    ) -> None:
+        self._line.send(f"{setting} {value}", session)
+        found = self._line.query(f"{setting}?", answer, session)
+        if not holds(found):
+            raise SourceError(f"{self.name}: {setting}", f"{found} after {value} was set", value)

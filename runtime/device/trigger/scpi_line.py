@@ -5,33 +5,24 @@ A caller that gives up takes nothing with it: the answer that may still come bel
 
 from __future__ import annotations
 
-import queue
 import re
 import threading
-from concurrent.futures import Future
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from typing import TypeVar
 
 from lightpage.clock import SYSTEM, Clock
-from lightpage.errors import InvalidInputError, LostShotError, Reason
+from lightpage.errors import LostShotError, Reason
 from lightpage.runtime.device.trigger.scpi_port import LineTimes, ScpiPort
+
+T = TypeVar("T")
 
 _DONE = re.compile("ok", re.IGNORECASE)
 _STOP_S = 2.0
-"""Longest wait for the thread at `close`."""
+"""Longest wait for the port at `close`."""
 _GRACE_S = 0.5
 """A caller waits so much longer than the thread, whose error says more."""
-
-
-@dataclass(frozen=True)
-class _Request:
-    """A message that a caller waits for; its result is the answer and the middle of its sending."""
-
-    message: str
-    answer: re.Pattern[str]
-    twice: bool
-    session: int | None
-    deadline: float
-    result: Future[tuple[str, float]] = field(default_factory=Future)
 
 
 class ScpiLine:
@@ -52,94 +43,59 @@ class ScpiLine:
         self._clock = clock
         self._port = ScpiPort(port, baud, self._times, clock)
         self.name = self._port.name
-        self._requests: queue.SimpleQueue[_Request | None] = queue.SimpleQueue()
-        self._lock = threading.Lock()
-        """Guards the thread's start and end."""
-        self._thread: threading.Thread | None = None
+        self._owner = ThreadPoolExecutor(1, self.name)
+        """Its only thread is the only one that touches the port."""
 
     @property
     def session(self) -> int:
         """Grows when the line is opened or synchronised; 0 before. In between, every message has been answered."""
         return self._port.session
 
-    @property
-    def identity(self) -> str | None:
-        """What the device answered to ``*IDN?``, last time; None before."""
-        return self._port.identity
-
-    def send(self, command: str, session: int | None = None, timeout_s: float | None = None) -> float:
+    def send(self, command: str, session: int | None = None) -> float:
         """Send a command, wait for its ``ok``, return the middle of its sending by the clock.
 
         Args:
-            command: without line end.
+            command: a line of ASCII without its end.
             session: send it only if the line was not interrupted since this session; None connects where needed.
-            timeout_s: longest wait; None for as long as connecting and synchronising may take.
 
         Raises:
             LostShotError: `Reason.TRIGGER_GONE`: no ``ok``, and it may or may not have been done;
                 `Reason.TRIGGER_REFUSED`: the device answers that it cannot.
             SourceError: the port's name or the baud rate makes no sense.
-            InvalidInputError: this is no single line of ASCII.
         """
-        return self._wait(command, _DONE, False, session, timeout_s)[1]
+        return self._wait(self._port.ask, command, _DONE, session)[1]
 
-    def query(
-        self, question: str, answer: re.Pattern[str], session: int | None = None, timeout_s: float | None = None
-    ) -> str:
+    def query(self, question: str, answer: re.Pattern[str], session: int | None = None) -> str:
         """Ask and return the answer. It is asked twice, so that an answer that the line altered is seen.
 
         Args:
             question: without line end.
             answer: what an answer looks like, all of it; anything else is none.
-            session, timeout_s: see `send`.
+            session: see `send`.
 
         Raises:
-            LostShotError, SourceError, InvalidInputError: see `send`.
+            LostShotError, SourceError: see `send`.
         """
-        return self._wait(question, answer, True, session, timeout_s)[0]
+        return self._wait(self._port.ask_twice, question, answer, session)
 
     def close(self) -> None:
-        """Let go of the line and end the thread; the next message opens it again."""
-        with self._lock:
-            thread = self._thread
-            if thread is None:
-                return
-            self._requests.put(None)
-            thread.join(_STOP_S)
-            if not thread.is_alive():
-                self._thread = None
+        """Let go of the line; the next message opens it again."""
+        with suppress(TimeoutError):
+            self._owner.submit(self._port.close).result(_STOP_S)
 
     def _wait(
-        self, message: str, answer: re.Pattern[str], twice: bool, session: int | None, timeout_s: float | None
-    ) -> tuple[str, float]:
-        if not (message.isascii() and message.isprintable() and message):
-            raise InvalidInputError(f"{self.name}: message", repr(message), "one line of printable ASCII")
-        timeout_s = self._times.longest_s if timeout_s is None else timeout_s
-        request = _Request(message, answer, twice, session, self._clock.now() + timeout_s)
-        with self._lock:
-            if self._thread is None or not self._thread.is_alive():
-                self._thread = threading.Thread(target=self._own, name=self.name, daemon=True)
-                self._thread.start()
-            self._requests.put(request)
+        self,
+        ask: Callable[[str, re.Pattern[str], int | None, float], T],
+        message: str,
+        answer: re.Pattern[str],
+        session: int | None,
+    ) -> T:
+        timeout_s = self._times.longest_s
+        result = self._owner.submit(ask, message, answer, session, self._clock.now() + timeout_s)
         answered = threading.Event()
-        request.result.add_done_callback(lambda _: answered.set())
+        result.add_done_callback(lambda _: answered.set())
         if not self._clock.wait(answered, timeout_s + _GRACE_S):
-            request.result.cancel()
-            raise LostShotError(
-                self.name, f"{message} not answered within {timeout_s:g} s", "an answer", Reason.TRIGGER_GONE
-            )
-        return request.result.result()
-
-    def _own(self) -> None:
-        """Serve callers until told to stop; only this thread touches the port."""
-        while (request := self._requests.get()) is not None:
-            if not request.result.set_running_or_notify_cancel():
-                continue
-            ask = request.message, request.answer, request.session, request.deadline
-            try:
-                done = (self._port.ask_twice(*ask), 0.0) if request.twice else self._port.ask(*ask)
-            except BaseException as error:  # noqa: BLE001, RUF100 — whatever it is, it is the caller's
-                request.result.set_exception(error)
-            else:
-                request.result.set_result(done)
-        self._port.close()
+            result.cancel()
+            told = f"{message} not answered within {timeout_s:g} s"
+            raise LostShotError(self.name, told, "an answer", Reason.TRIGGER_GONE)
+        return result.result()

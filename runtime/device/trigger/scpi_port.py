@@ -14,8 +14,10 @@ import os
 import re
 import termios
 from collections import Counter
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from contextlib import suppress
+from typing import TYPE_CHECKING, Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
 
 from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import LostShotError, Reason, SourceError
@@ -54,21 +56,22 @@ _ROUNDS = 2
 """Identifications in a row, each with silence after, that make a port synchronised."""
 
 
-@dataclass(frozen=True)
-class LineTimes:
+class LineTimes(BaseModel):
     """How long is waited on a line.
 
     Attributes:
         answer_s: for an answer.
-        quiet_s: silence that makes a line quiet.
+        quiet_s: silence that shows that no answer is on its way.
         late_s: for an identification that is due while another has come already; what is later still is taken as lost.
         synchronise_s: for synchronising, all in all.
     """
 
-    answer_s: float = 0.5
-    quiet_s: float = 0.05
-    late_s: float = 1.0
-    synchronise_s: float = 4.0
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    answer_s: Annotated[float, Field(ge=0.02, le=10.0)] = 0.5
+    quiet_s: Annotated[float, Field(ge=0.005, le=1.0)] = 0.05
+    late_s: Annotated[float, Field(ge=0.02, le=10.0)] = 1.0
+    synchronise_s: Annotated[float, Field(ge=0.2, le=60.0)] = 4.0
 
     @property
     def longest_s(self) -> float:
@@ -158,10 +161,8 @@ class ScpiPort:
         self._buffer.clear()
         self._given_up, self._due = self._given_up + self._due, 0
         if port is not None:
-            try:
+            with suppress(*GONE):
                 port.close()
-            except GONE:
-                return
 
     def _ready(self, session: int | None) -> Serial:
         """The open port, synchronised."""

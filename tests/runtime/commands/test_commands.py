@@ -24,7 +24,7 @@ from lightpage.recording.reader import Recording, RecordingWriter
 from lightpage.runtime.client.answers import RemotePage
 from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.commands.client import recalibrate as cli_recalibrate
-from lightpage.runtime.device.acquisition.sources import open_source
+from lightpage.runtime.device.acquisition.source import open_source
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.recalibration import Refit

@@ -1,13 +1,48 @@
-"""A page as the picture that a modulator shows."""
+"""The settings of a modulator that is a monitor, and a page as the picture that it shows."""
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
 
-from lightpage.device.profile import Profile
-from lightpage.errors import InvalidInputError, PageError
-from lightpage.runtime.device.modulator.settings import RasterSettings
+from lightpage.device.profile import Profile, Side, TomlTable
+from lightpage.errors import InvalidInputError
+
+Offset = Annotated[int, Field(ge=-30_000, le=30_000)]
+
+
+class ScreenSettings(TomlTable):
+    """A modulator that is a monitor of an X server, and where a page lies on it.
+
+    Pixels are the modulator's; row 0 is its upper edge, column 0 its left one.
+
+    Attributes:
+        rows_px, columns_px: the modulator's resolution.
+        offset_x_px: how far right of the modulator's centre the page's centre lies.
+        offset_y_px: how far below it.
+        flip_x: mirror the page, left for right; it stays where it is.
+        flip_y: mirror the page, top for bottom; it stays where it is.
+        background_grey: grey value beside the page.
+        x_display: the server, and its screen, as in ``:0`` or ``:0.1``; None for that of the variable DISPLAY.
+        monitor: which monitor of that screen, from 0, in the order of ``xrandr --listactivemonitors``.
+        settle_s: wait after the display has scanned the page out once, for the liquid crystal, seconds.
+    """
+
+    model_config = ConfigDict(strict=True)
+
+    rows_px: Side
+    columns_px: Side
+    offset_x_px: Offset = 0
+    offset_y_px: Offset = 0
+    flip_x: bool = False
+    flip_y: bool = False
+    background_grey: Annotated[int, Field(ge=0, le=255)] = 0
+    x_display: Annotated[str, Field(min_length=1)] | None = None
+    monitor: Annotated[int, Field(ge=0, le=99)] = 0
+    settle_s: Annotated[float, Field(ge=0, le=60, allow_inf_nan=False)] = 0.05
 
 
 class Raster:
@@ -21,22 +56,15 @@ class Raster:
         InvalidInputError: the page does not lie on the modulator.
     """
 
-    def __init__(self, profile: Profile, settings: RasterSettings) -> None:
-        self._page_shape = profile.page_shape
+    def __init__(self, profile: Profile, settings: ScreenSettings) -> None:
         self._symbol_size_px = profile.page.symbol_size_px
         self._settings = settings
-        rows, columns = (count * self._symbol_size_px for count in self._page_shape)
+        rows, columns = (count * self._symbol_size_px for count in profile.page_shape)
         self._rows = _span("rows", rows, settings.rows_px, settings.offset_y_px)
         self._columns = _span("columns", columns, settings.columns_px, settings.offset_x_px)
 
     def image(self, greys: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The picture, uint8 [rows_px, columns_px], of a page of grey values [ny, nx].
-
-        Raises:
-            PageError: a page of another shape than the device's.
-        """
-        if greys.shape != self._page_shape:
-            raise PageError("page to show", f"shape {greys.shape}", f"shape {self._page_shape}")
+        """The picture, uint8 [rows_px, columns_px], of a page of grey values [ny, nx]."""
         settings = self._settings
         placed = greys[:: -1 if settings.flip_y else 1, :: -1 if settings.flip_x else 1]
         image = np.full((settings.rows_px, settings.columns_px), settings.background_grey, np.uint8)

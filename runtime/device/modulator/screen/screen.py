@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 from lightpage.clock import SYSTEM, Clock
 from lightpage.device.profile import Profile
 from lightpage.errors import LostShotError, Reason, SourceError
-from lightpage.runtime.device.modulator.lookup_table import LookupTable
-from lightpage.runtime.device.modulator.screen.raster import Raster
+from lightpage.runtime.device.modulator.screen.raster import Raster, ScreenSettings
 from lightpage.runtime.device.modulator.screen.window_process import WindowProcess
-from lightpage.runtime.device.modulator.settings import ScreenSettings
 
 ANSWER_S = 1.0
 """Longest wait for the window's process to say whether the page is still on display."""
@@ -32,7 +30,7 @@ class ScreenModulator:
     Args:
         settings: which monitor, its resolution, and where the page lies.
         profile: how large page and symbols are.
-        lookup_table: grey value of each level, or what makes a table for a number of levels.
+        table_of: makes a lookup table, the grey value of each level, for a number of levels.
         window: opens a window, in a process of its own.
         clock: by which it waits; that of the window.
 
@@ -44,26 +42,18 @@ class ScreenModulator:
         self,
         settings: ScreenSettings,
         profile: Profile,
-        lookup_table: LookupTable | Callable[[int], LookupTable],
+        table_of: Callable[[int], NDArray[np.uint8]],
         window: Callable[[ScreenSettings], WindowProcess] = WindowProcess,
         clock: Clock = SYSTEM,
     ) -> None:
+        display = settings.x_display or os.environ.get("DISPLAY", "without DISPLAY")
+        self.name = f"screen {display}, monitor {settings.monitor}"
         self._settings, self._make_window, self._clock = settings, window, clock
         self._raster = Raster(profile, settings)
-        self._table_of: Callable[[int], LookupTable]
-        if isinstance(lookup_table, LookupTable):
-            self._table_of = lambda levels: lookup_table
-        else:
-            self._table_of = cache(lookup_table)
+        self._table_of = cache(table_of)
         self._window: WindowProcess | None = None
         self._was_open = False
         self._has_page = False
-
-    @property
-    def name(self) -> str:
-        """For people, e.g. ``screen :0.1, monitor 0``."""
-        display = self._settings.x_display or os.environ.get("DISPLAY", "without DISPLAY")
-        return f"screen {display}, monitor {self._settings.monitor}"
 
     def open(self, timeout_s: float, levels: int | None = None) -> None:
         """Open the window unless it is open; see `Modulator`.
@@ -81,7 +71,6 @@ class ScreenModulator:
         """Show a page and return once it is on display; see `Modulator`.
 
         Raises:
-            PageError: symbols of another shape or another number of levels.
             InvalidInputError: there is no lookup table for so many levels.
             SourceError: see `open`.
             LostShotError: `Reason.NOT_ON_DISPLAY`: not by then, or the window, or the X server, has gone away, or
@@ -89,7 +78,7 @@ class ScreenModulator:
         """
         deadline = self._clock.now() + timeout_s
         subject = f"page {page} on {self.name}"
-        image = self._raster.image(self._table_of(levels).greys_of(symbols, levels))
+        image = self._raster.image(self._table_of(levels)[symbols])
         self._has_page = False
         window = self._opened(subject, deadline)
         try:

@@ -13,8 +13,8 @@ from queue import Empty, SimpleQueue
 
 from lightpage.errors import SourceError
 from lightpage.helper_process import parent_link
-from lightpage.runtime.device.modulator.screen.screen_link import REQUEST, Answer
-from lightpage.runtime.device.modulator.settings import ScreenSettings
+from lightpage.runtime.device.modulator.screen.raster import ScreenSettings
+from lightpage.runtime.device.modulator.screen.window_process import REQUEST, Answer
 
 LOOK_S = 0.1
 """How often it looks at the X server's events without being asked."""

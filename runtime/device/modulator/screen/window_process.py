@@ -1,16 +1,49 @@
-"""The service's end of the process that has a modulator's window."""
+"""The service's end of the process that has a modulator's window, and what the two say to each other over a socket."""
 
 from __future__ import annotations
+
+import json
+import struct
+from dataclasses import asdict, dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.helper_process import HelperProcess
-from lightpage.runtime.device.modulator.screen.screen_link import REQUEST, Answer
-from lightpage.runtime.device.modulator.settings import ScreenSettings
+from lightpage.runtime.device.modulator.screen.raster import ScreenSettings
+
+REQUEST = struct.Struct("!?I")
+"""Whether a page follows (one byte per pixel of the modulator, row by row), and the request's number, from 1."""
 
 
-class WindowProcess:
+@dataclass(frozen=True)
+class Answer:
+    """A line of JSON from the window's process.
+
+    Attributes:
+        number: that of the request; 0 for the word that the window is open, or cannot be opened.
+        shows: whether the whole last page is on display, as far as the X server knows.
+        got: why the window cannot be opened, else empty.
+        expected: what would have been right.
+    """
+
+    number: int
+    shows: bool = False
+    got: str = ""
+    expected: str = ""
+
+    def to_line(self) -> bytes:
+        """As it is sent, the line's end included."""
+        return json.dumps(asdict(self)).encode() + b"\n"
+
+    @classmethod
+    def from_line(cls, line: bytes) -> Self:
+        """Read what `to_line` wrote."""
+        return cls(**json.loads(line))
+
+
+class WindowProcess(HelperProcess):
     """A process with a window in it; it ends with this one. Moments are `time.monotonic` seconds.
 
     Args:
@@ -23,7 +56,7 @@ class WindowProcess:
     def __init__(self, settings: ScreenSettings) -> None:
         self._number = 0
         self._opening: Answer | None = None
-        self._process = HelperProcess(
+        super().__init__(
             "lightpage.runtime.device.modulator.screen.screen_window",
             # of a table that wires a device, what else it says is not the window's
             settings.model_dump_json(include=set(ScreenSettings.model_fields)),
@@ -50,19 +83,11 @@ class WindowProcess:
         """
         self._number += 1
         request = REQUEST.pack(image is not None, self._number)
-        self._process.send(request if image is None else request + image.tobytes(), deadline)
+        self.send(request if image is None else request + image.tobytes(), deadline)
         return self._answer(self._number, deadline)
 
-    def ended(self) -> bool:
-        """Whether it runs no more."""
-        return self._process.ended()
-
-    def end(self) -> None:
-        """End it, and with it the window."""
-        self._process.end()
-
     def _answer(self, number: int, deadline: float) -> Answer:
-        answer = Answer.from_line(self._process.line(deadline))
+        answer = Answer.from_line(self.line(deadline))
         if answer.number != number:
             raise ConnectionError(f"its window answers request {answer.number} for {number}")
         return answer

@@ -15,7 +15,7 @@ from lightpage.recording.pages import Pages, PagesWriter
 from lightpage.runtime.device.acquisition.camera_source import CameraSource, Exposures, View
 from lightpage.runtime.device.acquisition.page_store import PageStore
 from lightpage.runtime.device.acquisition.pairing import PairingSettings
-from lightpage.runtime.device.cameras.camera import Frame, FrameStatus
+from lightpage.runtime.device.cameras.camera import BrokenFrame, Frame
 from tests.clock import HandClock
 from tests.runtime import toy
 
@@ -51,8 +51,8 @@ class LabCamera(LabDevice):
         self.id = 65529
         self.follows: Callable[[int], int] = lambda number: number % 65535 + 1
         self.clock_s, self.pace = 1e6, 1.00005
-        self.queue: list[tuple[float, int, Frame]] = []
-        self.exposures: list[tuple[float, FrameStatus, float]] = []
+        self.queue: list[tuple[float, int, Frame | BrokenFrame]] = []
+        self.exposures: list[tuple[float, bool, float]] = []
         self._count = 0
 
     def arm(self) -> None:
@@ -66,26 +66,25 @@ class LabCamera(LabDevice):
         self.queue.clear()
         self.exposures.clear()
 
-    def edge(self, after_s: float = 0.0, delivery_s: float = 0.001, status: FrameStatus = FrameStatus.COMPLETE) -> None:
+    def edge(self, after_s: float = 0.0, delivery_s: float = 0.001, whole: bool = True) -> None:
         """A trigger edge that exposes after a while and delivers a while later."""
-        heapq.heappush(self.exposures, (self.clock.now() + after_s, status, delivery_s))
+        heapq.heappush(self.exposures, (self.clock.now() + after_s, whole, delivery_s))
 
     def poll(self) -> None:
         """Expose what is due."""
         while self.exposures and self.exposures[0][0] <= self.clock.now():
-            at, status, delivery_s = heapq.heappop(self.exposures)
+            at, whole, delivery_s = heapq.heappop(self.exposures)
             self.id = self.follows(self.id)
             info = FrameInfo(self.name, self.id, self.clock_s + at * self.pace, at, "Mono8", 1e-4)
             self._count += 1
-            complete = status is FrameStatus.COMPLETE
-            frame = Frame(status, self.scene(), info) if complete else Frame(status, detail="packets missing")
+            frame = Frame(self.scene(), info) if whole else BrokenFrame("packets missing")
             heapq.heappush(self.queue, (at + delivery_s, self._count, frame))
 
     def fire(self) -> None:
         self.must_answer()
         self.edge()
 
-    def frame(self, timeout_s: float) -> Frame | None:
+    def frame(self, timeout_s: float) -> Frame | BrokenFrame | None:
         self.must_answer()
         end = self.clock.now() + timeout_s
         while True:

@@ -90,6 +90,8 @@ SHUTTERS = '[beams]\nkind = "shutters"\nsignal = {channel = %d}\nreference = {ch
         (PLAIN.replace('"software"', '"bell"'), "trigger.kind", "'bell'", "pulse_generator or software"),
         (PULSES.replace("[1, 2]", "[1, 1]"), "trigger.channels", "twice", "once"),
         (PULSES + SHUTTERS % 2, "", "beams.signal.channel = 2", "(1, 2)"),
+        (PULSES + SHUTTERS % 4, "", "channel 4 for both", "two"),
+        (PLAIN + SHUTTERS % 3, "", "shutters without a pulse generator", "pulse_generator"),
         (PLAIN.replace("levels = 16", "level = 3").replace('"software"', '"bell"'), "", "2 mistakes: trigger.kind", ""),
         (PLAIN + "[pairing]\ntolerance_s = 0.05\nspacing_s = 0.06\n", "pairing", "spacing_s = 0.06", "0.125"),
     ],
@@ -105,9 +107,7 @@ def test_a_file_that_makes_no_device_is_refused_by_the_name_of_the_key(
     assert expected in raised.value.expected
 
 
-def test_shutters_need_spare_channels_of_a_pulse_generator(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match=r"^beams"):
-        opened(tmp_path, PLAIN + SHUTTERS % 3)
+def test_beams_are_moved_by_shutters_or_by_a_controller(tmp_path: Path) -> None:
     assert isinstance(opened(tmp_path, PULSES + SHUTTERS % 3).beams, ShutterBeams)
     external = opened(tmp_path, PLAIN + '[modulator]\nkind = "external"\n[beams]\nkind = "external"\n')
     assert (type(external.modulator), type(external.beams)) == (ExternalModulator, ExternalBeams)

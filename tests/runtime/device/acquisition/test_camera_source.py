@@ -16,7 +16,7 @@ from lightpage.runtime.commands.service.serve import _take_dark_frames
 from lightpage.runtime.device.acquisition.beam_keeper import BeamKeeper
 from lightpage.runtime.device.acquisition.camera_source import CameraSource, View
 from lightpage.runtime.device.acquisition.page_store import PageStore
-from lightpage.runtime.device.modulator.operator import OperatorBeams
+from lightpage.runtime.device.modulator.beam_state import OperatorBeams
 from tests.clock import HandClock
 from tests.runtime import toy
 from tests.runtime.device.acquisition.lab import PAIRING, Lab, pages_of, reason_of, source_of
@@ -154,13 +154,8 @@ def test_light_where_none_should_be_is_the_sources_fault_and_changes_nothing(lab
         assert (source.shot(page=0).pair.in_phase[0] == np.maximum(modulator.pair.in_phase[0], 3) - 3).all()
 
 
-def test_a_frame_of_another_shape_and_cameras_of_different_depths_are_the_sources_fault(
-    lab: Lab, pages: PageStore
-) -> None:
+def test_cameras_of_different_depths_are_the_sources_fault(lab: Lab, pages: PageStore) -> None:
     source, _ = source_of(lab, pages)
-    lab.cameras[1].scene = lambda: np.full((4, 5), 9, np.uint8)
-    with source, pytest.raises(SourceError, match=r"^Q: frame"):
-        source.shot(page=0)
     lab.cameras[1].bit_depth = 12
     with pytest.raises(SourceError, match=r"^camera: cameras"):
         CameraSource(toy.PROFILE, (lab.cameras[0], lab.cameras[1]), lab, None, source.beams, pages, PAIRING)

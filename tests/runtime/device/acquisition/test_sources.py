@@ -30,8 +30,7 @@ from lightpage.recording.reader import Recording
 from lightpage.runtime.device.acquisition.page_store import PageStore
 from lightpage.runtime.device.acquisition.recording import RecordingSource
 from lightpage.runtime.device.acquisition.simulator import SimulatorSource
-from lightpage.runtime.device.acquisition.source import own_fault
-from lightpage.runtime.device.acquisition.sources import open_source
+from lightpage.runtime.device.acquisition.source import open_source, own_fault
 from tests.runtime import toy
 from tests.runtime.device.acquisition.lab import pages_of, reason_of
 
@@ -177,8 +176,9 @@ def test_the_source_of_a_vendor_in_the_documents_works(monkeypatch: pytest.Monke
     ((name, value),) = release["project"]["entry-points"]["lightpage.sources"].items()
     vendor = EntryPoint(name, value, "lightpage.sources")
     monkeypatch.setattr(EntryPoint, "load", lambda self: space[self.attr])
+    monkeypatch.setattr("lightpage.runtime.device.acquisition.source.entry_points", lambda group: [vendor])
     lost: list[int] = []
-    with open_source("vendor:7", [vendor]) as source:
+    with open_source("vendor:7") as source:
         source.on_lost = lambda page, error: lost.append(page)
         shot = source.shot()
         assert shot.infos is not None
@@ -191,7 +191,7 @@ def test_the_source_of_a_vendor_in_the_documents_works(monkeypatch: pytest.Monke
         assert references is not None
         assert references.in_phase[0, 0] == 50
     with pytest.raises(SourceError, match=r"^vendor"):
-        open_source("vendor:7", [vendor]).arm()
+        open_source("vendor:7").arm()
 
 
 def test_uploaded_pages_follow_those_of_the_file(tmp_path: Path) -> None:
@@ -234,5 +234,3 @@ def test_levels_of_an_empty_store_are_those_of_the_first_upload_unless_it_was_to
     assert store.levels == 8
     with pytest.raises(InvalidInputError):
         PageStore(toy.PROFILE, levels=16).append(toy.symbols_of(8, 1), 8)
-    with pytest.raises(PageError):
-        PageStore(toy.PROFILE, levels=1)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from lightpage.errors import Reason, SourceError
-from lightpage.runtime.device.cameras.camera import Camera, Frame, FrameStatus
+from lightpage.runtime.device.cameras.camera import Camera, Frame
 from lightpage.runtime.device.cameras.gentl import GenTLCamera
 from lightpage.runtime.device.cameras.settings import CameraSettings
 from tests.processes import children, runs
@@ -46,11 +46,8 @@ def taken(camera: Camera) -> Frame:
     """The next frame, which must be the picture that TLSimu makes under its number."""
     camera.fire()
     frame = camera.frame(WAIT_S)
-    assert frame is not None
-    assert frame.status is FrameStatus.COMPLETE, frame.detail
-    assert frame.info is not None
+    assert isinstance(frame, Frame), frame
     expected = (np.indices(SHAPE).sum(0) + frame.info.frame_id).astype(np.uint8)
-    assert frame.pixels is not None
     assert frame.pixels.dtype == np.uint8
     assert (frame.pixels == expected).all()
     return frame
@@ -67,7 +64,7 @@ def test_frames_arrive_to_the_byte_one_for_each_trigger(camera: GenTLCamera) -> 
         camera.fire()
     camera.arm()
     assert camera.frame(0.0) is None
-    infos = [frame.info for frame in (taken(camera) for _ in range(4)) if frame.info is not None]
+    infos = [taken(camera).info for _ in range(4)]
     assert camera.frame(0.05) is None
     assert (infos[0].serial, infos[0].pixel_format) == ("SN_InterfaceB_0", "Mono8")
     assert infos[0].exposure_s is None  # TLSimu knows none

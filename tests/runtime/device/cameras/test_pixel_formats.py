@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 
 from lightpage.errors import FrameError, InvalidInputError
-from lightpage.runtime.device.cameras.gentl_device import pixel_bytes
+from lightpage.runtime.device.cameras.gentl_process import pixel_bytes
 from lightpage.runtime.device.cameras.pixel_formats import (
     bit_depth,
-    pack,
     pixel_format,
-    pixel_format_of,
     unpack,
     without_padding,
 )
+from lightpage.virtual_device.packing import pack
 
 BYTES = {
     "Mono8": [0x21, 0x43],
@@ -44,7 +43,6 @@ def test_every_pair_of_neighbours_survives(name: str) -> None:
     """Every value in every place of a group, beside others."""
     depth = DEPTHS[name]
     assert bit_depth(name) == depth
-    assert pixel_format_of(pixel_format(name).code).name == name
     values = np.arange(2**depth, dtype=kind(depth))
     shuffled = np.random.default_rng(depth).permutation(values)
     frame = np.concatenate([np.roll(values, shift) for shift in range(4)] + [shuffled, values[:64]]).reshape(-1, 64)
@@ -74,8 +72,6 @@ def test_odd_sizes(name: str, pixels: int) -> None:
 def test_bad_input_is_named() -> None:
     with pytest.raises(InvalidInputError, match="RGB8"):
         bit_depth("RGB8")
-    with pytest.raises(InvalidInputError, match="0x02180014"):
-        pixel_format_of(0x02180014)
     with pytest.raises(FrameError, match="5 bytes"):
         unpack(np.zeros(5, np.uint8), (2, 2), "Mono12p")
     with pytest.raises(FrameError, match="12 bits"):

@@ -27,8 +27,7 @@ from lightpage.errors import (
 )
 from lightpage.metrics.measures import measure
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.device.acquisition.source import Shot
-from lightpage.runtime.device.acquisition.sources import open_source
+from lightpage.runtime.device.acquisition.source import Shot, open_source
 from lightpage.runtime.recalibration.recalibration import RefitResult
 from lightpage.runtime.service.models.audit import AuditLog
 from lightpage.runtime.service.models.registry import KEPT_MODELS

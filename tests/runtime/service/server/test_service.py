@@ -19,8 +19,7 @@ from lightpage.errors import InvalidInputError, NoSourceError, Reason, StoreErro
 from lightpage.page.symbols import pilot_mask
 from lightpage.runtime.client.outgoing import KnownPilots
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.device.acquisition.source import Shot
-from lightpage.runtime.device.acquisition.sources import open_source
+from lightpage.runtime.device.acquisition.source import Shot, open_source
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.limits import Limits
