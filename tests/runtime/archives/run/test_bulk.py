@@ -23,7 +23,7 @@ from lightpage.runtime.model.decoding.tracking import NoTracker
 from tests.runtime import coded, toy
 from tests.runtime.archives.archive import PAGES, RANGE, Archive
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[4]
 
 
 def test_every_page_is_read_once_and_a_second_run_does_what_is_missing(archive: Archive) -> None:

@@ -12,7 +12,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from lightpage.runtime.archives.run.task import Task
 from tests.runtime.archives.archive import PAGES, RANGE, Archive, spoil_page
 
-DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "scaling.md"
+DOCUMENT = Path(__file__).resolve().parents[4] / "docs" / "scaling.md"
 
 
 def values(text: str) -> dict[str, float]:

@@ -37,7 +37,7 @@ def test_pages_are_given_up_on_request_alone_and_read_again_on_another(
 RUNS = """
 import os, sys, time
 from lightpage.cli.main import lightpage, run
-from lightpage.runtime.commands import bulk
+from lightpage.runtime.commands.archives import bulk
 from lightpage.runtime.archives.workers.inline import InlineEngine
 from lightpage.runtime.archives.workers.work import Worker
 time.sleep = lambda seconds: None

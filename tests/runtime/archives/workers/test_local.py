@@ -31,7 +31,7 @@ from tests.runtime.archives.workers.deadly_worker import BEGUN, KILLS
 from tests.told import Told
 from tests.waiting import eventually
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[4]
 WORKER = "tests.runtime.archives.workers.deadly_worker"
 PAGES, RANGE = 12, 3
 LIMIT_S = 60
