@@ -140,6 +140,16 @@ def check_recording(decoder: Decoder, recording: Recording) -> None:
         )
 
 
+def check_symbols(recording: Recording, purpose: str = "measure against") -> None:
+    """Check that the symbols of a recording are known.
+
+    Raises:
+        RecordingError: they are not.
+    """
+    if not recording.has_symbols:
+        raise RecordingError(f"recording {recording.path}", "no symbols", f"known symbols to {purpose}")
+
+
 def pilots_of(decoder: Decoder, recording: Recording) -> NDArray[np.bool_]:
     """Where the pilots of a recording's pages are, [ny, nx]: as it says itself, or else the bundle's."""
     own = recording.pilots()
@@ -184,8 +194,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
         NothingReadError: no page could be decoded, or none was confirmed.
     """
     check_recording(decoder, recording)
-    if not recording.has_symbols:
-        raise RecordingError(f"recording {recording.path}", "no symbols", "known symbols to measure against")
+    check_symbols(recording)
     levels = recording.levels
     mask = pilots_of(decoder, recording)
     data = ~mask
@@ -194,7 +203,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
     refused: list[RefusedPage] = []
     due = 0
     before: list[float] = []
-    for index, read in track(read_ahead(recording.shown, recording.pages), "evaluate", total=recording.pages):
+    for index, read in track(read_ahead(recording.shown, range(recording.pages)), "evaluate", total=recording.pages):
         page = symbols = None
         try:
             frames, symbols = read.result()

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from lightpage.clock import SYSTEM, Clock
-from lightpage.errors import LightpageError, SurroundingsError, TakenError
+from lightpage.errors import InvalidInputError, LightpageError, SurroundingsError, TakenError
 from lightpage.failures import os_failure
 from lightpage.files import check_utf8, lock
 from lightpage.runtime.archives.run.job import Job, Source
-from lightpage.runtime.archives.run.part import WHOLE, Part
 from lightpage.runtime.archives.run.shard import RECORD, PageRecord, ShardRecord, holds_losses
-from lightpage.runtime.archives.run.task import Operation, RecordedFile, Task
+from lightpage.runtime.archives.run.task import Operation, Plain, RecordedFile, Task
 
 _LOCKING = "HDF5_USE_FILE_LOCKING"
 """Variable of the environment by which HDF5, and this, are told to go without locks."""
@@ -30,6 +31,46 @@ _AGAIN = ".again-"
 
 _QUESTION_S, _AGAIN_S = 600.0, 0.1
 """Longest wait for another part that writes down what is asked, and the time between two tries."""
+
+
+class Part(Plain):
+    """Every `count`th recording from `index`; of a fleet, every `count`th device with all its recordings.
+
+    Attributes:
+        index: from 0.
+        count: how many parts there are.
+    """
+
+    index: int
+    count: int
+
+    @classmethod
+    def parse(cls, text: str) -> Part:
+        """A part as users write it: K/N.
+
+        Raises:
+            InvalidInputError: it is none.
+        """
+        match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
+        if match is None or not int(match[1]) < int(match[2]):
+            raise InvalidInputError("--part", repr(text), "K/N with K from 0 to N - 1")
+        return cls(index=int(match[1]), count=int(match[2]))
+
+    def sources(self, job: Job) -> Iterator[tuple[int, Source]]:
+        """Its recordings, each with its place among the run's."""
+        for place, own in self.devices(job):
+            yield from enumerate(own, place)
+
+    def devices(self, job: Job) -> Iterator[tuple[int, tuple[Source, ...]]]:
+        """Recordings of each of its devices; see `lightpage.runtime.archives.run.job.Job.devices`."""
+        return islice(job.devices.items(), self.index, None, self.count)
+
+    def __str__(self) -> str:
+        return f"{self.index}/{self.count}"
+
+
+WHOLE = Part(index=0, count=1)
+"""All of it."""
 
 
 class Ledger:
@@ -121,17 +162,9 @@ class Ledger:
     def _not_writable(self, error: OSError) -> LightpageError:
         return os_failure(self._subject, error, "a folder that can be written")
 
-    def sources(self, job: Job) -> Iterator[tuple[int, Source]]:
-        """Recordings of the part, each with its place among the run's."""
-        return self.part.sources(job)
-
-    def devices(self, job: Job) -> Iterator[tuple[int, tuple[Source, ...]]]:
-        """Recordings of each device of the part, with the place of its first one among the run's."""
-        return self.part.devices(job)
-
     def sweep(self, job: Job) -> None:
         """Remove what workers that were killed have left half-written; none of this part may be at work."""
-        for index, _ in self.sources(job):
+        for index, _ in self.part.sources(job):
             for left in self.shard(index, 0).parent.glob(".*"):
                 shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)
 
@@ -149,13 +182,13 @@ class Ledger:
     def missing(self, job: Job) -> Iterator[Task]:
         """Ranges of the first reading that have no result, recording by recording; or such devices."""
         if job.choices.operation is Operation.RECALIBRATE:
-            for index, own in self.devices(job):
+            for index, own in self.part.devices(job):
                 device = self._device(job, index, own)
                 if device is not None and not self.recalibrated(index):
                     _make(device.shard.parent)
                     yield device
             return
-        for index, source in self.sources(job):
+        for index, source in self.part.sources(job):
             there = self.results(index)
             for task in self.ranges(job, index, source):
                 if task.shard.name not in there:
@@ -172,7 +205,7 @@ class Ledger:
         Raises:
             InvalidInputError: a shard that cannot be read.
         """
-        for index, source in self.sources(job):
+        for index, source in self.part.sources(job):
             there = self.results(index)
             for task in self.ranges(job, index, source):
                 shard = self.shard(index, task.pages[0], number)
@@ -243,22 +276,16 @@ class Ledger:
             fine_tuning=choices.fine_tuning,
         )
 
-    def doubt(self, job: Job, *, every_loss: bool = False) -> None:
-        """Have ranges read again whose pages were filed as lost for a fault of storage, as earlier versions did.
-
-        Args:
-            job: what was asked.
-            every_loss: whether ranges with lost pages of any cause are read again.
+    def doubt_losses(self, job: Job) -> None:
+        """Have ranges read again that have lost pages.
 
         Raises:
             StorageError, InvalidInputError: a shard that cannot be read.
         """
-        if job.choices.operation is Operation.RECALIBRATE:
-            return
-        for index, _ in self.sources(job):
+        for index, _ in self.part.sources(job):
             folder = self.shard(index, 0).parent
             for name in self.results(index):
-                if _AGAIN not in name and holds_losses(folder / name, misfiled_only=not every_loss):
+                if _AGAIN not in name and holds_losses(folder / name):
                     self.doubted.add(folder / name)
 
     def recalibrated(self, place: int) -> bool:

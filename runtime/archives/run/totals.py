@@ -13,7 +13,7 @@ from lightpage.codec.volume_file import ranges
 from lightpage.metrics.reliability import ConfidenceBin, calibration_error
 from lightpage.runtime.archives.run.job import Job, Source
 from lightpage.runtime.archives.run.ledger import Ledger
-from lightpage.runtime.archives.run.shard import BUNDLE, PageRecord, PageState, ShardRecord, record_of, with_end
+from lightpage.runtime.archives.run.shard import BUNDLE, PageRecord, PageState, ShardRecord, with_end
 from lightpage.runtime.archives.run.task import NamedBundle, Operation, Problem, Task
 
 AIR, CONFIRMED = "air_bits_per_symbol", "confirmed_bits"
@@ -178,8 +178,8 @@ class Reading:
         finished_s: when, seconds since 1970.
         seconds: that it took.
         pages: how many, or one device.
-        worker: who did it; empty where that was not noted.
-        read_bytes: of frames, as they lie in the recording; 0 where that was not noted.
+        worker: who did it.
+        read_bytes: of frames, as they lie in the recording.
     """
 
     finished_s: float
@@ -189,10 +189,9 @@ class Reading:
     read_bytes: int
 
     @classmethod
-    def of(cls, shard: Path, record: ShardRecord, pages: int) -> Reading:
-        """That of a shard; where no time was noted, it is that of the file."""
-        finished_s = record_of(shard).stat().st_mtime if record.finished_s is None else record.finished_s
-        return cls(finished_s, record.seconds, pages, record.worker, record.read_bytes)
+    def of(cls, record: ShardRecord, pages: int) -> Reading:
+        """That of a shard."""
+        return cls(record.finished_s, record.seconds, pages, record.worker, record.read_bytes)
 
 
 @dataclass
@@ -273,10 +272,10 @@ def totals(ledger: Ledger, job: Job, failures: Mapping[tuple[str, Path], Problem
     """
     found = Totals(rounds=[Round(model) for model in job.rounds])
     if job.choices.operation is Operation.RECALIBRATE:
-        for index, own in ledger.devices(job):
+        for index, own in ledger.part.devices(job):
             _add_device(found, ledger, index, own, failures or {})
         return found
-    for index, source in ledger.sources(job):
+    for index, source in ledger.part.sources(job):
         _add_recording(found, ledger, job, index, source)
     return found
 
@@ -299,7 +298,7 @@ def _add_device(
         page = record.pages[0]
         found.tally.add(page)
         found.tally.models[record.model.version] += 1
-        found.readings.append(Reading.of(shard, record, 1))
+        found.readings.append(Reading.of(record, 1))
         state = DeviceState.RECALIBRATED if page.state is PageState.READ else DeviceState.REFUSED
         row |= {"state": state, "air_before": None, "air_after": None, **record.summary, "reason": page.reason}
         if state is DeviceState.RECALIBRATED:
@@ -349,7 +348,7 @@ def _pages(
     if task.shard.name not in there:
         return
     first = ShardRecord.read(task.shard)
-    found.readings.append(Reading.of(task.shard, first, task.weight))
+    found.readings.append(Reading.of(first, task.weight))
     for part in first.confidence_bins:
         sums = found.confidence_bins.setdefault((part.low, part.high), [0.0, 0.0, 0.0])
         for place, value in enumerate((part.count, part.count * part.confidence, part.count * part.accuracy)):
@@ -360,7 +359,7 @@ def _pages(
         if shard.name not in there:
             continue
         again = ShardRecord.read(shard)
-        found.readings.append(Reading.of(shard, again, len(again.pages)))
+        found.readings.append(Reading.of(again, len(again.pages)))
         for page in again.pages:
             before = best[page.page][1]
             found.rounds[number - 1].add(before, page)

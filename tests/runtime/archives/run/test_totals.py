@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from lightpage.runtime.archives.run.ledger import Ledger
-from lightpage.runtime.archives.run.part import Part
+from lightpage.runtime.archives.run.ledger import Ledger, Part
 from lightpage.runtime.archives.run.shard import PageRecord, PageState, ShardRecord
 from lightpage.runtime.archives.run.task import Operation
 from lightpage.runtime.archives.run.totals import AIR, totals

@@ -19,14 +19,15 @@ import pytest
 from lightpage.errors import WorkerError
 from lightpage.runtime.archives.run.driver import run
 from lightpage.runtime.archives.run.engine import ATTEMPTS, longest_s
-from lightpage.runtime.archives.run.job import Choices, of_recordings
+from lightpage.runtime.archives.run.job import Choices
 from lightpage.runtime.archives.run.ledger import Ledger
+from lightpage.runtime.archives.run.question import of_recordings
 from lightpage.runtime.archives.run.task import Done, Failed, NamedBundle, Operation, Outcome, Stamp, Task
 from lightpage.runtime.archives.workers import ray_engine
-from lightpage.runtime.archives.workers.inline import InlineEngine
 from lightpage.runtime.archives.workers.ray_engine import RayEngine
 from lightpage.runtime.archives.workers.work import Worker
 from tests.runtime import toy
+from tests.runtime.archives.archive import InlineEngine
 from tests.runtime.archives.workers.test_local import pages
 
 PAGES, RANGE = 60, 5
