@@ -35,6 +35,7 @@ from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.models.registry import ModelRegistry
 from lightpage.runtime.service.monitoring.monitor import Monitor, MonitorSettings, PageFigures
 from lightpage.runtime.service.monitoring.observation import Observation
+from lightpage.runtime.service.pages.reading import read_page
 
 QUIET_BEFORE = 25
 """Pages of a drift before it begins: the monitor learns what is usual by 20."""
@@ -80,7 +81,7 @@ def read(
         source.moment = float(number)
         lost = ""
         try:
-            answer = plane.read_page(None, None, Caller(), user_data=True).answer
+            answer = read_page(plane, None, None, Caller(), user_data=True).answer
             if answer.user_data is not None and answer.user_data.loss is not None:
                 lost = answer.user_data.loss.value
         except LightpageError as error:

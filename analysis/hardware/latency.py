@@ -34,6 +34,7 @@ from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.pages.reading import read_page
 from lightpage.virtual_device.device import VirtualDevice
 from lightpage.virtual_device.namespace import go_on_inside
 
@@ -69,10 +70,10 @@ def measure(pages: int, folder: Path) -> dict[str, Any]:
             timed = TimedTrigger(source._trigger)
             source._trigger = source._pairing.trigger = timed
             plane = DataPlane(ModelRegistry(decoder, tracker_for), source)
-            plane.read_page(0, None, Caller(), user_data=True)
+            read_page(plane, 0, None, Caller(), user_data=True)
             for page in track(range(pages), "pages", total=pages):
                 try:
-                    found = plane.read_page(page, None, Caller(), user_data=True)
+                    found = read_page(plane, page, None, Caller(), user_data=True)
                 except LostPageError:
                     lost += 1
                     continue

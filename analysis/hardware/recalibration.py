@@ -37,6 +37,7 @@ from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.pages.reading import read_page
 
 PAGES = 16
 """Different pages that are read, over and over."""
@@ -102,7 +103,7 @@ def recalibration(recalibrator: Recalibrator) -> Taken:
 def timed(plane: DataPlane, pause_s: float = 0.0) -> float:
     """Seconds of one read, its bytes too, behind which nobody reads for a while."""
     start = time.perf_counter()
-    plane.read_page(None, None, Caller(), user_data=True)
+    read_page(plane, None, None, Caller(), user_data=True)
     taken = time.perf_counter() - start
     time.sleep(pause_s)
     return taken
@@ -125,7 +126,7 @@ def main(rounds: int, load: float, threads: int | None, json_path: Path | None) 
         pause_s = median(timed(plane) for _ in range(SETTLED)) * (1 / load - 1)
         alone += [timed(plane, pause_s) for _ in range(BEFORE)]
         idle.append(recalibration(recalibrator))
-        plane.rollback()
+        plane.models.rollback()
         for _ in range(SETTLED):
             timed(plane)
         with ThreadPoolExecutor(1) as pool:

@@ -51,6 +51,7 @@ from lightpage.runtime.service.models.registry import ModelRegistry
 from lightpage.runtime.service.models.store import ModelStore
 from lightpage.runtime.service.monitoring.flight_recorder import FlightRecorder
 from lightpage.runtime.service.monitoring.monitor import Monitor
+from lightpage.runtime.service.pages.reading import read_page
 
 PAGE_S = 300.0
 """Simulated time from one page to the next."""
@@ -125,8 +126,9 @@ class Week:
         base = Decoder.load(bundle_path(DEFAULT), self.threads)
         store = ModelStore(self.out / "models", base.bundle)
         registry = ModelRegistry(base, tracker_for)
-        if (last := store.last()) is not None:
-            registry.swap(Decoder.load(last, self.threads))
+        note = store.read()
+        if (last := note.history[note.cursor]) is not None:
+            registry.swap(Decoder.load(store.folder / last, self.threads))
         source = DriftingSource(base, lambda moment: state(moment, self.pages), seed=7)
         knock = int(KNOCK_SHARE * self.pages)
         if self.rows:
@@ -161,7 +163,7 @@ class Week:
         row: dict[str, Any] = {"page": number, "air": 0.0, "margin": None, "shift_px": None, "failed": False}
         before = plane.registry.current.version
         try:
-            found = plane.read_page(number, None, Caller(), user_data=True)
+            found = read_page(plane, number, None, Caller(), user_data=True)
         except LightpageError as error:
             disagree = isinstance(error.__cause__, FramesDisagreeError)
             failed = not (isinstance(error, LostPageError) or disagree)

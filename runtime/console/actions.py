@@ -10,10 +10,9 @@ from lightpage.errors import InvalidInputError
 from lightpage.runtime.client.answers import job_info
 from lightpage.runtime.client.wire.status import without_folders
 from lightpage.runtime.recalibration.known_pages import MIN_PAGES
-from lightpage.runtime.service.caller import Actor
+from lightpage.runtime.service.caller import Actor, Role
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
-from lightpage.runtime.service.server.roles import Role
 
 ROLE = Role.ADMIN
 """Who may do all of it."""
@@ -77,5 +76,5 @@ class Actions:
         return f"job {self._recalibrator.start(pages, expected, 'console', actor).id} has begun"
 
     def _roll_back(self, expected: str, actor: Actor) -> str:
-        current, before = self._plane.rollback(expected, actor=actor)
+        current, before = self._plane.models.rollback(expected, actor=actor)
         return f"{current.version} is in service again, {before.version} is not"

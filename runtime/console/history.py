@@ -134,13 +134,13 @@ def _row(observation: Observation) -> PageRow:
         lost=None if observation.lost is None else observation.lost.value,
         unread=unread,
         margin_bits=observation.margin_bits,
-        air_bits=observation.claimed_bits,
+        air_bits=None if page is None else page.information_bits,
         trust=None if page is None else page.pilot_trust,
         share=None if page is None else page.check.share,
         shift_x_px=None if image is None else image.shift_x_px,
         shift_y_px=None if image is None else image.shift_y_px,
         piston_rad=None if page is None else page.piston_rad,
-        residual_rad=observation.residual_rad,
+        residual_rad=None if page is None else page.residual_rad,
         recalibration_due=page is not None and bool(page.check.recalibration_due),
     )
 

@@ -25,12 +25,12 @@ from lightpage.runtime.client.wire.status import without_folders
 from lightpage.runtime.console.actions import ROLE, Actions
 from lightpage.runtime.console.history import History, PageRow
 from lightpage.runtime.console.pictures import confidence_png, frame_png
-from lightpage.runtime.service.caller import Actor
+from lightpage.runtime.service.caller import Actor, Identity, Role
 from lightpage.runtime.service.models.registry import Model, ModelRegistry
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.server.certificates import Certificates
-from lightpage.runtime.service.server.roles import Identity, Role, identity_of
+from lightpage.runtime.service.server.roles import identity_of
 
 if TYPE_CHECKING:
     from _typeshed.wsgi import StartResponse, WSGIApplication, WSGIEnvironment

@@ -1,15 +1,98 @@
-"""What the service needs to know of whoever called: how long they wait, and whether they are still there."""
+"""Whoever calls the service: who they are, what they may do, how long they wait, and whether they are still there."""
 
 from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
+from enum import StrEnum
 
-from lightpage.errors import CallerLeft
+from lightpage.errors import CallerLeft, NotAllowedError
+
+
+class Role(StrEnum):
+    """What a caller may do. Every role may look; none but `ADMIN` includes another."""
+
+    READ = "read"
+    """See what the service is and does."""
+    DECODE = "decode"
+    """Have pages decoded and read, and show pages."""
+    RECALIBRATE = "recalibrate"
+    """Start and cancel recalibrations."""
+    ADMIN = "admin"
+    """All of it, and change models."""
+
+
+ROLE_URI = "urn:lightpage:role:"
+"""A certificate's subject alternative names of this kind, with a role behind, say what its owner may do."""
+
+
+@dataclass(frozen=True)
+class Identity:
+    """A caller.
+
+    Attributes:
+        name: the common name of its certificate; empty on a connection that needs none.
+        roles: of it.
+        until: when the certificate ends, seconds since 1970.
+    """
+
+    name: str
+    roles: frozenset[Role]
+    until: float = math.inf
+
+    def may(self, role: Role) -> bool:
+        """Whether it has a role, or one that includes it."""
+        return role in self.roles or Role.ADMIN in self.roles or (role is Role.READ and bool(self.roles))
+
+    def check(self, role: Role, what: str, now: float) -> None:
+        """Check that it may do something.
+
+        Args:
+            role: that this needs.
+            what: it does, e.g. ``call Rollback``.
+            now: seconds since 1970.
+
+        Raises:
+            NotAllowedError: it may not, or its certificate has ended while it was connected.
+        """
+        if now >= self.until:
+            raise NotAllowedError(what, f"a certificate of {self.name} that has expired", "one that is valid")
+        if not self.may(role):
+            got = f"{self.name} with {_listed(self.roles)}"
+            raise NotAllowedError(what, got, f"a certificate with {ROLE_URI}{role}")
+
+
+LOCAL = Identity("", frozenset(Role))
+"""Whoever reaches a service that asks for no certificates: a process of this machine."""
+STRANGER = Identity("nobody", frozenset())
+"""Whoever has no certificate where one is asked for."""
+
+
+def _listed(roles: Iterable[Role]) -> str:
+    return ", ".join(f"role {role}" for role in sorted(roles)) or "no role"
+
+
+def own_name(name: str, caller: str) -> str:
+    """A name that a caller gave to something, where other callers' are others.
+
+    Args:
+        name: not empty.
+        caller: the name in its certificate; empty without one, and then the name is shared.
+    """
+    return f"{len(caller)}:{caller}/{name}" if caller else name
+
+
+def named_session(name: str, caller: str) -> str:
+    """The session that a caller has named, as `Caller.session` has it; see `own_name`."""
+    return f"session {own_name(name, caller)}"
+
+
+MOST_SESSIONS = 256
+"""Sessions that are remembered; of more, the one that was silent for longest is forgotten, and begins anew."""
 
 
 @dataclass(frozen=True)

@@ -33,12 +33,12 @@ from lightpage.runtime.client.wire.tls import TlsFiles
 from lightpage.runtime.model.bundle.shipped import DEFAULT
 from lightpage.runtime.model.execution.providers import CPU, Provider
 from lightpage.runtime.recalibration.known_pages import MIN_PAGES
+from lightpage.runtime.service.caller import named_session
 from lightpage.runtime.service.jobs.self_calibration import SelfCalibrationSettings
 from lightpage.runtime.service.limits import Limits
 from lightpage.runtime.service.models.audit import AUDIT_BYTES, AUDIT_KEPT
 from lightpage.runtime.service.monitoring.flight_recorder import PAGES, RING_BYTES, FlightSettings
 from lightpage.runtime.service.monitoring.traces import check_endpoint
-from lightpage.runtime.service.sessions import named_session
 
 PREFIX = "LIGHTPAGE_"
 """Of variables of the environment: LIGHTPAGE_TABLE__KEY."""

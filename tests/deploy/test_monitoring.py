@@ -28,6 +28,7 @@ from lightpage.runtime.service.models.store import ModelStore
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.monitoring.stages import Stages
+from lightpage.runtime.service.pages.reading import read_page
 from lightpage.runtime.service.settings import Option, service_settings
 from tests.deploy.manifests import DEPLOY
 from tests.runtime import toy
@@ -72,7 +73,7 @@ def shown(toy_zip: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
     metrics.watch_certificates(lambda: 2e9)
     for _ in range(3):
         stages = Stages()
-        plane.read_page(None, None, Caller(), stages=stages)
+        read_page(plane, None, None, Caller(), stages=stages)
         metrics.timed("ReadPage", stages)
         metrics.call_ended("ReadPage", "OK", "", stages.elapsed_s)
     console = Console(metrics, history, registry, monitor, "toy:device")

@@ -26,16 +26,20 @@ AREAS = {
     },
     "tracking": {"runtime/model/decoding": "image_tracker following tracking image_search image_drift"},
     "calibration": {"lightpage/calibration": "*", "train/fitting": "fit fitted"},
-    "registry": {"runtime/service": "registry models replays"},
-    "store": {"runtime/service": "store store_health file_ring flight_recorder jobs"},
-    "pairing": {"runtime/device/acquisition": "pairing camera_source beam_keeper page_store source"},
-    "ledger": {"runtime/scaling": "ledger totals shard task work job driver volumes"},
-    "failures": {"lightpage": "failures errors", "runtime": "errors wire/status rpc/call"},
-    "limits": {
-        "runtime": "rpc/message_gate rpc/uploads rpc/sent_pages rpc/frame_calls",
-        "runtime/service": "slots limits settings sessions incoming receiver",
+    "registry": {"runtime/service": "models/registry models/models pages/replays"},
+    "store": {
+        "runtime/service": "models/store models/store_health monitoring/file_ring monitoring/flight_recorder jobs/jobs"
     },
-    "wire": {"runtime/client/wire": "[!s]* s[!t]*", "runtime/client": "[!c]*", "runtime/rpc": "tensors"},
+    "pairing": {"runtime/device/acquisition": "pairing camera_source beam_keeper page_store source"},
+    "ledger": {
+        "runtime/archives": "run/ledger run/totals run/shard run/task workers/work run/job run/driver run/volumes"
+    },
+    "failures": {"lightpage": "failures errors", "runtime": "client/wire/status service/server/call"},
+    "limits": {
+        "runtime/service": "server/message_gate display/uploads jobs/sent_pages frames/frame_calls frames/frames admission "
+        "limits settings models/incoming",
+    },
+    "wire": {"runtime/client/wire": "[!s]* s[!t]*", "runtime/client": "[!c]*", "runtime/service/frames": "tensors"},
 }
 """Files of an area by their folder, without .py."""
 KINDS = ("comparison", "bound", "sign", "constant", "condition", "swallowed", "exchanged", "unstored")

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.page.pilots import PilotCheck
 from lightpage.runtime.model.decoding.image_position import ImagePosition
+from lightpage.von_mises import information
+
+_SYMBOLS = 4096
+"""Symbols at most by which a page's information is estimated: their mean is exact to a few thousandths, and soon taken.
+"""
 
 
 @dataclass(frozen=True)
@@ -83,3 +89,18 @@ class DecodedPage:
     timings: Timings
     phase_error: NDArray[np.float32]
     image: ImagePosition | None = None
+
+    @cached_property
+    def information_bits(self) -> float:
+        """Information that the page claims of a symbol's phase, bits, the mean of many symbols.
+
+        It is claimed as far as the pilots bear it out, and does not depend on how many levels there are.
+        """
+        concentration = self.concentration.ravel()
+        few = concentration[:: -(-concentration.size // _SYMBOLS)]
+        return float(information(few.astype(np.float64)).mean() / np.log(2))
+
+    @cached_property
+    def residual_rad(self) -> float:
+        """Smooth phase error that was taken off the page, root mean square, radians."""
+        return float(np.sqrt(np.mean(np.square(self.phase_error))))

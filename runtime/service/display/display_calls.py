@@ -9,8 +9,8 @@ from lightpage.errors import InvalidInputError, StalledError
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.device.modulator.beam_state import BeamState
 from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.display.display import Display, Wanted
 from lightpage.runtime.service.display.uploads import uploaded_pages
-from lightpage.runtime.service.replies import wanted_message
 from lightpage.runtime.service.server.call import Call
 
 _POLL_S = 0.02
@@ -36,13 +36,13 @@ class DisplayCalls:
         except TimeoutError:
             late = f"not all of them within {limits.receive_s:g} s"
             raise StalledError("uploaded pages", late, "faster pages") from None
-        first = await call.in_thread(lambda: self._plane.display.upload(symbols, levels))
+        first = await call.in_thread(lambda: Display(self._plane.source).upload(symbols, levels))
         return pb.UploadPagesReply(first_page=first, pages=len(symbols))
 
     async def WatchDisplay(self, request: pb.WatchDisplayRequest, call: Call) -> AsyncIterator[pb.WatchDisplayReply]:
         """Tell a controller what to show."""
         with self._plane.watches.held_at_once():
-            last, display = None, self._plane.display
+            last, display = None, Display(self._plane.source)
             while True:
                 if (wanted := display.wanted()) != last:
                     last = wanted
@@ -51,7 +51,7 @@ class DisplayCalls:
 
     def ReportDisplay(self, request: pb.ReportDisplayRequest, call: Call) -> pb.ReportDisplayReply:
         """Hear from a controller what is shown."""
-        kind, display = request.WhichOneof("what"), self._plane.display
+        kind, display = request.WhichOneof("what"), Display(self._plane.source)
         if kind is None:
             raise InvalidInputError("report of the display", "nothing", "a page, its end, or beams")
         if kind == "beams":
@@ -59,3 +59,12 @@ class DisplayCalls:
         else:
             display.shown(request.page if kind == "page" else None)
         return pb.ReportDisplayReply()
+
+
+def wanted_message(wanted: Wanted) -> pb.WatchDisplayReply:
+    """What a controller is to show as its message."""
+    beams = wanted.beams
+    return pb.WatchDisplayReply(
+        page=wanted.page,
+        beams=None if beams is None else pb.Beams(signal=beams.signal, reference=beams.reference),
+    )

@@ -23,9 +23,8 @@ from lightpage.runtime.client.wire.requests import check_options, pilots_of
 from lightpage.runtime.client.wire.status import refusal_of
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane, levels_for
-from lightpage.runtime.service.frames.receiver import PairReceiver
+from lightpage.runtime.service.frames.frames import PairReceiver, check_format, decode, decode_reply, receiver_for
 from lightpage.runtime.service.monitoring.stages import Stage, Stages
-from lightpage.runtime.service.replies import decode_reply
 from lightpage.runtime.service.server.call import Call
 from lightpage.runtime.service.server.call_log import reason_told
 
@@ -147,7 +146,7 @@ class FrameCalls:
         """Take in the chunks of a pair, as soon as its header is known to be right and there will be time for it."""
         self.check(header)
         shape, dtype = (header.rows_px, header.columns_px), pixel_type(header.pixel_type)
-        receiver = self._plane.receiver(shape, dtype, header.bit_depth, _caller(header, call))
+        receiver = receiver_for(self._plane, shape, dtype, header.bit_depth, _caller(header, call))
         try:
             if header.HasField("shared"):
                 await call.in_thread(partial(self._take_shared, header.shared, receiver))
@@ -199,7 +198,7 @@ class FrameCalls:
             InvalidInputError: what is not to be had of any page.
         """
         shape, dtype = (header.rows_px, header.columns_px), pixel_type(header.pixel_type)
-        self._plane.check_format(shape, dtype, header.bit_depth)
+        check_format(self._plane, shape, dtype, header.bit_depth)
         check_options(header.options)
         check_black(header)
         self._pilots(header)
@@ -217,7 +216,8 @@ class FrameCalls:
             version: of the model that must be in service; empty for any.
         """
         options = header.options
-        answer = self._plane.decode(
+        answer = decode(
+            self._plane,
             _without_black(pair, header),
             options.levels or None,
             _caller(header, call),

@@ -17,10 +17,11 @@ from lightpage.runtime.client.pb.inference import open_inference_pb2 as oip
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import PIXEL_CODES, message_of
 from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.service.admission import ReceiveBudget
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.frames.frame_calls import FrameCalls
+from lightpage.runtime.service.frames.frames import check_format
 from lightpage.runtime.service.frames.infer_message import take_apart
-from lightpage.runtime.service.frames.receiver import ReceiveBudget
 from lightpage.runtime.service.frames.tensors import (
     Tensor,
     inputs_of,
@@ -194,7 +195,7 @@ class InferenceCalls:
         bundle = self._plane.registry.current.decoder.bundle
         depth, dtype = bundle.manifest.camera_bit_depth, bundle.manifest.frame_dtype
         rows, columns = bundle.profile.frame_shape
-        self._plane.check_format((rows, columns), dtype, depth)
+        check_format(self._plane, (rows, columns), dtype, depth)
         names = list(outputs_of(request, [*OUTPUTS, USER_DATA], list(OUTPUTS)))
         asked = parameters_of(request, PARAMETERS)
         options = message_of(

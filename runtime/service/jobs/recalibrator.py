@@ -336,7 +336,7 @@ class Recalibrator:
             progress("put the new model in service", 1.0)
             self.jobs.foretell(outcome)
             decoder = model.decoder.of_another(Bundle.open(path))
-            plane.adopt(decoder, expected=model, actor=actor)
+            plane.models.adopt(decoder, expected=model, actor=actor)
         except BaseException:
             path.unlink(missing_ok=True)
             raise

@@ -20,7 +20,7 @@ from lightpage.runtime.client.wire.messages import pixel_type
 from lightpage.runtime.recalibration.known_pages import MIN_PAGES, KnownPages
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.frames.frame_calls import check_black
-from lightpage.runtime.service.frames.receiver import PairReceiver
+from lightpage.runtime.service.frames.frames import PairReceiver, check_format
 
 _WHERE = "message of RecalibrateFrames"
 
@@ -43,7 +43,7 @@ class SentPages:
         self._header, self._limits, self._budget = header, plane.limits, plane.received
         self._page_shape = plane.registry.current.decoder.bundle.profile.page_shape
         self._shape, self._dtype = (header.rows_px, header.columns_px), pixel_type(header.pixel_type)
-        plane.check_format(self._shape, self._dtype, header.bit_depth)
+        check_format(plane, self._shape, self._dtype, header.bit_depth)
         check_black(header)
         check_levels(header.levels)
         if header.pages < MIN_PAGES:

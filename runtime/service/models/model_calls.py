@@ -9,8 +9,8 @@ from functools import partial
 from lightpage.errors import MalformedError, StalledError
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.service.dataplane import DataPlane
-from lightpage.runtime.service.models.models import Upload
-from lightpage.runtime.service.replies import model_message
+from lightpage.runtime.service.models.models import ModelEntry, Upload
+from lightpage.runtime.service.models.store import Origin
 from lightpage.runtime.service.server.call import Call
 
 
@@ -75,3 +75,25 @@ class ModelCalls:
                 got = "a second header" if message.HasField("header") else "an empty message"
                 raise MalformedError("message of UploadModel", got, "chunks from there on")
             await call.in_thread(partial(upload.add, message.chunk))
+
+
+_ORIGINS = {
+    Origin.GIVEN: pb.MODEL_ORIGIN_GIVEN,
+    Origin.RECALIBRATED: pb.MODEL_ORIGIN_RECALIBRATED,
+    Origin.UPLOADED: pb.MODEL_ORIGIN_UPLOADED,
+}
+
+
+def model_message(entry: ModelEntry) -> pb.Model:
+    """A model as its message; metrics that are no numbers stay behind."""
+    manifest = entry.manifest
+    return pb.Model(
+        name=manifest.name,
+        version=manifest.version,
+        created=manifest.created,
+        current=entry.current,
+        metrics={k: float(v) for k, v in manifest.metrics.items() if isinstance(v, int | float)},
+        pinned=entry.pinned,
+        loaded=entry.loaded,
+        origin=pb.MODEL_ORIGIN_UNSPECIFIED if entry.origin is None else _ORIGINS[entry.origin],
+    )

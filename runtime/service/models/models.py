@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
+from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import (
     BundleError,
     CallerLeft,
@@ -32,6 +33,7 @@ from lightpage.runtime.service.caller import NOBODY, Actor, Caller
 from lightpage.runtime.service.models.audit import AuditLog
 from lightpage.runtime.service.models.registry import History, Model, ModelRegistry, Place
 from lightpage.runtime.service.models.store import UPLOAD, ModelStore, Note, Origin, Reason, Trouble
+from lightpage.runtime.service.models.store_health import StoreHealth
 
 _log = logging.getLogger(__name__)
 
@@ -64,6 +66,10 @@ class Models:
         most_bytes: size of an uploaded bundle at most.
         in_service: is told which model is about to be in service.
         audit: is told of every change, and of those that failed.
+        clock: by which a store that hangs is known.
+
+    Attributes:
+        store_health: tells of the store without waiting for its disk.
     """
 
     def __init__(
@@ -73,11 +79,13 @@ class Models:
         most_bytes: int,
         in_service: Callable[[Model], None],
         audit: AuditLog | None = None,
+        clock: Clock = SYSTEM,
     ) -> None:
         self._audit, self._changing = audit or AuditLog(), threading.RLock()
         self.registry, self.store = registry, store
         self._most_bytes, self._in_service = most_bytes, in_service
         self._own_note = Note()
+        self.store_health = StoreHealth(self.trouble, clock=clock)
         registry.made_under = self._made_under
         self._noting = threading.RLock()
         """Held while the note is changed; taken after the registry's lock and before the store's."""

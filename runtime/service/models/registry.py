@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import OrderedDict
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,8 +16,7 @@ from lightpage.runtime.model.bundle.signature import BundleKey
 from lightpage.runtime.model.bundle.signature_file import read_signature, signature_path
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.tracking import NoTracker, Tracker
-from lightpage.runtime.service.caller import Caller
-from lightpage.runtime.service.sessions import Sessions
+from lightpage.runtime.service.caller import MOST_SESSIONS, Caller
 
 KEPT_MODELS = 4
 """Models held loaded, the current one included: enough to step back over a bad day, and a bound on the memory."""
@@ -30,6 +30,29 @@ TrackerFactory = Callable[[Decoder], Tracker]
 def no_tracker(decoder: Decoder) -> Tracker:
     """A tracker that follows nothing."""
     return NoTracker(decoder)
+
+
+class Sessions:
+    """A tracker for each session: what the pages of different callers show is kept apart.
+
+    Args:
+        make: makes the tracker of a new one.
+        most: that are remembered.
+    """
+
+    def __init__(self, make: Callable[[], Tracker], most: int = MOST_SESSIONS) -> None:
+        self._make, self._most = make, most
+        self._lock = threading.Lock()
+        self._trackers: OrderedDict[str, Tracker] = OrderedDict()
+
+    def tracker(self, session: str) -> Tracker:
+        """The session's tracker."""
+        with self._lock:
+            found = self._trackers.pop(session, None) or self._make()
+            self._trackers[session] = found
+            while len(self._trackers) > self._most:
+                self._trackers.popitem(last=False)
+            return found
 
 
 @dataclass(frozen=True)

@@ -214,7 +214,6 @@ class ModelStore:
             note = replace(self.note, **changes)
             data: dict[str, Any] = {
                 "base": self._base,
-                "bundle": note.history[note.cursor],  # with the base all that earlier programs read
                 "history": note.history,
                 "cursor": note.cursor,
                 "pinned": sorted(note.pinned),
@@ -243,15 +242,6 @@ class ModelStore:
             os.replace(self.folder / CURRENT, self.folder / DAMAGED)
             _log.warning("%s: a new note is written; the damaged one is %s now", self._subject, DAMAGED)
 
-    def remember(self, path: Path | None) -> None:
-        """Note that a bundle came into service after the base, or the base itself (None).
-
-        Raises:
-            StoreError: the note cannot be written.
-        """
-        history = (None,) if path is None else (None, path.name)
-        self.change(history=history, cursor=len(history) - 1)
-
     @property
     def has_note(self) -> bool:
         """Whether there is a note, whole or not."""
@@ -266,14 +256,10 @@ class ModelStore:
         subject = f"{self._subject}: {CURRENT}"
         try:
             data = json.loads((self.folder / CURRENT).read_text("utf-8"))
-            name, base = data["bundle"], data["base"]
-            pinned = frozenset(map(str, data.get("pinned", ())))
-            origins = {version: Origin(origin) for version, origin in data.get("origins", {}).items()}
+            base, history, cursor = data["base"], tuple(data["history"]), int(data["cursor"])
+            pinned = frozenset(map(str, data["pinned"]))
+            origins = {version: Origin(origin) for version, origin in data["origins"].items()}
             keys = {version: str(key) for version, key in data.get("keys", {}).items()}
-            # A note of an earlier program names the bundle in service alone.
-            history = tuple(data.get("history", (None,) if name is None else (None, name)))
-            cursor = int(data.get("cursor", len(history) - 1))
-            in_service = history[cursor]
         except FileNotFoundError:
             if made := [version for version in self.versions() if "+r" in version]:
                 raise BundleError(subject, "no such file", f"a note: there is {', '.join(made)}") from None
@@ -282,27 +268,12 @@ class ModelStore:
             raise BundleError(subject, repr(error), "a note that can be read") from None
         if base != self._base:
             return Note(pinned=pinned, origins=origins, keys=keys)
-        if in_service != name or cursor < 0:
-            raise BundleError(subject, f"{name!r} and {in_service!r}", "one bundle in service")
+        if not 0 <= cursor < len(history):
+            raise BundleError(subject, f"bundle {cursor} of {len(history)} in service", "one of them")
         for each in history:
             if each is not None and not (isinstance(each, str) and Path(each).name == each and each.endswith(".zip")):
                 raise BundleError(subject, repr(each), "the name of a bundle")
         return Note(history, cursor, pinned, origins, keys)
-
-    def last(self) -> Path | None:
-        """The bundle that was in service when the program ended, None standing for the base.
-
-        None too without a note or with another base's, and, with a warning, where the note or its bundle is lost.
-        """
-        try:
-            note = self.read()
-            name = note.history[note.cursor]
-            if name is not None and not (self.folder / name).is_file():
-                raise BundleError(f"{self._subject}: {name}", "no such file", "the bundle that was in service")
-        except BundleError as error:
-            _log.warning("serving the base: %s", error)
-            return None
-        return None if name is None else self.folder / name
 
     def damaged(self, reason: Reason, error: LightpageError) -> None:
         """Say that the note or the bundle that was in service is lost; so it stays until `settled`."""

@@ -14,9 +14,9 @@ import numpy as np
 
 from lightpage.codec.page_bytes import Loss
 from lightpage.errors import Reason
+from lightpage.runtime.service.caller import MOST_SESSIONS
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.observation import Observation
-from lightpage.runtime.service.sessions import MOST_SESSIONS
 
 _log = logging.getLogger(__name__)
 
@@ -252,10 +252,10 @@ class PageFigures:
         if page is None or observation.lost is not None:
             return figures
         figures |= {
-            AIR.name: observation.claimed_bits or 0.0,
+            AIR.name: page.information_bits,
             TRUST.name: page.pilot_trust,
             SHARE.name: page.check.share,
-            RESIDUAL.name: observation.residual_rad or 0.0,
+            RESIDUAL.name: page.residual_rad,
         }
         if observation.tells:
             figures[CHANGED.name] = float(page.check.recalibration_due)

@@ -5,15 +5,18 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 
+import numpy as np
+
 from lightpage.errors import CallerLeft, InvalidInputError, LimitError, SlotsTakenError
+from lightpage.recording.layout import FrameInfo
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.requests import check_options
-from lightpage.runtime.client.wire.status import refusal_of
+from lightpage.runtime.client.wire.status import detail_of, refusal_of
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.frames.frames import decode_reply, user_data_message
 from lightpage.runtime.service.monitoring.stages import Stage, Stages
-from lightpage.runtime.service.pages.user_data import read_data
-from lightpage.runtime.service.replies import data_reply, read_reply
+from lightpage.runtime.service.pages.reading import DataPage, ReadAnswer, read_data, read_page
 from lightpage.runtime.service.server.call import Call
 from lightpage.runtime.service.server.call_log import reason_told
 
@@ -104,7 +107,7 @@ class PageCalls:
     def _read(self, request: pb.ReadPageRequest, caller: Caller, stages: Stages) -> pb.ReadPageReply:
         page, options = request.page if request.HasField("page") else None, request.options
         levels, user_data = options.levels or None, options.want_user_data
-        read = self._plane.read_page(page, levels, caller, user_data=user_data, stages=stages)
+        read = read_page(self._plane, page, levels, caller, user_data=user_data, stages=stages)
         return read_reply(read, request)
 
     def _check_count(self, subject: str, count: int) -> None:
@@ -118,3 +121,38 @@ class PageCalls:
 def _caller(options: pb.DecodeOptions, call: Call) -> Caller:
     """The caller with its session; without one, the pages are those of the device."""
     return call.caller.in_session(call.session(options.session), options.tracking == pb.TRACKING_STATELESS)
+
+
+def data_reply(page: DataPage) -> pb.ReadDataReply:
+    """A page of a range as its message."""
+    found = pb.UserData(loss=pb.DATA_LOSS_OPTICS) if page.found is None else user_data_message(page.found)
+    return pb.ReadDataReply(
+        page=page.source_page or 0,
+        user_data=found,
+        restored=page.source_page is None,
+        error=None if page.error is None else detail_of(page.error),
+        model_version=page.model_version,
+    )
+
+
+def read_reply(read: ReadAnswer, request: pb.ReadPageRequest) -> pb.ReadPageReply:
+    """A page read from the source as its message."""
+    written = read.shot.symbols if request.want_written else None
+    decoded = decode_reply(read.answer, request.options)
+    decoded.correlation_id = request.correlation_id
+    return pb.ReadPageReply(
+        decoded=decoded,
+        page=read.shot.page_index,
+        written=b"" if written is None else written.tobytes(),
+        pilot_mask=b"" if written is None else read.pilot_mask.astype(np.uint8).tobytes(),
+        frames=[_camera_frame(info) for info in read.shot.infos or ()],
+    )
+
+
+def _camera_frame(info: FrameInfo) -> pb.CameraFrame:
+    return pb.CameraFrame(
+        serial=info.serial,
+        frame_id=info.frame_id,
+        device_time_s=info.device_time_s,
+        host_time_s=info.host_time_s,
+    )

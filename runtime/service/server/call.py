@@ -28,14 +28,13 @@ from lightpage.errors import CallerLeft, MalformedError, OverloadedError, Stalle
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.frame_parts import parsed_part
 from lightpage.runtime.client.wire.status import status_of, told, trailers
-from lightpage.runtime.service.caller import Actor, Caller
+from lightpage.runtime.service.caller import LOCAL, STRANGER, Actor, Caller, Identity, Role, named_session, own_name
 from lightpage.runtime.service.limits import Limits
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.stages import CallTimes
 from lightpage.runtime.service.monitoring.traces import MOST_PAGES, EndedCall, Traces
-from lightpage.runtime.service.server.call_log import CallLog, reason_told
-from lightpage.runtime.service.server.roles import LOCAL, NEEDED, NOBODY, Identity, Role, identity_of
-from lightpage.runtime.service.sessions import named_session, own_name
+from lightpage.runtime.service.server.call_log import log_end, reason_told
+from lightpage.runtime.service.server.roles import NEEDED, identity_of
 
 SERVICE = pb.DESCRIPTOR.services_by_name["Lightpage"]
 
@@ -159,7 +158,7 @@ class Dispatcher:
     ) -> None:
         self._secured = secured
         self._services, self._pool, self._limits = tuple(services), pool, limits
-        self._metrics, self._traces, self._log = metrics, traces, CallLog()
+        self._metrics, self._traces = metrics, traces
         self._full_names: dict[str, tuple[str, str]] = {}
         """Of each name in metrics and logs that of the service and of the method."""
         self._active: set[asyncio.Task[Any]] = set()
@@ -362,7 +361,7 @@ class Dispatcher:
         found = context.auth_context().get("x509_pem_cert")
         if found:
             return identity_of(found[0])
-        return NOBODY if self._secured else LOCAL
+        return STRANGER if self._secured else LOCAL
 
     def _ended(self, call: Call, headers: dict[str, Any], code: grpc.StatusCode, error: BaseException | None) -> None:
         """Count a call, before its caller hears of its end."""
@@ -387,7 +386,8 @@ class Dispatcher:
                 ),
                 headers,
             )
-        self._log.ended(call, code, error)
+        fields = {"method": call.method, "peer": call.actor.name, "correlation_id": call.correlation_id}
+        log_end(fields | {"seconds": round(ended - call.begun, 4)}, code, error, is_watch=call.is_watch)
 
 
 class _Reader:

@@ -12,9 +12,8 @@ from lightpage.runtime.service.display.display_calls import DisplayCalls
 from lightpage.runtime.service.frames.frame_calls import FrameCalls
 from lightpage.runtime.service.jobs.job_calls import JobCalls
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
-from lightpage.runtime.service.models.model_calls import ModelCalls
+from lightpage.runtime.service.models.model_calls import ModelCalls, model_message
 from lightpage.runtime.service.pages.page_calls import PageCalls
-from lightpage.runtime.service.replies import model_message
 from lightpage.runtime.service.server.call import Call
 
 

@@ -1,34 +1,15 @@
-"""Who calls, by the certificate of the connection, and which call needs which role."""
+"""The caller that a connection's certificate names, and the role that each call needs."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from enum import StrEnum
+from collections.abc import Mapping
 from functools import lru_cache
 
 from cryptography import x509
 from cryptography.x509.oid import NameOID
 
 from lightpage.errors import NotAllowedError
-
-
-class Role(StrEnum):
-    """What a caller may do. Every role may look; none but `ADMIN` includes another."""
-
-    READ = "read"
-    """See what the service is and does."""
-    DECODE = "decode"
-    """Have pages decoded and read, and show pages."""
-    RECALIBRATE = "recalibrate"
-    """Start and cancel recalibrations."""
-    ADMIN = "admin"
-    """All of it, and change models."""
-
-
-ROLE_URI = "urn:lightpage:role:"
-"""A certificate's subject alternative names of this kind, with a role behind, say what its owner may do."""
+from lightpage.runtime.service.caller import ROLE_URI, Identity, Role
 
 NEEDED: Mapping[str, Role] = {
     **dict.fromkeys(["Describe", "ListModels", "ListJobs", "GetJob", "WatchJob"], Role.READ),
@@ -44,48 +25,6 @@ NEEDED: Mapping[str, Role] = {
 
 CERTIFICATES_KEPT = 256
 """Certificates whose contents are remembered; others are read again."""
-
-
-@dataclass(frozen=True)
-class Identity:
-    """A caller.
-
-    Attributes:
-        name: the common name of its certificate; empty on a connection that needs none.
-        roles: of it.
-        until: when the certificate ends, seconds since 1970.
-    """
-
-    name: str
-    roles: frozenset[Role]
-    until: float = math.inf
-
-    def may(self, role: Role) -> bool:
-        """Whether it has a role, or one that includes it."""
-        return role in self.roles or Role.ADMIN in self.roles or (role is Role.READ and bool(self.roles))
-
-    def check(self, role: Role, what: str, now: float) -> None:
-        """Check that it may do something.
-
-        Args:
-            role: that this needs.
-            what: it does, e.g. ``call Rollback``.
-            now: seconds since 1970.
-
-        Raises:
-            NotAllowedError: it may not, or its certificate has ended while it was connected.
-        """
-        if now >= self.until:
-            raise NotAllowedError(what, f"a certificate of {self.name} that has expired", "one that is valid")
-        if not self.may(role):
-            got = f"{self.name} with {_listed(self.roles)}"
-            raise NotAllowedError(what, got, f"a certificate with {ROLE_URI}{role}")
-
-
-LOCAL = Identity("", frozenset(Role))
-"""Whoever reaches a service that asks for no certificates: a process of this machine."""
-NOBODY = Identity("nobody", frozenset())
-"""Whoever has no certificate where one is asked for."""
 
 
 @lru_cache(CERTIFICATES_KEPT)
@@ -114,7 +53,3 @@ def _identity_of(certificate: bytes) -> Identity:
         uris = []
     roles = (Role(role) for uri in uris if (role := uri.removeprefix(ROLE_URI)) != uri and role in list(Role))
     return Identity(name, frozenset(roles), read.not_valid_after_utc.timestamp())
-
-
-def _listed(roles: Iterable[Role]) -> str:
-    return ", ".join(f"role {role}" for role in sorted(roles)) or "no role"

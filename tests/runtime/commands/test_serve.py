@@ -157,7 +157,7 @@ def test_a_service_keeps_to_its_limits_logs_json_and_writes_down_changes_and_los
         served.process.kill()
         served.process.wait()
     assert (status, "stopping" in out) == (0, True), err
-    assert store.last() is None
+    assert store.read().cursor == 0
     lines = [json.loads(line) for line in err.splitlines()]
     start = next(line for line in lines if "lightpage" in line)
     assert (start["python"], target in start["message"]) == (sys.version.split()[0], True)

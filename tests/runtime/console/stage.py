@@ -19,6 +19,7 @@ from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 from lightpage.runtime.service.models.registry import ModelRegistry
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor
+from lightpage.runtime.service.pages.reading import read_page
 from lightpage.runtime.service.server.certificates import Certificates
 from tests.runtime import toy
 
@@ -43,7 +44,7 @@ class Stage:
     def read(self, pages: int) -> None:
         for _ in range(pages):
             with suppress(LostPageError):
-                self.plane.read_page(None, None, Caller())
+                read_page(self.plane, None, None, Caller())
 
 
 @contextmanager

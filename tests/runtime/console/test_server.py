@@ -29,14 +29,14 @@ from lightpage.runtime.console.pictures import SIDE_PX, confidence_png, frame_pn
 from lightpage.runtime.console.server import IDENTITY, POINTS, RECENT, Console, ConsoleServer
 from lightpage.runtime.device.acquisition.source import Shot
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.service.caller import Actor, Caller
+from lightpage.runtime.service.caller import STRANGER, Actor, Caller, Identity, Role
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 from lightpage.runtime.service.models.registry import ModelRegistry
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.monitoring.observation import Observation
-from lightpage.runtime.service.server.roles import NOBODY, Identity, Role
+from lightpage.runtime.service.pages.reading import read_page
 from tests.clock import HandClock
 from tests.runtime import toy
 from tests.runtime.console.stage import Stage, stage
@@ -291,7 +291,7 @@ class Asked:
     def __init__(self, decoder: Decoder, folder: Path) -> None:
         self.source, self.clock = Numbered(), HandClock()
         self.plane = DataPlane(ModelRegistry(decoder), self.source)
-        self.plane.adopt(Decoder.load(toy.write_toy_bundle(folder / "c.zip", version="toy-2"), 1))
+        self.plane.models.adopt(Decoder.load(toy.write_toy_bundle(folder / "c.zip", version="toy-2"), 1))
         self.recalibrator = Recalibrator(self.plane, toy.fit_references)
         actions = Actions(self.plane, self.recalibrator)
         registry, metrics = self.plane.registry, self.plane.metrics
@@ -351,7 +351,7 @@ def test_an_administrator_recalibrates_with_the_calibration_pages_and_not_the_co
     assert job["id"] in told
     assert job["state"] in ("DONE", "REFUSED")
     assert asked.source.asked == list(pages or (0, 1))
-    assert asked.plane.read_page(None, None, Caller()).shot.page_index == 0
+    assert read_page(asked.plane, None, None, Caller()).shot.page_index == 0
 
 
 @pytest.mark.parametrize("roles", [[Role.READ], [Role.DECODE, Role.RECALIBRATE], []])
@@ -364,7 +364,7 @@ def test_nobody_else_does(roles: list[Role], asked: Asked) -> None:
 
 
 def test_who_proves_nothing_does_nothing(asked: Asked) -> None:
-    assert asked.act(NOBODY)[0] == asked.act(None)[0] == 403
+    assert asked.act(STRANGER)[0] == asked.act(None)[0] == 403
     asked.clock.advance(1000.0)  # the certificate has ended since its TLS session began
     for path in ("/", "/state.json", "/metrics"):
         assert asked.ask(path, OPERATOR)[0] == 403

@@ -26,7 +26,7 @@ from lightpage.runtime.client.wire.pages import RemotePage
 from lightpage.runtime.device.acquisition.source import Shot
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
-from lightpage.runtime.service.pages.user_data import read_data
+from lightpage.runtime.service.pages.reading import read_data
 from tests.runtime import coded, toy
 from tests.runtime.service.stage import Running, Start, a_page
 

@@ -20,7 +20,7 @@ from lightpage.runtime.device.modulator.external import ExternalBeams, ExternalM
 from lightpage.runtime.device.modulator.screen.screen import ScreenModulator
 from lightpage.runtime.device.modulator.shutters import ShutterBeams
 
-DOCS = Path(__file__).parents[3] / "docs"
+DOCS = Path(__file__).parents[4] / "docs"
 PLAIN = """
 profile = "bench"
 levels = 16

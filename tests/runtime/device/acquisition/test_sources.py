@@ -169,7 +169,7 @@ class VendorSdk:
 
 
 def test_the_source_of_a_vendor_in_the_documents_works(monkeypatch: pytest.MonkeyPatch) -> None:
-    text = (Path(__file__).parents[3] / "docs" / "cameras.md").read_text("utf-8")
+    text = (Path(__file__).parents[4] / "docs" / "cameras.md").read_text("utf-8")
     (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     space: dict[str, object] = {"VendorSdk": VendorSdk}
     exec(compile(code, "docs/cameras.md", "exec", dont_inherit=True), space)

@@ -28,7 +28,7 @@ from tests.waiting import eventually
 xcffib = pytest.importorskip("xcffib")
 from xcffib import randr, xproto  # noqa: E402
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[4]
 PROFILE = small_profile()
 LEVELS = 16
 WAIT_S = 60.0

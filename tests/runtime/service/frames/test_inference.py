@@ -22,6 +22,7 @@ from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import Caller
+from lightpage.runtime.service.frames.frames import decode
 from lightpage.runtime.service.frames.inference_calls import INFERENCE, large_messages
 from lightpage.runtime.service.frames.tensors import Tensor, inputs_of
 from lightpage.runtime.service.limits import Limits
@@ -167,7 +168,7 @@ def test_a_service_in_trouble_is_not_ready(start: Start, monkeypatch: pytest.Mon
 
 def test_only_the_version_in_service_decodes(start: Start, tmp_path: Path) -> None:
     service = start(limits=Limits(concurrent_decodes=1))
-    service.plane.adopt(Decoder(Bundle.open(toy.write_toy_bundle(tmp_path / "toy-2.zip", version="toy-2")), 1))
+    service.plane.models.adopt(Decoder(Bundle.open(toy.write_toy_bundle(tmp_path / "toy-2.zip", version="toy-2")), 1))
     request, stub = request_of(levels=16), stub_of(service)
     metadata = stub.ModelMetadata(oip.ModelMetadataRequest(name="lightpage", version="toy-1"), timeout=20)
     assert list(metadata.versions) == ["toy-1", "toy-2"]
@@ -184,7 +185,7 @@ def test_only_the_version_in_service_decodes(start: Start, tmp_path: Path) -> No
     request.model_name = "bench"
     assert fails(service, request).subject == "model name"
     with pytest.raises(OtherModelError):  # where the model changes while a pair waits for its turn
-        service.plane.decode(PAIR, 16, Caller(), version="toy-1")
+        decode(service.plane, PAIR, 16, Caller(), version="toy-1")
 
 
 def test_a_page_that_is_not_believed_is_no_answer(service: Running) -> None:

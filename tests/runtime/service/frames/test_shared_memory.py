@@ -22,7 +22,7 @@ from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.shared_memory import SharedMemory as ClientMemory
 from lightpage.runtime.client.wire.shared_memory import HANDLE_BYTES, SIZE, memory_path
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.service.frames.receiver import PairReceiver
+from lightpage.runtime.service.frames.frames import PairReceiver
 from lightpage.runtime.service.frames.shared_memory import Region, SharedMemory
 from tests.runtime import toy
 from tests.runtime.service.conftest import begun

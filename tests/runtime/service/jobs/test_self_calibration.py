@@ -21,15 +21,16 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_position import ImagePosition
 from lightpage.runtime.model.decoding.page import DecodedPage
 from lightpage.runtime.recalibration.outcome import Refit, RefitResult
-from lightpage.runtime.service.caller import Caller
+from lightpage.runtime.service.caller import Caller, named_session
 from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.frames.frames import decode
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 from lightpage.runtime.service.jobs.self_calibration import SelfCalibration, SelfCalibrationSettings
 from lightpage.runtime.service.models.registry import ModelRegistry
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor, MonitorSettings, PageFigures, SessionMonitors
 from lightpage.runtime.service.monitoring.observation import Observation
-from lightpage.runtime.service.sessions import named_session
+from lightpage.runtime.service.pages.reading import read_page
 from lightpage.runtime.service.settings import ServiceSettings
 from tests.clock import HandClock
 from tests.runtime import toy
@@ -157,7 +158,7 @@ def test_what_a_page_says_of_the_device(page: DecodedPage) -> None:
     poor = replace(page, check=replace(page.check, confirmed_bits=0.3 * page.check.claimed_bits))
     assert PageFigures().of(observation(poor))["page_due"] == poor.check.recalibration_due == 1
     assert "page_due" not in PageFigures().of(observation(poor, tells=False))
-    assert told["air_bits"] == observation(page).claimed_bits
+    assert told["air_bits"] == page.information_bits
     told = figures.of(observation(replace(page, piston_rad=-3.0), user_data=found(None, 0.1)))
     assert told["piston_walk_rad"] == pytest.approx(2 * math.pi - 6)
     assert (told["margin_bits"], told["unread"]) == (0.1, 0)
@@ -191,7 +192,7 @@ def plane_of(decoder: Decoder, *device_sessions: str) -> DataPlane:
 def send(plane: DataPlane, pair: FramePair, session: str, stateless: bool = False) -> bool:
     """Whether a caller hears that a recalibration is due."""
     try:
-        return plane.decode(pair, 16, Caller(session=session, stateless=stateless)).recalibration_due
+        return decode(plane, pair, 16, Caller(session=session, stateless=stateless)).recalibration_due
     except UnconfirmedPageError as error:
         return error.recalibration_due
 
@@ -212,7 +213,7 @@ def test_another_devices_frames_raise_their_own_sessions_flag_alone(session: str
     assert not send(plane, own(50), "session third")
     assert not plane.monitor.due
     assert not woken
-    assert not plane.read_page(None, None, Caller()).answer.recalibration_due
+    assert not read_page(plane, None, None, Caller()).answer.recalibration_due
     assert plane.monitor.state().pages == 1
 
 
@@ -223,7 +224,7 @@ def test_pages_of_the_source_feed_the_monitor_and_what_is_decoded_as_if_it_were_
     assert plane.monitor is not None
     plane.observers = (SimpleNamespace(observe=lambda each: of_device.append(each.of_device)),)
     for caller in (Caller(), Caller(session="session a"), Caller(stateless=True)):
-        plane.read_page(None, None, caller)
+        read_page(plane, None, None, caller)
     assert plane.monitor.state().pages == 3
     send(plane, own(1), "session b")
     assert of_device == [True, True, True, False]
@@ -240,7 +241,7 @@ def test_a_session_that_is_named_as_the_device_feeds_the_monitor(decoder: Decode
         send(plane, another_devices(seed), "session press-1")
     assert plane.monitor.due
     assert due_sessions(plane) == 0
-    assert plane.read_page(None, None, Caller()).answer.recalibration_due
+    assert read_page(plane, None, None, Caller()).answer.recalibration_due
     assert not send(plane, own(50), "session press-2")
 
 
@@ -274,7 +275,7 @@ def test_the_setting_names_sessions_as_callers_do(tmp_path: Path) -> None:
 def test_figures_of_the_last_page_show_the_device(decoder: Decoder) -> None:
     plane = plane_of(decoder, "session press-1")
     value = plane.metrics.registry.get_sample_value
-    plane.read_page(None, None, Caller())
+    read_page(plane, None, None, Caller())
     shown = value("lightpage_confidence_mean")
     dim = toy.ToyDevice(noise=60.0, seed=9).page(toy.symbols_of(16, 9)[0], 16)
     send(plane, dim, "session other")
@@ -327,7 +328,7 @@ class Loop:
         lost = 0
         for _ in range(count):
             try:
-                self.plane.read_page(None, None, Caller())
+                read_page(self.plane, None, None, Caller())
             except (UnconfirmedPageError, SourceError):
                 lost += 1
         return lost

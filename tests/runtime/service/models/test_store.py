@@ -25,7 +25,6 @@ from lightpage.runtime.service.models.store import (
     LOCK,
     PROBE_S,
     ModelStore,
-    Note,
     Origin,
 )
 from lightpage.runtime.service.models.store_health import LONGEST_S, StoreHealth
@@ -58,11 +57,17 @@ def put(store: ModelStore, *versions: str) -> None:
 def worn(decoder: Decoder, store: ModelStore) -> DataPlane:
     """A service with a history: base, r1, r2, r3."""
     put(store, "toy-1+r1", "toy-1+r2", "toy-1+r3")
-    store.remember(store.path_of("toy-1+r1"))
     plane = a_plane(decoder, store)
+    plane.models.activate("toy-1+r1")
     plane.models.activate("toy-1+r2")
     plane.models.activate("toy-1+r3")
     return plane
+
+
+def trouble(plane: DataPlane) -> str:
+    """What is wrong with the store, empty where nothing is."""
+    found = plane.models.trouble()
+    return "" if found is None else found.text
 
 
 def figure(plane: DataPlane, name: str, **labels: str) -> float | None:
@@ -70,13 +75,13 @@ def figure(plane: DataPlane, name: str, **labels: str) -> float | None:
 
 
 def test_the_history_survives_a_restart(worn: DataPlane, decoder: Decoder, store: ModelStore) -> None:
-    worn.rollback()
+    worn.models.rollback()
     after = a_plane(decoder, store)
     assert after.registry.history == worn.registry.history
     assert after.registry.current.version == "toy-1+r2"
     assert after.models.roll_forward()[0].version == "toy-1+r3"
     again = a_plane(decoder, store)
-    assert [again.rollback()[0].version for _ in range(3)] == ["toy-1+r2", "toy-1+r1", "toy-1"]
+    assert [again.models.rollback()[0].version for _ in range(3)] == ["toy-1+r2", "toy-1+r1", "toy-1"]
     assert a_plane(decoder, store).models.roll_forward()[0].version == "toy-1+r1"
 
 
@@ -91,23 +96,6 @@ def test_pins_and_origins_survive_a_restart_and_another_base(
         note = ModelStore(store.folder, base).read()
         assert (note.origins, note.pinned) == ({"toy-1+r2": Origin.UPLOADED}, {"toy-1+r1"})
         assert len(note.history) == places
-
-
-def test_a_note_of_an_earlier_program_is_read_and_one_of_this_names_what_that_reads(
-    decoder: Decoder, store: ModelStore
-) -> None:
-    put(store, "toy-1+r1")
-    store.change()
-    base = json.loads((store.folder / CURRENT).read_text())["base"]
-    (store.folder / CURRENT).write_text(json.dumps({"base": base, "bundle": "toy-1+r1.zip"}))
-    plane = a_plane(decoder, store)
-    assert plane.registry.current.version == "toy-1+r1"
-    assert plane.rollback()[0].version == "toy-1"
-    written = json.loads((store.folder / CURRENT).read_text())
-    kept = [written[name] for name in ("base", "bundle", "history", "cursor")]
-    assert kept == [base, None, [None, "toy-1+r1.zip"], 0]
-    (store.folder / CURRENT).write_text(json.dumps({"base": base, "bundle": None}))
-    assert store.read() == Note()
 
 
 def test_a_second_service_is_kept_out_and_what_a_killed_one_left_is_swept(decoder: Decoder, store: ModelStore) -> None:
@@ -134,16 +122,16 @@ def test_a_damaged_bundle_is_said_and_the_newest_before_it_that_is_there_serves(
     store.path_of("toy-1+r1").unlink()
     plane = a_plane(decoder, store)
     assert plane.registry.current.version == "toy-1+r2"
-    assert "toy-1+r3.zip" in plane.store_trouble()
+    assert "toy-1+r3.zip" in trouble(plane)
     assert figure(plane, "lightpage_store_ok") == 0
     assert figure(plane, "lightpage_store_trouble", reason="bundle") == 1
     assert figure(plane, "lightpage_model_info", version="toy-1+r2") == 1
     plane.models.pin("toy-1", True)  # says nothing of what is to be in service
-    assert "toy-1+r3.zip" in a_plane(decoder, store).store_trouble()
-    assert plane.rollback()[0].version == "toy-1"
-    assert plane.store_trouble() == a_plane(decoder, store).store_trouble() == ""
+    assert "toy-1+r3.zip" in trouble(a_plane(decoder, store))
+    assert plane.models.rollback()[0].version == "toy-1"
+    assert trouble(plane) == trouble(a_plane(decoder, store)) == ""
     store.path_of("toy-1+r2").unlink()
-    assert "toy-1+r2.zip" in a_plane(decoder, store).store_trouble()
+    assert "toy-1+r2.zip" in trouble(a_plane(decoder, store))
 
 
 def test_nothing_is_deleted_while_it_is_not_settled_what_is_to_be_in_service(
@@ -168,20 +156,27 @@ def test_a_note_that_is_damaged_or_gone_is_said(content: str | None, decoder: De
         note.write_text(content)
     plane = a_plane(decoder, store)
     assert plane.registry.current.version == "toy-1"
-    assert CURRENT in plane.store_trouble()
+    assert CURRENT in trouble(plane)
     assert figure(plane, "lightpage_store_trouble", reason="note") == 1
     assert note.exists() == (content is not None)  # the next start says it again
     plane.models.activate("toy-1+r2")
     kept = store.folder / DAMAGED
     assert (kept.read_text() if kept.exists() else None) == content
-    assert plane.store_trouble() == ""
+    assert trouble(plane) == ""
     assert a_plane(decoder, store).registry.current.version == "toy-1+r2"
 
 
 @pytest.mark.usefixtures("worn")
 @pytest.mark.parametrize(
     "change",
-    [{"cursor": 7}, {"cursor": -1}, {"cursor": 0}, {"history": [None, 3]}, {"bundle": "../x", "history": ["../x"]}],
+    [
+        {"cursor": 7},
+        {"cursor": -1},
+        {"cursor": "x"},
+        {"history": [None, 3]},
+        {"history": ["../x"], "cursor": 0},
+        {"base": 3, "pinned": 3},
+    ],
 )
 def test_a_note_that_contradicts_itself_is_damaged(change: dict[str, object], store: ModelStore) -> None:
     note = store.folder / CURRENT
@@ -199,8 +194,8 @@ def test_pinned_loaded_and_foreign_bundles_are_never_pruned_and_pruned_ones_leav
         store.path_of(name).write_bytes(b"")
     for age, name in enumerate(["bench", *names]):
         os.utime(store.path_of(name), (age, age))
-    store.remember(store.path_of(names[0]))
     plane = a_plane(decoder, store)
+    plane.models.activate(names[0])
     for name in names[1:6]:
         plane.models.activate(name)
     plane.models.pin(names[1], True)
@@ -225,10 +220,10 @@ def test_a_full_disk_is_noticed_and_said_until_there_is_room(
         patch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=2 * size - 1))
         with pytest.raises(StoreError, match="model store"):
             plane.models.check_store()
-        assert str(2 * size) in plane.store_trouble()
+        assert str(2 * size) in trouble(plane)
         assert figure(plane, "lightpage_store_trouble", reason="full") == 1
         patch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=2 * size))
-        assert plane.store_trouble() == ""
+        assert trouble(plane) == ""
         with pytest.raises(StoreError, match="model store"):
             plane.models.check_store(2 * size + 1)
     assert figure(plane, "lightpage_store_ok") == 1
@@ -242,32 +237,32 @@ def test_a_store_that_cannot_be_written_is_noticed_and_nothing_changes(
     with monkeypatch.context() as patch:
         for module in ("lightpage.runtime.service.models.store", "lightpage.files"):
             patch.setattr(f"{module}.new_file", _read_only)
-        for change in (worn.rollback, lambda: models.pin("toy-1", True), lambda: models.activate("toy-1")):
+        for change in (models.rollback, lambda: models.pin("toy-1", True), lambda: models.activate("toy-1")):
             with pytest.raises(StoreError, match="model store"):
                 change()
-        assert "Read-only" in worn.store_trouble()
+        assert "Read-only" in trouble(worn)
         assert figure(worn, "lightpage_store_trouble", reason="read_only") == 1
     assert worn.registry.current.version == "toy-1+r3"
     assert not models.entry(worn.registry.models[0]).pinned
-    assert worn.store_trouble() == ""
-    assert worn.rollback()[0].version == "toy-1+r2"
+    assert trouble(worn) == ""
+    assert worn.models.rollback()[0].version == "toy-1+r2"
 
 
 def test_a_folder_that_is_gone_or_another_is_noticed(decoder: Decoder, store: ModelStore, tmp_path: Path) -> None:
     plane = DataPlane(ModelRegistry(decoder), store=store)
     with store.locked():
         plane.models.resume()
-        assert plane.store_trouble() == ""
+        assert trouble(plane) == ""
         away = store.folder.rename(tmp_path / "away")
         assert figure(plane, "lightpage_store_trouble", reason="gone") == 1
         store.folder.mkdir()  # as under a disk that is not mounted
         (store.folder / LOCK).touch()
-        assert "another folder" in plane.store_trouble()
+        assert "another folder" in trouble(plane)
         with pytest.raises(StoreError, match="another folder"):
             store.change()
         shutil.rmtree(store.folder)
         away.rename(store.folder)
-        assert plane.store_trouble() == ""
+        assert trouble(plane) == ""
 
 
 def test_the_store_is_tried_now_and_then_and_not_whenever_somebody_asks(
@@ -275,19 +270,19 @@ def test_the_store_is_tried_now_and_then_and_not_whenever_somebody_asks(
 ) -> None:
     clock = HandClock()
     plane = a_plane(decoder, store, clock=clock.now)
-    assert plane.store_trouble() == ""
+    assert trouble(plane) == ""
     monkeypatch.setattr("lightpage.runtime.service.models.store.new_file", _read_only)
     clock.advance(PROBE_S - 0.1)
-    assert plane.store_trouble() == ""
+    assert trouble(plane) == ""
     clock.advance(0.1)
-    assert "Read-only" in plane.store_trouble()
+    assert "Read-only" in trouble(plane)
 
 
 def test_a_service_without_a_store_has_no_trouble_and_shows_none(decoder: Decoder) -> None:
     plane = DataPlane(ModelRegistry(decoder))
     plane.models.resume()
     plane.models.check_store()
-    assert plane.store_trouble() == ""
+    assert trouble(plane) == ""
     assert figure(plane, "lightpage_store_ok") is None
 
 

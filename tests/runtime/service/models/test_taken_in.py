@@ -208,7 +208,7 @@ def test_a_stored_bundle_without_its_own_signature_is_refused(service: Signed) -
 def recalibrated(plane: DataPlane, folder: Path, version: str) -> Path:
     """The bundle of a recalibration that the service has made and put in service."""
     path = toy.write_toy_bundle(folder / "store" / f"{version}.zip", version=version)
-    plane.adopt(plane.registry.current.decoder.of_another(Bundle.open(path)))
+    plane.models.adopt(plane.registry.current.decoder.of_another(Bundle.open(path)))
     return path
 
 
@@ -218,7 +218,9 @@ def test_a_recalibration_under_no_key_or_another_one_needs_a_signature(tmp_path:
     own = recalibrated(begin(tmp_path, before if earlier == "another" else None), tmp_path, "toy-1+r1")
     plane = begin(tmp_path, signer)
     assert plane.registry.current.version == "toy-1"
-    assert f"under {earlier} bundle" in plane.store_trouble()
+    found = plane.models.trouble()
+    assert found is not None
+    assert f"under {earlier} bundle" in found.text
     with pytest.raises(BundleError, match=f"under {earlier} bundle"):
         plane.models.activate("toy-1+r1")
     recalibrated(plane, tmp_path, "toy-1+r2")

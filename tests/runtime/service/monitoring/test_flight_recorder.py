@@ -24,6 +24,7 @@ from lightpage.runtime.service.monitoring.flight_recorder import FlightRecorder,
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.monitoring.observation import Observation
+from lightpage.runtime.service.pages.reading import read_page
 from tests.runtime import toy
 from tests.waiting import eventually
 
@@ -46,7 +47,7 @@ def count(metrics: ServiceMetrics, result: str) -> float:
 def read_lost(plane: DataPlane, pages: int) -> None:
     for _ in range(pages):
         with suppress(UnconfirmedPageError):
-            plane.read_page(None, None, Caller())
+            read_page(plane, None, None, Caller())
 
 
 def test_a_lost_page_is_kept_with_why(registry: ModelRegistry, tmp_path: Path) -> None:
@@ -140,7 +141,7 @@ def test_a_disk_that_takes_nothing_hurts_no_read(registry: ModelRegistry, tmp_pa
         folder.write_text("no folder")
         read_lost(plane, 3)
         source.device.offsets = toy.OFFSETS
-        plane.read_page(None, None, Caller())
+        read_page(plane, None, None, Caller())
     assert count(metrics, "failed") + count(metrics, "dropped") == 3
 
 

@@ -8,7 +8,6 @@ import logging
 import re
 import threading
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +18,7 @@ import pytest
 
 from lightpage.errors import BundleError, CallerLeft, InvalidInputError, OverloadedError, Reason
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.service.caller import Actor, Caller
+from lightpage.runtime.service.caller import Actor
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 from lightpage.runtime.service.jobs.self_calibration import SelfCalibration
@@ -29,8 +28,7 @@ from lightpage.runtime.service.models.store import ModelStore
 from lightpage.runtime.service.monitoring.logs import LimitedHandler, PageLog, TextFormatter, logging_to_stderr
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.monitoring.observation import Observation
-from lightpage.runtime.service.server.call import Call
-from lightpage.runtime.service.server.call_log import CallLog
+from lightpage.runtime.service.server.call_log import log_end
 from tests.clock import HandClock
 from tests.lightpage.full_disk import full_disk
 from tests.runtime import toy
@@ -39,8 +37,8 @@ from tests.waiting import eventually
 _Code = grpc.StatusCode
 
 
-def call(method: str = "ReadPage", correlation_id: str = "order 7") -> Call:
-    return Call(method, Caller(), ThreadPoolExecutor(1), "ipv4:127.0.0.1:9", correlation_id)
+def call(method: str = "ReadPage", correlation_id: str = "order 7") -> dict[str, Any]:
+    return {"method": method, "peer": "ipv4:127.0.0.1:9", "correlation_id": correlation_id, "seconds": 0.5}
 
 
 @contextmanager
@@ -53,10 +51,9 @@ def json_lines(level: str = "debug", most: int = 100) -> Iterator[list[dict[str,
 
 def test_a_call_is_logged_with_who_called_why_it_ended_and_how_long_it_took() -> None:
     with json_lines() as lines:
-        CallLog().ended(call(), _Code.INVALID_ARGUMENT, InvalidInputError("levels", 1, "2..256"))
+        log_end(call(), _Code.INVALID_ARGUMENT, InvalidInputError("levels", 1, "2..256"))
     (line,) = lines
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}\+00:00", line.pop("time"))
-    assert line.pop("seconds") >= 0
     assert line == {
         "level": "INFO",
         "logger": "lightpage.runtime.service.server.call_log",
@@ -64,6 +61,7 @@ def test_a_call_is_logged_with_who_called_why_it_ended_and_how_long_it_took() ->
         "method": "ReadPage",
         "peer": "ipv4:127.0.0.1:9",
         "correlation_id": "order 7",
+        "seconds": 0.5,
         "code": "INVALID_ARGUMENT",
         "reason": "INVALID_VALUE",
     }
@@ -84,7 +82,7 @@ def test_how_a_call_ends_says_how_loud_it_is(
     method: str, code: grpc.StatusCode, error: BaseException | None, level: str, reason: str | None
 ) -> None:
     with json_lines() as lines:
-        CallLog().ended(call(method), code, error)
+        log_end(call(method), code, error, is_watch=method == "WatchDisplay")
     (line,) = lines
     assert (line["level"], line["code"], line.get("reason")) == (level, code.name, reason)
     assert ("traceback" in line) == (level == "ERROR")
@@ -110,7 +108,7 @@ def test_a_caller_cannot_write_lines_of_its_own() -> None:
     stream = io.StringIO()
     with logging_to_stderr("text", "info", 5, stream):
         error = InvalidInputError("name\n2026 ERROR root: \x1b[31mforged", "a", "b")
-        CallLog().ended(call(correlation_id='x\ny="1"' + 1000 * "z"), _Code.INVALID_ARGUMENT, error)
+        log_end(call(correlation_id='x\ny="1"' + 1000 * "z"), _Code.INVALID_ARGUMENT, error)
     (line,) = stream.getvalue().splitlines()
     assert "name\\n2026 ERROR root: \\x1b[31mforged" in line
     assert ' correlation_id="x\\ny=\\"1\\"zzz' in line

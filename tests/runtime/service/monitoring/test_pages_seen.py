@@ -12,12 +12,14 @@ from lightpage.page.pilots import Pilots
 from lightpage.runtime.device.acquisition.source import SHOT_S, Shot
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import Caller
-from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.dataplane import DataPlane, Seen
+from lightpage.runtime.service.frames.frames import decode
 from lightpage.runtime.service.models.registry import ModelRegistry
 from lightpage.runtime.service.monitoring.metrics import VERSIONS, ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import PageFigures
-from lightpage.runtime.service.monitoring.observation import Observation, Seen
+from lightpage.runtime.service.monitoring.observation import Observation
 from lightpage.runtime.service.monitoring.stages import CallTimes, Lap, Stage, Stages
+from lightpage.runtime.service.pages.reading import read_page
 from lightpage.von_mises import information
 from tests.clock import HandClock
 from tests.runtime import toy
@@ -45,23 +47,21 @@ def test_pages_given_out_and_lost_are_observed(decoder: Decoder) -> None:
     broken, notebook = Notebook(broken=True), Notebook()
     registry = ModelRegistry(decoder)
     plane = DataPlane(registry, LosingSource(toy.ToyDevice()), observers=[broken, notebook])
-    plane.read_page(0, None, Caller())
+    read_page(plane, 0, None, Caller())
     with pytest.raises(LostShotError):
-        plane.read_page(1, None, Caller())
+        read_page(plane, 1, None, Caller())
     pair = toy.ToyDevice().page(toy.symbols_of(16, 3)[0], 16, 0.1)
     wrong = Pilots.of_symbols(registry.current.decoder.bundle.pilot_mask, np.zeros(toy.PAGE, np.uint8), 16)
     with pytest.raises(UnconfirmedPageError):
-        plane.decode(pair, 16, Caller(), wrong)
+        decode(plane, pair, 16, Caller(), wrong)
     given, shot, unconfirmed = notebook.seen
     assert (given.page_index, given.lost, given.tells) == (0, None, True)
     assert given.page is not None
     assert given.pair is not None
     kappa = given.page.concentration.astype(np.float64)
-    assert given.claimed_bits == pytest.approx(information(kappa).mean() / np.log(2))
-    assert given.residual_rad == pytest.approx(np.sqrt(np.square(given.page.phase_error).mean()))
-    assert not given.unread
+    assert given.page.information_bits == pytest.approx(information(kappa).mean() / np.log(2))
+    assert given.page.residual_rad == pytest.approx(np.sqrt(np.square(given.page.phase_error).mean()))
     assert (shot.page_index, shot.lost, shot.pair, shot.page) == (1, Reason.MISSING_FRAME, None, None)
-    assert shot.unread
     assert (unconfirmed.lost, unconfirmed.tells) == (Reason.PILOTS_DISAGREE, False)
     assert unconfirmed.page is not None
     assert len(broken.seen) == 3
@@ -73,9 +73,9 @@ def test_pages_of_the_source_whose_frames_contradict_each_other_are_observed_as_
     notebook, source = Notebook(), toy.ToySource(toy.ToyDevice((180.0, 30.0)))
     plane = DataPlane(ModelRegistry(decoder), source, observers=[notebook])
     with pytest.raises(SourceError, match="contradict"):
-        plane.read_page(0, None, Caller())
+        read_page(plane, 0, None, Caller())
     with pytest.raises(FrameError, match="contradict"):  # a caller's frames may be swapped
-        plane.decode(source.shot(page=1).pair, 16, Caller())
+        decode(plane, source.shot(page=1).pair, 16, Caller())
     (seen,) = notebook.seen
     assert (seen.lost, seen.page_index, seen.page) == (Reason.UNSPECIFIED, 0, None)
     assert seen.pair is not None

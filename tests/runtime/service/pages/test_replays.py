@@ -22,7 +22,7 @@ from lightpage.errors import (
 )
 from lightpage.runtime.client.wire.status import status_of
 from lightpage.runtime.service.caller import Caller
-from lightpage.runtime.service.frames.receiver import PairReceiver, ReceiveBudget
+from lightpage.runtime.service.frames.frames import PairReceiver, ReceiveBudget
 from lightpage.runtime.service.pages.replays import Replays
 from tests.clock import HandClock
 

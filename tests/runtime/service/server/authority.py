@@ -15,7 +15,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from lightpage.runtime.client.wire.tls import TlsFiles
-from lightpage.runtime.service.server.roles import ROLE_URI
+from lightpage.runtime.service.caller import ROLE_URI
 
 _DAY = timedelta(days=1)
 _USES = inspect.signature(x509.KeyUsage).parameters

@@ -23,6 +23,7 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.frames.inference_calls import INFERENCE
 from lightpage.runtime.service.limits import Limits
+from lightpage.runtime.service.pages import page_calls
 from lightpage.runtime.service.pages.page_calls import PageCalls
 from lightpage.runtime.service.server.call import SERVICE, Call
 from tests.clock import HandClock
@@ -169,13 +170,13 @@ def test_a_page_that_is_read_on_though_its_caller_left_has_the_services_own_dead
 ) -> None:
     running, clock, left = begun(decoder, limits=Limits(deadline_s=7.0)), HandClock(), list[float]()
 
-    def read_page(page: object, levels: object, caller: Caller, **_: object) -> None:
+    def read_page(plane: object, page: object, levels: object, caller: Caller, **_: object) -> None:
         for _ in range(2):
             left.append(caller.seconds_left())
             clock.advance(2.0)
         raise CallerLeft
 
-    monkeypatch.setattr(running.plane, "read_page", read_page)
+    monkeypatch.setattr(page_calls, "read_page", read_page)
     call = Call("ReadPage", Caller(lambda: 1.0), ThreadPoolExecutor(1))
     with pytest.raises(CallerLeft):
         PageCalls(running.plane, clock.now).ReadPage(pb.ReadPageRequest(request_id="a"), call)

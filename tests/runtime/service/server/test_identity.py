@@ -23,12 +23,13 @@ from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2_grpc as pb_gr
 from lightpage.runtime.client.wire.channel import open_channel
 from lightpage.runtime.client.wire.tls import TlsFiles
 from lightpage.runtime.commands.service.healthcheck import is_serving
+from lightpage.runtime.service.caller import Role
 from lightpage.runtime.service.frames.inference_calls import INFERENCE, PREFIX
 from lightpage.runtime.service.models.audit import AuditLog
 from lightpage.runtime.service.server.call import SERVICE
 from lightpage.runtime.service.server.certificates import Certificates
 from lightpage.runtime.service.server.health_server import HealthServer
-from lightpage.runtime.service.server.roles import NEEDED, Role
+from lightpage.runtime.service.server.roles import NEEDED
 from lightpage.runtime.service.server.server import LightpageServer
 from tests.runtime.service.server.authority import Authority
 from tests.runtime.service.stage import Remembering, Running, Start, a_page

@@ -1,7 +1,8 @@
-"""How many may do a thing at once: first come, first served, and nobody is let in who could not finish."""
+"""What may be at work at once: slots, first come, first served, and bytes of frames that were received."""
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections import deque
 from collections.abc import Iterator
@@ -9,6 +10,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import ceil
 from statistics import median
+
+import numpy as np
 
 from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import OverloadedError, SlotsTakenError
@@ -25,6 +28,13 @@ REMEMBERED = 20
 
 FORGET_S = 30.0
 """After that a call's time is forgotten: where all are refused, nothing else would show that calls are fast again."""
+
+
+Bytes = np.ndarray[tuple[int], np.dtype[np.uint8]]
+
+_RETRY_S = 1.0
+_UNSEEN = 2
+"""References to spare memory that nobody has a view of: the budget's, and the argument of the count itself."""
 
 
 @dataclass(eq=False)
@@ -192,3 +202,69 @@ class Slots:
             return OverloadedError(subject, told, f"at least {needed_s:.2f} s")
         expected = f"at least {needed_s:.2f} s, {wait_s:.2f} s of it in the queue; try again later"
         return OverloadedError(subject, told, expected, max(self.usual_s / self._count, needed_s - left_s))
+
+
+class ReceiveBudget:
+    """Bytes that all callers together may have sent of pairs that are not yet decoded.
+
+    Only what has come counts: a caller who sends a header and no more takes nothing from the others.
+
+    Args:
+        size: bytes.
+    """
+
+    def __init__(self, size: int) -> None:
+        self._size, self._used, self._taken = size, 0, 0
+        self._spare: Bytes | None = None
+        self._lock = threading.Lock()
+
+    @property
+    def used(self) -> int:
+        """Bytes that are taken."""
+        with self._lock:
+            return self._used
+
+    @property
+    def size(self) -> int:
+        """Bytes that there are."""
+        return self._size
+
+    @property
+    def taken(self) -> int:
+        """Bytes that were ever taken."""
+        with self._lock:
+            return self._taken
+
+    def take(self, count: int) -> None:
+        """Take bytes.
+
+        Raises:
+            OverloadedError: they are not there.
+        """
+        with self._lock:
+            if self._used + count > self._size:
+                got, expected = f"{self._used} bytes", f"at most {self._size} with {count} more; try again later"
+                raise OverloadedError("frames that are being received", got, expected, retry_s=_RETRY_S)
+            self._used += count
+            self._taken += count
+
+    def give_back(self, count: int) -> None:
+        """Give bytes back."""
+        with self._lock:
+            self._used -= count
+
+    def memory(self, size: int) -> Bytes:
+        """Memory for a pair, uint8 [size]: that of one before, where nobody holds a view of it any more.
+
+        The system would have to fill new memory with zeros first, which takes as long as the pair does.
+        """
+        with self._lock:
+            if self._spare is not None and self._spare.size == size and sys.getrefcount(self._spare) == _UNSEEN:
+                spare, self._spare = self._spare, None
+                return spare
+        return np.empty(size, np.uint8)
+
+    def spare(self, memory: Bytes) -> None:
+        """Leave memory of a pair to a later one; one is kept."""
+        with self._lock:
+            self._spare = memory

@@ -1,0 +1,286 @@
+"""Frames that callers send: checked against the camera, received, decoded with the model in service, and answered."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.codec.page_bytes import PageBytes
+from lightpage.errors import CallerLeft, FrameError, LimitError
+from lightpage.page.pilots import Pilots
+from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
+from lightpage.runtime.client.wire.messages import DATA_LOSSES, FLOAT, image_message
+from lightpage.runtime.service.admission import Bytes, ReceiveBudget
+from lightpage.runtime.service.caller import Caller
+from lightpage.runtime.service.dataplane import Answer, DataPlane, Seen, levels_for, observed
+from lightpage.runtime.service.monitoring.monitor import (
+    AIR,
+    CHANGED,
+    MARGIN,
+    PISTON_WALK,
+    RESIDUAL,
+    SHARE,
+    SHIFT,
+    TRUST,
+    UNREAD,
+)
+from lightpage.runtime.service.monitoring.stages import Stage, Stages
+
+
+class PairReceiver:
+    """Takes in-phase pixels, then quadrature pixels, in chunks of any size.
+
+    Args:
+        shape: (rows, columns) of a frame.
+        dtype: "uint8" or "uint16" (little-endian on the wire).
+        max_bytes: most bytes of a pair.
+        budget: that it takes its bytes from until it is closed; None for none.
+
+    Raises:
+        LimitError: the pair would be larger than `max_bytes`; nothing is allocated then.
+    """
+
+    def __init__(self, shape: tuple[int, int], dtype: str, max_bytes: int, budget: ReceiveBudget | None = None) -> None:
+        self._shape, self._budget = shape, budget
+        self._dtype = np.dtype(dtype).newbyteorder("<")
+        self.size = 2 * shape[0] * shape[1] * self._dtype.itemsize
+        if self.size > max_bytes:
+            raise LimitError("frame pair", f"{self.size} bytes", f"at most {max_bytes}")
+        self._lock = threading.Lock()
+        """Held while bytes are taken in, so that nobody lets go of them meanwhile."""
+        self._buffer: Bytes | None = None
+        self._filled, self._closed = 0, False
+
+    @property
+    def filled(self) -> int:
+        """Bytes that have come."""
+        return self._filled
+
+    @property
+    def complete(self) -> bool:
+        """Whether every pixel has come."""
+        return self._filled == self.size
+
+    def add(self, chunk: bytes | memoryview) -> None:
+        """Take in the next bytes.
+
+        Raises:
+            FrameError: more bytes than the two frames have.
+            OverloadedError: more than the budget has.
+            CallerLeft: it is closed.
+        """
+        with self._lock:
+            if self._closed:
+                raise CallerLeft
+            end = self._filled + len(chunk)
+            if end > self.size:
+                raise FrameError("frame pair", f"at least {end} bytes", f"{self.size} bytes, as the header says")
+            if self._budget is not None:
+                self._budget.take(len(chunk))
+            if self._buffer is None:
+                self._buffer = np.empty(self.size, np.uint8) if self._budget is None else self._budget.memory(self.size)
+            self._buffer[self._filled : end] = np.frombuffer(chunk, np.uint8)
+            self._filled = end
+
+    def checked(self) -> Self:
+        """Itself, if every pixel has come.
+
+        Raises:
+            FrameError: bytes are missing.
+        """
+        if not self.complete:
+            raise FrameError("frame pair", f"{self._filled} bytes", f"{self.size} bytes, as the header says")
+        return self
+
+    def pair(self) -> FramePair:
+        """The two frames, views of the one buffer.
+
+        Raises:
+            FrameError: bytes are missing.
+        """
+        self.checked()
+        assert self._buffer is not None  # of what is complete
+        halves = self._buffer.reshape(2, -1)
+        native = self._dtype.newbyteorder("=")
+        in_phase, quadrature = (
+            half.view(self._dtype).reshape(self._shape).astype(native, copy=False) for half in halves
+        )
+        return FramePair(in_phase, quadrature)
+
+    def close(self) -> None:
+        """Give back what it took from the budget, and take no more."""
+        with self._lock:
+            self._closed = True
+            if self._budget is not None:
+                self._budget.give_back(self._filled)
+                if self._buffer is not None:
+                    self._budget.spare(self._buffer)
+            self._filled, self._buffer = 0, None
+
+
+def check_format(plane: DataPlane, shape: tuple[int, int], dtype: str, bit_depth: int) -> None:
+    """Check what a caller says of frames against the camera, before a byte is allocated for them.
+
+    Raises:
+        LimitError: the pair is larger than the service accepts.
+        FrameError: not this device's size, type or bit depth.
+    """
+    # Size first: a header may claim anything, and a limit is the service's, not the camera's.
+    if 2 * shape[0] * shape[1] * np.dtype(dtype).itemsize > plane.limits.pair_bytes:
+        PairReceiver(shape, dtype, plane.limits.pair_bytes)
+    bundle = plane.registry.current.decoder.bundle
+    expected = (bundle.profile.frame_shape, bundle.manifest.frame_dtype, bundle.manifest.camera_bit_depth)
+    if (shape, dtype, bit_depth) != expected:
+        raise FrameError(
+            "frame pair",
+            f"{shape[0]}x{shape[1]} pixels, {dtype}, {bit_depth} bits",
+            f"{expected[0][0]}x{expected[0][1]} pixels, {expected[1]}, {expected[2]} bits",
+        )
+
+
+def receiver_for(plane: DataPlane, shape: tuple[int, int], dtype: str, bit_depth: int, caller: Caller) -> PairReceiver:
+    """A receiver for one pair, to be closed; see `check_format`.
+
+    Raises:
+        LimitError, FrameError: see `check_format`.
+        OverloadedError: there is so much to decode that the caller's deadline would pass.
+    """
+    check_format(plane, shape, dtype, bit_depth)
+    plane.decodes.check(caller)
+    return PairReceiver(shape, dtype, plane.limits.pair_bytes, plane.received)
+
+
+def decode(
+    plane: DataPlane,
+    pair: FramePair,
+    levels: int | None,
+    caller: Caller,
+    pilots: Pilots | None = None,
+    *,
+    user_data: bool = False,
+    version: str = "",
+    stages: Stages | None = None,
+) -> Answer:
+    """Decode a pair with the model in service.
+
+    Args:
+        plane: the service.
+        pair: both frames.
+        levels: M; None stands for `default_levels`, or for that of the code where user bytes are asked for.
+        caller: who waits; nothing is computed for one who has gone.
+        pilots: known symbols where they differ from the device's pattern.
+        user_data: whether to read the page's bytes too.
+        version: of the model that must be in service; empty for any.
+        stages: times the page.
+
+    Raises:
+        BundleError: user bytes are asked for, and the model has no code.
+        InvalidInputError: they are, and `levels` are not the code's.
+        OtherModelError: another model is in service.
+        SlotsTakenError: no slot until the caller's time is up.
+        CallerLeft: the caller has gone.
+        UnconfirmedPageError, FrameError, PageError: see `Tracker.decode`.
+    """
+    stages = stages or Stages()
+    stages.begin(Stage.QUEUE)
+    with plane.decodes.held(caller):
+        began = time.perf_counter()
+        # Taken once: a swap in the meantime changes the next request, not this one.
+        model = plane.registry.expect(version)
+        sure = pilots is None
+        levels = levels_for(model.decoder, levels, plane.default_levels, user_data)
+        if user_data:
+            pilots = pilots or model.decoder.written_pilots(levels)
+        subject, monitor = "frame pair", plane.monitor_of(caller)
+        seen = Seen(subject, None, model.version)
+        seen.note(tells=sure, pair=pair, of_device=monitor is not None and monitor is plane.monitor)
+        with observed(plane.observers_of(monitor), seen):
+            with plane.optics(user_data):
+                page = plane.decode(model, caller, pair, levels, pilots, subject, stages, monitor, sure=sure)
+            found = plane.user_data(model, page, stages, monitor) if user_data else None
+            seen.note(page=page, user_data=found)
+        plane.decodes.took(time.perf_counter() - began)
+    return plane.answer(page, model, stages, found, monitor)
+
+
+def decode_reply(answer: Answer, options: pb.DecodeOptions) -> pb.DecodeReply:
+    """An answer as its message, for `options` that have been checked."""
+    page, found = answer.page, answer.user_data
+    rows, columns = page.symbols.shape
+    return pb.DecodeReply(
+        rows=rows,
+        columns=columns,
+        levels=page.levels,
+        symbols=page.symbols.tobytes(),
+        confidence=_confidence_bytes(page.confidence, options.confidence_format),
+        confidence_format=options.confidence_format or pb.CONFIDENCE_FORMAT_FLOAT32,
+        concentration=page.concentration.astype(FLOAT).tobytes() if options.want_concentration else b"",
+        phase=page.phase.astype(FLOAT).tobytes() if options.want_phase else b"",
+        piston_rad=page.piston_rad,
+        pilot_coherence=page.pilot_coherence,
+        pilot_trust=page.pilot_trust,
+        claimed_bits=page.check.claimed_bits,
+        confirmed_bits=page.check.confirmed_bits,
+        recalibration_due=answer.recalibration_due,
+        recalibration_reasons=_recalibration_reasons(answer),
+        image=None if page.image is None else image_message(page.image),
+        user_data=None if found is None else user_data_message(found),
+        model_version=answer.model_version,
+        timings=pb.Timings(
+            receive_s=answer.receive_s,
+            decode_s=page.timings.total_s,
+            inference_s=page.timings.inference_s,
+            total_s=answer.total_s,
+        ),
+    )
+
+
+_SIGNS = {
+    MARGIN.name: pb.RECALIBRATION_REASON_MARGIN,
+    AIR.name: pb.RECALIBRATION_REASON_INFORMATION,
+    TRUST.name: pb.RECALIBRATION_REASON_TRUST,
+    SHARE.name: pb.RECALIBRATION_REASON_PILOT_SHARE,
+    CHANGED.name: pb.RECALIBRATION_REASON_PAGES,
+    UNREAD.name: pb.RECALIBRATION_REASON_UNREAD,
+    RESIDUAL.name: pb.RECALIBRATION_REASON_RESIDUAL,
+    SHIFT.name: pb.RECALIBRATION_REASON_SHIFT,
+    PISTON_WALK.name: pb.RECALIBRATION_REASON_PISTON,
+}
+
+
+def _recalibration_reasons(answer: Answer) -> list[pb.RecalibrationReason]:
+    own = [pb.RECALIBRATION_REASON_PAGE] if answer.page.check.recalibration_due else []
+    return own + [_SIGNS.get(name, pb.RECALIBRATION_REASON_OTHER) for name in answer.monitor_signs]
+
+
+def _confidence_bytes(confidence: NDArray[np.float32], code: int) -> bytes:
+    if code == pb.CONFIDENCE_FORMAT_UINT8:
+        return np.floor(confidence * 255).astype(np.uint8).tobytes()
+    return confidence.astype(FLOAT).tobytes()
+
+
+def user_data_message(found: PageBytes) -> pb.UserData:
+    """What a page gave as its message."""
+    header = found.header
+    return pb.UserData(
+        data=found.data or b"",
+        loss=DATA_LOSSES[found.loss],
+        header=None
+        if header is None
+        else pb.PageHeader(
+            volume=header.volume, page=header.page, volume_bytes=header.volume_bytes, code_id=header.code_id
+        ),
+        data_pages=0 if found.file is None else found.file.data_pages,
+        parity_pages=0 if found.file is None else found.file.parity_pages,
+        file_checksum=0 if found.file is None else found.file.checksum,
+        margin_bits=found.margin_bits,
+        corrected=found.corrected,
+        blocks=found.blocks,
+        failed_blocks=found.failed_blocks,
+        iterations=found.iterations,
+    )

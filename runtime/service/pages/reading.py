@@ -1,0 +1,198 @@
+"""Reads pages of the service's own source: one as symbols, or a range for its bytes, lost ones restored from parity."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.codec.page_bytes import Header, PageBytes
+from lightpage.codec.volume import Successor, Volume, restore_group
+from lightpage.errors import LightpageError, LostPageError, PageError, SourceError
+from lightpage.page.pilots import Pilots
+from lightpage.runtime.device.acquisition.source import FrameSource, Shot, own_fault
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.service.caller import Caller
+from lightpage.runtime.service.dataplane import Answer, DataPlane, Seen, levels_for, observed
+from lightpage.runtime.service.monitoring.stages import Stage, Stages
+
+GROUPS = 4
+"""Groups whose pages are held: pages of a few files may take turns. A group of full-size pages is 40 MB."""
+
+
+@dataclass(frozen=True)
+class ReadAnswer:
+    """An answer for a page of the source, with what the source knows of it."""
+
+    answer: Answer
+    shot: Shot
+    pilot_mask: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class DataPage:
+    """One page of a range.
+
+    Attributes:
+        source_page: its number in the source; None where its bytes were restored.
+        found: what it gave; None where it could not be decoded.
+        error: why not.
+        model_version: what decoded it, or the last page of its group; empty where nothing did.
+        stages: times it; None where its bytes were restored.
+    """
+
+    source_page: int | None
+    found: PageBytes | None
+    error: LightpageError | None = None
+    model_version: str = ""
+    stages: Stages | None = None
+
+
+@dataclass
+class _Group:
+    """The pages of one group that were read."""
+
+    volume: Volume
+    number: int
+    last: PageBytes
+    model_version: str
+    pages: dict[int, bytes] = field(default_factory=dict)
+
+    def restored(self) -> Iterator[DataPage]:
+        """Data pages of the group that were not read, where the others give them."""
+        numbers = self.volume.numbers_in(self.number)[: self.volume.data_in(self.number)]
+        absent = [number for number in numbers if number not in self.pages]
+        whole = restore_group(self.volume, self.number, self.pages) if absent else None
+        if whole is None or self.last.header is None:
+            return
+        for number in absent:
+            header = replace(self.last.header, page=number)
+            page = PageBytes(header, whole[numbers.index(number)], self.last.file, None, 0.0, 0, 0, 0, 0.0)
+            yield DataPage(None, page, model_version=self.model_version)
+
+
+def read_page(
+    plane: DataPlane,
+    page: int | None,
+    levels: int | None,
+    caller: Caller,
+    *,
+    user_data: bool = False,
+    expected: Header | None = None,
+    stages: Stages | None = None,
+) -> ReadAnswer:
+    """Read a page from the source and decode it; `levels` None stands for the source's own, or the code's.
+
+    Args:
+        plane: the service.
+        page: which; the next one if None.
+        levels: M.
+        caller: who waits.
+        user_data: whether to read the page's bytes too.
+        expected: the page of its volume that should be there, where that is known.
+        stages: times the page.
+
+    Raises:
+        BundleError, InvalidInputError: see `decode`.
+        SourceError: no source, or one that is damaged or dark.
+        PageError: no such page, or an impossible level count; else as `decode`.
+    """
+    source, stages = plane.source, stages or Stages()
+    stages.begin(Stage.QUEUE)
+    # The slot first: pages that wait for one shall not be read yet, nor lie in memory.
+    with plane.decodes.held(caller):
+        model, begun = plane.registry.current, time.perf_counter()
+        seen = Seen(f"{'next page' if page is None else f'page {page}'} of {source.name}", page, model.version)
+        with observed(plane.observers_of(plane.monitor), seen):
+            stages.begin(Stage.RECEIVE)
+            found = _shot(plane, source, page, caller, user_data)
+            subject = f"page {found.page_index} of {source.name}"
+            seen.note(subject=subject, page_index=found.page_index, levels=source.levels)
+            seen.note(pair=found.pair, infos=found.infos, symbols=found.symbols, pilot_mask=found.pilot_mask)
+            mask = _mask(found, model.decoder)
+            levels = levels_for(model.decoder, levels, source.levels, user_data)
+            if user_data and not np.array_equal(mask, model.decoder.bundle.pilot_mask):
+                raise SourceError(f"{source.name}: pilots", "other places", "those of the model in service")
+            # Pilots are what was written, whatever level count the caller wants to see.
+            if found.symbols is not None:
+                pilots = Pilots.of_symbols(mask, found.symbols, source.levels)
+            else:
+                own = model.decoder
+                pilots = own.written_pilots(levels) if user_data else own.pilots(source.levels, mask)
+            with own_fault(f"{subject}: "), plane.optics(user_data):
+                decoded = plane.decode(model, caller, found.pair, levels, pilots, subject, stages, plane.monitor)
+            data = plane.user_data(model, decoded, stages, plane.monitor, expected) if user_data else None
+            seen.note(page=decoded, user_data=data)
+        plane.decodes.took(time.perf_counter() - begun)
+    return ReadAnswer(plane.answer(decoded, model, stages, data, plane.monitor), found, mask)
+
+
+def _shot(plane: DataPlane, source: FrameSource, page: int | None, caller: Caller, user_data: bool) -> Shot:
+    """A page of the source; a lost shot is counted."""
+    try:
+        with own_fault(), plane.optics(user_data):
+            return source.shot(min(source.shot_s, caller.seconds_left()), page)
+    except LostPageError as error:
+        plane.metrics.lost(error)
+        raise
+
+
+def _mask(found: Shot, decoder: Decoder) -> NDArray[np.bool_]:
+    return decoder.bundle.pilot_mask if found.pilot_mask is None else found.pilot_mask
+
+
+def read_data(
+    plane: DataPlane, first: int, count: int, caller: Caller, timed: Callable[[], Stages] = Stages
+) -> Iterator[DataPage]:
+    """Read pages `first` to `first + count - 1` of the source, or to its last one.
+
+    Args:
+        plane: reads and decodes.
+        first, count: of the source's pages.
+        caller: who waits.
+        timed: begins to time a page.
+
+    Raises:
+        BundleError: the model has no code.
+        SourceError: there is no source.
+        PageError: there is no page `first`.
+    """
+    _ = plane.source, plane.registry.current.decoder.page_codec  # they are there
+    groups: dict[tuple[Volume, int], _Group] = {}
+    successor = Successor()
+    for index in range(first, first + count):
+        stages = timed()
+        try:
+            answer = read_page(
+                plane, index, None, caller, user_data=True, expected=successor.header, stages=stages
+            ).answer
+        except (LostPageError, SourceError) as error:
+            successor = successor.after()
+            stages.begin(Stage.RESPOND)
+            yield DataPage(index, None, error, stages=stages)
+            continue
+        except PageError:
+            if index == first:
+                raise
+            break
+        found = answer.user_data
+        assert found is not None  # it was asked for
+        volume = Volume.of_page(found)
+        if volume is not None and found.header is not None and found.data is not None:
+            key = volume, found.header.page // volume.group_pages
+            if key not in groups and len(groups) == GROUPS:
+                yield from groups.pop(next(iter(groups))).restored()
+            group = groups.pop(key, None) or _Group(*key, found, answer.model_version)
+            groups[key] = group  # the one used last is the last to go
+            group.last, group.model_version = found, answer.model_version
+            group.pages[found.header.page] = found.data
+            if len(group.pages) == len(volume.numbers_in(group.number)):
+                del groups[key]  # nothing is missing
+            successor = Successor(volume, found.header)
+        successor = successor.after()
+        yield DataPage(index, found, model_version=answer.model_version, stages=stages)
+    for group in groups.values():
+        yield from group.restored()
