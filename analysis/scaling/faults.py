@@ -42,11 +42,11 @@ from lightpage.cli.paths import OutputFile, OutputFolder
 from lightpage.files import write_json
 from lightpage.helper_process import same_packages
 from lightpage.runtime.archives.run.driver import run
-from lightpage.runtime.archives.run.job import Choices, Job
+from lightpage.runtime.archives.run.job import Job
 from lightpage.runtime.archives.run.ledger import Ledger
 from lightpage.runtime.archives.run.question import of_recordings
 from lightpage.runtime.archives.run.shard import RECORD, SYMBOLS, ShardRecord
-from lightpage.runtime.archives.run.task import Operation
+from lightpage.runtime.archives.run.task import Choices, Operation
 from lightpage.runtime.archives.workers.local import LocalEngine
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 from lightpage.train.models.presets import FAST

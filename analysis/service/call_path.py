@@ -23,10 +23,9 @@ from analysis.service.running import RunningService
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.files import write_json
-from lightpage.runtime.archives.run.job import Choices
 from lightpage.runtime.archives.run.ledger import Ledger
 from lightpage.runtime.archives.run.question import of_recordings
-from lightpage.runtime.archives.run.task import Operation
+from lightpage.runtime.archives.run.task import Choices, Operation
 from lightpage.runtime.archives.workers.work import Worker
 from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.model.bundle.bundle import Bundle

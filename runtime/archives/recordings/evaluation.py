@@ -75,21 +75,17 @@ class Evaluation:
 
     def to_json(self) -> dict[str, Any]:
         """The figures under the names that other programs read."""
-        figures = self.figures
+        figures = vars(self.figures).copy()
+        del figures["count"]
         return {
             "bundle_version": self.bundle_version,
             "pages": self.pages,
             "pages_left_out": self.pages_left_out,
             "symbols_per_page": self.symbols_per_page,
-            "levels": figures.levels,
-            "air_bits_per_symbol": figures.air_bits_per_symbol,
+            **figures,
             "air_before_refit_bits_per_symbol": self.air_before_refit,
-            "own_mi_bits_per_symbol": figures.own_mi_bits_per_symbol,
-            "over_claim_bits_per_symbol": figures.over_claim_bits_per_symbol,
-            "gmi_bits_per_symbol": figures.gmi_bits_per_symbol,
+            "over_claim_bits_per_symbol": self.figures.over_claim_bits_per_symbol,
             "page_kB": self.page_kb,
-            "symbol_error_rate": figures.symbol_error_rate,
-            "ece": figures.ece,
             "seconds_per_page": self.seconds_per_page,
             "inference_seconds_per_page": self.inference_seconds_per_page,
             "air_per_page": list(self.air_per_page),

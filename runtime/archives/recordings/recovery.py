@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from scipy.stats import beta
 
 from lightpage.codec.code import Code, problems_of
-from lightpage.codec.page_bytes import LOSSES, Loss, PageBytes
+from lightpage.codec.page_bytes import LOSSES, Header, Loss, PageBytes
 from lightpage.codec.page_codec import PageCodec
 from lightpage.codec.volume import Successor, Volume
 from lightpage.codec.volume_file import Restored, VolumeFiles, ranges
@@ -111,10 +111,6 @@ class Recovery:
     def unread(self) -> tuple[RecoveredPage, ...]:
         """Recorded pages that gave no bytes."""
         return tuple(page for page in self.pages if page.loss is not None)
-
-    def reason_of(self, page: int) -> str:
-        """Why a recorded page gave no bytes, for people."""
-        return next(each.reason for each in self.pages if each.page == page)
 
     @property
     def failure_bound(self) -> float:
@@ -295,17 +291,15 @@ class PageReader:
             if of_storage and not self._give_up:
                 raise
             self._next = self._next.after()
-            number, volume = (None, None) if expected is None else (expected.page, expected.volume)
-            return RecoveredPage(index, number, volume, Loss.STORAGE if of_storage else Loss.OPTICS, str(error))
+            loss = Loss.STORAGE if of_storage else Loss.OPTICS
+            return RecoveredPage(index, *_place(expected), loss, str(error))
         own = take(found)
         if own is not None and found.header is not None:
             self._next = Successor(own, found.header)
         self._next = self._next.after()
-        header = found.header or expected
         return RecoveredPage(
             index,
-            None if header is None else header.page,
-            None if header is None else header.volume,
+            *_place(found.header or expected),
             found.loss,
             "" if found.loss is None else LOSSES[found.loss],
             found.margin_bits,
@@ -316,6 +310,11 @@ class PageReader:
             decoded - start,
             read - decoded,
         )
+
+
+def _place(header: Header | None) -> tuple[int | None, int | None]:
+    """Number and volume of a page."""
+    return (None, None) if header is None else (header.page, header.volume)
 
 
 def told_losses(pages: Sequence[RecoveredPage]) -> list[str]:
@@ -348,9 +347,10 @@ def lost_data(recovery: Recovery, out: Path, holes: bool, give_up: bool = False)
     """
     if recovery.volume is not None and not recovery.lost:
         return None
-    unreadable = [page.page for page in recovery.unread if page.loss is Loss.STORAGE]
+    unreadable = [page for page in recovery.unread if page.loss is Loss.STORAGE]
     if unreadable and not give_up:
-        got = f"no data of recorded pages {ranges(unreadable)} from storage ({recovery.reason_of(unreadable[0])})"
+        pages = ranges([page.page for page in unreadable])
+        got = f"no data of recorded pages {pages} from storage ({unreadable[0].reason})"
         expected = "storage that gives them: the same command tries again; with --give-up they are lost"
         return MissingResultsError(f"file {out}", got, expected)
     told = "; ".join(told_losses(recovery.unread))

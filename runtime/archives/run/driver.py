@@ -56,8 +56,8 @@ class Progressed:
     def count(self, outcome: Outcome) -> int:
         """Count an outcome and return how much of the work it was worth."""
         if isinstance(outcome, Failed):
-            if outcome.task.operation is Operation.RECALIBRATE:
-                self.failures[outcome.task.device, outcome.task.recording] = outcome.problem
+            if outcome.task.recalibrates:
+                self.failures[outcome.task.origin] = outcome.problem
             self.fail(outcome.problem.about(outcome.task.device))
             return 0
         self.ranges += 1
@@ -182,11 +182,11 @@ def _of_failures(
     tasks: Iterable[Task], again: Iterable[Failed], settled: Sequence[Failed], give_up: bool
 ) -> Iterator[Task]:
     """Tasks of the recordings that failures `again` are of, but for those that are `settled`."""
-    recordings = {(failed.task.device, failed.task.recording) for failed in again}
-    recordings -= {(failed.task.device, failed.task.recording) for failed in settled if failed.whole_recording}
+    recordings = {failed.task.origin for failed in again}
+    recordings -= {failed.task.origin for failed in settled if failed.whole_recording}
     shards = {failed.task.shard for failed in settled}
     for task in tasks:
-        if (task.device, task.recording) in recordings and task.shard not in shards:
+        if task.origin in recordings and task.shard not in shards:
             yield task.model_copy(update={"give_up": give_up})
 
 
@@ -219,17 +219,17 @@ def _steps(
         watch.deaths(more)
 
     def wanted() -> Iterator[Task]:
-        return (task for task in tasks if (task.device, task.recording) not in given_up)
+        return (task for task in tasks if task.origin not in given_up)
 
     with closing(engine.run(wanted())) as outcomes:
         for outcome in outcomes:
             count_deaths()
             if isinstance(outcome, Failed):
-                key = outcome.task.device, outcome.task.recording
-                if outcome.whole_recording and key in given_up:
+                origin = outcome.task.origin
+                if outcome.whole_recording and origin in given_up:
                     continue  # it was under way when the recording was found to be unreadable, and is told already
                 if outcome.whole_recording:
-                    given_up.add(key)
+                    given_up.add(origin)
                 if later(outcome):
                     failed.append(outcome)
                     continue

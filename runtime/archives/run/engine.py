@@ -8,7 +8,7 @@ from collections.abc import Generator, Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
-from lightpage.runtime.archives.run.task import Failed, Operation, Outcome, Problem, Task
+from lightpage.runtime.archives.run.task import Failed, Outcome, Problem, Task
 
 ATTEMPTS = 3
 """Times that a range is given to a worker; a range that has cost so many workers their life is left alone."""
@@ -63,9 +63,9 @@ class Attempt:
 
 def longest_s(task: Task) -> float:
     """Seconds after which a worker that has not done a task is taken for dead."""
-    if task.operation is not Operation.RECALIBRATE:
+    if not task.recalibrates:
         return _START_S + _PAGE_S * len(task.pages)
-    return _START_S + (_RECALIBRATION_S if task.fine_tuning is None else _FINE_TUNING_S)
+    return _START_S + (_RECALIBRATION_S if task.choices.fine_tuning is None else _FINE_TUNING_S)
 
 
 class Attempts:

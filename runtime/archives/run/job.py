@@ -10,25 +10,16 @@ from typing import Literal
 
 from pydantic import ValidationError
 
-from lightpage.codec.code import Code
 from lightpage.errors import BundleError, InvalidInputError, LightpageError, RecordingError
 from lightpage.failures import os_failure
 from lightpage.files import check_utf8, replace_text
 from lightpage.recording.reader import Recording
-from lightpage.runtime.archives.run.task import FineTuning, NamedBundle, Operation, Plain, Problem, Stamp
+from lightpage.runtime.archives.run.task import Choices, NamedBundle, Plain, Problem, Stamp
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import MANIFEST
 from lightpage.runtime.model.bundle.shipped import bundle_path
-from lightpage.runtime.model.execution.providers import CPU
 
 FILE = "job.json"
-
-RANGE_PAGES = 32
-"""Of a range, unless told otherwise: what a worker that dies costs at most, and often enough that its first page, whose
-image is looked for, costs little."""
-
-KNOWN_PAGES = 2
-"""Pages that a device is recalibrated with, unless told otherwise."""
 
 
 class Source(Plain):
@@ -53,37 +44,6 @@ class Source(Plain):
     problem: Problem | None = None
     run: Path | None = None
     given_up: bool = False
-
-
-class Choices(Plain):
-    """What is asked beside recordings and bundles.
-
-    Attributes:
-        operation: what is done.
-        range_pages: pages of a range.
-        tracking: whether the image is followed within a range.
-        symbols: whether decoding keeps symbols and confidences.
-        code: of the pages whose user bytes are read; None for each recording's, or else its bundle's.
-        provider: what pages are computed with.
-        known_pages: that a device is recalibrated with; None for `KNOWN_PAGES`, or all of them with `fine_tuning`.
-        fine_tuning: how devices are trained on after the fit of their geometry; None to fit the geometry alone.
-        parts: that processes do independently of each other.
-    """
-
-    operation: Operation
-    range_pages: int = RANGE_PAGES
-    tracking: bool = True
-    symbols: bool = True
-    code: Code | None = None
-    provider: str = CPU
-    known_pages: int | None = None
-    fine_tuning: FineTuning | None = None
-    parts: int = 1
-
-    @property
-    def device_pages(self) -> int | None:
-        """Known pages that a device is recalibrated with; None for all that it has."""
-        return self.known_pages or (KNOWN_PAGES if self.fine_tuning is None else None)
 
 
 class Job(Plain):

@@ -183,10 +183,12 @@ class Ledger:
         """Ranges of the first reading that have no result, recording by recording; or such devices."""
         if job.choices.operation is Operation.RECALIBRATE:
             for index, own in self.part.devices(job):
-                device = self._device(job, index, own)
-                if device is not None and not self.recalibrated(index):
-                    _make(device.shard.parent)
-                    yield device
+                if self.recalibrated(index) or any(each.problem is not None for each in own):
+                    continue
+                shard = self.shard(index, 0)
+                _make(shard.parent)
+                count = job.choices.device_pages or sum(each.pages for each in own)
+                yield _task(job, own, tuple(range(count)), shard)
             return
         for index, source in self.part.sources(job):
             there = self.results(index)
@@ -226,55 +228,24 @@ class Ledger:
         Raises:
             InvalidInputError: a shard that cannot be read.
         """
-        best = {page.page: page for page in ShardRecord.read(self.shard(source, first)).pages}
-        for number in range(1, rounds):
-            shard = self.shard(source, first, number)
-            for page in ShardRecord.read(shard).pages if shard.name in there else ():
-                if page.better_than(best[page.page]):
+        best: dict[int, PageRecord] = {}
+        for shard in self.readings(source, first, there, rounds).values():
+            for page in ShardRecord.read(shard).pages:
+                if page.page not in best or page.better_than(best[page.page]):
                     best[page.page] = page
         return list(best.values())
 
-    def ranges(self, job: Job, index: int, source: Source) -> Iterator[Task]:
-        """All ranges of a recording, whether they are done or not."""
-        choices = job.choices
-        if source.stamp is None:
-            return
-        count, step = source.pages, choices.range_pages
-        for first in range(0, count, step):
-            yield Task(
-                operation=choices.operation,
-                device=source.device,
-                recording=source.path,
-                stamp=source.stamp,
-                pages=tuple(range(first, min(first + step, count))),
-                bundle=job.bundles[source.bundle],
-                shard=self.shard(index, first),
-                tracking=choices.tracking,
-                symbols=choices.symbols,
-                code=choices.code,
-                provider=choices.provider,
-            )
+    def readings(self, source: int, first: int, there: frozenset[str], rounds: int) -> dict[int, Path]:
+        """Paths of the results of a range by their rounds; arguments as for `pages`."""
+        shards = {number: self.shard(source, first, number) for number in range(rounds)}
+        return {number: shard for number, shard in shards.items() if shard.name in there}
 
-    def _device(self, job: Job, index: int, own: tuple[Source, ...]) -> Task | None:
-        """The task of a device, whose first recording has this place; None where something of it is lacking."""
-        if any(each.problem is not None for each in own):
-            return None
-        choices, (first, *others) = job.choices, own
-        count = choices.device_pages or sum(each.pages for each in own)
-        assert first.stamp is not None  # it has no problem
-        return Task(
-            operation=choices.operation,
-            device=first.device,
-            recording=first.path,
-            stamp=first.stamp,
-            pages=tuple(range(count)),
-            bundle=job.bundles[first.bundle],
-            shard=self.shard(index, 0),
-            more=tuple(RecordedFile(path=each.path, stamp=each.stamp) for each in others if each.stamp is not None),
-            run=first.run,
-            provider=choices.provider,
-            fine_tuning=choices.fine_tuning,
-        )
+    def ranges(self, job: Job, index: int, source: Source) -> Iterator[Task]:
+        """All ranges of a recording, whether they are done or not; none of one that could not be opened."""
+        step, count = job.choices.range_pages, source.pages
+        for first in range(0, count, step):
+            pages = tuple(range(first, min(first + step, count)))
+            yield _task(job, (source,), pages, self.shard(index, first))
 
     def doubt_losses(self, job: Job) -> None:
         """Have ranges read again that have lost pages.
@@ -302,6 +273,20 @@ class Ledger:
             return frozenset()
         except OSError as error:
             raise os_failure(f"folder {folder}", error, "a folder that can be read") from None
+
+
+def _task(job: Job, own: tuple[Source, ...], pages: tuple[int, ...], shard: Path) -> Task:
+    """What is done with pages of recordings that could be opened."""
+    first = own[0]
+    return Task(
+        choices=job.choices,
+        device=first.device,
+        files=tuple(RecordedFile(path=each.path, stamp=each.stamp) for each in own if each.stamp is not None),
+        pages=pages,
+        bundle=job.bundles[first.bundle],
+        shard=shard,
+        run=first.run,
+    )
 
 
 def _make(folder: Path) -> None:

@@ -15,8 +15,8 @@ from lightpage.errors import InvalidInputError
 from lightpage.files import check_utf8, matching, read_text
 from lightpage.progress import note
 from lightpage.runtime.archives.run.driver import AGAIN_S
-from lightpage.runtime.archives.run.job import Choices, Job, Source, bundle_as_it_is, look_at, named_bundle
-from lightpage.runtime.archives.run.task import Plain
+from lightpage.runtime.archives.run.job import Job, Source, bundle_as_it_is, look_at, named_bundle
+from lightpage.runtime.archives.run.task import Choices, Plain
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 
 

@@ -345,26 +345,19 @@ def _pages(
     found: Totals, ledger: Ledger, job: Job, index: int, task: Task, there: frozenset[str]
 ) -> Iterator[tuple[ShardRecord, PageRecord]]:
     """The readings that count of the pages of a range, each with the shard that it is from; rounds are counted."""
-    if task.shard.name not in there:
-        return
-    first = ShardRecord.read(task.shard)
-    found.readings.append(Reading.of(first, task.weight))
-    for part in first.confidence_bins:
-        sums = found.confidence_bins.setdefault((part.low, part.high), [0.0, 0.0, 0.0])
-        for place, value in enumerate((part.count, part.count * part.confidence, part.count * part.accuracy)):
-            sums[place] += value
-    best = {page.page: (first, page) for page in first.pages}
-    for number in range(1, 1 + len(job.rounds)):
-        shard = ledger.shard(index, task.pages[0], number)
-        if shard.name not in there:
-            continue
-        again = ShardRecord.read(shard)
-        found.readings.append(Reading.of(again, len(again.pages)))
-        for page in again.pages:
-            before = best[page.page][1]
-            found.rounds[number - 1].add(before, page)
-            if page.better_than(before):
-                best[page.page] = again, page
+    best: dict[int, tuple[ShardRecord, PageRecord]] = {}
+    for number, shard in ledger.readings(index, task.pages[0], there, 1 + len(job.rounds)).items():
+        record = ShardRecord.read(shard)
+        found.readings.append(Reading.of(record, len(record.pages)))
+        for part in record.confidence_bins if number == 0 else ():
+            sums = found.confidence_bins.setdefault((part.low, part.high), [0.0, 0.0, 0.0])
+            for place, value in enumerate((part.count, part.count * part.confidence, part.count * part.accuracy)):
+                sums[place] += value
+        for page in record.pages:
+            if number:
+                found.rounds[number - 1].add(best[page.page][1], page)
+            if number == 0 or page.better_than(best[page.page][1]):
+                best[page.page] = record, page
     yield from best.values()
 
 

@@ -130,12 +130,11 @@ def known_files(folder: Path) -> list[dict[str, Any]] | None:
 
 
 def _shards(ledger: Ledger, job: Job) -> list[Path]:
-    found = []
+    found: list[Path] = []
     for index, source in enumerate(job.sources):
         there = ledger.results(index)
         for task in ledger.ranges(job, index, source):
-            readings = [ledger.shard(index, task.pages[0], number) for number in range(1 + len(job.rounds))]
-            found += [shard for shard in readings if shard.name in there]
+            found += ledger.readings(index, task.pages[0], there, 1 + len(job.rounds)).values()
     return found
 
 

@@ -38,7 +38,7 @@ def recalibrated(
     deep: Callable[[], DeepRecalibration],
     tell: Callable[[Step], None],
 ) -> Findings:
-    """What becomes of a device; that its pages fit no geometry is a finding too.
+    """What becomes of a device; that its pages fit no geometry is a finding too. A deep recalibration is gone on with.
 
     Args:
         task: which device.
@@ -49,45 +49,34 @@ def recalibrated(
     Raises:
         LightpageError: something that says nothing of the device.
     """
-    findings = _REFUSED if task.fine_tuning is None else _REFUSED_DEEPLY
+    findings = _REFUSED if task.choices.fine_tuning is None else _REFUSED_DEEPLY
     out = with_end(task.shard, BUNDLE)
     out.unlink(missing_ok=True)  # of a worker that was killed before it wrote the record
     try:
-        if task.fine_tuning is None:
+        if task.choices.fine_tuning is None:
             known = read_recorded(recording, first_lit_pages(recording, len(task.pages), warn))
             outcome = recalibrate(decoder, known, out, next_version(decoder.version), fit, lambda *_: None)
         else:
-            outcome = _trained_on(task, recording, decoder, out, deep, tell)
+            if task.run is None:
+                expected = "the training run that its bundle was made from"
+                raise InvalidInputError(f"device {task.device}", "no run", expected)
+            name = task.device or task.name
+            log = StepLog(with_end(task.shard, LOG), lambda what: tell(Step(device=name, what=what)))
+            with reporting(log):
+                outcome = deep().recalibrate(
+                    decoder,
+                    recording,
+                    task.run,
+                    with_end(task.shard, TRAINING),
+                    out,
+                    task.choices.fine_tuning,
+                    len(task.pages),
+                    log.progress,
+                )
     except findings as error:
         lost = PageRecord(page=0, state=PageState.LOST, loss=type(error).__name__, reason=str(error))
         return Findings(pages=(lost,))
     return Findings(pages=(PageRecord(page=0, state=PageState.READ),), summary=_summary(outcome))
-
-
-def _trained_on(
-    task: Task,
-    recording: Recording,
-    decoder: Decoder,
-    out: Path,
-    deep: Callable[[], DeepRecalibration],
-    tell: Callable[[Step], None],
-) -> RecalibrationOutcome:
-    """Recalibrate a device deeply, or go on where an earlier run was ended."""
-    assert task.fine_tuning is not None  # or it would be re-fitted
-    if task.run is None:
-        raise InvalidInputError(f"device {task.device}", "no run", "the training run that its bundle was made from")
-    log = StepLog(with_end(task.shard, LOG), lambda what: tell(Step(device=task.device or task.name, what=what)))
-    with reporting(log):
-        return deep().recalibrate(
-            decoder,
-            recording,
-            task.run,
-            with_end(task.shard, TRAINING),
-            out,
-            task.fine_tuning,
-            len(task.pages),
-            log.progress,
-        )
 
 
 def _summary(outcome: RecalibrationOutcome) -> dict[str, float | str | None]:

@@ -59,7 +59,7 @@ class PageRange:
             Operation.DECODE: self._decoded,
             Operation.EVALUATE: self._evaluated,
             Operation.RECOVER: self._recovered,
-        }[self.task.operation]()
+        }[self.task.choices.operation]()
 
     def _decoded(self) -> Findings:
         """Symbols, confidences, and figures where the symbols are known."""
@@ -72,7 +72,7 @@ class PageRange:
 
         with ExitStack() as stack:
             writer = None
-            if self.task.symbols:
+            if self.task.choices.symbols:
                 writer = stack.enter_context(DecodedWriter(with_end(self.task.shard, SYMBOLS), levels))
             for page, found, symbols in self._read(decode, records):
                 if writer is not None:
@@ -107,7 +107,7 @@ class PageRange:
 
     def _recovered(self) -> Findings:
         """User bytes."""
-        code = self.task.code or code_of(self.recording, self.decoder.bundle)
+        code = self.task.choices.code or code_of(self.recording, self.decoder.bundle)
         reader = PageReader(self.decoder, self.recording, self.tracker, code, give_up=self.task.give_up)
         kept: list[tuple[int, PageBytes]] = []
         records: list[PageRecord] = []

@@ -20,7 +20,6 @@ from lightpage.runtime.archives.run.task import (
     Done,
     Failed,
     NamedBundle,
-    Operation,
     Outcome,
     Problem,
     Stamp,
@@ -65,7 +64,7 @@ class Worker:
         start, read_bytes = time.perf_counter(), 0
         opened = read = opening = False
         try:
-            warm = self._opened(task.bundle, task.provider)
+            warm = self._opened(task.bundle, task.choices.provider)
             opening = True
             _check_stamp(task)
             with _recording_of(task) as recording:
@@ -86,9 +85,9 @@ class Worker:
             return _written(task, Findings(pages=tuple(lost_page(page, failure) for page in task.pages)), start, 0)
 
     def _findings(self, task: Task, recording: Recording, warm: _Warm) -> Findings:
-        if task.operation is Operation.RECALIBRATE:
+        if task.recalibrates:
             return recalibrated(task, recording, warm.decoder, self._fit, self._deep, self.tell)
-        tracker = warm.tracker.anew() if task.tracking else NoTracker(warm.decoder)
+        tracker = warm.tracker.anew() if task.choices.tracking else NoTracker(warm.decoder)
         return PageRange(task, recording, warm.decoder, tracker).findings()
 
     def _opened(self, bundle: NamedBundle, provider: str) -> _Warm:
@@ -142,7 +141,7 @@ def _recording_of(task: Task) -> Iterator[Recording]:
     Raises:
         RecordingError: see `Recording.open` and `join`.
     """
-    if not task.more:
+    if len(task.files) == 1:
         with Recording.open(task.recording) as recording:
             yield recording
         return

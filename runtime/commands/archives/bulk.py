@@ -19,10 +19,10 @@ from lightpage.codec.volume_file import parse_volume
 from lightpage.errors import InvalidInputError, LightpageError
 from lightpage.files import write_json
 from lightpage.runtime.archives.run.driver import run
-from lightpage.runtime.archives.run.job import KNOWN_PAGES, RANGE_PAGES, Choices, Job
+from lightpage.runtime.archives.run.job import Job
 from lightpage.runtime.archives.run.ledger import WHOLE, Ledger, Part
 from lightpage.runtime.archives.run.question import asked_job, with_round
-from lightpage.runtime.archives.run.task import FineTuning, Operation, Problem
+from lightpage.runtime.archives.run.task import KNOWN_PAGES, RANGE_PAGES, Choices, FineTuning, Operation, Problem
 from lightpage.runtime.archives.run.totals import totals
 from lightpage.runtime.archives.run.volumes import ALL_FILES, Wanted, recovered_files
 from lightpage.runtime.archives.workers.engines import LOCAL, RAY, engine_of

@@ -24,7 +24,7 @@ from lightpage.runtime.commands.client.connection import TARGET, with_tls
 from lightpage.runtime.model.bundle.manifest import check_version
 from lightpage.runtime.model.bundle.shipped import bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.recalibration.known_pages import KnownPages, read_recorded
+from lightpage.runtime.recalibration.known_pages import read_recorded
 from lightpage.runtime.recalibration.outcome import RecalibrationOutcome
 from lightpage.runtime.recalibration.recalibration import next_version
 from lightpage.runtime.recalibration.recalibration import recalibrate as recalibrate_bundle
@@ -189,15 +189,11 @@ def _offline(bundle: str, recording: str, out: Path, pages: int, version: str | 
         check_version(version, "--version")
     decoder = Decoder.load(bundle_path(bundle))
     with percent_bar() as progress:
-        known = _read(decoder, recording, pages)
+        with Recording.open(recording) as file:
+            check_recording(decoder, file)
+            known = read_recorded(file, first_lit_pages(file, pages, warn))
         new = next_version(decoder.version) if version is None else version
         return recalibrate_bundle(decoder, known, out, new, refit, progress)
-
-
-def _read(decoder: Decoder, recording: str, pages: int) -> KnownPages:
-    with Recording.open(recording) as file:
-        check_recording(decoder, file)
-        return read_recorded(file, first_lit_pages(file, pages, warn))
 
 
 @click.command()

@@ -56,34 +56,32 @@ _KEYS = {
 }
 """Of options the settings that they are above of; all others are above of those of their name in [service]."""
 
+_FILE, _FOLDER = click.Path(path_type=Path), click.Path(file_okay=False, path_type=Path)
+
 
 @click.command()
 @click.option(
     "--config",
-    type=click.Path(path_type=Path),
+    type=_FILE,
     envvar="LIGHTPAGE_CONFIG",
     show_envvar=True,
     help="Settings, SERVICE.toml; variables of the environment and options count before them.",
 )
 @click.option("--print-config", is_flag=True, help="Print the settings in effect and where they come from, and end.")
 @click.option("--bundle", show_default=DEFAULT, help="A bundle's path, or the name of a shipped one.")
-@click.option(
-    "--bundle-key", type=click.Path(path_type=Path), help="Public key, PEM, that bundles must be signed with."
-)
+@click.option("--bundle-key", type=_FILE, help="Public key, PEM, that bundles must be signed with.")
 @click.option(
     "--source", help="simulator:PROFILE, recording:FILE, camera:CONFIG.toml; without it only sent frames decode."
 )
-@click.option(
-    "--pages", "pages_file", type=click.Path(path_type=Path), help="Pages that the source is to show, PAGES.h5."
-)
+@click.option("--pages", "pages_file", type=_FILE, help="Pages that the source is to show, PAGES.h5.")
 @click.option("--address", show_default=ADDRESS, help="HOST:PORT to listen on; port 0 takes a free one.")
 @click.option(
     "--health-address",
     help="HOST:PORT of health checks, answered by a process of their own; by default the next port. off: none.",
 )
-@click.option("--ca", type=click.Path(path_type=Path), help="TLS: authorities of the callers' certificates, PEM.")
-@click.option("--certificate", type=click.Path(path_type=Path), help="TLS: certificate of the service, PEM.")
-@click.option("--key", type=click.Path(path_type=Path), help="TLS: its private key, PEM.")
+@click.option("--ca", type=_FILE, help="TLS: authorities of the callers' certificates, PEM.")
+@click.option("--certificate", type=_FILE, help="TLS: certificate of the service, PEM.")
+@click.option("--key", type=_FILE, help="TLS: its private key, PEM.")
 @click.option("--metrics-port", type=click.IntRange(0, 65535), help="Show metrics and console on this port.")
 @click.option("--metrics-host", show_default="127.0.0.1", help="Where the figures are shown.")
 @click.option(
@@ -91,14 +89,10 @@ _KEYS = {
 )
 @click.option(
     "--store",
-    type=click.Path(file_okay=False, path_type=Path),
+    type=_FOLDER,
     help=f"Folder of recalibrated and uploaded bundles; it remembers which one serves. {STORE_VARIABLE} too.",
 )
-@click.option(
-    "--incoming",
-    type=click.Path(file_okay=False, path_type=Path),
-    help="Folder whose bundles are taken into the store, as uploads are.",
-)
+@click.option("--incoming", type=_FOLDER, help="Folder whose bundles are taken into the store, as uploads are.")
 @click.option(
     "--recordings",
     type=click.Path(exists=True, file_okay=False, path_type=Path),
@@ -122,11 +116,7 @@ _KEYS = {
     multiple=True,
     help="Number of a page of the source whose symbols are known; repeat it. Without, the next two pages serve.",
 )
-@click.option(
-    "--flight-recorder",
-    type=click.Path(file_okay=False, path_type=Path),
-    help="Folder in which the frames of lost and weak pages are kept.",
-)
+@click.option("--flight-recorder", type=_FOLDER, help="Folder in which the frames of lost and weak pages are kept.")
 @click.option("--flight-recorder-pages", show_default=str(PAGES), type=click.IntRange(1), help="Kept there at most.")
 @click.pass_context
 def serve(context: click.Context, /, config: Path | None, print_config: bool, **_: Any) -> None:

@@ -121,7 +121,8 @@ def test_a_service_keeps_to_its_limits_logs_json_and_writes_down_changes_and_los
     toy_zip: Path, decoder: Decoder, tmp_path: Path
 ) -> None:
     store = ModelStore(tmp_path / "store", decoder.bundle)
-    store.remember(toy.write_toy_bundle(store.path_of("toy-1+r1"), version="toy-1+r1"))
+    toy.write_toy_bundle(newer := store.path_of("toy-1+r1"), version="toy-1+r1")
+    store.change(history=(None, newer.name), cursor=1)
     toy.write_toy_recording(tmp_path / "lost.h5", toy.ToyDevice((60.0, 170.0)), 16, 4)
     file = tmp_path / "service.toml"
     file.write_text(

@@ -12,11 +12,10 @@ import pytest
 
 from lightpage.errors import StorageError
 from lightpage.recording.reader import Recording
-from lightpage.runtime.archives.run.job import Choices
 from lightpage.runtime.archives.run.ledger import Ledger
 from lightpage.runtime.archives.run.question import of_recordings
 from lightpage.runtime.archives.run.shard import PageState, ShardRecord, record_of
-from lightpage.runtime.archives.run.task import Done, Failed, Operation, Task
+from lightpage.runtime.archives.run.task import Choices, Done, Failed, Operation, Task
 from lightpage.runtime.archives.workers.device import EVERY_S, StepLog
 from lightpage.runtime.archives.workers.work import Worker
 from tests.clock import HandClock
@@ -117,7 +116,8 @@ def test_another_recording_or_bundle_than_the_run_began_with_is_not_read(
     os.utime(tmp_path / "a.h5", (1, 1))
     changed = failure(task)
     assert (changed.problem.passes, changed.whole_recording) == (False, True)
-    gone = task.model_copy(update={"recording": tmp_path / "gone.h5"})
+    file = task.files[0].model_copy(update={"path": tmp_path / "gone.h5"})
+    gone = task.model_copy(update={"files": (file,)})
     failed = failure(gone)
     assert (failed.problem.subject, failed.whole_recording) == (f"recording {tmp_path / 'gone.h5'}", True)
     given_up = Worker(1).work(gone.model_copy(update={"give_up": True}))
