@@ -179,6 +179,12 @@ def _recorded(bundle: Bundle, folder: Path, *settings: str) -> Path:
     return out
 
 
+def _room(file: str) -> str:
+    """The folder of a file, of those in `lightpage.runtime` the room that they belong to."""
+    depth = 3 if file.startswith("lightpage/runtime/") else 2
+    return "/".join(Path(file).parent.parts[:depth])
+
+
 def _show(files: Sequence[EnteredFile]) -> None:
     width = max(len(file.file) for file in files)
     numbers = {file.file: file.number for file in files}
@@ -189,8 +195,8 @@ def _show(files: Sequence[EnteredFile]) -> None:
             functions = ", ".join(file.functions[:_SHOWN]) + more
             caller = numbers.get(file.entered_from, "-")
             click.echo(f"{file.number:>3} {caller:>4} {file.file:<{width}} {file.calls:>6}  {functions}")
-        folders = Counter(str(Path(file.file).parent) for file in shown)
-        told = ", ".join(f"{folder} {count}" for folder, count in folders.most_common())
+        rooms = Counter(_room(file.file) for file in shown)
+        told = ", ".join(f"{room} {count}" for room, count in rooms.most_common())
         click.echo(f"{len(shown)} files {'that only record' if apart else 'on the way'}: {told or 'none'}")
 
 

@@ -28,16 +28,20 @@ AREAS = {
     "calibration": {"lightpage/calibration": "*", "train/fitting": "fit fitted"},
     "registry": {"runtime/service": "models/registry models/models pages/replays"},
     "store": {
-        "runtime/service": "models/store models/store_health monitoring/file_ring monitoring/flight_recorder jobs/jobs"
+        "runtime/service/models": "store store_health",
+        "runtime/service/monitoring": "file_ring flight_recorder",
+        "runtime/service/jobs": "jobs",
     },
     "pairing": {"runtime/device/acquisition": "pairing camera_source beam_keeper page_store source"},
     "ledger": {
-        "runtime/archives": "run/ledger run/totals run/shard run/task workers/work run/job run/driver run/volumes"
+        "runtime/archives/run": "ledger totals shard task job driver volumes",
+        "runtime/archives/workers": "work",
     },
     "failures": {"lightpage": "failures errors", "runtime": "client/wire/status service/server/call"},
     "limits": {
-        "runtime/service": "server/message_gate display/uploads jobs/sent_pages frames/frame_calls frames/frames admission "
-        "limits settings models/incoming",
+        "runtime/service": "admission limits settings server/message_gate display/uploads models/incoming",
+        "runtime/service/frames": "frames frame_calls",
+        "runtime/service/jobs": "sent_pages",
     },
     "wire": {"runtime/client/wire": "[!s]* s[!t]*", "runtime/client": "[!c]*", "runtime/service/frames": "tensors"},
 }
