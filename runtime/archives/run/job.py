@@ -212,25 +212,20 @@ def bundle_as_it_is(path: Path, known: Mapping[Path, NamedBundle] | None = None)
         path: of it, absolute.
         known: bundles as they were before; one whose file is as it was is not read again.
     """
-    before = known.get(path) if known else None
-    if before is not None and before.stamp is not None and before.stamp == _stamp(path):
-        return before, None
     try:
-        return _named(path), None
+        return _named(path, known.get(path) if known else None), None
     except LightpageError as error:
         return NamedBundle(path=path, sha256="", version=""), Problem.of(error)
 
 
-def _named(path: Path) -> NamedBundle:
-    stamp, sha256 = _stamp(path), bundle_sha256(path)
-    return NamedBundle(path=path, sha256=sha256, version=Bundle.open(path).version, stamp=stamp)
-
-
-def _stamp(bundle: Path) -> Stamp | None:
+def _named(path: Path, before: NamedBundle | None = None) -> NamedBundle:
     try:
-        return Stamp.of(_told_by(bundle))
+        stamp = Stamp.of(_told_by(path))
     except OSError:
-        return None
+        stamp = None  # whoever reads it tells why
+    if before is not None and stamp is not None and before.stamp == stamp:
+        return before
+    return NamedBundle(path=path, sha256=bundle_sha256(path), version=Bundle.open(path).version, stamp=stamp)
 
 
 def _told_by(bundle: Path) -> Path:

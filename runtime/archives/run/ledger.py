@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from itertools import islice
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from lightpage.clock import SYSTEM, Clock
@@ -109,9 +108,7 @@ class Ledger:
             self._locks = stack.pop_all()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._locks.close()
 
     @contextmanager
@@ -121,20 +118,18 @@ class Ledger:
         Raises:
             TakenError: another one has not ended with it in time.
         """
-        asking = self._question_lock(self._clock.now() + _QUESTION_S)
-        try:
-            yield
-        finally:
-            os.close(asking)
-
-    def _question_lock(self, until: float) -> int:
-        while True:
+        until, asking = self._clock.now() + _QUESTION_S, None
+        while asking is None:
             try:
-                return self._locked(_QUESTION)
+                asking = self._locked(_QUESTION)
             except TakenError:
                 if self._clock.now() > until:
                     raise
                 self._clock.sleep(_AGAIN_S)
+        try:
+            yield
+        finally:
+            os.close(asking)
 
     def _locked(self, name: str, *, shared: bool = False) -> int:
         """A descriptor that holds a lock until it is closed.

@@ -104,8 +104,9 @@ class Tally:
         """Pages without a result."""
         return self.pages - self.read - self.left_out - self.lost.total()
 
-    def add(self, page: PageRecord) -> None:
-        """Count a page that has a result."""
+    def add(self, page: PageRecord, version: str) -> None:
+        """Count a page that has a result, by the version of what read it."""
+        self.models[version] += 1
         self.read += page.state is PageState.READ
         self.left_out += page.state is PageState.LEFT_OUT
         self.recalibration_due += page.recalibration_due and page.state is PageState.READ
@@ -195,29 +196,43 @@ class Reading:
 
 
 @dataclass
-class Group:
+class Counts:
+    """What was found of pages.
+
+    Attributes:
+        tally: of all of them.
+        figures: of those that were read.
+    """
+
+    tally: Tally = field(default_factory=Tally)
+    figures: Means = field(default_factory=Means)
+
+    def add(self, page: PageRecord, version: str) -> None:
+        """Count a page that has a result, by the version of what read it."""
+        self.tally.add(page, version)
+        if page.state is PageState.READ:
+            confirmed = {} if page.confirmed_bits is None else {CONFIRMED: page.confirmed_bits}
+            self.figures.add({**page.figures, **confirmed})
+
+
+@dataclass
+class Group(Counts):
     """What was found of a device, or of a recording where there is no fleet.
 
     Attributes:
         recordings: that it has.
-        tally: of their pages.
-        figures: of those that were read.
         told: the first problem that anything of it had, for people; empty without one.
     """
 
     recordings: int = 0
-    tally: Tally = field(default_factory=Tally)
-    figures: Means = field(default_factory=Means)
     told: str = ""
 
 
 @dataclass
-class Totals:
+class Totals(Counts):
     """What a run has found.
 
     Attributes:
-        tally: of all pages.
-        figures: means over the pages that were read.
         confidence_bins: of all pages of an evaluation together.
         rounds: what later readings have brought.
         recordings: a row each, unless devices are recalibrated.
@@ -228,8 +243,6 @@ class Totals:
         readings: all ranges that were done, a few numbers each.
     """
 
-    tally: Tally = field(default_factory=Tally)
-    figures: Means = field(default_factory=Means)
     confidence_bins: dict[tuple[float, float], list[float]] = field(default_factory=dict)
     rounds: list[Round] = field(default_factory=list)
     recordings: list[dict[str, Any]] = field(default_factory=list)
@@ -296,8 +309,7 @@ def _add_device(
     if ledger.recalibrated(index):
         record = ShardRecord.read(shard)
         page = record.pages[0]
-        found.tally.add(page)
-        found.tally.models[record.model.version] += 1
+        found.tally.add(page, record.model.version)
         found.readings.append(Reading.of(record, 1))
         state = DeviceState.RECALIBRATED if page.state is PageState.READ else DeviceState.REFUSED
         row |= {"state": state, "air_before": None, "air_after": None, **record.summary, "reason": page.reason}
@@ -312,30 +324,24 @@ def _add_device(
 
 
 def _add_recording(found: Totals, ledger: Ledger, job: Job, index: int, source: Source) -> None:
-    own, figures, there = Tally(), Means(), ledger.results(index)
+    own, there = Counts(), ledger.results(index)
     lost: dict[str, list[int]] = {}
     group = found.groups.setdefault(source.device or str(source.path), Group())
     group.recordings += 1
     if source.problem is not None:
         group.told = group.told or str(source.problem)
     for task in ledger.ranges(job, index, source):
-        for tally in (own, group.tally, found.tally):
-            tally.pages += task.weight
+        for counts in (own, group, found):
+            counts.tally.pages += task.weight
         for record, page in _pages(found, ledger, job, index, task, there):
-            for tally in (own, group.tally, found.tally):
-                tally.add(page)
-                tally.models[record.model.version] += 1
-            if page.state is PageState.READ:
-                for means in (figures, group.figures, found.figures):
-                    means.add(page.figures)
-                    if page.confirmed_bits is not None:
-                        means.add({CONFIRMED: page.confirmed_bits})
-            elif page.state is PageState.LOST:
+            for counts in (own, group, found):
+                counts.add(page, record.model.version)
+            if page.state is PageState.LOST:
                 lost.setdefault(page.loss or UNKNOWN, []).append(page.page)
                 group.told = group.told or page.reason
                 _tell_lost(found, page, f"{_recording(source)}: page {page.page}: {page.reason}")
-    row = {"device": source.device, "recording": str(source.path), **own.to_json()}
-    row |= {"lost_pages": {cause: ranges(pages) for cause, pages in lost.items()}, "figures": figures.to_json()}
+    row = {"device": source.device, "recording": str(source.path), **own.tally.to_json()}
+    row |= {"lost_pages": {cause: ranges(pages) for cause, pages in lost.items()}, "figures": own.figures.to_json()}
     if source.problem is not None:
         row["problem"] = str(source.problem)
     found.recordings.append(row)

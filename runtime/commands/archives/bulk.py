@@ -35,6 +35,7 @@ from lightpage.runtime.model.execution.providers import Provider
 
 CLOCK = SYSTEM
 """Of the pauses before what may pass is tried again."""
+_FILE = click.Path(path_type=Path)
 
 
 @click.group(cls=Group)
@@ -67,9 +68,7 @@ def _options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--address", help="With --engine ray: of the cluster, `auto` for the one that runs here."),
         click.option("--engine", type=click.Choice([LOCAL, RAY]), default=LOCAL, show_default=True, help="Who works."),
         click.option("--bundle", help=f"A bundle's path, or the name of a shipped one; {DEFAULT} by default."),
-        click.option(
-            "--fleet", type=click.Path(path_type=Path), help="TOML file of devices: name, bundle, recordings."
-        ),
+        click.option("--fleet", type=_FILE, help="TOML file of devices: name, bundle, recordings."),
         click.option(
             "--recordings", multiple=True, metavar="GLOB", help="HDF5 recordings; may be given several times."
         ),
@@ -104,7 +103,7 @@ def decode(**asked: Any) -> None:
 @bulk.command()
 @_options
 @_pages_options
-@click.option("--code", "code_path", type=click.Path(path_type=Path), help="Code; the recordings' or the bundles'.")
+@click.option("--code", "code_path", type=_FILE, help="Code; the recordings' or the bundles'.")
 @click.option("--volume", metavar="ID[:CHECKSUM]", help="Write the file of this volume alone.")
 @click.option("--holes", is_flag=True, help="Where data are lost, write FILE.holes with zeros in their place.")
 def recover(code_path: Path | None, volume: str | None, holes: bool, **asked: Any) -> None:
@@ -206,8 +205,7 @@ def _bulk(
         found = totals(ledger, job, made.failures)
         files = recovered_files(ledger, job, wanted) if operation is Operation.RECOVER and own == WHOLE else []
     result = Result(job, own, made, found, files)
-    if json_path is not None:
-        write_json(json_path, result.to_json())
+    write_json(json_path, result.to_json())
     click.echo(result.table())
     if (error := result.failure(f"bulk run {out}")) is not None:
         raise error

@@ -118,8 +118,7 @@ def encode(
         "user_bytes_per_page": codec.user_bytes,
         "code": told,
     }
-    if json_path is not None:
-        write_json(json_path, figures)
+    write_json(json_path, figures)
     click.echo(
         f"{out}: volume {volume.id}, {volume.pages} pages of {code.levels} levels and {codec.user_bytes} bytes; "
         f"{volume.file_pages} hold {volume.file_bytes} bytes, {volume.pages - volume.file_pages} are parity"

@@ -187,8 +187,7 @@ def _record(
         "black_levels": None if dark_frames is None else [one.black_level for one in dark_frames],
         "seconds": time.perf_counter() - begun,
     }
-    if json_path is not None:
-        write_json(json_path, figures)
+    write_json(json_path, figures)
     told = ", ".join(f"{times} {reason}" for reason, times in sorted(by_reason.items()))
     click.echo(
         f"{out}: {counted(count, 'page')} of {source.levels} levels; "

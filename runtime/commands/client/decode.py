@@ -89,11 +89,10 @@ def decode(
                 raise
             broke = error  # the source does not show the same pages again: what came is kept
             click.get_current_context().meta[RESUME_KEY] = "what came before is kept"
-        if json_path is not None:
-            data = {"target": target, "levels": levels, "pages": results, "refused_pages": [asdict(r) for r in refused]}
-            data["pages_unconfirmed"] = unconfirmed(refused)
-            data["pages_asked_for"] = count
-            write_json(json_path, data)
+        data = {"target": target, "levels": levels, "pages": results, "refused_pages": [asdict(r) for r in refused]}
+        data["pages_unconfirmed"] = unconfirmed(refused)
+        data["pages_asked_for"] = count
+        write_json(json_path, data)
         if refused and not results:
             raise refusal(subject, refused, count)
     click.echo(table(results))

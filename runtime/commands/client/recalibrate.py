@@ -86,8 +86,7 @@ def recalibrate(
         if detach:
             with LightpageClient(target, tls=tls) as client:
                 job = _start(client, recording, pages, send, wait_s)
-            if json_path is not None:
-                write_json(json_path, {"job": job.id})
+            write_json(json_path, {"job": job.id})
             click.echo(job.id)
             return
         result: RecalibrationOutcome | Recalibrated = _remote(target, tls, recording, pages, send, wait_s)
@@ -102,8 +101,7 @@ def recalibrate(
             raise InvalidInputError("options", f"no {lacking}", f"{', '.join(given)}, or --target")
         result = _offline(bundle, recording, out, pages, version)
     data = summary(result, time.perf_counter() - start)
-    if json_path is not None:
-        write_json(json_path, data)
+    write_json(json_path, data)
     click.echo(table(data))
 
 
