@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -19,7 +18,7 @@ from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording, page_hashes
 from lightpage.runtime.archives.recordings.read_ahead import read_ahead
-from lightpage.runtime.archives.recordings.refused import RefusedPage, refusal, unconfirmed
+from lightpage.runtime.archives.recordings.refused import RefusedPage, refusal, refused_json
 from lightpage.runtime.model.bundle.manifest import GOLDEN
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.frames import narrow
@@ -94,7 +93,7 @@ class Evaluation:
             "maps": {name: page.round(_MAP_DECIMALS).tolist() for name, page in vars(self.maps).items()},
             "bundle": self.bundle,
             "pages_recalibration_due": self.recalibration_due,
-            **_refused_json(self.refused),
+            **refused_json(self.refused),
         }
 
 
@@ -109,10 +108,6 @@ class NothingReadError(LightpageError):
     def __init__(self, refusal: LightpageError, figures: dict[str, Any]) -> None:
         super().__init__(refusal.subject, refusal.got, refusal.expected)
         self.refusal, self.figures = refusal, figures
-
-
-def _refused_json(refused: Sequence[RefusedPage]) -> dict[str, Any]:
-    return {"pages_unconfirmed": unconfirmed(refused), "refused_pages": [asdict(page) for page in refused]}
 
 
 def was_seen(decoder: Decoder, frames: FramePair) -> bool:
@@ -219,7 +214,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
             "pages": 0,
             "pages_left_out": recording.pages - len(refused),
             "bundle": _describe(decoder, levels),
-            **_refused_json(refused),
+            **refused_json(refused),
         }
         raise NothingReadError(told, figures)
     if not timings:

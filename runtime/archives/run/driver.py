@@ -153,13 +153,14 @@ def run(
             failed, counted = list[Failed](), list[Failed]()
             for turn, pause_s in enumerate(pauses_s, 1):
                 last = turn == len(pauses_s)
+                every = give_up and last
                 tasks: Iterable[Task] = missing()
                 if pause_s is not None:
-                    again = [each for each in failed if each.problem.passes or (give_up and last)]
+                    again = [each for each in failed if every or each.problem.passes]
                     if not again:
                         continue
-                    failed = [each for each in failed if each not in again]
-                    tasks = list(_of_failures(tasks, again, [*failed, *counted], give_up and last))
+                    failed = [each for each in failed if not (every or each.problem.passes)]
+                    tasks = list(_of_failures(tasks, again, [*failed, *counted], every))
                     todo = sum(task.weight for task in tasks)
                     note(f"{again[0].problem}; {todo} {unit}s are tried again in {pause_s:g} s")
                     clock.sleep(pause_s)

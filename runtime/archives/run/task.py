@@ -78,7 +78,7 @@ class NamedBundle(Plain):
         path: where it lies.
         sha256: see `bundle_sha256`; empty of one that could not be read when the run began.
         version: of its manifest; likewise.
-        stamp: of the file that was read; None in records of earlier versions.
+        stamp: of the file that was read; None of one that could not be.
     """
 
     path: Path

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -166,8 +167,7 @@ def _file(
 
 def _written(path: Path, volume: Volume, shards: dict[Path, int], *, despite_losses: bool) -> Restored:
     """Put a file together, and give it its name unless data are lost; raises as `VolumeFile` does."""
-    file = VolumeFile(path, volume)
-    try:
+    with closing(VolumeFile(path, volume)) as file:
         for shard in shards:
             for _, page in read_user_bytes(shard):
                 if Volume.of_page(page) == volume and page.header is not None and page.data is not None:
@@ -176,5 +176,3 @@ def _written(path: Path, volume: Volume, shards: dict[Path, int], *, despite_los
         if despite_losses or not done.lost:
             file.complete(done.lost)
         return done
-    finally:
-        file.close()

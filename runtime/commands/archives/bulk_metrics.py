@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -14,10 +13,6 @@ from lightpage.runtime.archives.run.driver import Watch
 from lightpage.runtime.archives.run.ledger import Ledger
 from lightpage.runtime.archives.run.task import Operation
 from lightpage.runtime.client.wire.address import check_address, is_local
-
-if TYPE_CHECKING:
-    from lightpage.runtime.archives.run.metrics import BulkMetrics
-    from lightpage.runtime.console.server import ConsoleServer
 
 METRICS_SUFFIX = ".prom"
 
@@ -46,35 +41,24 @@ def watched(ledger: Ledger, operation: Operation, address: str | None, file: Pat
     if address is None and file is None:
         yield Watch()
         return
-    from lightpage.runtime.archives.run.metrics import BulkMetrics  # prometheus_client, for who asks for it
+    from prometheus_client import make_wsgi_app  # for who asks for metrics
+
+    from lightpage.runtime.archives.run.metrics import BulkMetrics
+    from lightpage.runtime.console.server import ConsoleServer
 
     metrics = BulkMetrics(ledger.folder.name, operation, ledger.part)
     try:
         with ExitStack() as stack:
             if address is not None:
-                stack.enter_context(_shown(metrics, address))
+                host, _, port = address.rpartition(":")
+                try:
+                    server = stack.enter_context(ConsoleServer(make_wsgi_app(metrics.registry), int(port), host))
+                except OSError as error:
+                    got, expected = error.strerror or error, "an address of this machine and a free port"
+                    raise InvalidInputError(f"--metrics {address}", got, expected) from None
+                click.echo(f"metrics at http://{host}:{server.port}/metrics", err=True)
             yield metrics
     finally:
         metrics.end()
         if file is not None:
             metrics.write(file)
-
-
-def _shown(metrics: BulkMetrics, address: str) -> ConsoleServer:
-    """The metrics at an address, until it is closed.
-
-    Raises:
-        InvalidInputError: nobody can listen there.
-    """
-    from prometheus_client import make_wsgi_app
-
-    from lightpage.runtime.console.server import ConsoleServer
-
-    host, _, port = address.rpartition(":")
-    try:
-        server = ConsoleServer(make_wsgi_app(metrics.registry), int(port), host)
-    except OSError as error:
-        got, expected = error.strerror or error, "an address of this machine and a free port"
-        raise InvalidInputError(f"--metrics {address}", got, expected) from None
-    click.echo(f"metrics at http://{host}:{server.port}/metrics", err=True)
-    return server

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections import Counter
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -62,9 +63,8 @@ def record(
     """
     if out.exists() and not force:
         raise InvalidInputError(f"--out {out}", "a file that exists", "a new name, or --force")
-    source = open_source(spec)
-    source.operator = ask_operator
-    try:
+    with closing(open_source(spec)) as source:
+        source.operator = ask_operator
         profile = load_profile(profile_name) if profile_name is not None else source.profile
         if profile is None:
             raise InvalidInputError("options", f"no --profile, which {source.name} does not tell either", "--profile P")
@@ -82,8 +82,6 @@ def record(
                 _record(source, profile, count, out, longest_s, dark, force, json_path)
         except LostShotError as error:  # of dark or reference frames
             raise LostDataError(error.subject, error.got, f"{error.expected} ({error.reason.value})") from None
-    finally:
-        source.close()
 
 
 def _count(source: FrameSource, asked: int | None, symbols: Path | None) -> int:
