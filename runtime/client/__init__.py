@@ -1,1 +1,4 @@
-"""For those who call the service."""
+"""The client, and what travels on the wire between it and the service: messages, addresses, certificates, statuses.
+
+The wheel `lightpage-client` is made of this room and of what it imports of `model`, so it stays small.
+"""

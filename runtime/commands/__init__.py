@@ -1,4 +1,7 @@
-"""Subcommands of `lightpage` that need no torch."""
+"""Subcommands of `lightpage` that need no torch: they read options, call other rooms, and alone know of terminals.
+
+`archives` works on files, `client` talks to a running service, `service` runs one.
+"""
 
 import os
 

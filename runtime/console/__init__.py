@@ -1,1 +1,4 @@
-"""A local web page that shows how a running service fares. It changes nothing."""
+"""The console: the service's web page, its HTTP server, and metrics for Prometheus.
+
+This room imports `service` and `client`.
+"""

@@ -1,0 +1,84 @@
+"""How large the house is: `python -m tests.house` prints its figures beside their limits, those of `limits.toml`."""
+
+from __future__ import annotations
+
+import ast
+import io
+import subprocess
+import sys
+import tokenize
+import tomllib
+from collections import Counter
+from pathlib import Path
+
+import grimp
+
+ROOT = Path(__file__).resolve().parents[1]
+_NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
+
+
+def figures() -> dict[str, float]:
+    """Return each figure by its name in `limits.toml`."""
+    tracked = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    files = [ROOT / name for name in tracked.split("\0") if name and (ROOT / name).is_file()]
+    code = [path for path in files if path.suffix == ".py" and "pb" not in path.parts]
+    product = [path for path in code if path.relative_to(ROOT).parts[0] != "tests"]
+    graph = grimp.build_graph("lightpage", cache_dir=None)
+    rooms = graph.find_children("lightpage.runtime")
+    arrows = {
+        room: {
+            other
+            for other in rooms - {room}
+            if graph.direct_import_exists(importer=room, imported=other, as_packages=True)
+        }
+        for room in rooms
+    }
+    return {
+        "rooms": len(rooms),
+        "floors": max(_floor(room, arrows) for room in rooms),
+        "arrows": sum(map(len, arrows.values())),
+        "imports": max(_imports(path) for path in product),
+        "files": max(Counter(path.parent for path in code).values()),
+        "runtime_lines": sum(code_lines(path.read_text()) for path in product if (ROOT / "runtime") in path.parents),
+    }
+
+
+def _floor(room: str, arrows: dict[str, set[str]]) -> int:
+    """The floor of a room, one above the highest that it imports; import-linter sees to it that there is no circle."""
+    return 1 + max((_floor(other, arrows) for other in arrows[room]), default=0)
+
+
+def _imports(path: Path) -> int:
+    return sum(isinstance(node, ast.Import | ast.ImportFrom) for node in ast.walk(ast.parse(path.read_text())))
+
+
+def code_lines(source: str) -> int:
+    """Count the lines of code: no docstrings, comments or blank lines."""
+    texts = [node.value for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Expr)]
+    told = {
+        line
+        for text in texts
+        if isinstance(text, ast.Constant) and isinstance(text.value, str)
+        for line in range(text.lineno, (text.end_lineno or 0) + 1)
+    }
+    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
+    lines = {n for token in tokens if token.type not in _NO_CODE for n in range(token.start[0], token.end[0] + 1)}
+    return len(lines - told)
+
+
+def limits() -> dict[str, float]:
+    """Return the limits, by the figures' names."""
+    found: dict[str, float] = tomllib.loads((ROOT / "tests" / "limits.toml").read_text())["house"]
+    return found
+
+
+def main() -> int:
+    """Print the figures, and return 1 where one is over its limit."""
+    most, found = limits(), figures()
+    for name, value in found.items():
+        print(f"{name:<15} {value:>8,} of {most[name]:,}")
+    return int(any(value > most[name] for name, value in found.items()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
