@@ -293,16 +293,18 @@ def results_on_stdout() -> Iterator[None]:
         _results.reset(token)
 
 
-def write_json(path: str | Path, data: Any) -> None:
+def write_json(path: str | Path | None, data: Any) -> None:
     """Write `data` to `path` as JSON, null for what is not a number, replacing what is there in one step.
 
     Args:
-        path: of the file, or `STDOUT`.
+        path: of the file, or `STDOUT`; None where nobody wants it.
         data: what JSON can hold.
 
     Raises:
         InvalidInputError: the path cannot be written.
     """
+    if path is None:
+        return
     text = json.dumps(_plain(data), indent=2, allow_nan=False) + "\n"
     if Path(path) == STDOUT:
         print(text, end="", file=_results.get() or sys.stdout, flush=True)

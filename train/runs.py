@@ -40,8 +40,8 @@ FORMAT = 8
 together with those of this one, or when the simulator's light changes (as the simulator's `LIGHT` is then), or which
 pages the comparison trains on."""
 
-_RENAMED = {"levels": "depth", "--levels": "--depth"}
-"""Choices that earlier versions kept under other names: the depth of the network was called its levels."""
+_RENAMED = {"levels": "depth"}
+"""Choices that runs in analysis/weights keep under other names: the depth of the network was called its levels."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ def check_begun(folder: Path, options: dict[str, Any]) -> bool:
 
 
 def renamed(choices: Mapping[str, Any]) -> dict[str, Any]:
-    """Choices that a run keeps, of this version or an earlier one, under the names of this version."""
+    """Choices that a run keeps, under the names that they have now."""
     return {_RENAMED.get(name, name): value for name, value in choices.items()}
 
 

@@ -23,7 +23,7 @@ def main(recording: Path, bundle: Path, first: int, end: int, threads: int) -> N
     with Recording.open(recording) as file:
         mask = pilots_of(decoder, file)
         begun = time.perf_counter()
-        for _, read in read_ahead(lambda at: file.shown(first + at), end - first):
+        for _, read in read_ahead(file.shown, range(first, end)):
             frames, symbols = read.result()
             decode_unseen(decoder, file, tracker, mask, frames, symbols)
     print(time.perf_counter() - begun)

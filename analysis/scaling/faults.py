@@ -42,12 +42,12 @@ from lightpage.cli.paths import OutputFile, OutputFolder
 from lightpage.files import write_json
 from lightpage.helper_process import same_packages
 from lightpage.runtime.archives.run.driver import run
-from lightpage.runtime.archives.run.job import Choices, Job, of_recordings
+from lightpage.runtime.archives.run.job import Job
 from lightpage.runtime.archives.run.ledger import Ledger
+from lightpage.runtime.archives.run.question import of_recordings
 from lightpage.runtime.archives.run.shard import RECORD, SYMBOLS, ShardRecord
-from lightpage.runtime.archives.run.task import Operation
-from lightpage.runtime.archives.workers.inline import InlineEngine
-from lightpage.runtime.archives.workers.work import Worker
+from lightpage.runtime.archives.run.task import Choices, Operation
+from lightpage.runtime.archives.workers.local import LocalEngine
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 from lightpage.train.models.presets import FAST
 
@@ -141,12 +141,12 @@ def _records(folder: Path) -> Iterator[Path]:
 
 
 def single(job: Job, folder: Path) -> None:
-    """What one process reads; what is there of it already stays."""
+    """What one worker reads; what is there of it already stays."""
     if Job.read(folder) != job:
         shutil.rmtree(folder, ignore_errors=True)
     with Ledger(folder) as ledger:
         job.write(ledger.folder)
-        run(ledger, job, lambda: InlineEngine(Worker(THREADS)))
+        run(ledger, job, lambda: LocalEngine(1, THREADS))
 
 
 def killed(bulk: BulkRun, job: Job, kills: int, nodes: int, cluster: Cluster | None, seed: int) -> dict[str, Any]:

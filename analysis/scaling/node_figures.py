@@ -22,7 +22,7 @@ from lightpage.runtime.archives.run.engine import Engine
 from lightpage.runtime.archives.run.job import Job
 from lightpage.runtime.archives.run.ledger import Ledger
 from lightpage.runtime.archives.run.shard import ShardRecord
-from lightpage.runtime.archives.run.task import NamedBundle, Operation, Stamp, Task
+from lightpage.runtime.archives.run.task import Choices, NamedBundle, Operation, RecordedFile, Stamp, Task
 from lightpage.runtime.archives.run.totals import totals
 from lightpage.runtime.archives.workers.local import LocalEngine
 from lightpage.runtime.archives.workers.ray_engine import RayEngine, connected
@@ -195,10 +195,10 @@ def _driver(engine: Engine, in_flight: int) -> DriverFigures:
 
 def _tasks() -> Iterator[Task]:
     """Without end, and as long as real ones."""
+    recording = Path("/archive/shelf-1/recording-000001.h5")
     task = Task(
-        operation=Operation.DECODE,
-        recording=Path("/archive/shelf-1/recording-000001.h5"),
-        stamp=Stamp(size=1 << 33, modified_ns=1 << 60),
+        choices=Choices(operation=Operation.DECODE),
+        files=(RecordedFile(path=recording, stamp=Stamp(size=1 << 33, modified_ns=1 << 60)),),
         pages=tuple(range(32)),
         bundle=NamedBundle(path=Path("/archive/bundle.zip"), sha256="0" * 64, version="1"),
         shard=Path("/archive/run/shards/000000/00000000"),

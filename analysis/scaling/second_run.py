@@ -25,10 +25,11 @@ from lightpage.cli.main import run as run_command
 from lightpage.cli.paths import OutputFile, OutputFolder
 from lightpage.files import write_json
 from lightpage.helper_process import same_packages
-from lightpage.runtime.archives.run.job import RANGE_PAGES, Choices, Job, of_recordings
+from lightpage.runtime.archives.run.job import Job
 from lightpage.runtime.archives.run.ledger import Ledger
+from lightpage.runtime.archives.run.question import of_recordings
 from lightpage.runtime.archives.run.shard import record_of
-from lightpage.runtime.archives.run.task import Operation
+from lightpage.runtime.archives.run.task import RANGE_PAGES, Choices, Operation
 from lightpage.runtime.archives.run.volumes import FOLDER
 from lightpage.runtime.model.bundle.shipped import DEFAULT
 

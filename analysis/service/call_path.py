@@ -23,10 +23,9 @@ from analysis.service.running import RunningService
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.files import write_json
-from lightpage.runtime.archives.run.job import Choices, of_recordings
 from lightpage.runtime.archives.run.ledger import Ledger
-from lightpage.runtime.archives.run.task import Operation
-from lightpage.runtime.archives.workers.inline import InlineEngine
+from lightpage.runtime.archives.run.question import of_recordings
+from lightpage.runtime.archives.run.task import Choices, Operation
 from lightpage.runtime.archives.workers.work import Worker
 from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.model.bundle.bundle import Bundle
@@ -152,12 +151,12 @@ def bulk_page(bundle: Bundle, folder: Path) -> Entries:
     """The functions that a worker of a bulk run enters to decode a range of one page, which it begins to track."""
     choices = Choices(operation=Operation.DECODE, range_pages=1)
     job = of_recordings(choices, [str(_recorded(bundle, folder))], str(bundle.path), None)
-    engine = InlineEngine(Worker(threads=1))
+    worker = Worker(threads=1)
     with Ledger(folder / "run") as ledger:
         before, task, *_ = ledger.missing(job)
-    list(engine.run([before]))
+    worker.work(before)
     with tracing() as recorder:
-        list(engine.run([task]))
+        worker.work(task)
     return recorder.entries()
 
 

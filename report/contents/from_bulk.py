@@ -322,7 +322,7 @@ def _recalibrations(found: Totals, common: str) -> list[Recalibration]:
 def _workers(readings: Sequence[Reading]) -> list[Worker]:
     sums: dict[str, list[float]] = {}
     for reading in readings:
-        own = sums.setdefault(reading.worker or "not noted", [0, 0, 0.0])
+        own = sums.setdefault(reading.worker, [0, 0, 0.0])
         for place, value in enumerate((1, reading.pages, reading.seconds)):
             own[place] += value
     workers = [Worker(name, int(count), int(pages), seconds) for name, (count, pages, seconds) in sums.items()]

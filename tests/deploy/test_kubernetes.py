@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from lightpage.cli.main import EXIT_AGAIN, EXIT_ERROR, EXIT_LOST
-from lightpage.runtime.archives.run.part import Part
+from lightpage.runtime.archives.run.ledger import Part
 from lightpage.runtime.service.settings import ServiceSettings, service_settings
 from tests.deploy import manifests
 from tests.deploy.manifests import FOLDER, KUSTOMIZATION

@@ -40,7 +40,6 @@ class Choice:
         published: what holds without it for the published decoders, where they have it.
         localizers: that have it.
         of_preset: whether it is set by `--preset`; `--help` does not list it then, but it may be given too.
-        earlier: flag of earlier versions, which may be given too.
     """
 
     flag: str
@@ -50,12 +49,6 @@ class Choice:
     published: object = None
     localizers: tuple[str, ...] = _ALL
     of_preset: bool = False
-    earlier: str | None = None
-
-    @property
-    def flags(self) -> tuple[str, ...]:
-        """All that it may be given by."""
-        return (self.flag,) if self.earlier is None else (self.flag, self.earlier)
 
     @property
     def name(self) -> str:
@@ -116,7 +109,6 @@ CHOICES = (
         "How often the network halves its resolution below symbol pitch; 0 is the flat one.",
         localizers=LOCALIZERS,
         of_preset=True,
-        earlier="--levels",
     ),
     Choice(
         "--refinements",
@@ -203,7 +195,7 @@ C = TypeVar("C", bound=Callable[..., Any])
 def with_choices(command: C) -> C:
     """Give a command the options of `CHOICES`; what is not given comes as None."""
     for choice in reversed(CHOICES):
-        command = click.option(*choice.flags, choice.name, type=choice.type, help=choice.help, hidden=choice.of_preset)(
+        command = click.option(choice.flag, choice.name, type=choice.type, help=choice.help, hidden=choice.of_preset)(
             command
         )
     return command

@@ -8,14 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.codec.choose import HEADROOM, Choice, DrawnPage, choose
-from lightpage.errors import InvalidInputError, LostPageError, RecordingError
+from lightpage.errors import InvalidInputError, LostPageError
 from lightpage.metrics.information import achievable_rate
 from lightpage.page.pilots import Pilots, remove_piston
 from lightpage.page.symbols import symbol_phases
 from lightpage.progress import track, warn
-from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording
-from lightpage.runtime.archives.recordings.evaluation import check_recording, was_seen
+from lightpage.runtime.archives.recordings.evaluation import check_recording, check_symbols, decode_unseen, pilots_of
 from lightpage.runtime.archives.recordings.read_ahead import read_ahead
 from lightpage.runtime.archives.recordings.refused import RefusedPage, refusal
 from lightpage.runtime.model.decoding.decoder import Decoder
@@ -54,25 +53,22 @@ def choose_code(
         InvalidInputError: too few pages that the bundle has not seen and can decode, or no code carries them.
     """
     check_recording(decoder, recording)
-    if not recording.has_symbols:
-        raise RecordingError(f"recording {recording.path}", "no symbols", "known symbols to choose a code by")
-    own, levels = recording.pilots(), recording.levels
-    mask = decoder.bundle.pilot_mask if own is None else own
+    check_symbols(recording, "choose a code by")
+    levels, mask = recording.levels, pilots_of(decoder, recording)
     errors: list[NDArray[np.float32]] = []
     concentrations: list[NDArray[np.float32]] = []
     refused: list[RefusedPage] = []
-    for index, read in track(read_ahead(recording.shown, recording.pages), "choose a code", total=recording.pages):
+    shown = read_ahead(recording.shown, range(recording.pages))
+    for index, read in track(shown, "choose a code", total=recording.pages):
         try:
             frames, symbols = read.result()
-            if symbols is None or was_seen(decoder, frames):
-                continue
-            pair, pilots = narrow(frames, recording.bit_depth), Pilots.of_symbols(mask, symbols, levels)
-            page = tracker.decode(pair, levels, pilots)
+            page = decode_unseen(decoder, recording, tracker, mask, frames, symbols)
         except (InvalidInputError, LostPageError) as error:
             refused.append(RefusedPage.of(index, error))  # a page that is lost to the optics is lost to every code
             continue
-        errors.append(phase_errors(page, symbols, levels))
-        concentrations.append(page.concentration)
+        if page is not None and symbols is not None:
+            errors.append(phase_errors(page, symbols, levels))
+            concentrations.append(page.concentration)
     if refused:
         lost = refusal(f"recording {recording.path}", refused, recording.pages)
         warn(f"{lost.subject}: {lost.got}; they do not count")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -20,7 +19,7 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording, page_hashes
 from lightpage.runtime.archives.recordings.read_ahead import read_ahead
-from lightpage.runtime.archives.recordings.refused import RefusedPage, refusal, unconfirmed
+from lightpage.runtime.archives.recordings.refused import RefusedPage, refusal, refused_json
 from lightpage.runtime.model.bundle.manifest import GOLDEN
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.page import DecodedPage, Timings
@@ -75,21 +74,17 @@ class Evaluation:
 
     def to_json(self) -> dict[str, Any]:
         """The figures under the names that other programs read."""
-        figures = self.figures
+        figures = vars(self.figures).copy()
+        del figures["count"]
         return {
             "bundle_version": self.bundle_version,
             "pages": self.pages,
             "pages_left_out": self.pages_left_out,
             "symbols_per_page": self.symbols_per_page,
-            "levels": figures.levels,
-            "air_bits_per_symbol": figures.air_bits_per_symbol,
+            **figures,
             "air_before_refit_bits_per_symbol": self.air_before_refit,
-            "own_mi_bits_per_symbol": figures.own_mi_bits_per_symbol,
-            "over_claim_bits_per_symbol": figures.over_claim_bits_per_symbol,
-            "gmi_bits_per_symbol": figures.gmi_bits_per_symbol,
+            "over_claim_bits_per_symbol": self.figures.over_claim_bits_per_symbol,
             "page_kB": self.page_kb,
-            "symbol_error_rate": figures.symbol_error_rate,
-            "ece": figures.ece,
             "seconds_per_page": self.seconds_per_page,
             "inference_seconds_per_page": self.inference_seconds_per_page,
             "air_per_page": list(self.air_per_page),
@@ -98,7 +93,7 @@ class Evaluation:
             "maps": {name: page.round(_MAP_DECIMALS).tolist() for name, page in vars(self.maps).items()},
             "bundle": self.bundle,
             "pages_recalibration_due": self.recalibration_due,
-            **_refused_json(self.refused),
+            **refused_json(self.refused),
         }
 
 
@@ -113,10 +108,6 @@ class NothingReadError(LightpageError):
     def __init__(self, refusal: LightpageError, figures: dict[str, Any]) -> None:
         super().__init__(refusal.subject, refusal.got, refusal.expected)
         self.refusal, self.figures = refusal, figures
-
-
-def _refused_json(refused: Sequence[RefusedPage]) -> dict[str, Any]:
-    return {"pages_unconfirmed": unconfirmed(refused), "refused_pages": [asdict(page) for page in refused]}
 
 
 def was_seen(decoder: Decoder, frames: FramePair) -> bool:
@@ -138,6 +129,16 @@ def check_recording(decoder: Decoder, recording: Recording) -> None:
         raise RecordingError(
             f"recording {recording.path}", f"{recording.bit_depth} bits", f"{depth} bits, as the bundle"
         )
+
+
+def check_symbols(recording: Recording, purpose: str = "measure against") -> None:
+    """Check that the symbols of a recording are known.
+
+    Raises:
+        RecordingError: they are not.
+    """
+    if not recording.has_symbols:
+        raise RecordingError(f"recording {recording.path}", "no symbols", f"known symbols to {purpose}")
 
 
 def pilots_of(decoder: Decoder, recording: Recording) -> NDArray[np.bool_]:
@@ -184,8 +185,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
         NothingReadError: no page could be decoded, or none was confirmed.
     """
     check_recording(decoder, recording)
-    if not recording.has_symbols:
-        raise RecordingError(f"recording {recording.path}", "no symbols", "known symbols to measure against")
+    check_symbols(recording)
     levels = recording.levels
     mask = pilots_of(decoder, recording)
     data = ~mask
@@ -194,7 +194,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
     refused: list[RefusedPage] = []
     due = 0
     before: list[float] = []
-    for index, read in track(read_ahead(recording.shown, recording.pages), "evaluate", total=recording.pages):
+    for index, read in track(read_ahead(recording.shown, range(recording.pages)), "evaluate", total=recording.pages):
         page = symbols = None
         try:
             frames, symbols = read.result()
@@ -214,7 +214,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
             "pages": 0,
             "pages_left_out": recording.pages - len(refused),
             "bundle": _describe(decoder, levels),
-            **_refused_json(refused),
+            **refused_json(refused),
         }
         raise NothingReadError(told, figures)
     if not timings:

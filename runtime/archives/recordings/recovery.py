@@ -34,11 +34,10 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.coded_pages import air_bits
-from lightpage.runtime.archives.recordings.evaluation import check_recording
+from lightpage.runtime.archives.recordings.evaluation import check_recording, pilots_of
 from lightpage.runtime.archives.recordings.read_ahead import read_ahead
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.model.decoding.page import DecodedPage
 from lightpage.runtime.model.decoding.tracking import Tracker
 
 CONFIDENCE = 0.95
@@ -112,10 +111,6 @@ class Recovery:
     def unread(self) -> tuple[RecoveredPage, ...]:
         """Recorded pages that gave no bytes."""
         return tuple(page for page in self.pages if page.loss is not None)
-
-    def reason_of(self, page: int) -> str:
-        """Why a recorded page gave no bytes, for people."""
-        return next(each.reason for each in self.pages if each.page == page)
 
     @property
     def failure_bound(self) -> float:
@@ -213,15 +208,11 @@ def recover(
             each other, or no room.
         LostDataError: the file that was put together is not the one that was encoded.
     """
-    reader = page_reader(decoder, recording, tracker, code)
-    codec, bundle = reader.codec, decoder.bundle
-    pages: list[RecoveredPage] = []
+    reader = PageReader(decoder, recording, tracker, code)
+    codec, mask = reader.codec, decoder.bundle.pilot_mask
     with VolumeFiles(out) as files:
-        for index, read in track(read_ahead(recording.shown, recording.pages), "recover", total=recording.pages):
-            try:
-                pages.append(read_page(reader, recording.bit_depth, index, read, files.add))
-            except StorageError as error:
-                pages.append(unread_page(reader, index, Loss.STORAGE, error))
+        read = track(read_ahead(recording.shown, range(recording.pages)), "recover", total=recording.pages)
+        pages = tuple(reader.read(index, shown, files.add) for index, shown in read)
         file = files.chosen(volume_id, checksum)
         done = Restored((), ()) if file is None else file.restore()
         if file is not None and (holes or not done.lost):
@@ -233,134 +224,97 @@ def recover(
         return Recovery(
             code,
             volume,
-            tuple(pages),
+            pages,
             done.restored,
             done.lost,
             () if file is None else tuple(file.missing()),
             foreign,
             0 if file is None else file.repeated,
             codec.user_bytes,
-            bundle.pilot_mask.size,
-            int(np.count_nonzero(~bundle.pilot_mask)),
+            mask.size,
+            int(np.count_nonzero(~mask)),
             codec.blocks,
         )
 
 
 class PageReader:
-    """Frames to bytes, page after page; knows which page of its volume should come next.
+    """Reads the pages of a recording one after the other; knows which page of its volume should come next.
 
     Args:
-        codec: of the pages.
-        decode: frame pair to decoded page.
-    """
-
-    def __init__(self, codec: PageCodec, decode: Callable[[FramePair], DecodedPage]) -> None:
-        self.codec, self._decode = codec, decode
-        self._next = Successor()
-
-    @property
-    def expected(self) -> Header | None:
-        """The page that should come next, where that is known."""
-        return self._next.header
-
-    def read(self, pair: FramePair) -> tuple[DecodedPage, PageBytes, float, float]:
-        """A page, its bytes, and the seconds of the optical decode and of the code.
-
-        Raises:
-            LostPageError, InvalidInputError: the frames cannot be decoded.
-        """
-        start = time.perf_counter()
-        page = self._decode(pair)
-        decoded = time.perf_counter()
-        found = self.codec.decode(page.phase, page.concentration, self.expected)
-        return page, found, decoded - start, time.perf_counter() - decoded
-
-    def follow(self, volume: Volume | None, header: Header | None) -> None:
-        """Take note of a page: of the volume that it belongs to, or of none, where it is lost."""
-        if volume is not None and header is not None:
-            self._next = Successor(volume, header)
-        self.skip()
-
-    def skip(self) -> None:
-        """Go on to the page after the one that was expected."""
-        self._next = self._next.after()
-
-
-def page_reader(decoder: Decoder, recording: Recording, tracker: Tracker, code: Code) -> PageReader:
-    """What reads the pages of a recording.
+        decoder, recording, tracker, code: see `recover`.
+        give_up: whether pages that storage does not give are unread, as those that are lost.
 
     Raises:
         RecordingError: another device's recording, or one of other levels or pilots.
     """
-    check_recording(decoder, recording)
-    bundle = decoder.bundle
-    if recording.declared_levels not in (None, code.levels):
-        raise RecordingError(f"recording {recording.path}: levels", recording.levels, f"{code.levels}, as the code has")
-    own = recording.pilots()
-    if own is not None and not np.array_equal(own, bundle.pilot_mask):
-        raise RecordingError(f"recording {recording.path}: pilots", "other places", "those of the bundle")
-    pilots = decoder.written_pilots(code.levels)
-    return PageReader(PageCodec(code, bundle.pilot_mask), lambda pair: tracker.decode(pair, code.levels, pilots))
+
+    def __init__(
+        self, decoder: Decoder, recording: Recording, tracker: Tracker, code: Code, *, give_up: bool = True
+    ) -> None:
+        check_recording(decoder, recording)
+        subject, mask = f"recording {recording.path}", decoder.bundle.pilot_mask
+        if recording.declared_levels not in (None, code.levels):
+            raise RecordingError(f"{subject}: levels", recording.levels, f"{code.levels}, as the code has")
+        if not np.array_equal(pilots_of(decoder, recording), mask):
+            raise RecordingError(f"{subject}: pilots", "other places", "those of the bundle")
+        self.codec = PageCodec(code, mask)
+        self._bit_depth, self._tracker, self._give_up = recording.bit_depth, tracker, give_up
+        self._pilots = decoder.written_pilots(code.levels)
+        self._next = Successor()
+
+    def read(
+        self,
+        index: int,
+        shown: Future[tuple[FramePair, NDArray[np.uint8] | None]],
+        take: Callable[[PageBytes], Volume | None],
+    ) -> RecoveredPage:
+        """Read the next page.
+
+        Args:
+            index: of it in the recording.
+            shown: its frames and, where they are known, its symbols.
+            take: takes its bytes, and says which volume they belong to.
+
+        Raises:
+            StorageError: the frames could not be read, which says nothing of the page, and it is not given up.
+        """
+        expected, levels = self._next.header, self.codec.code.levels
+        try:
+            frames, symbols = shown.result()
+            start = time.perf_counter()
+            page = self._tracker.decode(narrow(frames, self._bit_depth), levels, self._pilots)
+            decoded = time.perf_counter()
+            found = self.codec.decode(page.phase, page.concentration, expected)
+            read = time.perf_counter()
+        except (InvalidInputError, LostPageError, StorageError) as error:
+            of_storage = isinstance(error, StorageError)
+            if of_storage and not self._give_up:
+                raise
+            self._next = self._next.after()
+            loss = Loss.STORAGE if of_storage else Loss.OPTICS
+            return RecoveredPage(index, *_place(expected), loss, str(error))
+        own = take(found)
+        if own is not None and found.header is not None:
+            self._next = Successor(own, found.header)
+        self._next = self._next.after()
+        return RecoveredPage(
+            index,
+            *_place(found.header or expected),
+            found.loss,
+            "" if found.loss is None else LOSSES[found.loss],
+            found.margin_bits,
+            found.corrected,
+            found.failed_blocks,
+            found.iterations,
+            None if symbols is None else air_bits(page, symbols, ~self.codec.pilots, levels),
+            decoded - start,
+            read - decoded,
+        )
 
 
-def unread_page(reader: PageReader, index: int, loss: Loss, error: LightpageError) -> RecoveredPage:
-    """A page that gave nothing, which `reader` passes over.
-
-    Args:
-        reader: of the recording's pages.
-        index: of the page.
-        loss: why, for programs.
-        error: why, for people.
-    """
-    expected = reader.expected
-    reader.skip()
-    number, volume = (None, None) if expected is None else (expected.page, expected.volume)
-    return RecoveredPage(index, number, volume, loss, str(error))
-
-
-def read_page(
-    reader: PageReader,
-    bit_depth: int,
-    index: int,
-    read: Future[tuple[FramePair, NDArray[np.uint8] | None]],
-    take: Callable[[PageBytes], Volume | None],
-) -> RecoveredPage:
-    """Read one page of a recording.
-
-    Args:
-        reader: of its pages.
-        bit_depth: of the recording.
-        index: of the page.
-        read: its frames and, where they are known, its symbols.
-        take: takes the page, and says which volume it belongs to.
-
-    Raises:
-        StorageError: the frames could not be read, which says nothing of the page.
-    """
-    expected = reader.expected
-    try:
-        frames, symbols = read.result()
-        page, found, seconds, code_seconds = reader.read(narrow(frames, bit_depth))
-    except (InvalidInputError, LostPageError) as error:
-        return unread_page(reader, index, Loss.OPTICS, error)
-    reader.follow(take(found), found.header)
-    header = found.header if found.header is not None else expected
-    data = ~reader.codec.pilots
-    rate = None if symbols is None else air_bits(page, symbols, data, reader.codec.code.levels)
-    return RecoveredPage(
-        index,
-        None if header is None else header.page,
-        None if header is None else header.volume,
-        found.loss,
-        "" if found.loss is None else LOSSES[found.loss],
-        found.margin_bits,
-        found.corrected,
-        found.failed_blocks,
-        found.iterations,
-        rate,
-        seconds,
-        code_seconds,
-    )
+def _place(header: Header | None) -> tuple[int | None, int | None]:
+    """Number and volume of a page."""
+    return (None, None) if header is None else (header.page, header.volume)
 
 
 def told_losses(pages: Sequence[RecoveredPage]) -> list[str]:
@@ -393,9 +347,10 @@ def lost_data(recovery: Recovery, out: Path, holes: bool, give_up: bool = False)
     """
     if recovery.volume is not None and not recovery.lost:
         return None
-    unreadable = [page.page for page in recovery.unread if page.loss is Loss.STORAGE]
+    unreadable = [page for page in recovery.unread if page.loss is Loss.STORAGE]
     if unreadable and not give_up:
-        got = f"no data of recorded pages {ranges(unreadable)} from storage ({recovery.reason_of(unreadable[0])})"
+        pages = ranges([page.page for page in unreadable])
+        got = f"no data of recorded pages {pages} from storage ({unreadable[0].reason})"
         expected = "storage that gives them: the same command tries again; with --give-up they are lost"
         return MissingResultsError(f"file {out}", got, expected)
     told = "; ".join(told_losses(recovery.unread))

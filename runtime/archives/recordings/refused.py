@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Self
+from dataclasses import asdict, dataclass
+from typing import Any, Self
 
 from lightpage.errors import Cause, InvalidInputError, LightpageError, LostPageError, MissingResultsError
 
@@ -49,6 +49,11 @@ class RefusedPage:
 def unconfirmed(refused: Sequence[RefusedPage]) -> int:
     """How many of the pages were decoded and not confirmed."""
     return sum(page.unconfirmed for page in refused)
+
+
+def refused_json(refused: Sequence[RefusedPage]) -> dict[str, Any]:
+    """The pages under the names that other programs read."""
+    return {"pages_unconfirmed": unconfirmed(refused), "refused_pages": [asdict(page) for page in refused]}
 
 
 def refusal(subject: str, refused: Sequence[RefusedPage], pages: int) -> InvalidInputError | MissingResultsError:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from lightpage.clock import SYSTEM, Clock
@@ -55,8 +56,8 @@ class Progressed:
     def count(self, outcome: Outcome) -> int:
         """Count an outcome and return how much of the work it was worth."""
         if isinstance(outcome, Failed):
-            if outcome.task.operation is Operation.RECALIBRATE:
-                self.failures[outcome.task.device, outcome.task.recording] = outcome.problem
+            if outcome.task.recalibrates:
+                self.failures[outcome.task.origin] = outcome.problem
             self.fail(outcome.problem.about(outcome.task.device))
             return 0
         self.ranges += 1
@@ -130,7 +131,7 @@ def run(
     ledger.sweep(job)
     for problem, is_given_up in dict.fromkeys(  # a bundle is lacking to all recordings of its device
         (source.problem.about(source.device), source.given_up)
-        for _, source in ledger.sources(job)
+        for _, source in ledger.part.sources(job)
         if source.problem is not None
     ):
         if is_given_up:
@@ -139,35 +140,37 @@ def run(
         made.fail(problem)
         watch.fail()
     unit = "device" if job.choices.operation is Operation.RECALIBRATE else "page"
+    pauses_s = (None, *AGAIN_S, *([0.0] if give_up else []))
     try:
         for number in range(1 + len(job.rounds)):
-
-            def missing(number: int = number) -> Iterator[Task]:
-                return ledger.missing_again(job, number) if number else ledger.missing(job)
-
-            todo = sum(task.weight for task in missing())
-            whole = _all(ledger, job)
+            missing = partial(ledger.missing_again, job, number) if number else partial(ledger.missing, job)
+            todo, whole = sum(task.weight for task in missing()), _all(ledger, job)
             watch.wanted(whole, todo)
             if not todo:
                 continue
             total = todo if number else whole
             what = f"{job.choices.operation} again" if number else str(job.choices.operation)
             failed, counted = list[Failed](), list[Failed]()
-            for turn in _turns(give_up):
-                again = [each for each in failed if turn.takes(each)]
-                if turn.pause_s is not None and not again:
-                    continue
-                failed = [each for each in failed if not turn.takes(each)]
+            for turn, pause_s in enumerate(pauses_s, 1):
+                last = turn == len(pauses_s)
+                every = give_up and last
                 tasks: Iterable[Task] = missing()
-                if turn.pause_s is not None:
-                    tasks = list(_of_failures(tasks, again, [*failed, *counted], turn.give_up))
+                if pause_s is not None:
+                    again = [each for each in failed if every or each.problem.passes]
+                    if not again:
+                        continue
+                    failed = [each for each in failed if not (every or each.problem.passes)]
+                    tasks = list(_of_failures(tasks, again, [*failed, *counted], every))
                     todo = sum(task.weight for task in tasks)
-                    note(f"{again[0].problem}; {todo} {unit}s are tried again in {turn.pause_s:g} s")
-                    clock.sleep(turn.pause_s)
+                    note(f"{again[0].problem}; {todo} {unit}s are tried again in {pause_s:g} s")
+                    clock.sleep(pause_s)
+
+                def later(one: Failed, last: bool = last) -> bool:
+                    return not last and (give_up or one.problem.passes)
+
                 works = engine()
                 watch.begin(works)
-                steps = _steps(works, tasks, ledger, made, watch, turn.later, failed, counted)
-                with closing(steps):
+                with closing(_steps(works, tasks, ledger, made, watch, later, failed, counted)) as steps:
                     for _ in track(steps, what, unit=unit, total=total, done=total - todo, state=made.state):
                         pass
     finally:
@@ -176,50 +179,15 @@ def run(
     return made
 
 
-@dataclass(frozen=True)
-class _Turn:
-    """One going through what is missing.
-
-    Attributes:
-        takes: whether a failure of the turns before is tried again in this one.
-        later: whether a failure of this one is tried again in a later one.
-        pause_s: before it; None for the first one, which does all that is missing.
-        give_up: whether pages that storage does not give are lost.
-    """
-
-    takes: Callable[[Failed], bool]
-    later: Callable[[Failed], bool]
-    pause_s: float | None = None
-    give_up: bool = False
-
-
-def _turns(give_up: bool) -> list[_Turn]:
-    def passes(failed: Failed) -> bool:
-        return failed.problem.passes
-
-    def every(failed: Failed) -> bool:
-        return True
-
-    def none(failed: Failed) -> bool:
-        return False
-
-    before_last = every if give_up else passes
-    turns = [_Turn(passes, before_last, pause_s) for pause_s in (None, *AGAIN_S)]
-    if give_up:
-        return [*turns, _Turn(every, none, 0.0, give_up=True)]
-    return [*turns[:-1], replace(turns[-1], later=none)]
-
-
 def _of_failures(
-    tasks: Iterable[Task], again: Iterable[Failed], settled: Iterable[Failed], give_up: bool
+    tasks: Iterable[Task], again: Iterable[Failed], settled: Sequence[Failed], give_up: bool
 ) -> Iterator[Task]:
     """Tasks of the recordings that failures `again` are of, but for those that are `settled`."""
-    settled = list(settled)
-    recordings = {(failed.task.device, failed.task.recording) for failed in again}
-    recordings -= {(failed.task.device, failed.task.recording) for failed in settled if failed.whole_recording}
+    recordings = {failed.task.origin for failed in again}
+    recordings -= {failed.task.origin for failed in settled if failed.whole_recording}
     shards = {failed.task.shard for failed in settled}
     for task in tasks:
-        if (task.device, task.recording) in recordings and task.shard not in shards:
+        if task.origin in recordings and task.shard not in shards:
             yield task.model_copy(update={"give_up": give_up})
 
 
@@ -252,17 +220,17 @@ def _steps(
         watch.deaths(more)
 
     def wanted() -> Iterator[Task]:
-        return (task for task in tasks if (task.device, task.recording) not in given_up)
+        return (task for task in tasks if task.origin not in given_up)
 
     with closing(engine.run(wanted())) as outcomes:
         for outcome in outcomes:
             count_deaths()
             if isinstance(outcome, Failed):
-                key = outcome.task.device, outcome.task.recording
-                if outcome.whole_recording and key in given_up:
+                origin = outcome.task.origin
+                if outcome.whole_recording and origin in given_up:
                     continue  # it was under way when the recording was found to be unreadable, and is told already
                 if outcome.whole_recording:
-                    given_up.add(key)
+                    given_up.add(origin)
                 if later(outcome):
                     failed.append(outcome)
                     continue
@@ -278,5 +246,5 @@ def _steps(
 def _all(ledger: Ledger, job: Job) -> int:
     """Pages of the ledger's part of the job, or devices."""
     if job.choices.operation is Operation.RECALIBRATE:
-        return sum(all(source.problem is None for source in own) for _, own in ledger.devices(job))
-    return sum(source.pages for _, source in ledger.sources(job))
+        return sum(all(source.problem is None for source in own) for _, own in ledger.part.devices(job))
+    return sum(source.pages for _, source in ledger.part.sources(job))

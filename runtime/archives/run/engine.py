@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Iterable, Iterator
+from collections import deque
+from collections.abc import Generator, Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
-from lightpage.runtime.archives.run.task import Failed, Operation, Outcome, Problem, Task
+from lightpage.runtime.archives.run.task import Failed, Outcome, Problem, Task
 
 ATTEMPTS = 3
 """Times that a range is given to a worker; a range that has cost so many workers their life is left alone."""
@@ -60,20 +61,35 @@ class Attempt:
     deadline: float = math.inf
 
 
-def next_attempt(tasks: Iterator[Task]) -> Attempt | None:
-    """The first attempt at the next task; None after the last."""
-    task = next(tasks, None)
-    return None if task is None else Attempt(task)
-
-
 def longest_s(task: Task) -> float:
     """Seconds after which a worker that has not done a task is taken for dead."""
-    if task.operation is not Operation.RECALIBRATE:
+    if not task.recalibrates:
         return _START_S + _PAGE_S * len(task.pages)
-    return _START_S + (_RECALIBRATION_S if task.fine_tuning is None else _FINE_TUNING_S)
+    return _START_S + (_RECALIBRATION_S if task.choices.fine_tuning is None else _FINE_TUNING_S)
 
 
-def given_up(task: Task, got: str) -> Failed:
-    """The outcome of a task that has cost too many workers their life."""
-    expected = f"a result; {ATTEMPTS} workers died at it"
-    return Failed(task=task, problem=Problem(subject=task.name, got=got, expected=expected))
+class Attempts:
+    """Tasks yet to be handed out; those whose worker died come first."""
+
+    def __init__(self, tasks: Iterable[Task]) -> None:
+        self._following, self._again = iter(tasks), deque[Attempt]()
+
+    def next(self) -> Attempt | None:
+        """The next one; None after the last."""
+        if self._again:
+            return self._again.popleft()
+        task = next(self._following, None)
+        return None if task is None else Attempt(task)
+
+    def died(self, attempt: Attempt, got: str) -> Failed | None:
+        """Note that a worker has died; the task's outcome where it has cost too many, and else it comes again.
+
+        Args:
+            attempt: that it was at.
+            got: how it died, for people.
+        """
+        if attempt.number + 1 < ATTEMPTS:
+            self._again.append(Attempt(attempt.task, attempt.number + 1))
+            return None
+        expected = f"a result; {ATTEMPTS} workers died at it"
+        return Failed(task=attempt.task, problem=Problem(subject=attempt.task.name, got=got, expected=expected))

@@ -4,33 +4,22 @@ from __future__ import annotations
 
 import glob
 import hashlib
-import os
-import tomllib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 
-from lightpage.codec.code import Code
 from lightpage.errors import BundleError, InvalidInputError, LightpageError, RecordingError
 from lightpage.failures import os_failure
-from lightpage.files import check_utf8, matching, read_text, replace_text
+from lightpage.files import check_utf8, replace_text
 from lightpage.recording.reader import Recording
-from lightpage.runtime.archives.run.task import FineTuning, NamedBundle, Operation, Plain, Problem, Stamp
+from lightpage.runtime.archives.run.task import Choices, NamedBundle, Plain, Problem, Stamp
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import MANIFEST
 from lightpage.runtime.model.bundle.shipped import bundle_path
-from lightpage.runtime.model.execution.providers import CPU
 
 FILE = "job.json"
-
-RANGE_PAGES = 32
-"""Of a range, unless told otherwise: what a worker that dies costs at most, and often enough that its first page, whose
-image is looked for, costs little."""
-
-KNOWN_PAGES = 2
-"""Pages that a device is recalibrated with, unless told otherwise."""
 
 
 class Source(Plain):
@@ -50,42 +39,11 @@ class Source(Plain):
     device: str
     path: Path
     bundle: int
-    stamp: Stamp | None
-    pages: int
+    stamp: Stamp | None = None
+    pages: int = 0
     problem: Problem | None = None
     run: Path | None = None
     given_up: bool = False
-
-
-class Choices(Plain):
-    """What is asked beside recordings and bundles.
-
-    Attributes:
-        operation: what is done.
-        range_pages: pages of a range.
-        tracking: whether the image is followed within a range.
-        symbols: whether decoding keeps symbols and confidences.
-        code: of the pages whose user bytes are read; None for each recording's, or else its bundle's.
-        provider: what pages are computed with.
-        known_pages: that a device is recalibrated with; None for `KNOWN_PAGES`, or all of them with `fine_tuning`.
-        fine_tuning: how devices are trained on after the fit of their geometry; None to fit the geometry alone.
-        parts: that processes do independently of each other.
-    """
-
-    operation: Operation
-    range_pages: int = RANGE_PAGES
-    tracking: bool = True
-    symbols: bool = True
-    code: Code | None = None
-    provider: str = CPU
-    known_pages: int | None = None
-    fine_tuning: FineTuning | None = None
-    parts: int = 1
-
-    @property
-    def device_pages(self) -> int | None:
-        """Known pages that a device is recalibrated with; None for all that it has."""
-        return self.known_pages or (KNOWN_PAGES if self.fine_tuning is None else None)
 
 
 class Job(Plain):
@@ -194,27 +152,6 @@ class Job(Plain):
             found[place] = (*found.get(place, ()), source)
         return found
 
-    def checked(
-        self,
-        devices: Iterable[tuple[int, tuple[Source, ...]]],
-        check: Callable[[int, tuple[Source, ...], Path], None],
-    ) -> Job:
-        """The same; of these devices, one that `check` refuses has a problem.
-
-        Args:
-            devices: of `devices`, places and recordings.
-            check: is given the place, recordings and bundle's path of each that has none yet.
-        """
-        sources = list(self.sources)
-        for place, own in devices:
-            if any(source.problem is not None for source in own):
-                continue
-            try:
-                check(place, own, self.bundles[own[0].bundle].path)
-            except LightpageError as error:
-                sources[place] = own[0].model_copy(update={"problem": Problem.of(error)})
-        return self.model_copy(update={"sources": tuple(sources)})
-
     def check(self, folder: Path, asked: Job) -> None:
         """Check that a run asks what was asked before; files that have gone or changed are the workers' to tell.
 
@@ -275,55 +212,25 @@ def bundle_as_it_is(path: Path, known: Mapping[Path, NamedBundle] | None = None)
         path: of it, absolute.
         known: bundles as they were before; one whose file is as it was is not read again.
     """
-    before = known.get(path) if known else None
-    if before is not None and before.stamp is not None and before.stamp == _stamp(path):
-        return before, None
     try:
-        return _named(path), None
+        return _named(path, known.get(path) if known else None), None
     except LightpageError as error:
         return NamedBundle(path=path, sha256="", version=""), Problem.of(error)
 
 
-def _named(path: Path) -> NamedBundle:
-    stamp, sha256 = _stamp(path), bundle_sha256(path)
-    return NamedBundle(path=path, sha256=sha256, version=Bundle.open(path).version, stamp=stamp)
-
-
-def _stamp(bundle: Path) -> Stamp | None:
+def _named(path: Path, before: NamedBundle | None = None) -> NamedBundle:
     try:
-        return Stamp.of(_told_by(bundle))
+        stamp = Stamp.of(_told_by(path))
     except OSError:
-        return None
+        stamp = None  # whoever reads it tells why
+    if before is not None and stamp is not None and before.stamp == stamp:
+        return before
+    return NamedBundle(path=path, sha256=bundle_sha256(path), version=Bundle.open(path).version, stamp=stamp)
 
 
 def _told_by(bundle: Path) -> Path:
     """The file whose contents say what a bundle is."""
     return bundle / MANIFEST if bundle.is_dir() else bundle
-
-
-def found_recordings(patterns: Sequence[str], folder: Path | None = None) -> list[Path]:
-    """Files that the patterns name, each once, sorted within a pattern.
-
-    A file that has a pattern for its name, brackets and all, is meant by it.
-
-    Args:
-        patterns: names, or patterns of `glob`; ``~`` is the home folder where nothing has that name.
-        folder: that they are relative to; by default the working folder.
-
-    Raises:
-        InvalidInputError: a pattern that names none, or a name that is not UTF-8.
-    """
-    found: dict[Path, None] = {}
-    base = Path.cwd() if folder is None else folder.absolute()
-    for pattern in patterns:
-        asked = pattern if os.path.lexists(base / pattern) else os.path.expanduser(pattern)
-        names = matching(str(base / asked)) or ([asked] if not glob.has_magic(asked) else [])
-        if not names:
-            raise InvalidInputError(f"--recordings {pattern}", "no file", "a pattern of files that are there")
-        found |= dict.fromkeys(base / name for name in names)
-    for path in found:
-        check_utf8(path, "--recordings")
-    return list(found)
 
 
 def look_at(
@@ -338,14 +245,15 @@ def look_at(
 
     One that cannot be opened is kept with its problem, or with what its bundle is `lacking`.
     """
+    found = Source(device=device, path=path, bundle=bundle, run=run, problem=lacking)
     if lacking is not None:
-        return Source(device=device, path=path, bundle=bundle, stamp=None, pages=0, problem=lacking, run=run)
+        return found
     if known and (source := known.get((device, path))) is not None:
         return source.model_copy(update={"bundle": bundle, "run": run})
     try:
         stamp = Stamp.of(path)
         with Recording.open(path) as recording:
-            return Source(device=device, path=path, bundle=bundle, stamp=stamp, pages=recording.pages, run=run)
+            return found.model_copy(update={"stamp": stamp, "pages": recording.pages})
     except LightpageError as error:
         problem = Problem.of(error)
     except FileNotFoundError as error:
@@ -355,96 +263,4 @@ def look_at(
         problem = Problem.of(RecordingError(f"recording {path}", got, expected))
     except OSError as error:
         problem = Problem.of(os_failure(f"recording {path}", error, "a recording", RecordingError))
-    return Source(device=device, path=path, bundle=bundle, stamp=None, pages=0, problem=problem, run=run)
-
-
-def of_recordings(choices: Choices, patterns: Sequence[str], bundle: str, before: Job | None) -> Job:
-    """A run over recordings of one device, or of devices that share a bundle.
-
-    Args:
-        choices: how.
-        patterns: of the recordings' names.
-        bundle: a path, or the name of a shipped one.
-        before: what the folder was asked before; recordings that are in it are not opened.
-
-    Raises:
-        LightpageError: no such bundle, or no such files.
-    """
-    known = _known(before)
-    sources = tuple(look_at("", path, 0, known=known) for path in found_recordings(patterns))
-    return Job(choices=choices, bundles=(named_bundle(bundle),), sources=sources)
-
-
-class _Device(Plain):
-    name: str = Field(min_length=1)
-    bundle: str = Field(min_length=1)
-    recordings: tuple[str, ...] = Field(min_length=1)
-    run: str | None = None
-
-
-class _Fleet(Plain):
-    device: tuple[_Device, ...]
-
-
-def of_fleet(choices: Choices, path: Path, before: Job | None) -> Job:
-    """A run over the devices that a file names, each with its bundle and recordings; paths are relative to the file.
-
-    A bundle that cannot be read, or a pattern that names no file, is a problem of the devices that name it.
-
-    Args:
-        choices, before: see `of_recordings`.
-        path: of the file.
-
-    Raises:
-        InvalidInputError: the file cannot be read, or two devices have one name.
-    """
-    subject = f"fleet {path}"
-    expected = "[[device]] tables with name, bundle and recordings"
-    try:
-        fleet = _Fleet.model_validate(tomllib.loads(read_text(path, subject, expected)))
-    except (tomllib.TOMLDecodeError, ValidationError) as error:
-        raise InvalidInputError(subject, error, expected) from None
-    names = [device.name for device in fleet.device]
-    if not names or len(set(names)) < len(names):
-        raise InvalidInputError(subject, f"devices {', '.join(names) or 'none'}", "devices of different names")
-    there = {} if before is None else {bundle.path: bundle for bundle in before.bundles}
-    named = dict.fromkeys(_beside(path, device.bundle) for device in fleet.device)
-    places = {name: place for place, name in enumerate(named)}
-    bundles = [bundle_as_it_is(name, there) for name in named]
-    sources, known = [], _known(before)
-    for device in fleet.device:
-        place = places[_beside(path, device.bundle)]
-        _, lacking = bundles[place]
-        run = None if device.run is None else (path.parent / device.run).absolute()
-        recordings = _recordings_of(device, path.parent, known)
-        sources += [look_at(device.name, found, place, run, known, lacking) for found in recordings]
-    return Job(choices=choices, bundles=tuple(bundle for bundle, _ in bundles), sources=tuple(sources))
-
-
-def _recordings_of(device: _Device, folder: Path, known: Mapping[tuple[str, Path], Source]) -> list[Path]:
-    """Files of a device; of a pattern that names none, or named none when the run began, the pattern itself.
-
-    Of files that have gone since, nothing: the run knows them.
-    """
-    found: dict[Path, None] = {}
-    begun = any(name == device.name for name, _ in known)
-    for pattern in device.recordings:
-        itself = (folder / pattern).absolute()
-        if (device.name, itself) in known:
-            found[itself] = None
-            continue
-        try:
-            found |= dict.fromkeys(found_recordings([pattern], folder))
-        except InvalidInputError:
-            found |= {} if begun else {itself: None}
-    return list(found)
-
-
-def _known(job: Job | None) -> dict[tuple[str, Path], Source]:
-    return {} if job is None else {(source.device, source.path): source for source in job.sources}
-
-
-def _beside(fleet: Path, bundle: str) -> Path:
-    """Path of a bundle: of a shipped one by its name, else relative to the fleet's file."""
-    shipped = bundle_path(bundle)
-    return (shipped if shipped != Path(bundle) else fleet.parent / bundle).absolute()
+    return found.model_copy(update={"problem": problem})

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from itertools import islice
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from lightpage.clock import SYSTEM, Clock
-from lightpage.errors import LightpageError, SurroundingsError, TakenError
+from lightpage.errors import InvalidInputError, LightpageError, SurroundingsError, TakenError
 from lightpage.failures import os_failure
 from lightpage.files import check_utf8, lock
 from lightpage.runtime.archives.run.job import Job, Source
-from lightpage.runtime.archives.run.part import WHOLE, Part
 from lightpage.runtime.archives.run.shard import RECORD, PageRecord, ShardRecord, holds_losses
-from lightpage.runtime.archives.run.task import Operation, RecordedFile, Task
+from lightpage.runtime.archives.run.task import Operation, Plain, RecordedFile, Task
 
 _LOCKING = "HDF5_USE_FILE_LOCKING"
 """Variable of the environment by which HDF5, and this, are told to go without locks."""
@@ -30,6 +30,46 @@ _AGAIN = ".again-"
 
 _QUESTION_S, _AGAIN_S = 600.0, 0.1
 """Longest wait for another part that writes down what is asked, and the time between two tries."""
+
+
+class Part(Plain):
+    """Every `count`th recording from `index`; of a fleet, every `count`th device with all its recordings.
+
+    Attributes:
+        index: from 0.
+        count: how many parts there are.
+    """
+
+    index: int
+    count: int
+
+    @classmethod
+    def parse(cls, text: str) -> Part:
+        """A part as users write it: K/N.
+
+        Raises:
+            InvalidInputError: it is none.
+        """
+        match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
+        if match is None or not int(match[1]) < int(match[2]):
+            raise InvalidInputError("--part", repr(text), "K/N with K from 0 to N - 1")
+        return cls(index=int(match[1]), count=int(match[2]))
+
+    def sources(self, job: Job) -> Iterator[tuple[int, Source]]:
+        """Its recordings, each with its place among the run's."""
+        for place, own in self.devices(job):
+            yield from enumerate(own, place)
+
+    def devices(self, job: Job) -> Iterator[tuple[int, tuple[Source, ...]]]:
+        """Recordings of each of its devices; see `lightpage.runtime.archives.run.job.Job.devices`."""
+        return islice(job.devices.items(), self.index, None, self.count)
+
+    def __str__(self) -> str:
+        return f"{self.index}/{self.count}"
+
+
+WHOLE = Part(index=0, count=1)
+"""All of it."""
 
 
 class Ledger:
@@ -68,9 +108,7 @@ class Ledger:
             self._locks = stack.pop_all()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._locks.close()
 
     @contextmanager
@@ -80,20 +118,18 @@ class Ledger:
         Raises:
             TakenError: another one has not ended with it in time.
         """
-        asking = self._question_lock(self._clock.now() + _QUESTION_S)
-        try:
-            yield
-        finally:
-            os.close(asking)
-
-    def _question_lock(self, until: float) -> int:
-        while True:
+        until, asking = self._clock.now() + _QUESTION_S, None
+        while asking is None:
             try:
-                return self._locked(_QUESTION)
+                asking = self._locked(_QUESTION)
             except TakenError:
                 if self._clock.now() > until:
                     raise
                 self._clock.sleep(_AGAIN_S)
+        try:
+            yield
+        finally:
+            os.close(asking)
 
     def _locked(self, name: str, *, shared: bool = False) -> int:
         """A descriptor that holds a lock until it is closed.
@@ -121,17 +157,9 @@ class Ledger:
     def _not_writable(self, error: OSError) -> LightpageError:
         return os_failure(self._subject, error, "a folder that can be written")
 
-    def sources(self, job: Job) -> Iterator[tuple[int, Source]]:
-        """Recordings of the part, each with its place among the run's."""
-        return self.part.sources(job)
-
-    def devices(self, job: Job) -> Iterator[tuple[int, tuple[Source, ...]]]:
-        """Recordings of each device of the part, with the place of its first one among the run's."""
-        return self.part.devices(job)
-
     def sweep(self, job: Job) -> None:
         """Remove what workers that were killed have left half-written; none of this part may be at work."""
-        for index, _ in self.sources(job):
+        for index, _ in self.part.sources(job):
             for left in self.shard(index, 0).parent.glob(".*"):
                 shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)
 
@@ -149,13 +177,15 @@ class Ledger:
     def missing(self, job: Job) -> Iterator[Task]:
         """Ranges of the first reading that have no result, recording by recording; or such devices."""
         if job.choices.operation is Operation.RECALIBRATE:
-            for index, own in self.devices(job):
-                device = self._device(job, index, own)
-                if device is not None and not self.recalibrated(index):
-                    _make(device.shard.parent)
-                    yield device
+            for index, own in self.part.devices(job):
+                if self.recalibrated(index) or any(each.problem is not None for each in own):
+                    continue
+                shard = self.shard(index, 0)
+                _make(shard.parent)
+                count = job.choices.device_pages or sum(each.pages for each in own)
+                yield _task(job, own, tuple(range(count)), shard)
             return
-        for index, source in self.sources(job):
+        for index, source in self.part.sources(job):
             there = self.results(index)
             for task in self.ranges(job, index, source):
                 if task.shard.name not in there:
@@ -172,7 +202,7 @@ class Ledger:
         Raises:
             InvalidInputError: a shard that cannot be read.
         """
-        for index, source in self.sources(job):
+        for index, source in self.part.sources(job):
             there = self.results(index)
             for task in self.ranges(job, index, source):
                 shard = self.shard(index, task.pages[0], number)
@@ -193,72 +223,35 @@ class Ledger:
         Raises:
             InvalidInputError: a shard that cannot be read.
         """
-        best = {page.page: page for page in ShardRecord.read(self.shard(source, first)).pages}
-        for number in range(1, rounds):
-            shard = self.shard(source, first, number)
-            for page in ShardRecord.read(shard).pages if shard.name in there else ():
-                if page.better_than(best[page.page]):
+        best: dict[int, PageRecord] = {}
+        for shard in self.readings(source, first, there, rounds).values():
+            for page in ShardRecord.read(shard).pages:
+                if page.page not in best or page.better_than(best[page.page]):
                     best[page.page] = page
         return list(best.values())
 
+    def readings(self, source: int, first: int, there: frozenset[str], rounds: int) -> dict[int, Path]:
+        """Paths of the results of a range by their rounds; arguments as for `pages`."""
+        shards = {number: self.shard(source, first, number) for number in range(rounds)}
+        return {number: shard for number, shard in shards.items() if shard.name in there}
+
     def ranges(self, job: Job, index: int, source: Source) -> Iterator[Task]:
-        """All ranges of a recording, whether they are done or not."""
-        choices = job.choices
-        if source.stamp is None:
-            return
-        count, step = source.pages, choices.range_pages
+        """All ranges of a recording, whether they are done or not; none of one that could not be opened."""
+        step, count = job.choices.range_pages, source.pages
         for first in range(0, count, step):
-            yield Task(
-                operation=choices.operation,
-                device=source.device,
-                recording=source.path,
-                stamp=source.stamp,
-                pages=tuple(range(first, min(first + step, count))),
-                bundle=job.bundles[source.bundle],
-                shard=self.shard(index, first),
-                tracking=choices.tracking,
-                symbols=choices.symbols,
-                code=choices.code,
-                provider=choices.provider,
-            )
+            pages = tuple(range(first, min(first + step, count)))
+            yield _task(job, (source,), pages, self.shard(index, first))
 
-    def _device(self, job: Job, index: int, own: tuple[Source, ...]) -> Task | None:
-        """The task of a device, whose first recording has this place; None where something of it is lacking."""
-        if any(each.problem is not None for each in own):
-            return None
-        choices, (first, *others) = job.choices, own
-        count = choices.device_pages or sum(each.pages for each in own)
-        assert first.stamp is not None  # it has no problem
-        return Task(
-            operation=choices.operation,
-            device=first.device,
-            recording=first.path,
-            stamp=first.stamp,
-            pages=tuple(range(count)),
-            bundle=job.bundles[first.bundle],
-            shard=self.shard(index, 0),
-            more=tuple(RecordedFile(path=each.path, stamp=each.stamp) for each in others if each.stamp is not None),
-            run=first.run,
-            provider=choices.provider,
-            fine_tuning=choices.fine_tuning,
-        )
-
-    def doubt(self, job: Job, *, every_loss: bool = False) -> None:
-        """Have ranges read again whose pages were filed as lost for a fault of storage, as earlier versions did.
-
-        Args:
-            job: what was asked.
-            every_loss: whether ranges with lost pages of any cause are read again.
+    def doubt_losses(self, job: Job) -> None:
+        """Have ranges read again that have lost pages.
 
         Raises:
             StorageError, InvalidInputError: a shard that cannot be read.
         """
-        if job.choices.operation is Operation.RECALIBRATE:
-            return
-        for index, _ in self.sources(job):
+        for index, _ in self.part.sources(job):
             folder = self.shard(index, 0).parent
             for name in self.results(index):
-                if _AGAIN not in name and holds_losses(folder / name, misfiled_only=not every_loss):
+                if _AGAIN not in name and holds_losses(folder / name):
                     self.doubted.add(folder / name)
 
     def recalibrated(self, place: int) -> bool:
@@ -275,6 +268,20 @@ class Ledger:
             return frozenset()
         except OSError as error:
             raise os_failure(f"folder {folder}", error, "a folder that can be read") from None
+
+
+def _task(job: Job, own: tuple[Source, ...], pages: tuple[int, ...], shard: Path) -> Task:
+    """What is done with pages of recordings that could be opened."""
+    first = own[0]
+    return Task(
+        choices=job.choices,
+        device=first.device,
+        files=tuple(RecordedFile(path=each.path, stamp=each.stamp) for each in own if each.stamp is not None),
+        pages=pages,
+        bundle=job.bundles[first.bundle],
+        shard=shard,
+        run=first.run,
+    )
 
 
 def _make(folder: Path) -> None:

@@ -7,14 +7,13 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
-from prometheus_client.metrics import MetricWrapperBase
 
 from lightpage.codec.page_bytes import Loss
 from lightpage.errors import Reason
 from lightpage.files import replace_text
 from lightpage.runtime.archives.run.driver import Watch
 from lightpage.runtime.archives.run.engine import Engine
-from lightpage.runtime.archives.run.part import WHOLE, Part
+from lightpage.runtime.archives.run.ledger import WHOLE, Part
 from lightpage.runtime.archives.run.shard import PageState
 from lightpage.runtime.archives.run.task import Failed, Operation, Outcome
 
@@ -41,58 +40,53 @@ class BulkMetrics(Watch):
 
     def __init__(self, run: str, operation: Operation, part: Part = WHOLE) -> None:
         self.registry = own = CollectorRegistry()
-        self._own = run, str(part)
+        self._own = values = run, str(part)
         one = ["run", "part"]
-        self.pages = Counter("lightpage_bulk_pages", "Pages, by what became of them.", [*one, "state"], registry=own)
-        self.lost = Counter("lightpage_bulk_pages_lost", "Lost pages, by cause.", [*one, "reason"], registry=own)
-        self.failed = Counter("lightpage_bulk_ranges_failed", "Ranges or files without a result.", one, registry=own)
-        self.died = Counter("lightpage_bulk_workers_died", "Workers that died.", one, registry=own)
-        self.read_bytes = Counter("lightpage_bulk_read_bytes", "Frames, as they lie in recordings.", one, registry=own)
-        self.job_pages = Gauge("lightpage_bulk_job_pages", "Pages of the whole job, or devices.", one, registry=own)
-        self.left = Gauge("lightpage_bulk_job_pages_left", "Those yet to be read, or read again.", one, registry=own)
-        self.in_flight = Gauge("lightpage_bulk_ranges_in_flight", "Page ranges handed out.", one, registry=own)
-        self.workers = Gauge("lightpage_bulk_workers", "Workers alive.", one, registry=own)
-        self.ended = Gauge("lightpage_bulk_end_timestamp_seconds", "When the run ended.", one, registry=own)
-        self.info = Gauge("lightpage_bulk_info", "1 for what the run does.", [*one, "operation"], registry=own)
-        self.page_seconds = Histogram(
-            "lightpage_bulk_page_seconds",
-            "A worker's time for a page, mean of its range.",
-            one,
-            buckets=_SECONDS,
-            registry=own,
-        )
-        self.info.labels(*self._own, operation).set(1)
-        self._begin_at_zero(operation)
 
-    def _begin_at_zero(self, operation: Operation) -> None:
-        """Show what may happen before it does: Prometheus sees no rise from nothing to the first one."""
-        known: tuple[tuple[MetricWrapperBase, Iterable[tuple[str, ...]]], ...] = (
-            (self.pages, ((state,) for state in PageState)),
-            (self.lost, ((reason,) for reason in _CAUSES.get(operation, ()))),
-            *((metric, ((),)) for metric in (self.failed, self.died, self.read_bytes, self.page_seconds)),
-            *((metric, ((),)) for metric in (self.job_pages, self.left, self.in_flight, self.workers)),
-        )
-        for metric, values in known:
-            for value in values:
-                metric.labels(*self._own, *value)
+        def counter(name: str, what: str) -> Counter:
+            return Counter(name, what, one, registry=own).labels(*values)
+
+        def gauge(name: str, what: str) -> Gauge:
+            return Gauge(name, what, one, registry=own).labels(*values)
+
+        # What has its labels is shown at once: Prometheus sees no rise from nothing to the first one.
+        self._pages = Counter("lightpage_bulk_pages", "Pages, by what became of them.", [*one, "state"], registry=own)
+        self._lost = Counter("lightpage_bulk_pages_lost", "Lost pages, by cause.", [*one, "reason"], registry=own)
+        for state in PageState:
+            self._pages.labels(*values, state)
+        for reason in _CAUSES.get(operation, ()):
+            self._lost.labels(*values, reason)
+        self._failed = counter("lightpage_bulk_ranges_failed", "Ranges or files without a result.")
+        self._died = counter("lightpage_bulk_workers_died", "Workers that died.")
+        self._read_bytes = counter("lightpage_bulk_read_bytes", "Frames, as they lie in recordings.")
+        self._job_pages = gauge("lightpage_bulk_job_pages", "Pages of the whole job, or devices.")
+        self._left = gauge("lightpage_bulk_job_pages_left", "Those yet to be read, or read again.")
+        self._in_flight = gauge("lightpage_bulk_ranges_in_flight", "Page ranges handed out.")
+        self._workers = gauge("lightpage_bulk_workers", "Workers alive.")
+        self._ended = Gauge("lightpage_bulk_end_timestamp_seconds", "When the run ended.", one, registry=own)
+        info = Gauge("lightpage_bulk_info", "1 for what the run does.", [*one, "operation"], registry=own)
+        info.labels(*values, operation).set(1)
+        told = "A worker's time for a page, mean of its range."
+        seconds = Histogram("lightpage_bulk_page_seconds", told, one, buckets=_SECONDS, registry=own)
+        self._page_seconds = seconds.labels(*values)
 
     def wanted(self, total: int, left: int) -> None:
         """Note how many pages the job has, or devices, and how many have no result."""
-        self.job_pages.labels(*self._own).set(total)
-        self.left.labels(*self._own).set(left)
+        self._job_pages.set(total)
+        self._left.set(left)
 
     def begin(self, engine: Engine) -> None:
         """Show how many workers there are and what they have, whenever somebody looks."""
-        self.in_flight.labels(*self._own).set_function(lambda: engine.in_flight)
-        self.workers.labels(*self._own).set_function(lambda: engine.workers_alive)
+        self._in_flight.set_function(lambda: engine.in_flight)
+        self._workers.set_function(lambda: engine.workers_alive)
 
     def fail(self) -> None:
         """Count what has no result."""
-        self.failed.labels(*self._own).inc()
+        self._failed.inc()
 
     def deaths(self, count: int) -> None:
         """Count workers that died."""
-        self.died.labels(*self._own).inc(count)
+        self._died.inc(count)
 
     def count(self, outcome: Outcome) -> None:
         """Count what became of a range."""
@@ -102,17 +96,17 @@ class BulkMetrics(Watch):
         pages, lost = outcome.task.weight, sum(outcome.lost.values())
         read = pages - lost - outcome.left_out
         for state, count in ((PageState.READ, read), (PageState.LOST, lost), (PageState.LEFT_OUT, outcome.left_out)):
-            self.pages.labels(*self._own, state).inc(count)
+            self._pages.labels(*self._own, state).inc(count)
         for reason, count in outcome.lost.items():
-            self.lost.labels(*self._own, reason).inc(count)
-        self.read_bytes.labels(*self._own).inc(outcome.read_bytes)
-        self.left.labels(*self._own).dec(pages)
+            self._lost.labels(*self._own, reason).inc(count)
+        self._read_bytes.inc(outcome.read_bytes)
+        self._left.dec(pages)
         for _ in range(pages):
-            self.page_seconds.labels(*self._own).observe(outcome.seconds / pages)
+            self._page_seconds.observe(outcome.seconds / pages)
 
     def end(self) -> None:
         """Note when the run ended."""
-        self.ended.labels(*self._own).set(time.time())
+        self._ended.labels(*self._own).set(time.time())
 
     def write(self, path: Path) -> None:
         """Write all of it in the format of Prometheus, whole or not at all.

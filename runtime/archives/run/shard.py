@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from lightpage.codec.header import parse_header
-from lightpage.codec.page_bytes import FILE_BYTES, FileFacts, Loss, PageBytes
+from lightpage.codec.page_bytes import FILE_BYTES, FileFacts, PageBytes
 from lightpage.errors import InvalidInputError, LightpageError
 from lightpage.failures import os_failure
 from lightpage.files import replace_file, replace_text
@@ -70,26 +70,16 @@ class PageRecord(Plain):
         return (self.confirmed_bits or 0.0) >= (earlier.confirmed_bits or 0.0)
 
 
-class ShardRecord(Plain):
+class Findings(Plain):
     """What became of the pages of a range.
 
     Attributes:
-        model: what read them.
         pages: one each, in order.
-        seconds: that it took.
-        finished_s: when it was done, seconds since 1970 by the worker's clock; None of a record of earlier versions.
-        worker: who did it, host and process; empty of such a record.
-        read_bytes: of frames, as they lie in the recording.
         confidence_bins: of an evaluation, see `lightpage.metrics.accumulator`.
         summary: of a recalibration, what `lightpage recalibrate --json` says; else empty.
     """
 
-    model: NamedBundle
     pages: tuple[PageRecord, ...]
-    seconds: float
-    finished_s: float | None = None
-    worker: str = ""
-    read_bytes: int = 0
     confidence_bins: tuple[ConfidenceBin, ...] = ()
     summary: dict[str, float | str | None] = Field(default_factory=dict)
 
@@ -102,6 +92,24 @@ class ShardRecord(Plain):
     def left_out(self) -> int:
         """Pages that the bundle was made from."""
         return sum(page.state is PageState.LEFT_OUT for page in self.pages)
+
+
+class ShardRecord(Findings):
+    """Findings, and how they came about.
+
+    Attributes:
+        model: what read the pages.
+        seconds: that it took.
+        finished_s: when it was done, seconds since 1970 by the worker's clock.
+        worker: who did it, host and process.
+        read_bytes: of frames, as they lie in the recording.
+    """
+
+    model: NamedBundle
+    seconds: float
+    finished_s: float
+    worker: str
+    read_bytes: int
 
     def write(self, shard: Path) -> None:
         """Write it, whole or not at all; the range is done then.
@@ -125,25 +133,17 @@ class ShardRecord(Plain):
             raise InvalidInputError(f"shard {path}", error, _WRITTEN) from None
 
 
-_MISFILED, _MISFILED_AS = b"wanted data that can be read", ("UnreadableError", Loss.OPTICS.value)
-"""How version 0.1.0 filed a page that storage had not given: in its reason, and as what it was lost."""
+_LOST = f'"state":"{PageState.LOST}"'.encode()
+"""In the record of a shard with lost pages."""
 
 
-def holds_losses(shard: Path, *, misfiled_only: bool) -> bool:
-    """Whether a shard's record holds lost pages.
-
-    Args:
-        shard: path of the shard.
-        misfiled_only: count pages alone that version 0.1.0 has filed as lost since storage did not give them.
+def holds_losses(shard: Path) -> bool:
+    """Whether a shard's record holds lost pages; it need not be parsed for that.
 
     Raises:
         InvalidInputError, StorageError: the record cannot be read.
     """
-    content = _content(record_of(shard))
-    if (_MISFILED if misfiled_only else f'"{PageState.LOST}"'.encode()) not in content:
-        return False  # most are so, and need not be parsed
-    lost = (page for page in ShardRecord.read(shard).pages if page.state is PageState.LOST)
-    return any(not misfiled_only or (page.loss in _MISFILED_AS and _MISFILED.decode() in page.reason) for page in lost)
+    return _LOST in _content(record_of(shard))
 
 
 def _content(path: Path) -> bytes:

@@ -78,7 +78,7 @@ class NamedBundle(Plain):
         path: where it lies.
         sha256: see `bundle_sha256`; empty of one that could not be read when the run began.
         version: of its manifest; likewise.
-        stamp: of the file that was read; None in records of earlier versions.
+        stamp: of the file that was read; None of one that could not be.
     """
 
     path: Path
@@ -110,58 +110,94 @@ class FineTuning(Plain):
     seed: int = 0
 
 
-class Task(Plain):
-    """A range of pages of one recording, or one device to recalibrate.
+RANGE_PAGES = 32
+"""Of a range, unless told otherwise: what a worker that dies costs at most, and often enough that its first page, whose
+image is looked for, costs little."""
+
+KNOWN_PAGES = 2
+"""Pages that a device is recalibrated with, unless told otherwise."""
+
+
+class Choices(Plain):
+    """What is asked beside recordings and bundles.
 
     Attributes:
-        operation: what to do.
-        device: its name in the fleet; empty without a fleet.
-        recording: path of the file.
-        stamp: of the recording as it was when the run began.
-        pages: their numbers; to recalibrate, as many known pages as are wanted.
-        bundle: what to decode with.
-        shard: path of the result, without the end of its name.
-        tracking: whether the image is followed within the range.
+        operation: what is done.
+        range_pages: pages of a range.
+        tracking: whether the image is followed within a range.
         symbols: whether decoding keeps symbols and confidences.
-        code: of the pages whose user bytes are read; None for the recording's, or else the bundle's.
-        provider: what pages are computed with, as `Provider.parse` takes it.
-        more: further recordings of a device that is recalibrated, whose pages follow those of the first.
-        run: of a device that is recalibrated deeply: folder of the training run that its bundle was made from.
-        fine_tuning: how it is trained then; None for a re-fit of the geometry alone.
-        give_up: whether pages that storage does not give are lost, in place of the range having no result.
+        code: of the pages whose user bytes are read; None for each recording's, or else its bundle's.
+        provider: what pages are computed with.
+        known_pages: that a device is recalibrated with; None for `KNOWN_PAGES`, or all of them with `fine_tuning`.
+        fine_tuning: how devices are trained on after the fit of their geometry; None to fit the geometry alone.
+        parts: that processes do independently of each other.
     """
 
     operation: Operation
-    device: str = ""
-    recording: Path
-    stamp: Stamp
-    pages: tuple[int, ...]
-    bundle: NamedBundle
-    shard: Path
+    range_pages: int = RANGE_PAGES
     tracking: bool = True
     symbols: bool = True
     code: Code | None = None
     provider: str = CPU
-    more: tuple[RecordedFile, ...] = ()
-    run: Path | None = None
+    known_pages: int | None = None
     fine_tuning: FineTuning | None = None
+    parts: int = 1
+
+    @property
+    def device_pages(self) -> int | None:
+        """Known pages that a device is recalibrated with; None for all that it has."""
+        return self.known_pages or (KNOWN_PAGES if self.fine_tuning is None else None)
+
+
+class Task(Plain):
+    """A range of pages of one recording, or one device to recalibrate.
+
+    Attributes:
+        choices: what is done, and how.
+        device: its name in the fleet; empty without a fleet.
+        files: the recording; of a device that is recalibrated all of its own, whose pages follow each other.
+        pages: their numbers; to recalibrate, as many known pages as are wanted.
+        bundle: what to decode with.
+        shard: path of the result, without the end of its name.
+        run: of a device that is recalibrated deeply: folder of the training run that its bundle was made from.
+        give_up: whether pages that storage does not give are lost, in place of the range having no result.
+    """
+
+    choices: Choices
+    device: str = ""
+    files: tuple[RecordedFile, ...]
+    pages: tuple[int, ...]
+    bundle: NamedBundle
+    shard: Path
+    run: Path | None = None
     give_up: bool = False
 
     @property
-    def files(self) -> tuple[RecordedFile, ...]:
-        """All recordings, in order."""
-        return (RecordedFile(path=self.recording, stamp=self.stamp), *self.more)
+    def recalibrates(self) -> bool:
+        """Whether it is a device to recalibrate."""
+        return self.choices.operation is Operation.RECALIBRATE
+
+    @property
+    def recording(self) -> Path:
+        """Path of the recording, or of the first one."""
+        return self.files[0].path
+
+    @property
+    def origin(self) -> tuple[str, Path]:
+        """Device and recording."""
+        return self.device, self.recording
 
     @property
     def weight(self) -> int:
         """How many pages the work is worth in a count of all of it; a device that is recalibrated counts once."""
-        return 1 if self.operation is Operation.RECALIBRATE else len(self.pages)
+        return 1 if self.recalibrates else len(self.pages)
 
     @property
     def name(self) -> str:
         """Of the range, for people."""
-        if self.operation is Operation.RECALIBRATE:
-            return f"recording {self.recording}" + (f" and {len(self.more)} more" if self.more else "")
+        if self.recalibrates:
+            more = len(self.files) - 1
+            return f"recording {self.recording}" + (f" and {more} more" if more else "")
         return f"recording {self.recording}: pages {self.pages[0]}-{self.pages[-1]}"
 
 

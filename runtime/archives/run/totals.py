@@ -13,7 +13,7 @@ from lightpage.codec.volume_file import ranges
 from lightpage.metrics.reliability import ConfidenceBin, calibration_error
 from lightpage.runtime.archives.run.job import Job, Source
 from lightpage.runtime.archives.run.ledger import Ledger
-from lightpage.runtime.archives.run.shard import BUNDLE, PageRecord, PageState, ShardRecord, record_of, with_end
+from lightpage.runtime.archives.run.shard import BUNDLE, PageRecord, PageState, ShardRecord, with_end
 from lightpage.runtime.archives.run.task import NamedBundle, Operation, Problem, Task
 
 AIR, CONFIRMED = "air_bits_per_symbol", "confirmed_bits"
@@ -104,8 +104,9 @@ class Tally:
         """Pages without a result."""
         return self.pages - self.read - self.left_out - self.lost.total()
 
-    def add(self, page: PageRecord) -> None:
-        """Count a page that has a result."""
+    def add(self, page: PageRecord, version: str) -> None:
+        """Count a page that has a result, by the version of what read it."""
+        self.models[version] += 1
         self.read += page.state is PageState.READ
         self.left_out += page.state is PageState.LEFT_OUT
         self.recalibration_due += page.recalibration_due and page.state is PageState.READ
@@ -178,8 +179,8 @@ class Reading:
         finished_s: when, seconds since 1970.
         seconds: that it took.
         pages: how many, or one device.
-        worker: who did it; empty where that was not noted.
-        read_bytes: of frames, as they lie in the recording; 0 where that was not noted.
+        worker: who did it.
+        read_bytes: of frames, as they lie in the recording.
     """
 
     finished_s: float
@@ -189,36 +190,49 @@ class Reading:
     read_bytes: int
 
     @classmethod
-    def of(cls, shard: Path, record: ShardRecord, pages: int) -> Reading:
-        """That of a shard; where no time was noted, it is that of the file."""
-        finished_s = record_of(shard).stat().st_mtime if record.finished_s is None else record.finished_s
-        return cls(finished_s, record.seconds, pages, record.worker, record.read_bytes)
+    def of(cls, record: ShardRecord, pages: int) -> Reading:
+        """That of a shard."""
+        return cls(record.finished_s, record.seconds, pages, record.worker, record.read_bytes)
 
 
 @dataclass
-class Group:
+class Counts:
+    """What was found of pages.
+
+    Attributes:
+        tally: of all of them.
+        figures: of those that were read.
+    """
+
+    tally: Tally = field(default_factory=Tally)
+    figures: Means = field(default_factory=Means)
+
+    def add(self, page: PageRecord, version: str) -> None:
+        """Count a page that has a result, by the version of what read it."""
+        self.tally.add(page, version)
+        if page.state is PageState.READ:
+            confirmed = {} if page.confirmed_bits is None else {CONFIRMED: page.confirmed_bits}
+            self.figures.add({**page.figures, **confirmed})
+
+
+@dataclass
+class Group(Counts):
     """What was found of a device, or of a recording where there is no fleet.
 
     Attributes:
         recordings: that it has.
-        tally: of their pages.
-        figures: of those that were read.
         told: the first problem that anything of it had, for people; empty without one.
     """
 
     recordings: int = 0
-    tally: Tally = field(default_factory=Tally)
-    figures: Means = field(default_factory=Means)
     told: str = ""
 
 
 @dataclass
-class Totals:
+class Totals(Counts):
     """What a run has found.
 
     Attributes:
-        tally: of all pages.
-        figures: means over the pages that were read.
         confidence_bins: of all pages of an evaluation together.
         rounds: what later readings have brought.
         recordings: a row each, unless devices are recalibrated.
@@ -229,8 +243,6 @@ class Totals:
         readings: all ranges that were done, a few numbers each.
     """
 
-    tally: Tally = field(default_factory=Tally)
-    figures: Means = field(default_factory=Means)
     confidence_bins: dict[tuple[float, float], list[float]] = field(default_factory=dict)
     rounds: list[Round] = field(default_factory=list)
     recordings: list[dict[str, Any]] = field(default_factory=list)
@@ -273,10 +285,10 @@ def totals(ledger: Ledger, job: Job, failures: Mapping[tuple[str, Path], Problem
     """
     found = Totals(rounds=[Round(model) for model in job.rounds])
     if job.choices.operation is Operation.RECALIBRATE:
-        for index, own in ledger.devices(job):
+        for index, own in ledger.part.devices(job):
             _add_device(found, ledger, index, own, failures or {})
         return found
-    for index, source in ledger.sources(job):
+    for index, source in ledger.part.sources(job):
         _add_recording(found, ledger, job, index, source)
     return found
 
@@ -297,9 +309,8 @@ def _add_device(
     if ledger.recalibrated(index):
         record = ShardRecord.read(shard)
         page = record.pages[0]
-        found.tally.add(page)
-        found.tally.models[record.model.version] += 1
-        found.readings.append(Reading.of(shard, record, 1))
+        found.tally.add(page, record.model.version)
+        found.readings.append(Reading.of(record, 1))
         state = DeviceState.RECALIBRATED if page.state is PageState.READ else DeviceState.REFUSED
         row |= {"state": state, "air_before": None, "air_after": None, **record.summary, "reason": page.reason}
         if state is DeviceState.RECALIBRATED:
@@ -313,30 +324,24 @@ def _add_device(
 
 
 def _add_recording(found: Totals, ledger: Ledger, job: Job, index: int, source: Source) -> None:
-    own, figures, there = Tally(), Means(), ledger.results(index)
+    own, there = Counts(), ledger.results(index)
     lost: dict[str, list[int]] = {}
     group = found.groups.setdefault(source.device or str(source.path), Group())
     group.recordings += 1
     if source.problem is not None:
         group.told = group.told or str(source.problem)
     for task in ledger.ranges(job, index, source):
-        for tally in (own, group.tally, found.tally):
-            tally.pages += task.weight
+        for counts in (own, group, found):
+            counts.tally.pages += task.weight
         for record, page in _pages(found, ledger, job, index, task, there):
-            for tally in (own, group.tally, found.tally):
-                tally.add(page)
-                tally.models[record.model.version] += 1
-            if page.state is PageState.READ:
-                for means in (figures, group.figures, found.figures):
-                    means.add(page.figures)
-                    if page.confirmed_bits is not None:
-                        means.add({CONFIRMED: page.confirmed_bits})
-            elif page.state is PageState.LOST:
+            for counts in (own, group, found):
+                counts.add(page, record.model.version)
+            if page.state is PageState.LOST:
                 lost.setdefault(page.loss or UNKNOWN, []).append(page.page)
                 group.told = group.told or page.reason
                 _tell_lost(found, page, f"{_recording(source)}: page {page.page}: {page.reason}")
-    row = {"device": source.device, "recording": str(source.path), **own.to_json()}
-    row |= {"lost_pages": {cause: ranges(pages) for cause, pages in lost.items()}, "figures": figures.to_json()}
+    row = {"device": source.device, "recording": str(source.path), **own.tally.to_json()}
+    row |= {"lost_pages": {cause: ranges(pages) for cause, pages in lost.items()}, "figures": own.figures.to_json()}
     if source.problem is not None:
         row["problem"] = str(source.problem)
     found.recordings.append(row)
@@ -346,26 +351,19 @@ def _pages(
     found: Totals, ledger: Ledger, job: Job, index: int, task: Task, there: frozenset[str]
 ) -> Iterator[tuple[ShardRecord, PageRecord]]:
     """The readings that count of the pages of a range, each with the shard that it is from; rounds are counted."""
-    if task.shard.name not in there:
-        return
-    first = ShardRecord.read(task.shard)
-    found.readings.append(Reading.of(task.shard, first, task.weight))
-    for part in first.confidence_bins:
-        sums = found.confidence_bins.setdefault((part.low, part.high), [0.0, 0.0, 0.0])
-        for place, value in enumerate((part.count, part.count * part.confidence, part.count * part.accuracy)):
-            sums[place] += value
-    best = {page.page: (first, page) for page in first.pages}
-    for number in range(1, 1 + len(job.rounds)):
-        shard = ledger.shard(index, task.pages[0], number)
-        if shard.name not in there:
-            continue
-        again = ShardRecord.read(shard)
-        found.readings.append(Reading.of(shard, again, len(again.pages)))
-        for page in again.pages:
-            before = best[page.page][1]
-            found.rounds[number - 1].add(before, page)
-            if page.better_than(before):
-                best[page.page] = again, page
+    best: dict[int, tuple[ShardRecord, PageRecord]] = {}
+    for number, shard in ledger.readings(index, task.pages[0], there, 1 + len(job.rounds)).items():
+        record = ShardRecord.read(shard)
+        found.readings.append(Reading.of(record, len(record.pages)))
+        for part in record.confidence_bins if number == 0 else ():
+            sums = found.confidence_bins.setdefault((part.low, part.high), [0.0, 0.0, 0.0])
+            for place, value in enumerate((part.count, part.count * part.confidence, part.count * part.accuracy)):
+                sums[place] += value
+        for page in record.pages:
+            if number:
+                found.rounds[number - 1].add(best[page.page][1], page)
+            if number == 0 or page.better_than(best[page.page][1]):
+                best[page.page] = record, page
     yield from best.values()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -130,12 +131,11 @@ def known_files(folder: Path) -> list[dict[str, Any]] | None:
 
 
 def _shards(ledger: Ledger, job: Job) -> list[Path]:
-    found = []
+    found: list[Path] = []
     for index, source in enumerate(job.sources):
         there = ledger.results(index)
         for task in ledger.ranges(job, index, source):
-            readings = [ledger.shard(index, task.pages[0], number) for number in range(1 + len(job.rounds))]
-            found += [shard for shard in readings if shard.name in there]
+            found += ledger.readings(index, task.pages[0], there, 1 + len(job.rounds)).values()
     return found
 
 
@@ -167,8 +167,7 @@ def _file(
 
 def _written(path: Path, volume: Volume, shards: dict[Path, int], *, despite_losses: bool) -> Restored:
     """Put a file together, and give it its name unless data are lost; raises as `VolumeFile` does."""
-    file = VolumeFile(path, volume)
-    try:
+    with closing(VolumeFile(path, volume)) as file:
         for shard in shards:
             for _, page in read_user_bytes(shard):
                 if Volume.of_page(page) == volume and page.header is not None and page.data is not None:
@@ -177,5 +176,3 @@ def _written(path: Path, volume: Volume, shards: dict[Path, int], *, despite_los
         if despite_losses or not done.lost:
             file.complete(done.lost)
         return done
-    finally:
-        file.close()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import select
 import time
-from collections import deque
 from collections.abc import Callable, Generator, Iterable, Sized
 from typing import Protocol
 
@@ -14,14 +13,7 @@ from lightpage.errors import WorkerError
 from lightpage.failures import short_resource
 from lightpage.helper_process import HelperProcess, same_packages
 from lightpage.progress import note
-from lightpage.runtime.archives.run.engine import (
-    ATTEMPTS,
-    THREADS_OF_WORKER,
-    Attempt,
-    given_up,
-    longest_s,
-    next_attempt,
-)
+from lightpage.runtime.archives.run.engine import THREADS_OF_WORKER, Attempt, Attempts, longest_s
 from lightpage.runtime.archives.run.task import Outcome, Step, Task
 from lightpage.runtime.model.execution.cpus import available_cpus
 
@@ -101,15 +93,12 @@ class LocalEngine:
 
     def run(self, tasks: Iterable[Task]) -> Generator[Outcome, None, None]:
         """See `Engine`."""
-        following, again = iter(tasks), deque[Attempt]()
+        attempts = Attempts(tasks)
         busy: dict[WorkerLink, Attempt] = {}
         free: list[WorkerLink] = []
         try:
             while True:
-                while len(busy) < self.workers:
-                    attempt = again.popleft() if again else next_attempt(following)
-                    if attempt is None:
-                        break
+                while len(busy) < self.workers and (attempt := attempts.next()):
                     worker = free.pop() if free else self._start(self._module, self.threads)
                     busy[worker] = attempt
                     self._hand_over(worker, attempt)
@@ -124,11 +113,8 @@ class LocalEngine:
                         worker.end(grace_s=1.0)
                         self.restarts += 1
                         self._count(busy, free)
-                        attempt.number += 1
-                        if attempt.number < ATTEMPTS:
-                            again.append(attempt)
-                        else:
-                            yield given_up(attempt.task, _told(worker, error))
+                        if (failed := attempts.died(attempt, _told(worker, error))) is not None:
+                            yield failed
                         continue
                     answer = _ANSWER.validate_json(line)
                     if isinstance(answer, Step):

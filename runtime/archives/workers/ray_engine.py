@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from itertools import islice
@@ -14,14 +13,7 @@ from typing import TYPE_CHECKING, Any
 from lightpage.errors import InvalidInputError, WorkerError
 from lightpage.failures import short_resource
 from lightpage.helper_process import same_packages
-from lightpage.runtime.archives.run.engine import (
-    ATTEMPTS,
-    THREADS_OF_WORKER,
-    Attempt,
-    given_up,
-    longest_s,
-    next_attempt,
-)
+from lightpage.runtime.archives.run.engine import THREADS_OF_WORKER, Attempt, Attempts, longest_s
 from lightpage.runtime.archives.run.task import Outcome, Task
 from lightpage.runtime.model.execution.cpus import available_cpus
 from lightpage.runtime.model.execution.memory import SHARED
@@ -81,18 +73,17 @@ class RayEngine:
             ModuleNotFoundError: Ray is not installed: the extra cluster brings it.
         """
         with connected(self._address) as ray:
-            yield from self._run(ray, iter(tasks))
+            yield from self._run(ray, Attempts(tasks))
 
-    def _run(self, ray: Any, following: Iterator[Task]) -> Generator[Outcome, None, None]:
+    def _run(self, ray: Any, attempts: Attempts) -> Generator[Outcome, None, None]:
         threads = self._threads_of(ray)
         work = ray.remote(self._work).options(num_cpus=threads, num_gpus=self._gpus, max_retries=0)
-        again = deque[Attempt]()
         busy: dict[Any, Attempt] = {}
         try:
             while True:
                 self._count(ray, threads)
                 most = self._workers or max(1, self.workers_alive) * AHEAD
-                while len(busy) < most and (attempt := again.popleft() if again else next_attempt(following)):
+                while len(busy) < most and (attempt := attempts.next()):
                     busy[work.remote(attempt.task, threads)] = attempt
                 self.in_flight = len(busy)
                 if not busy:
@@ -108,14 +99,12 @@ class RayEngine:
                         if not ready:
                             ray.cancel(ref, force=True)  # nobody hears what it may answer still
                             raise TimeoutError("no answer in time")
-                        outcome: Outcome = ray.get(ref)
+                        outcome: Outcome | None = ray.get(ref)
                     except (ray.exceptions.RayError, TimeoutError) as error:
                         self.restarts += 1
-                        if attempt.number + 1 < ATTEMPTS:
-                            again.append(Attempt(attempt.task, attempt.number + 1))
-                            continue
-                        outcome = given_up(attempt.task, _told(error))
-                    yield outcome
+                        outcome = attempts.died(attempt, _told(error))
+                    if outcome is not None:
+                        yield outcome
         finally:
             for ref in busy:
                 ray.cancel(ref, force=True)

@@ -57,10 +57,7 @@ def code(
     if out_bundle is not None:
         manifest = decoder.bundle.manifest.model_copy(update={"code": best.code.to_toml(), "version": version})
         write_bundle(out_bundle, manifest, decoder.bundle.files)
-    if json_path is not None:
-        choices = [asdict(choice) | {"code": choice.code.model_dump()} for choice in tried]
-        write_json(
-            json_path, {"code": best.code.model_dump(), "user_bytes_per_page": best.user_bytes, "tried": choices}
-        )
+    choices = [asdict(choice) | {"code": choice.code.model_dump()} for choice in tried]
+    write_json(json_path, {"code": best.code.model_dump(), "user_bytes_per_page": best.user_bytes, "tried": choices})
     click.echo("\n".join([HEADER, *(choice.line() for choice in tried)]))
     click.echo(f"{best.code.describe()}: {best.user_bytes} user bytes a page")

@@ -6,7 +6,6 @@ import secrets
 import shutil
 import sys
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, cast
 
@@ -29,25 +28,13 @@ from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.shipped import bundle_path
 
 
-@dataclass(frozen=True)
-class Target:
-    """The device that pages are written for.
-
-    Attributes:
-        profile: nominal.
-        code: of its pages.
-        mask: where the pilots are, bool [ny, nx].
-        pilots: their levels in row order.
-    """
-
-    profile: Profile
-    code: Code
-    mask: NDArray[np.bool_]
-    pilots: NDArray[np.uint8]
-
-
-def target_of(bundle: str | None, profile_name: str | None, code_path: Path | None) -> Target:
+def target_of(
+    bundle: str | None, profile_name: str | None, code_path: Path | None
+) -> tuple[Profile, Code, NDArray[np.bool_], NDArray[np.uint8]]:
     """The device of a bundle, or of a profile and a code.
+
+    Returns:
+        Nominal profile, code of its pages, where the pilots are [ny, nx], and their levels in row order.
 
     Raises:
         InvalidInputError: both or neither, or no code.
@@ -62,12 +49,12 @@ def target_of(bundle: str | None, profile_name: str | None, code_path: Path | No
             raise InvalidInputError("options", "--profile without --code", "the code of the device's pages")
         profile = load_profile(profile_name)
         mask = pilot_mask(profile)
-        return Target(profile, own, mask, pilot_symbols(profile, own.levels)[mask])
+        return profile, own, mask, pilot_symbols(profile, own.levels)[mask]
     opened = Bundle.open(bundle_path(str(bundle)))
     code = own or opened.code
     if code is None:
         raise InvalidInputError(opened.subject, "no code", "--code CODE.toml, as `lightpage code` makes it")
-    return Target(opened.profile, code, opened.pilot_mask, opened.written_pilots(code.levels))
+    return opened.profile, code, opened.pilot_mask, opened.written_pilots(code.levels)
 
 
 def _opened(file: Path) -> BinaryIO:
@@ -115,14 +102,14 @@ def encode(
     """Put FILE on pages to write: user bytes in, levels with pilots out. `-` reads stdin."""
     if out.exists() and not force:
         raise InvalidInputError(f"--out {out}", "a file that exists", "a new name, or --force")
-    target = target_of(bundle, profile_name, code_path)
-    codec = PageCodec(target.code, target.mask)
+    profile, code, mask, pilots = target_of(bundle, profile_name, code_path)
+    codec = PageCodec(code, mask)
     number = secrets.randbits(32) if volume_id is None else volume_id
     with _opened(file) as source:
         volume = Volume.of_file(source, number, codec.user_bytes, data_pages, parity_pages)
-        told = target.code.model_dump() | volume.to_json()
-        with PagesWriter(out, target.profile, target.code.levels, told) as writer:
-            batches = encode_volume(codec, volume, source, target.pilots)
+        told = code.model_dump() | volume.to_json()
+        with PagesWriter(out, profile, code.levels, told) as writer:
+            batches = encode_volume(codec, volume, source, pilots)
             for pages in track(batches, "encode", unit="batch"):
                 writer.append(pages)
     figures = {
@@ -131,9 +118,8 @@ def encode(
         "user_bytes_per_page": codec.user_bytes,
         "code": told,
     }
-    if json_path is not None:
-        write_json(json_path, figures)
+    write_json(json_path, figures)
     click.echo(
-        f"{out}: volume {volume.id}, {volume.pages} pages of {target.code.levels} levels and {codec.user_bytes} bytes; "
+        f"{out}: volume {volume.id}, {volume.pages} pages of {code.levels} levels and {codec.user_bytes} bytes; "
         f"{volume.file_pages} hold {volume.file_bytes} bytes, {volume.pages - volume.file_pages} are parity"
     )

@@ -35,11 +35,9 @@ def evaluate(load: Load, recording: str, json_path: Path | None, tracking: bool)
         try:
             count, result = pages.pages, evaluate_recording(decoder, pages, tracker)
         except NothingReadError as error:
-            if json_path is not None:
-                write_json(json_path, error.figures)
+            write_json(json_path, error.figures)
             raise error.refusal from None
-    if json_path is not None:
-        write_json(json_path, result.to_json())
+    write_json(json_path, result.to_json())
     click.echo(describe(result))
     if result.figures.air_bits_per_symbol <= 0:
         warn(WORTH_NOTHING)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 import time
 from collections import Counter
+from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import click
-import numpy as np
-from numpy.typing import NDArray
 
 from lightpage.cli.main import RESUME_KEY
 from lightpage.cli.paths import OutputFile
@@ -17,12 +17,11 @@ from lightpage.device.profile import Profile, load_profile
 from lightpage.errors import FrameError, InvalidInputError, LostDataError, LostPageError, LostShotError, SourceError
 from lightpage.files import write_json
 from lightpage.progress import note, track, warn
-from lightpage.recording.black_level import DarkFrame
 from lightpage.recording.exposure import check_pair_light
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import LostShot
 from lightpage.recording.pages import Pages
-from lightpage.recording.writer import RecordingWriter, Symbols, pages_there, partial_path
+from lightpage.recording.writer import RecordingWriter, pages_there, partial_path
 from lightpage.runtime.device.acquisition.page_store import PageStore
 from lightpage.runtime.device.acquisition.source import FrameSource, Shot, open_source
 from lightpage.words import counted
@@ -63,9 +62,8 @@ def record(
     """
     if out.exists() and not force:
         raise InvalidInputError(f"--out {out}", "a file that exists", "a new name, or --force")
-    source = open_source(spec)
-    source.operator = ask_operator
-    try:
+    with closing(open_source(spec)) as source:
+        source.operator = ask_operator
         profile = load_profile(profile_name) if profile_name is not None else source.profile
         if profile is None:
             raise InvalidInputError("options", f"no --profile, which {source.name} does not tell either", "--profile P")
@@ -73,7 +71,7 @@ def record(
         if symbols is not None:
             source.show_pages(PageStore(profile, Pages.open(symbols)))
         count = _count(source, pages, symbols)
-        there = _there(source, profile, out, force)
+        there = pages_there(out, profile, source.levels, source.bit_depth, overwrite=force, **_shown(source))
         _check_room(count, there)
         _tell_where(out, there)
         source.on_lost = _tell_loss
@@ -83,8 +81,6 @@ def record(
                 _record(source, profile, count, out, longest_s, dark, force, json_path)
         except LostShotError as error:  # of dark or reference frames
             raise LostDataError(error.subject, error.got, f"{error.expected} ({error.reason.value})") from None
-    finally:
-        source.close()
 
 
 def _count(source: FrameSource, asked: int | None, symbols: Path | None) -> int:
@@ -104,26 +100,10 @@ def _count(source: FrameSource, asked: int | None, symbols: Path | None) -> int:
     return asked or there or 0
 
 
-def _code_of(source: FrameSource) -> str | None:
-    return None if source.pages is None else source.pages.code
-
-
-def _symbols_of(source: FrameSource) -> Symbols | None:
-    """Of the pages that it shows, where they are known before they are photographed."""
-    return source.pages.__getitem__ if source.pages is not None and len(source.pages) else None
-
-
-def _there(source: FrameSource, profile: Profile, out: Path, force: bool) -> int:
-    """Pages of an earlier run to go on from, known before anything is connected."""
-    return pages_there(
-        out,
-        profile,
-        source.levels,
-        source.bit_depth,
-        code=_code_of(source),
-        symbols=_symbols_of(source),
-        overwrite=force,
-    )
+def _shown(source: FrameSource) -> dict[str, Any]:
+    """What is known of the pages that a source shows before they are photographed, as a recording's writer takes it."""
+    pages = source.pages
+    return {"code": pages.code, "symbols": pages.__getitem__ if len(pages) else None} if pages is not None else {}
 
 
 def _check_room(count: int, there: int) -> None:
@@ -170,14 +150,14 @@ def _record(
         source.levels,
         source.bit_depth,
         references,
-        code=_code_of(source),
         keep_references=True,
-        symbols=_symbols_of(source),
         overwrite=force,
+        **_shown(source),
     ) as writer:
         _check_room(count, writer.pages)
         if dark_frames is not None:
-            writer.set_dark_frames(*_darkness(dark_frames))
+            first, second = dark_frames
+            writer.set_dark_frames(FramePair(first.mean, second.mean), (first.hot, second.hot))
 
         def keep(page: int, error: LostShotError) -> None:
             _tell_loss(page, error)
@@ -185,8 +165,8 @@ def _record(
             writer.add_loss(losses[-1])
 
         source.on_lost = keep
-        first = writer.pages
-        for index in track(range(first, count), "record", total=count, done=first):
+        begun_at = writer.pages
+        for index in track(range(begun_at, count), "record", total=count, done=begun_at):
             shot, attempts = _good_shot(source, index, shot_seconds)
             repeated += attempts - 1
             writer.append(shot.symbols, shot.pair, infos=shot.infos)
@@ -194,7 +174,7 @@ def _record(
     by_reason = Counter(loss.reason for loss in losses)
     figures = {
         "pages": count,
-        "pages_recorded_now": count - first,
+        "pages_recorded_now": count - begun_at,
         "pages_repeated": repeated,
         "shots_lost": len(losses),
         "losses": dict(by_reason),
@@ -204,8 +184,7 @@ def _record(
         "black_levels": None if dark_frames is None else [one.black_level for one in dark_frames],
         "seconds": time.perf_counter() - begun,
     }
-    if json_path is not None:
-        write_json(json_path, figures)
+    write_json(json_path, figures)
     told = ", ".join(f"{times} {reason}" for reason, times in sorted(by_reason.items()))
     click.echo(
         f"{out}: {counted(count, 'page')} of {source.levels} levels; "
@@ -219,30 +198,21 @@ def _good_shot(source: FrameSource, index: int, seconds: float) -> tuple[Shot, i
     Raises:
         LostDataError: none of `ATTEMPTS` was good.
     """
-    for attempt in range(1, ATTEMPTS):
+    page = f"page {index} of {source.name}"
+    attempt = 0
+    while True:
+        attempt += 1
         try:
-            return _shot(source, index, seconds), attempt
-        except (LostPageError, FrameError):
-            continue
-    try:
-        return _shot(source, index, seconds), ATTEMPTS
-    except (LostPageError, FrameError) as error:
-        page = f"page {index} of {source.name}"
-        subject = error.subject if error.subject.startswith(page) else f"{page}: {error.subject}"
-        reason = f"{error.reason.value}; " if isinstance(error, LostPageError) else ""
-        tried = f"{reason}lost {ATTEMPTS} times in a row; the same command goes on from here"
-        raise LostDataError(subject, error.got, f"{error.expected} ({tried})") from None
-
-
-def _shot(source: FrameSource, index: int, seconds: float) -> Shot:
-    shot = source.shot(seconds, index)
-    check_pair_light(f"page {index} of {source.name}: ", shot.pair, source.bit_depth)
-    return shot
-
-
-def _darkness(dark: tuple[DarkFrame, DarkFrame]) -> tuple[FramePair, tuple[NDArray[np.intp], NDArray[np.intp]]]:
-    first, second = dark
-    return FramePair(first.mean, second.mean), (first.hot, second.hot)
+            shot = source.shot(seconds, index)
+            check_pair_light(f"{page}: ", shot.pair, source.bit_depth)
+            return shot, attempt
+        except (LostPageError, FrameError) as error:
+            if attempt < ATTEMPTS:
+                continue
+            subject = error.subject if error.subject.startswith(page) else f"{page}: {error.subject}"
+            reason = f"{error.reason.value}; " if isinstance(error, LostPageError) else ""
+            tried = f"{reason}lost {ATTEMPTS} times in a row; the same command goes on from here"
+            raise LostDataError(subject, error.got, f"{error.expected} ({tried})") from None
 
 
 def ask_operator(text: str) -> None:

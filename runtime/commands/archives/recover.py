@@ -50,8 +50,7 @@ def recover(
         code = code_of(pages, decoder.bundle) if code_path is None else load_code(code_path)
         tracker = tracker_for(decoder) if tracking else NoTracker(decoder)
         result = recover_file(decoder, pages, tracker, code, out, *parse_volume(volume), holes=holes)
-    if json_path is not None:
-        write_json(json_path, result.to_json())
+    write_json(json_path, result.to_json())
     click.echo(describe(result))
     for line in told_losses(result.unread) if not result.lost and result.volume is not None else ():
         warn(f"no bytes: {line}")

@@ -23,7 +23,7 @@ from lightpage.progress import track, warn
 from lightpage.recording.decoded_file import DecodedWriter
 from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording
-from lightpage.runtime.archives.recordings.refused import WORTH_NOTHING, RefusedPage, refusal, unconfirmed
+from lightpage.runtime.archives.recordings.refused import WORTH_NOTHING, RefusedPage, refusal, refused_json
 from lightpage.runtime.client.answers import RemotePage
 from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.client.outgoing import KnownPilots
@@ -89,11 +89,8 @@ def decode(
                 raise
             broke = error  # the source does not show the same pages again: what came is kept
             click.get_current_context().meta[RESUME_KEY] = "what came before is kept"
-        if json_path is not None:
-            data = {"target": target, "levels": levels, "pages": results, "refused_pages": [asdict(r) for r in refused]}
-            data["pages_unconfirmed"] = unconfirmed(refused)
-            data["pages_asked_for"] = count
-            write_json(json_path, data)
+        told = {"target": target, "levels": levels, "pages": results, "pages_asked_for": count}
+        write_json(json_path, told | refused_json(refused))
         if refused and not results:
             raise refusal(subject, refused, count)
     click.echo(table(results))
@@ -170,9 +167,9 @@ def _measured(page: RemotePage) -> PageMeasures | None:
     """Figures over the data symbols of a page whose symbols are known in the level count that was asked for."""
     if page.written is None or page.phase is None or page.concentration is None or page.pilot_mask is None:
         return None
-    data = ~page.pilot_mask
-    if not data.any():
+    if page.pilot_mask.all():
         return None
+    data = ~page.pilot_mask
     return measure(page.phase[data], page.concentration[data], page.written[data], page.levels)
 
 

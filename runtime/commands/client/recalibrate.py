@@ -24,7 +24,7 @@ from lightpage.runtime.commands.client.connection import TARGET, with_tls
 from lightpage.runtime.model.bundle.manifest import check_version
 from lightpage.runtime.model.bundle.shipped import bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.recalibration.known_pages import KnownPages, read_recorded
+from lightpage.runtime.recalibration.known_pages import read_recorded
 from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome, next_version
 from lightpage.runtime.recalibration.recalibration import recalibrate as recalibrate_bundle
 from lightpage.runtime.recalibration.refit import refit
@@ -85,8 +85,7 @@ def recalibrate(
         if detach:
             with LightpageClient(target, tls=tls) as client:
                 job = _start(client, recording, pages, send, wait_s)
-            if json_path is not None:
-                write_json(json_path, {"job": job.id})
+            write_json(json_path, {"job": job.id})
             click.echo(job.id)
             return
         result: RecalibrationOutcome | Recalibrated = _remote(target, tls, recording, pages, send, wait_s)
@@ -101,8 +100,7 @@ def recalibrate(
             raise InvalidInputError("options", f"no {lacking}", f"{', '.join(given)}, or --target")
         result = _offline(bundle, recording, out, pages, version)
     data = summary(result, time.perf_counter() - start)
-    if json_path is not None:
-        write_json(json_path, data)
+    write_json(json_path, data)
     click.echo(table(data))
 
 
@@ -188,15 +186,11 @@ def _offline(bundle: str, recording: str, out: Path, pages: int, version: str | 
         check_version(version, "--version")
     decoder = Decoder.load(bundle_path(bundle))
     with percent_bar() as progress:
-        known = _read(decoder, recording, pages)
+        with Recording.open(recording) as file:
+            check_recording(decoder, file)
+            known = read_recorded(file, first_lit_pages(file, pages, warn))
         new = next_version(decoder.version) if version is None else version
         return recalibrate_bundle(decoder, known, out, new, refit, progress)
-
-
-def _read(decoder: Decoder, recording: str, pages: int) -> KnownPages:
-    with Recording.open(recording) as file:
-        check_recording(decoder, file)
-        return read_recorded(file, first_lit_pages(file, pages, warn))
 
 
 @click.command()

@@ -41,11 +41,11 @@ def top(address: str, interval: float, once: bool, tls: TlsFiles | None) -> None
     """Show how a service fares that runs with --metrics-port. The key q ends it."""
     scrapes = Scrapes()
     scrapes.add(scrape(address, tls))
-    if once or not sys.stdout.isatty():
+    terminal = sys.stdout.isatty()
+    if once or not terminal:
         time.sleep(interval)
         scrapes.add(scrape(address, tls))
-        width = None if sys.stdout.isatty() else _WIDTH
-        Console(width=width, highlight=False).print(view(scrapes, address))
+        Console(width=None if terminal else _WIDTH, highlight=False).print(view(scrapes, address))
         return
     silent = ""
     with _keys() as pressed, Live(view(scrapes, address), screen=True, auto_refresh=False) as live:
@@ -65,13 +65,14 @@ def view(scrapes: Scrapes, address: str, silent: str = "") -> RenderableType:
     parts: list[RenderableType] = [_header(change, scrapes.restarts, address)]
     if silent:
         parts.append(Text(silent, style="bold white on red"))
-    load, device, process = (
-        Panel(table(change), title=title, expand=False)
-        for title, table in (("load", _load), ("device", _device), ("process", _process))
-    )
     upper = Table.grid(padding=(0, 1))
-    upper.add_row(load, Group(device, process))
-    return Group(*parts, upper, Panel(_stages(change), title="stages", expand=False))
+    right = Group(_panel("device", _device(change)), _panel("process", _process(change)))
+    upper.add_row(_panel("load", _load(change)), right)
+    return Group(*parts, upper, _panel("stages", _stages(change)))
+
+
+def _panel(title: str, table: Table) -> Panel:
+    return Panel(table, title=title, expand=False)
 
 
 def _header(change: Change, restarts: int, address: str) -> Text:
@@ -159,27 +160,17 @@ def _stages(change: Change) -> Table:
     for stage in Stage:
         count = change.rise(f"{name}_count", stage=stage.value)
         share = change.rise(f"{name}_sum", stage=stage.value) / whole if whole > 0 else math.nan
-        times = (
-            change.mean(name, stage=stage.value),
-            *(change.quantile(q, name, stage=stage.value) for q in (0.5, 0.99)),
-        )
-        table.add_row(
-            stage.value.replace("_", " "),
-            f"{count:.0f}",
-            f"{100 * share:.0f}%" if math.isfinite(share) else "-",
-            *map(_seconds, times),
-        )
+        quantiles = (change.quantile(q, name, stage=stage.value) for q in (0.5, 0.99))
+        times = map(_seconds, (change.mean(name, stage=stage.value), *quantiles))
+        percent = f"{100 * share:.0f}%" if math.isfinite(share) else "-"
+        table.add_row(stage.value.replace("_", " "), f"{count:.0f}", percent, *times)
     return table
 
 
 def _number(value: float) -> str:
-    return (
-        f"{value:.3g}"
-        if math.isfinite(value) and abs(value) < 1000
-        else f"{value:.0f}"
-        if math.isfinite(value)
-        else "-"
-    )
+    if not math.isfinite(value):
+        return "-"
+    return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
 
 
 def _seconds(value: float) -> str:

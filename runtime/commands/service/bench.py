@@ -57,7 +57,6 @@ def bench(load: Load, rounds: int, json_path: Path | None) -> None:
         "decode_over_inference": median["decode"] / median["inference"],
         "grpc_over_inference": median["grpc"] / median["inference"],
     }
-    if json_path is not None:
-        write_json(json_path, figures)
+    write_json(json_path, figures)
     for name, label in (("inference", "ONNX Runtime alone"), ("decode", "whole decode"), ("grpc", "through gRPC")):
         click.echo(f"{label:<20} p50 {1e3 * median[name]:8.1f} ms   {median[name] / median['inference']:5.2f} x")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,6 @@ import pytest
 from lightpage.cli.main import run as run_command
 from lightpage.runtime.archives.run.shard import ShardRecord
 from lightpage.runtime.archives.run.task import Outcome, Task
-from lightpage.runtime.archives.workers.inline import InlineEngine
 from lightpage.runtime.archives.workers.work import Worker
 from lightpage.runtime.commands.archives import bulk as command
 from tests.clock import HandClock
@@ -66,6 +65,22 @@ class Archive:
         coded.recording(self.folder / "a.h5", pages[:8], spoilt)
         coded.recording(self.folder / "b.h5", pages[8:])
         return pages, ("--no-tracking", "--bundle", str(bundle))
+
+
+class InlineEngine:
+    """Has a worker of this process do one task after the other; an error that nobody foresaw ends it."""
+
+    restarts, in_flight, workers_alive = 0, 0, 1
+
+    def __init__(self, worker: Worker) -> None:
+        self._worker = worker
+
+    def run(self, tasks: Iterable[Task]) -> Generator[Outcome, None, None]:
+        for task in tasks:
+            self.in_flight = 1
+            outcome = self._worker.work(task)
+            self.in_flight = 0
+            yield outcome
 
 
 class Watched(Worker):

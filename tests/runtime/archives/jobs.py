@@ -6,9 +6,9 @@ from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
 
 from lightpage.errors import InvalidInputError, StorageError
-from lightpage.runtime.archives.run.job import Choices, Job, Source
+from lightpage.runtime.archives.run.job import Job, Source
 from lightpage.runtime.archives.run.shard import PageRecord, PageState, ShardRecord
-from lightpage.runtime.archives.run.task import Done, NamedBundle, Operation, Outcome, Problem, Stamp, Task
+from lightpage.runtime.archives.run.task import Choices, Done, NamedBundle, Operation, Outcome, Problem, Stamp, Task
 
 PAGES, RANGE = 7, 3
 BUNDLE = NamedBundle(path=Path("/toy.zip"), sha256="0" * 64, version="toy-1")

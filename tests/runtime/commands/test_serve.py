@@ -26,9 +26,10 @@ from lightpage.recording.reader import Recording
 from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
+from lightpage.runtime.commands.service.ending import leave_the_rest, stop_signals
 from lightpage.runtime.commands.service.healthcheck import is_serving
 from lightpage.runtime.commands.service.healthcheck import main as healthcheck
-from lightpage.runtime.commands.service.serve import leave_the_rest, serve, stop_signals
+from lightpage.runtime.commands.service.serve import serve
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.models.store import ModelStore
 from lightpage.runtime.service.settings import ServiceSettings

@@ -76,7 +76,7 @@ def test_a_preset_is_what_it_says_and_single_options_change_it() -> None:
     assert options("--preset", "standard") == ("wave", Hyperparameters())
     assert options("--preset", "standard", "--localizer", "coherent") == ("coherent", Hyperparameters())
     assert options("--preset", "fast", "--channels", "8") == ("coherent", replace(PRESETS["fast"].choices, channels=8))
-    assert options("--levels", "2")[1].depth == options("--depth", "2")[1].depth == 2  # its earlier name
+    assert options("--depth", "2")[1].depth == 2
     assert options("--field-rounds", "0") == ("coherent", Hyperparameters(refinements=1, field_rounds=0))
     assert options("--localizer", "ray", "--channels", "8")[1] == PublishedChoices(channels=(8, 16))
 
@@ -265,10 +265,10 @@ def test_a_run_goes_on_with_its_own_options_alone(tmp_path: Path) -> None:
 
 
 def test_the_depth_of_the_network_is_known_by_its_earlier_name(tmp_path: Path) -> None:
-    (tmp_path / "begun.json").write_text(json.dumps({"format": FORMAT, "--channels": 8, "--levels": 1}))
-    assert check_begun(tmp_path, {"--channels": 8, "--depth": 1})
-    with pytest.raises(InvalidInputError, match="--depth: got 0"):
-        check_begun(tmp_path, {"--channels": 8, "--depth": 0})
+    (tmp_path / "begun.json").write_text(json.dumps({"format": FORMAT, "channels": 8, "levels": 1}))
+    assert check_begun(tmp_path, {"channels": 8, "depth": 1})
+    with pytest.raises(InvalidInputError, match="depth: got 0"):
+        check_begun(tmp_path, {"channels": 8, "depth": 0})
 
 
 def test_a_second_training_in_the_same_folder_is_refused(device: list[str], tmp_path: Path) -> None:

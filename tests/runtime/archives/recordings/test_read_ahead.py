@@ -24,7 +24,7 @@ def test_the_next_page_is_read_while_the_caller_works_and_no_further() -> None:
         begun[index].set()
         return f"page {index}"
 
-    for index, page in read_ahead(read, 5):
+    for index, page in read_ahead(read, range(5)):
         assert page.result(LIMIT_S) == f"page {index}"
         if index < 4:
             assert begun[index + 1].wait(LIMIT_S)  # while this page is still in the caller's hands
@@ -35,7 +35,7 @@ def test_a_page_that_cannot_be_read_says_so_in_its_place() -> None:
     def read(index: int) -> int:
         return 6 // (index - 1)
 
-    failures = [page.exception(LIMIT_S) for _, page in read_ahead(read, 3)]
+    failures = [page.exception(LIMIT_S) for _, page in read_ahead(read, range(3))]
     assert [type(failure) for failure in failures] == [type(None), ZeroDivisionError, type(None)]
 
 
@@ -49,7 +49,7 @@ def test_whoever_stops_early_waits_for_no_page_that_has_not_begun() -> None:
         assert go.wait(LIMIT_S)
         return index
 
-    pages = read_ahead(slow, 4)
+    pages = read_ahead(slow, range(4))
     next(pages)
     assert first.wait(LIMIT_S)
     threading.Timer(0.05, go.set).start()

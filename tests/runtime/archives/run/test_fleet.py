@@ -18,7 +18,6 @@ from lightpage.progress import Progress, note, track
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.run.task import FineTuning
 from lightpage.runtime.archives.workers.fine_tuning import deep_recalibration
-from lightpage.runtime.archives.workers.inline import InlineEngine
 from lightpage.runtime.archives.workers.work import Worker
 from lightpage.runtime.commands.archives import bulk as command
 from lightpage.runtime.model.bundle.bundle import Bundle
@@ -27,6 +26,7 @@ from lightpage.runtime.recalibration.known_pages import read_recorded
 from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome, next_version, recalibrate
 from tests.clock import HandClock
 from tests.runtime import toy
+from tests.runtime.archives.archive import InlineEngine
 
 PAGES = 3
 

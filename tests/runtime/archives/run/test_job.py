@@ -12,8 +12,9 @@ from typing import Any
 import pytest
 
 from lightpage.errors import BundleError, InvalidInputError, StorageError
-from lightpage.runtime.archives.run.job import Choices, bundle_sha256, found_recordings, of_fleet, of_recordings
-from lightpage.runtime.archives.run.task import FineTuning, NamedBundle, Operation
+from lightpage.runtime.archives.run.job import bundle_sha256
+from lightpage.runtime.archives.run.question import found_recordings, of_fleet, of_recordings
+from lightpage.runtime.archives.run.task import Choices, FineTuning, NamedBundle, Operation
 from tests.runtime import toy
 from tests.runtime.archives.jobs import BUNDLE, NEWER, PASSES, STAYS, job, source
 

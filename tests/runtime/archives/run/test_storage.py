@@ -37,11 +37,14 @@ def test_pages_are_given_up_on_request_alone_and_read_again_on_another(
 RUNS = """
 import os, sys, time
 from lightpage.cli.main import lightpage, run
-from lightpage.runtime.commands import bulk
-from lightpage.runtime.archives.workers.inline import InlineEngine
+from lightpage.runtime.commands.archives import bulk
 from lightpage.runtime.archives.workers.work import Worker
 time.sleep = lambda seconds: None
-bulk.engine_of = lambda *_: InlineEngine(Worker(1))
+class Inline:
+    restarts, in_flight, workers_alive = 0, 0, 1
+    def run(self, tasks):
+        yield from map(Worker(1).work, tasks)
+bulk.engine_of = lambda *_: Inline()
 def ends(number):
     return run(lightpage, [*sys.argv[1:], "--json", f"{number}.json"])
 assert ends(0) == 75

@@ -15,18 +15,19 @@ from lightpage.cli.main import run as run_command
 from lightpage.progress import reporting
 from lightpage.runtime.archives.run.driver import run
 from lightpage.runtime.archives.run.engine import ATTEMPTS, longest_s
-from lightpage.runtime.archives.run.job import Choices, Job, of_recordings
+from lightpage.runtime.archives.run.job import Job
 from lightpage.runtime.archives.run.ledger import Ledger
 from lightpage.runtime.archives.run.metrics import BulkMetrics
+from lightpage.runtime.archives.run.question import of_recordings
 from lightpage.runtime.archives.run.shard import PageRecord, ShardRecord
-from lightpage.runtime.archives.run.task import Done, Failed, Operation, Outcome, Step, Task
-from lightpage.runtime.archives.workers.inline import InlineEngine
+from lightpage.runtime.archives.run.task import Choices, Done, Failed, Operation, Outcome, Step, Task
 from lightpage.runtime.archives.workers.local import LocalEngine
 from lightpage.runtime.archives.workers.work import Worker
 from lightpage.runtime.commands.archives.bulk import bulk
 from tests.clock import HandClock
 from tests.runtime import toy
 from tests.runtime.archives import jobs
+from tests.runtime.archives.archive import InlineEngine
 from tests.runtime.archives.workers.deadly_worker import BEGUN, KILLS
 from tests.told import Told
 from tests.waiting import eventually

@@ -19,14 +19,24 @@ import pytest
 from lightpage.errors import WorkerError
 from lightpage.runtime.archives.run.driver import run
 from lightpage.runtime.archives.run.engine import ATTEMPTS, longest_s
-from lightpage.runtime.archives.run.job import Choices, of_recordings
 from lightpage.runtime.archives.run.ledger import Ledger
-from lightpage.runtime.archives.run.task import Done, Failed, NamedBundle, Operation, Outcome, Stamp, Task
+from lightpage.runtime.archives.run.question import of_recordings
+from lightpage.runtime.archives.run.task import (
+    Choices,
+    Done,
+    Failed,
+    NamedBundle,
+    Operation,
+    Outcome,
+    RecordedFile,
+    Stamp,
+    Task,
+)
 from lightpage.runtime.archives.workers import ray_engine
-from lightpage.runtime.archives.workers.inline import InlineEngine
 from lightpage.runtime.archives.workers.ray_engine import RayEngine
 from lightpage.runtime.archives.workers.work import Worker
 from tests.runtime import toy
+from tests.runtime.archives.archive import InlineEngine
 from tests.runtime.archives.workers.test_local import pages
 
 PAGES, RANGE = 60, 5
@@ -93,9 +103,8 @@ class FakeRay:
 
 def a_range(page: int) -> Task:
     return Task(
-        operation=Operation.DECODE,
-        recording=Path("a.h5"),
-        stamp=Stamp(size=1, modified_ns=1),
+        choices=Choices(operation=Operation.DECODE),
+        files=(RecordedFile(path=Path("a.h5"), stamp=Stamp(size=1, modified_ns=1)),),
         pages=(page,),
         bundle=NamedBundle(path=Path("b.zip"), sha256="", version=""),
         shard=Path(f"{page}"),

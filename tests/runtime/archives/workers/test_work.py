@@ -12,11 +12,11 @@ import pytest
 
 from lightpage.errors import StorageError
 from lightpage.recording.reader import Recording
-from lightpage.runtime.archives.run.job import Choices, of_recordings
 from lightpage.runtime.archives.run.ledger import Ledger
+from lightpage.runtime.archives.run.question import of_recordings
 from lightpage.runtime.archives.run.shard import PageState, ShardRecord, record_of
-from lightpage.runtime.archives.run.steps import EVERY_S, StepLog
-from lightpage.runtime.archives.run.task import Done, Failed, Operation, Task
+from lightpage.runtime.archives.run.task import Choices, Done, Failed, Operation, Task
+from lightpage.runtime.archives.workers.device import EVERY_S, StepLog
 from lightpage.runtime.archives.workers.work import Worker
 from tests.clock import HandClock
 from tests.runtime import coded, toy
@@ -96,7 +96,7 @@ def test_results_that_storage_does_not_take_make_no_page_lost(
     def refuse(*_: object) -> None:
         raise StorageError("shard", "Input/output error", "a file that can be written")
 
-    monkeypatch.setattr("lightpage.runtime.archives.workers.work.write_user_bytes", refuse)
+    monkeypatch.setattr("lightpage.runtime.archives.workers.page_range.write_user_bytes", refuse)
     failed = failure(asked(Operation.RECOVER, give_up=True))
     assert (failed.problem.subject, failed.problem.passes) == ("shard", True)
 
@@ -116,7 +116,8 @@ def test_another_recording_or_bundle_than_the_run_began_with_is_not_read(
     os.utime(tmp_path / "a.h5", (1, 1))
     changed = failure(task)
     assert (changed.problem.passes, changed.whole_recording) == (False, True)
-    gone = task.model_copy(update={"recording": tmp_path / "gone.h5"})
+    file = task.files[0].model_copy(update={"path": tmp_path / "gone.h5"})
+    gone = task.model_copy(update={"files": (file,)})
     failed = failure(gone)
     assert (failed.problem.subject, failed.whole_recording) == (f"recording {tmp_path / 'gone.h5'}", True)
     given_up = Worker(1).work(gone.model_copy(update={"give_up": True}))

@@ -12,11 +12,11 @@ import pytest
 
 from lightpage.errors import LostShotError, PageError, Reason, SourceError
 from lightpage.progress import reporting
-from lightpage.runtime.commands.service.serve import _take_dark_frames
 from lightpage.runtime.device.acquisition.beam_keeper import BeamKeeper
 from lightpage.runtime.device.acquisition.camera_source import CameraSource, View
 from lightpage.runtime.device.acquisition.page_store import PageStore
 from lightpage.runtime.device.modulator.beam_state import OperatorBeams
+from lightpage.runtime.service.assembly import take_dark_frames
 from tests.clock import HandClock
 from tests.runtime import toy
 from tests.runtime.device.acquisition.lab import PAIRING, Lab, pages_of, reason_of, source_of
@@ -382,7 +382,7 @@ def test_no_page_is_taken_while_a_beam_may_be_blocked(lab: Lab, pages: PageStore
 
     modulator.let_through = failing  # type: ignore[method-assign]
     with source:
-        _take_dark_frames(source)  # as the service does when it starts
+        take_dark_frames(source)  # as the service does when it starts
         assert set(seen) == {""}  # what is blocked for a purpose is no trouble
         assert source.trouble()
         fired = len(lab.fired)

@@ -1,0 +1,133 @@
+"""A device that a worker recalibrates: re-fitted, or trained on too, from known pages of its own."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TypeVar
+
+from lightpage.calibration.known_pages import first_lit_pages
+from lightpage.errors import CalibrationError, FrameError, InvalidInputError, RecalibrationRefusedError
+from lightpage.progress import State, reporting, warn
+from lightpage.recording.reader import Recording
+from lightpage.runtime.archives.run.shard import BUNDLE, LOG, TRAINING, Findings, PageRecord, PageState, with_end
+from lightpage.runtime.archives.run.task import Step, Task
+from lightpage.runtime.archives.workers.fine_tuning import DeepRecalibration
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.recalibration.known_pages import read_recorded
+from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome, Refit, next_version, recalibrate
+
+T = TypeVar("T")
+
+EVERY_S = 30.0
+"""Seconds from one line of a step to the next."""
+
+_REFUSED = (RecalibrationRefusedError, CalibrationError, InvalidInputError)
+_REFUSED_DEEPLY = (RecalibrationRefusedError, CalibrationError, FrameError)
+"""What a deep recalibration finds of a device; anything else is tried again by the next run."""
+
+
+def recalibrated(
+    task: Task,
+    recording: Recording,
+    decoder: Decoder,
+    fit: Refit,
+    deep: Callable[[], DeepRecalibration],
+    tell: Callable[[Step], None],
+) -> Findings:
+    """What becomes of a device; that its pages fit no geometry is a finding too. A deep recalibration is gone on with.
+
+    Args:
+        task: which device.
+        recording: with its known pages.
+        decoder: of its bundle.
+        fit, deep, tell: see `lightpage.runtime.archives.workers.work.Worker`.
+
+    Raises:
+        LightpageError: something that says nothing of the device.
+    """
+    findings = _REFUSED if task.choices.fine_tuning is None else _REFUSED_DEEPLY
+    out = with_end(task.shard, BUNDLE)
+    out.unlink(missing_ok=True)  # of a worker that was killed before it wrote the record
+    try:
+        if task.choices.fine_tuning is None:
+            known = read_recorded(recording, first_lit_pages(recording, len(task.pages), warn))
+            outcome = recalibrate(decoder, known, out, next_version(decoder.version), fit, lambda *_: None)
+        else:
+            if task.run is None:
+                expected = "the training run that its bundle was made from"
+                raise InvalidInputError(f"device {task.device}", "no run", expected)
+            name = task.device or task.name
+            log = StepLog(with_end(task.shard, LOG), lambda what: tell(Step(device=name, what=what)))
+            with reporting(log):
+                outcome = deep().recalibrate(
+                    decoder,
+                    recording,
+                    task.run,
+                    with_end(task.shard, TRAINING),
+                    out,
+                    task.choices.fine_tuning,
+                    len(task.pages),
+                    log.progress,
+                )
+    except findings as error:
+        lost = PageRecord(page=0, state=PageState.LOST, loss=type(error).__name__, reason=str(error))
+        return Findings(pages=(lost,))
+    return Findings(pages=(PageRecord(page=0, state=PageState.READ),), summary=_summary(outcome))
+
+
+def _summary(outcome: RecalibrationOutcome) -> dict[str, float | str | None]:
+    """What became of a device, for people and programs."""
+    return {
+        "version": outcome.version,
+        "previous_version": outcome.previous_version,
+        "angle_deg": outcome.report.angle_deg,
+        "air_before": outcome.air_before,
+        "air_after": outcome.air_after,
+        "air_limit": outcome.air_limit,
+        "pages_used": outcome.pages_used,
+        "pages_held_back": outcome.pages_held_back,
+    }
+
+
+class StepLog:
+    """Tells of steps in lines; see `lightpage.progress.Reporter`.
+
+    Args:
+        path: of the log, which is gone on with.
+        tell: called with each line.
+        clock: by which lines are told now and then.
+    """
+
+    def __init__(self, path: Path, tell: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> None:
+        self._path, self._tell, self._clock = path, tell, clock
+        self._step, self._next = "", 0.0
+
+    def track(
+        self, items: Iterable[T], what: str, unit: str, total: int | None, done: int, state: State
+    ) -> Iterator[T]:
+        """See `Reporter`."""
+        number = done
+        for number, item in enumerate(items, done + 1):
+            yield item
+            self._now(what, f"{unit} {number}" + (f" of {total}" if total else ""), state)
+        self.note(f"{what}: {number} {unit}s" + (f", {state()}" if state() else ""))
+
+    def note(self, what: str) -> None:
+        """See `Reporter`."""
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ} {what}\n")
+        self._tell(what)
+
+    def progress(self, step: str, share: float) -> None:
+        """See `lightpage.progress.Progress`."""
+        self._now(step, f"{share:.0%}", lambda: "")
+
+    def _now(self, step: str, where: str, state: State) -> None:
+        """A line when a step begins, and then one every so often."""
+        if step == self._step and self._clock() < self._next:
+            return
+        self._step, self._next = step, self._clock() + EVERY_S
+        self.note(f"{step}: {where}" + (f", {state()}" if state() else ""))

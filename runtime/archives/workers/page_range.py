@@ -1,0 +1,190 @@
+"""The pages of a range on their way: decoded, measured or read for their user bytes; each is a finding, or lost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.codec.page_bytes import PageBytes
+from lightpage.codec.volume import Volume
+from lightpage.errors import InvalidInputError, LightpageError, LostPageError, StorageError
+from lightpage.metrics.accumulator import Accumulator
+from lightpage.metrics.measures import PageMeasures, measure
+from lightpage.page.pilots import Pilots
+from lightpage.recording.decoded_file import DecodedWriter
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.layout import narrow
+from lightpage.recording.reader import Recording
+from lightpage.runtime.archives.recordings.evaluation import check_symbols, decode_unseen, pilots_of
+from lightpage.runtime.archives.recordings.read_ahead import read_ahead
+from lightpage.runtime.archives.recordings.recovery import PageReader, RecoveredPage, code_of
+from lightpage.runtime.archives.run.shard import SYMBOLS, Findings, PageRecord, PageState, with_end, write_user_bytes
+from lightpage.runtime.archives.run.task import Operation, Task
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.page import DecodedPage
+from lightpage.runtime.model.decoding.tracking import Tracker
+
+T = TypeVar("T")
+Symbols = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class PageRange:
+    """What a worker reads.
+
+    Attributes:
+        task: which pages, and what is done with them.
+        recording: of the pages.
+        decoder: of the task's bundle.
+        tracker: of that, which has learnt nothing yet.
+    """
+
+    task: Task
+    recording: Recording
+    decoder: Decoder
+    tracker: Tracker
+
+    def findings(self) -> Findings:
+        """What becomes of the pages; what they give beside it is written.
+
+        Raises:
+            LightpageError: something that says nothing of a page.
+        """
+        return {
+            Operation.DECODE: self._decoded,
+            Operation.EVALUATE: self._evaluated,
+            Operation.RECOVER: self._recovered,
+        }[self.task.choices.operation]()
+
+    def _decoded(self) -> Findings:
+        """Symbols, confidences, and figures where the symbols are known."""
+        levels, mask = self.recording.levels, pilots_of(self.decoder, self.recording)
+        records: list[PageRecord] = []
+
+        def decode(frames: FramePair, symbols: Symbols | None) -> DecodedPage:
+            pilots = self.decoder.pilots(levels, mask) if symbols is None else Pilots.of_symbols(mask, symbols, levels)
+            return self.tracker.decode(narrow(frames, self.recording.bit_depth), levels, pilots)
+
+        with ExitStack() as stack:
+            writer = None
+            if self.task.choices.symbols:
+                writer = stack.enter_context(DecodedWriter(with_end(self.task.shard, SYMBOLS), levels))
+            for page, found, symbols in self._read(decode, records):
+                if writer is not None:
+                    writer.append(_Page(found.symbols, found.confidence, self.decoder.version, page))
+                measures = None
+                if symbols is not None and not mask.all():
+                    measures = measure(found.phase[~mask], found.concentration[~mask], symbols[~mask], levels)
+                records.append(_read_record(page, found, measures))
+        return Findings(pages=tuple(records))
+
+    def _evaluated(self) -> Findings:
+        """Figures of the pages that the bundle has not seen.
+
+        Raises:
+            RecordingError: the recording has no symbols.
+        """
+        check_symbols(self.recording)
+        mask = pilots_of(self.decoder, self.recording)
+        accumulator = Accumulator(self.recording.levels, ~mask, len(self.task.pages))
+        records: list[PageRecord] = []
+
+        def decode(frames: FramePair, symbols: Symbols | None) -> DecodedPage | None:
+            return decode_unseen(self.decoder, self.recording, self.tracker, mask, frames, symbols)
+
+        for page, found, symbols in self._read(decode, records):
+            if found is None or symbols is None:
+                records.append(PageRecord(page=page, state=PageState.LEFT_OUT))
+                continue
+            accumulator.add(found.phase[~mask], found.concentration[~mask], symbols[~mask])
+            records.append(_read_record(page, found, accumulator.pages[-1]))
+        return Findings(pages=tuple(records), confidence_bins=tuple(accumulator.confidence_bins()))
+
+    def _recovered(self) -> Findings:
+        """User bytes."""
+        code = self.task.choices.code or code_of(self.recording, self.decoder.bundle)
+        reader = PageReader(self.decoder, self.recording, self.tracker, code, give_up=self.task.give_up)
+        kept: list[tuple[int, PageBytes]] = []
+        records: list[PageRecord] = []
+        for page, shown in read_ahead(self.recording.shown, self.task.pages):
+
+            def take(found: PageBytes, page: int = page) -> Volume | None:
+                volume = Volume.of_page(found)
+                if volume is not None:
+                    kept.append((page, found))
+                return volume
+
+            records.append(_recovered_record(reader.read(page, shown, take)))
+        write_user_bytes(self.task.shard, kept)
+        return Findings(pages=tuple(records))
+
+    def _read(
+        self, decode: Callable[[FramePair, Symbols | None], T], records: list[PageRecord]
+    ) -> Iterator[tuple[int, T, Symbols | None]]:
+        """Yield number, what was decoded, and symbols of each page; those that are lost go into `records`."""
+        findings: tuple[type[LightpageError], ...] = (InvalidInputError, LostPageError)
+        if self.task.give_up:
+            findings += (StorageError,)
+        for page, shown in read_ahead(self.recording.shown, self.task.pages):
+            try:
+                frames, symbols = shown.result()
+                found = decode(frames, symbols)
+            except findings as error:
+                records.append(lost_page(page, error))
+                continue
+            yield page, found, symbols
+
+
+@dataclass(frozen=True)
+class _Page:
+    """A page as `DecodedWriter` takes it."""
+
+    symbols: Symbols
+    confidence: NDArray[np.float32]
+    model_version: str
+    page: int | None
+
+
+def lost_page(page: int, error: LightpageError) -> PageRecord:
+    """The page that an error is about."""
+    due, loss = False, type(error).__name__
+    if isinstance(error, LostPageError):
+        due, loss = error.recalibration_due, error.reason.value
+    return PageRecord(page=page, state=PageState.LOST, loss=loss, reason=str(error), recalibration_due=due)
+
+
+def _read_record(page: int, found: DecodedPage, measures: PageMeasures | None) -> PageRecord:
+    return PageRecord(
+        page=page,
+        state=PageState.READ,
+        recalibration_due=found.check.recalibration_due,
+        confirmed_bits=found.check.confirmed_bits,
+        figures={
+            "mean_confidence": float(found.confidence.mean()),
+            "pilot_trust": found.pilot_trust,
+            "claimed_bits": found.check.claimed_bits,
+            **({} if measures is None else vars(measures)),
+        },
+    )
+
+
+def _recovered_record(page: RecoveredPage) -> PageRecord:
+    return PageRecord(
+        page=page.page,
+        state=PageState.READ if page.loss is None else PageState.LOST,
+        loss=page.loss,
+        reason=page.reason,
+        figures={
+            "number": page.number,
+            "volume": page.volume,
+            "margin_bits": page.margin_bits,
+            "corrected": page.corrected,
+            "failed_blocks": page.failed_blocks,
+            "air_bits_per_symbol": page.air_bits,
+        },
+    )
