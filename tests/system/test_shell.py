@@ -150,10 +150,13 @@ WITH_TORCH = ("lightpage.train", "lightpage.export", "lightpage.study", "lightpa
 
 IN_THE_IMAGE = f"""
 import importlib, json, pkgutil, sys
+import lightpage
 lacking = {{}}
-without = ("train", "export", "study", "report")  # what needs torch
-names = [name for _, name, is_package in pkgutil.iter_modules(lightpage.__path__) if name not in without]
-
+rooms = [room for room in pkgutil.iter_modules(lightpage.__path__, "lightpage.") if room.name not in {WITH_TORCH}]
+for room in rooms:
+    within = importlib.import_module(room.name).__path__ if room.ispkg else []
+    for module in pkgutil.walk_packages(within, room.name + "."):
+        try:
             importlib.import_module(module.name)
         except ModuleNotFoundError as error:
             lacking[module.name] = error.name
