@@ -33,7 +33,7 @@ from lightpage.progress import track
 from lightpage.runtime.client.pb.inference import open_inference_pb2 as oip
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.service.frames.inference_calls import INFERENCE
-from lightpage.runtime.service.server.call import ENDLESS, SERVICE
+from lightpage.runtime.service.server.dispatcher import ENDLESS, SERVICE
 
 _CALL_S = 30.0
 _ROUND = 500

@@ -32,7 +32,7 @@ from lightpage.files import write_json
 from lightpage.progress import track
 from lightpage.runtime.client.wire.channel import TlsFiles, open_channel
 from lightpage.runtime.service.frames.inference_calls import INFERENCE, PREFIX
-from lightpage.runtime.service.server.call import SERVICE
+from lightpage.runtime.service.server.dispatcher import SERVICE
 
 OPERATIONS = Path(__file__).resolve().parents[2] / "docs" / "operations.md"
 CALL_S = 10.0

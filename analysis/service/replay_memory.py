@@ -32,12 +32,11 @@ from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.page import DecodedPage
 from lightpage.runtime.model.decoding.tracking import NoTracker
-from lightpage.runtime.service.caller import Caller
+from lightpage.runtime.service.caller import Call, Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.models.registry import ModelRegistry
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.pages.page_calls import PageCalls
-from lightpage.runtime.service.server.call import Call
 
 PAGES = 1000
 
@@ -94,7 +93,7 @@ def measured(pages: int = PAGES) -> dict[str, float]:
         gc.collect()
         tracemalloc.start()
         try:
-            before, counted = tracemalloc.get_traced_memory()[0], plane.replays.held_bytes
+            before, counted = tracemalloc.get_traced_memory()[0], calls.replays.held_bytes
             for number in range(pages):
                 lose(number, pool)
             gc.collect()
@@ -105,7 +104,7 @@ def measured(pages: int = PAGES) -> dict[str, float]:
         "pages": pages,
         "frame_pair_bytes": pair.in_phase.nbytes + pair.quadrature.nbytes,
         "held_bytes": held / pages,
-        "counted_bytes": (plane.replays.held_bytes - counted) / pages,
+        "counted_bytes": (calls.replays.held_bytes - counted) / pages,
     }
 
 

@@ -29,7 +29,7 @@ from lightpage.cli.paths import OutputFile
 from lightpage.files import write_json
 from lightpage.progress import track
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.service.server.call import SERVICE
+from lightpage.runtime.service.server.dispatcher import SERVICE
 
 _LOOK_S = 2.0
 _CALLERS = 4

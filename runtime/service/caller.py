@@ -1,16 +1,23 @@
-"""Whoever calls the service: who they are, what they may do, how long they wait, and whether they are still there."""
+"""Whoever calls the service, and the call: who they are, what they may do, how long they wait, whether they left."""
 
 from __future__ import annotations
 
+import asyncio
 import math
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import TypeVar
 
 from lightpage.errors import CallerLeft, NotAllowedError
+from lightpage.runtime.service.stages import CallTimes
+
+T = TypeVar("T")
 
 
 class Role(StrEnum):
@@ -171,3 +178,60 @@ class Caller:
         """Raise `CallerLeft` if the caller has gone."""
         if not self.is_here:
             raise CallerLeft
+
+
+@dataclass
+class Call:
+    """What a handler knows of its call beside the request.
+
+    Attributes:
+        method: name of the RPC.
+        caller: who waits for the answer.
+        pool: threads for what blocks.
+        peer: address and connection that it came from.
+        correlation_id: the caller's own text for the log, empty where it gave none.
+        begun: when its first byte came, by `time.perf_counter`.
+        times: of its pages.
+        identity: who calls.
+        is_watch: whether it lasts as long as its caller likes.
+    """
+
+    method: str
+    caller: Caller
+    pool: Executor
+    peer: str = ""
+    correlation_id: str = ""
+    begun: float = field(default_factory=time.perf_counter)
+    times: CallTimes = field(default_factory=CallTimes)
+    identity: Identity = LOCAL
+    is_watch: bool = False
+
+    @property
+    def actor(self) -> Actor:
+        """Who calls, for records."""
+        return Actor(f"{self.identity.name} at {self.peer}" if self.identity.name else self.peer, self.correlation_id)
+
+    def own(self, name: str) -> str:
+        """A name that the caller gave to a session or a request, where other callers' are others; empty for none."""
+        return name and own_name(name, self.identity.name)
+
+    def session(self, name: str) -> str:
+        """Where the pages of a session that the caller named are followed; empty for none."""
+        return name and named_session(name, self.identity.name)
+
+    @property
+    def connection_session(self) -> str:
+        """Where the pages of its connection are followed; empty where gRPC has one name for all connections."""
+        return "" if self.peer.startswith("unix:") else f"connection {self.own(self.peer)}"
+
+    async def in_thread(self, work: Callable[[], T], otherwise: Callable[[], None] | None = None) -> T:
+        """Do in a thread what blocks or computes; when the call ends before, the work goes on by itself.
+
+        Args:
+            work: what is done.
+            otherwise: runs instead of `work` if the call is cancelled while `work` is queued.
+        """
+        future = self.pool.submit(work)
+        if otherwise is not None:
+            future.add_done_callback(lambda done: otherwise() if done.cancelled() else None)
+        return await asyncio.wrap_future(future)

@@ -30,7 +30,6 @@ from lightpage.runtime.model.decoding.page import DecodedPage
 from lightpage.runtime.model.decoding.tracking import unconfirmed_page
 from lightpage.runtime.service.admission import ReceiveBudget, Slots
 from lightpage.runtime.service.caller import Caller
-from lightpage.runtime.service.frames.shared_memory import SharedMemory
 from lightpage.runtime.service.limits import Limits
 from lightpage.runtime.service.models.audit import AuditLog
 from lightpage.runtime.service.models.models import Models
@@ -40,8 +39,8 @@ from lightpage.runtime.service.monitoring.heart import Heart
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor, SessionMonitors
 from lightpage.runtime.service.monitoring.observation import Observation, Observer
-from lightpage.runtime.service.monitoring.stages import Stage, Stages
-from lightpage.runtime.service.pages.replays import Replays
+from lightpage.runtime.service.shared_memory import SharedMemory
+from lightpage.runtime.service.stages import Stage, Stages
 
 _log = logging.getLogger(__name__)
 
@@ -162,7 +161,7 @@ class DataPlane:
         device_sessions: Collection[str] = (),
         clock: Clock = SYSTEM,
     ) -> None:
-        self.registry, self.store = registry, store
+        self.registry, self.store, self.clock = registry, store, clock
         self.limits = limits or Limits()
         self.metrics = metrics or ServiceMetrics()
         self.monitor = monitor
@@ -177,12 +176,10 @@ class DataPlane:
         self.shared: SharedMemory | None = None
         """Memory that clients share with the service."""
         self.heart = Heart(self.limits.decode_s, clock.now)
-        self.replays = Replays(self.limits.replay_s, self.limits.replay_bytes, clock)
         self.decodes = Slots(self.limits.concurrent_decodes, "decodes", self.limits.deadline_s, clock)
         self.ranges = Slots(self.limits.concurrent_ranges, "ranges of pages", self.limits.deadline_s, clock)
         self.watches = Slots(self.limits.concurrent_watches, "watches of the display", self.limits.deadline_s, clock)
-        self.uploads = Slots(1, "uploads of models", self.limits.deadline_s, clock)
-        self.models = Models(registry, store, self.limits.model_bytes, self._in_service, audit, clock)
+        self.models = Models(registry, store, self.limits, self._in_service, audit, clock)
         self._in_service(registry.current)
         self.metrics.watch_load(self.decodes, self.received)
         if store is not None:

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from lightpage.runtime.client.shared_memory import memory_path
 from lightpage.runtime.client.wire.address import check_free, is_local
 from lightpage.runtime.service.assembly import Assembly
-from lightpage.runtime.service.frames.shared_memory import SharedMemory
 from lightpage.runtime.service.jobs.self_calibration import SelfCalibration
 from lightpage.runtime.service.models.incoming import Incoming
 from lightpage.runtime.service.monitoring.traces import Traces
@@ -17,6 +16,7 @@ from lightpage.runtime.service.server.certificates import Certificates
 from lightpage.runtime.service.server.health_server import HealthServer, next_port
 from lightpage.runtime.service.server.server import LightpageServer
 from lightpage.runtime.service.settings import OFF, ServiceSettings
+from lightpage.runtime.service.shared_memory import SharedMemory
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def listening(settings: ServiceSettings, assembly: Assembly, certificates: Certi
             health = stack.enter_context(HealthServer(address, server.health, files)).target
         stack.enter_context(server)
         if service.incoming is not None:
-            stack.enter_context(Incoming(plane, service.incoming))
+            stack.enter_context(Incoming(plane.models, service.incoming))
         if settings.self_calibrates:
             own = settings.self_calibration.settings()
             stack.enter_context(SelfCalibration(plane, assembly.monitor, recalibrator, own))

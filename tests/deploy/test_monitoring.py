@@ -27,9 +27,9 @@ from lightpage.runtime.service.models.registry import ModelRegistry
 from lightpage.runtime.service.models.store import ModelStore
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor
-from lightpage.runtime.service.monitoring.stages import Stages
 from lightpage.runtime.service.pages.reading import read_page
 from lightpage.runtime.service.settings import Option, service_settings
+from lightpage.runtime.service.stages import Stages
 from tests.deploy.manifests import DEPLOY
 from tests.runtime import toy
 

@@ -37,7 +37,7 @@ AREAS = {
         "runtime/archives/run": "ledger totals shard task job driver volumes",
         "runtime/archives/workers": "work",
     },
-    "failures": {"lightpage": "failures errors", "runtime": "client/wire/status service/server/call"},
+    "failures": {"lightpage": "failures errors", "runtime": "client/wire/status service/server/dispatcher"},
     "limits": {
         "runtime/service": "admission limits settings server/message_gate display/uploads models/incoming",
         "runtime/service/frames": "frames frame_calls",

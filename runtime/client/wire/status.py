@@ -224,3 +224,10 @@ def error_from(detail: pb.ErrorDetail, retry_s: float | None = None) -> Lightpag
 def _reason(code: pb.LossReason) -> Reason:
     """A reason from the wire; one that this version does not know is unspecified."""
     return next((reason for reason, known in _REASONS.items() if known == code), Reason.UNSPECIFIED)
+
+
+def reason_told(error: BaseException | None) -> str:
+    """The name of the reason that the caller hears; empty where there is none to tell."""
+    if error is None or isinstance(error, CallerLeft) or not isinstance(error, Exception):
+        return ""
+    return reason_name(error)

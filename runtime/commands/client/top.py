@@ -24,7 +24,7 @@ from lightpage.errors import LightpageError
 from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.commands.client.connection import with_tls
 from lightpage.runtime.console.scrapes import WINDOW_S, Change, Scrapes, scrape
-from lightpage.runtime.service.monitoring.stages import Stage
+from lightpage.runtime.service.stages import Stage
 
 _WIDTH = 100
 """Columns where the output is no terminal."""

@@ -8,10 +8,10 @@ from collections.abc import AsyncIterator
 from lightpage.errors import InvalidInputError, StalledError
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.device.modulator.beam_state import BeamState
+from lightpage.runtime.service.caller import Call
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.display.display import Display, Wanted
 from lightpage.runtime.service.display.uploads import uploaded_pages
-from lightpage.runtime.service.server.call import Call
 
 _POLL_S = 0.02
 """How often is looked for something new to show."""

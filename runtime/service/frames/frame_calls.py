@@ -19,13 +19,11 @@ from lightpage.recording.layout import frame_type
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import FramePart
 from lightpage.runtime.client.wire.requests import check_options, pilots_of, pixel_type
-from lightpage.runtime.client.wire.status import refusal_of
-from lightpage.runtime.service.caller import Caller
+from lightpage.runtime.client.wire.status import reason_told, refusal_of
+from lightpage.runtime.service.caller import Call, Caller
 from lightpage.runtime.service.dataplane import DataPlane, levels_for
 from lightpage.runtime.service.frames.frames import PairReceiver, check_format, decode, decode_reply, receiver_for
-from lightpage.runtime.service.monitoring.stages import Stage, Stages
-from lightpage.runtime.service.server.call import Call
-from lightpage.runtime.service.server.call_log import reason_told
+from lightpage.runtime.service.stages import Stage, Stages
 
 _ON_THEIR_WAY = 2
 """Pairs of one DecodePages that are received or decoded at a time: one is decoded while the next one comes."""

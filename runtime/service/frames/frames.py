@@ -30,7 +30,7 @@ from lightpage.runtime.service.monitoring.monitor import (
     TRUST,
     UNREAD,
 )
-from lightpage.runtime.service.monitoring.stages import Stage, Stages
+from lightpage.runtime.service.stages import Stage, Stages
 
 
 class PairReceiver:

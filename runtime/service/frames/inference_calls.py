@@ -18,6 +18,7 @@ from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import PIXEL_CODES, message_of
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.service.admission import ReceiveBudget
+from lightpage.runtime.service.caller import Call
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.frames.frame_calls import FrameCalls
 from lightpage.runtime.service.frames.frames import check_format
@@ -31,8 +32,7 @@ from lightpage.runtime.service.frames.tensors import (
     typed_bytes,
 )
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
-from lightpage.runtime.service.monitoring.stages import Stage, Stages
-from lightpage.runtime.service.server.call import Call
+from lightpage.runtime.service.stages import Stage, Stages
 
 INFERENCE = oip.DESCRIPTOR.services_by_name["GRPCInferenceService"]
 PREFIX = "inference/"

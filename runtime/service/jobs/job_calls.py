@@ -9,11 +9,11 @@ from functools import partial
 
 from lightpage.errors import InvalidInputError, MalformedError, OverloadedError
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
+from lightpage.runtime.service.caller import Call
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.messages import result_message
 from lightpage.runtime.service.jobs.recalibrator import PagesToUse, Recalibrator, Step
 from lightpage.runtime.service.jobs.sent_pages import SentPages
-from lightpage.runtime.service.server.call import Call
 
 _POLL_S = 0.1
 """How often is looked whether a job has changed."""

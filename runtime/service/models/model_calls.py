@@ -8,21 +8,20 @@ from functools import partial
 
 from lightpage.errors import MalformedError, StalledError
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.service.dataplane import DataPlane
-from lightpage.runtime.service.models.models import ModelEntry, Upload
+from lightpage.runtime.service.caller import Call
+from lightpage.runtime.service.models.models import ModelEntry, Models, Upload
 from lightpage.runtime.service.models.store import Origin
-from lightpage.runtime.service.server.call import Call
 
 
 class ModelCalls:
     """Handlers of the calls about models.
 
     Args:
-        plane: has the models.
+        models: of the service.
     """
 
-    def __init__(self, plane: DataPlane) -> None:
-        self._plane, self._models = plane, plane.models
+    def __init__(self, models: Models) -> None:
+        self._models = models
 
     def ListModels(self, request: pb.ListModelsRequest, call: Call) -> pb.ListModelsReply:
         """All models that are loaded, or those of the store too."""
@@ -52,10 +51,10 @@ class ModelCalls:
         first = await anext(requests, None)
         if first is None or first.WhichOneof("part") != "header":
             raise MalformedError("first message of UploadModel", "no header", "a header, then chunks")
-        header, limit_s = first.header, self._plane.limits.model_s
+        header, limit_s = first.header, self._models.limits.model_s
         call.correlation_id = header.correlation_id or call.correlation_id
         call.caller.actor = call.actor
-        with self._plane.uploads.held_at_once():
+        with self._models.uploads.held_at_once():
             upload = self._models.upload(header.bytes, header.sha256, call.caller, header.signature)
             try:
                 async with asyncio.timeout(limit_s):

@@ -29,7 +29,9 @@ from lightpage.runtime.model.bundle.bundle import read_manifest
 from lightpage.runtime.model.bundle.manifest import Manifest, check_version
 from lightpage.runtime.model.bundle.signature_file import MOST_BYTES, signature_path
 from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.service.admission import Slots
 from lightpage.runtime.service.caller import NOBODY, Actor, Caller
+from lightpage.runtime.service.limits import Limits
 from lightpage.runtime.service.models.audit import AuditLog
 from lightpage.runtime.service.models.registry import History, Model, ModelRegistry, Place
 from lightpage.runtime.service.models.store import UPLOAD, ModelStore, Note, Origin, Reason, Trouble
@@ -63,27 +65,29 @@ class Models:
     Args:
         registry: the models.
         store: where they are kept, or None.
-        most_bytes: size of an uploaded bundle at most.
+        limits: of uploads.
         in_service: is told which model is about to be in service.
         audit: is told of every change, and of those that failed.
         clock: by which a store that hangs is known.
 
     Attributes:
         store_health: tells of the store without waiting for its disk.
+        uploads: the one slot for uploads.
     """
 
     def __init__(
         self,
         registry: ModelRegistry,
         store: ModelStore | None,
-        most_bytes: int,
+        limits: Limits,
         in_service: Callable[[Model], None],
         audit: AuditLog | None = None,
         clock: Clock = SYSTEM,
     ) -> None:
         self._audit, self._changing = audit or AuditLog(), threading.RLock()
         self.registry, self.store = registry, store
-        self._most_bytes, self._in_service = most_bytes, in_service
+        self.limits, self._in_service = limits, in_service
+        self.uploads = Slots(1, "uploads of models", limits.deadline_s, clock)
         self._own_note = Note()
         self.store_health = StoreHealth(self.trouble, clock=clock)
         registry.made_under = self._made_under
@@ -267,8 +271,8 @@ class Models:
             raise StoreError("model store", "none", "a service started with --store")
         if size == 0:
             raise InvalidInputError("header.bytes", 0, "the size of the zip")
-        if size > self._most_bytes:
-            raise LimitError("uploaded model", f"{size} bytes", f"at most {self._most_bytes}")
+        if size > self.limits.model_bytes:
+            raise LimitError("uploaded model", f"{size} bytes", f"at most {self.limits.model_bytes}")
         if len(digest) not in (0, 32):
             raise InvalidInputError("header.sha256", f"{len(digest)} bytes", "32, or none")
         if len(signature) > MOST_BYTES:

@@ -31,7 +31,7 @@ from lightpage.runtime.service.models.store_health import StoreHealth
 
 if TYPE_CHECKING:
     from lightpage.runtime.service.admission import ReceiveBudget, Slots
-    from lightpage.runtime.service.monitoring.stages import Stages
+    from lightpage.runtime.service.stages import Stages
 
 _SECONDS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 _FINE_SECONDS = tuple(sorted({*_SECONDS, 0.001, 0.002, 0.03, 0.07, 0.15, 0.3, 0.7, 1.5, 3.0, 7.0, 20.0, 60.0}))

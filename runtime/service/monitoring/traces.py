@@ -19,7 +19,7 @@ import grpc
 
 from lightpage.errors import InvalidInputError
 from lightpage.runtime.service.monitoring.logs import MOST_TEXT
-from lightpage.runtime.service.monitoring.stages import Lap, Stages
+from lightpage.runtime.service.stages import Lap, Stages
 
 MOST_PAGES = 64
 """Pages of a call that have spans, the first ones: a range may have thousands."""

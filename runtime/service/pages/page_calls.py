@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
+from lightpage.clock import Clock
 from lightpage.errors import CallerLeft, InvalidInputError, LimitError, SlotsTakenError
 from lightpage.recording.layout import FrameInfo
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.requests import check_options
-from lightpage.runtime.client.wire.status import detail_of, refusal_of
-from lightpage.runtime.service.caller import Caller
+from lightpage.runtime.client.wire.status import detail_of, reason_told, refusal_of
+from lightpage.runtime.service.caller import Call, Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.frames.frames import decode_reply, user_data_message
-from lightpage.runtime.service.monitoring.stages import Stage, Stages
 from lightpage.runtime.service.pages.reading import DataPage, ReadAnswer, read_data, read_page
-from lightpage.runtime.service.server.call import Call
-from lightpage.runtime.service.server.call_log import reason_told
+from lightpage.runtime.service.pages.replays import Replays
+from lightpage.runtime.service.stages import Stage, Stages
 
 _MOST_PAGES = 1 << 32
 """Of a source: their numbers travel in 32 bits."""
@@ -29,11 +28,15 @@ class PageCalls:
 
     Args:
         plane: reads and decodes.
-        clock: seconds that never go back.
+        clock: by which callers wait; that of the service if None.
+
+    Attributes:
+        replays: answers that are given again to whoever asks with the same request id.
     """
 
-    def __init__(self, plane: DataPlane, clock: Callable[[], float] = time.monotonic) -> None:
-        self._plane, self._clock = plane, clock
+    def __init__(self, plane: DataPlane, clock: Clock | None = None) -> None:
+        self._plane, self._clock, limits = plane, clock or plane.clock, plane.limits
+        self.replays = Replays(limits.replay_s, limits.replay_bytes, self._clock)
 
     def ReadPage(self, request: pb.ReadPageRequest, call: Call) -> pb.ReadPageReply:
         """Read a page from the source and decode it; with a request id at most once."""
@@ -47,15 +50,15 @@ class PageCalls:
 
         def work() -> bytes:
             # The answer is wanted even where its caller leaves meanwhile, and asks again.
-            until = self._clock() + limit_s
-            detached = Caller(lambda: until - self._clock(), caller.session, caller.stateless, caller.actor)
+            until = self._clock.now() + limit_s
+            detached = Caller(lambda: until - self._clock.now(), caller.session, caller.stateless, caller.actor)
             return self._read(request, detached, stages).SerializeToString()
 
         same = pb.ReadPageRequest()
         same.CopyFrom(request)
         same.correlation_id = ""
         asked = same.SerializeToString(deterministic=True)
-        answer, replayed = self._plane.replays.once(call.own(request.request_id), asked, caller, work)
+        answer, replayed = self.replays.once(call.own(request.request_id), asked, caller, work)
         stages.begin(Stage.RESPOND)
         reply = pb.ReadPageReply.FromString(answer)
         reply.replayed, reply.decoded.correlation_id = replayed, request.correlation_id

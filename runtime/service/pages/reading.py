@@ -17,7 +17,7 @@ from lightpage.runtime.device.acquisition.source import FrameSource, Shot, own_f
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import Answer, DataPlane, Seen, levels_for, observed
-from lightpage.runtime.service.monitoring.stages import Stage, Stages
+from lightpage.runtime.service.stages import Stage, Stages
 
 GROUPS = 4
 """Groups whose pages are held: pages of a few files may take turns. A group of full-size pages is 40 MB."""

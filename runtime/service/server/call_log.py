@@ -8,8 +8,7 @@ from typing import Any
 
 import grpc
 
-from lightpage.errors import CallerLeft
-from lightpage.runtime.client.wire.status import reason_name, told
+from lightpage.runtime.client.wire.status import reason_told, told
 
 _FAULTS_OF_THE_SERVICE = frozenset(
     [
@@ -50,10 +49,3 @@ def _level(code: grpc.StatusCode, error: BaseException | None, is_watch: bool) -
     if error is None or (is_watch and code is grpc.StatusCode.CANCELLED):
         return logging.DEBUG
     return logging.WARNING if code in _FAULTS_OF_THE_SERVICE else logging.INFO
-
-
-def reason_told(error: BaseException | None) -> str:
-    """The name of the reason that the caller hears; empty where there is none to tell."""
-    if error is None or isinstance(error, CallerLeft) or not isinstance(error, Exception):
-        return ""
-    return reason_name(error)

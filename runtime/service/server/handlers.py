@@ -7,6 +7,7 @@ from importlib.metadata import version as installed_version
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import PIXEL_CODES
 from lightpage.runtime.client.wire.status import without_folders
+from lightpage.runtime.service.caller import Call
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.display.display_calls import DisplayCalls
 from lightpage.runtime.service.frames.frame_calls import FrameCalls
@@ -14,17 +15,16 @@ from lightpage.runtime.service.jobs.job_calls import JobCalls
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 from lightpage.runtime.service.models.model_calls import ModelCalls, model_message
 from lightpage.runtime.service.pages.page_calls import PageCalls
-from lightpage.runtime.service.server.call import Call
 
 
 def handlers(plane: DataPlane, recalibrator: Recalibrator) -> tuple[object, ...]:
-    """Objects whose methods are named as the RPCs that they answer; see `lightpage.runtime.service.server.call`."""
+    """Objects whose methods are named as the RPCs that they answer; see `server.dispatcher`."""
     return (
         Describing(plane),
         FrameCalls(plane),
         PageCalls(plane),
         DisplayCalls(plane),
-        ModelCalls(plane),
+        ModelCalls(plane.models),
         JobCalls(plane, recalibrator),
     )
 

@@ -28,8 +28,8 @@ from lightpage.runtime.service.frames.inference_calls import (
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 from lightpage.runtime.service.limits import Limits
 from lightpage.runtime.service.monitoring.traces import Traces
-from lightpage.runtime.service.server.call import SERVICE, Dispatcher, Served
 from lightpage.runtime.service.server.certificates import Certificates
+from lightpage.runtime.service.server.dispatcher import SERVICE, Dispatcher, Served
 from lightpage.runtime.service.server.handlers import handlers
 from lightpage.runtime.service.server.health_servicer import HealthServicer
 from lightpage.runtime.service.server.message_gate import MessageGate

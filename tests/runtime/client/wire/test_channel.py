@@ -18,7 +18,7 @@ from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from lightpage.runtime.client.wire.address import check_address, check_free, host_and_port, names_machine
 from lightpage.runtime.client.wire.channel import REPEATABLE
-from lightpage.runtime.service.server.call import SERVICE
+from lightpage.runtime.service.server.dispatcher import SERVICE
 from tests.clock import HandClock
 from tests.waiting import eventually
 

@@ -26,7 +26,7 @@ from lightpage.runtime.service.frames.frames import decode
 from lightpage.runtime.service.frames.inference_calls import INFERENCE, large_messages
 from lightpage.runtime.service.frames.tensors import Tensor, inputs_of
 from lightpage.runtime.service.limits import Limits
-from lightpage.runtime.service.server.call import SERVICE
+from lightpage.runtime.service.server.dispatcher import SERVICE
 from tests.runtime import coded, toy
 from tests.runtime.service.stage import Refused, Remembering, Running, Start, a_page, refused
 

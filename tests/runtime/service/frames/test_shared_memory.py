@@ -23,7 +23,7 @@ from lightpage.runtime.client.shared_memory import HANDLE_BYTES, SIZE, memory_pa
 from lightpage.runtime.client.shared_memory import SharedMemory as ClientMemory
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.frames.frames import PairReceiver
-from lightpage.runtime.service.frames.shared_memory import Region, SharedMemory
+from lightpage.runtime.service.shared_memory import Region, SharedMemory
 from tests.runtime import toy
 from tests.runtime.service.conftest import begun
 from tests.runtime.service.stage import Refused, Running, Start, a_page, header, refused

@@ -44,7 +44,7 @@ def versions(plane: DataPlane) -> list[str]:
 
 
 def test_a_bundle_is_moved_to_the_store_once_it_is_whole(plane: DataPlane, folder: Path) -> None:
-    incoming, path = Incoming(plane, folder), folder / "new.zip"
+    incoming, path = Incoming(plane.models, folder), folder / "new.zip"
     whole = toy.write_toy_bundle(folder / "new.part", version="toy-2")
     data = toy.write_toy_bundle(folder.parent / "toy-2.zip", version="toy-2").read_bytes()
     path.write_bytes(data[:100])
@@ -61,7 +61,7 @@ def test_a_bundle_is_moved_to_the_store_once_it_is_whole(plane: DataPlane, folde
 def test_what_is_refused_is_said_once_and_stays(
     plane: DataPlane, folder: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    incoming, path = Incoming(plane, folder), folder / "bad.zip"
+    incoming, path = Incoming(plane.models, folder), folder / "bad.zip"
     path.write_bytes(b"no zip")
     (folder / "link.zip").symlink_to(toy.write_toy_bundle(folder.parent / "elsewhere.zip", version="toy-3"))
     for _ in range(4):
@@ -78,7 +78,7 @@ def test_what_is_refused_is_said_once_and_stays(
 def test_what_the_store_cannot_take_is_tried_again(
     plane: DataPlane, folder: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    incoming = Incoming(plane, folder)
+    incoming = Incoming(plane.models, folder)
     toy.write_toy_bundle(folder / "new.zip", version="toy-2")
     incoming.look()
     with full_disk(10):
@@ -95,7 +95,7 @@ def test_the_folder_is_looked_at_while_the_service_runs(
     caplog.set_level(logging.INFO)
     clock = HandClock()
     toy.write_toy_bundle(folder / "new.zip", version="toy-2")
-    with Incoming(plane, folder, 5.0, clock):
+    with Incoming(plane.models, folder, 5.0, clock):
         clock.until_somebody_waits()
         assert versions(plane) == ["toy-1"]
         eventually(lambda: clock.advance(5.0) or "as toy-2" in caplog.text)
@@ -149,7 +149,7 @@ class Signed:
         self.models.take_in(path, signature=signature)
 
     def looked(self) -> set[str]:
-        taking = Incoming(self.plane, self.incoming)
+        taking = Incoming(self.plane.models, self.incoming)
         taking.look()
         taking.look()
         return set(self.models.versions())

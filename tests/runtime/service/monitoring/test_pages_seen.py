@@ -18,8 +18,8 @@ from lightpage.runtime.service.models.registry import ModelRegistry
 from lightpage.runtime.service.monitoring.metrics import VERSIONS, ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import PageFigures
 from lightpage.runtime.service.monitoring.observation import Observation
-from lightpage.runtime.service.monitoring.stages import CallTimes, Lap, Stage, Stages
 from lightpage.runtime.service.pages.reading import read_page
+from lightpage.runtime.service.stages import CallTimes, Lap, Stage, Stages
 from lightpage.von_mises import information
 from tests.clock import HandClock
 from tests.runtime import toy

@@ -24,8 +24,8 @@ from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.frames.inference_calls import INFERENCE, PREFIX
 from lightpage.runtime.service.limits import Limits
 from lightpage.runtime.service.monitoring.logs import MOST_TEXT
-from lightpage.runtime.service.monitoring.stages import Stage
 from lightpage.runtime.service.monitoring.traces import MOST_PAGES, Traces
+from lightpage.runtime.service.stages import Stage
 from tests.runtime import coded, toy
 from tests.runtime.service.conftest import begun
 from tests.runtime.service.frames.test_inference import infer, request_of, stub_of

@@ -16,8 +16,8 @@ from lightpage.errors import InvalidInputError, NotAllowedError
 from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.service.caller import LOCAL, Identity, Role
 from lightpage.runtime.service.frames.inference_calls import INFERENCE, PREFIX
-from lightpage.runtime.service.server.call import SERVICE
 from lightpage.runtime.service.server.certificates import Certificates
+from lightpage.runtime.service.server.dispatcher import SERVICE
 from lightpage.runtime.service.server.roles import NEEDED, identity_of
 from tests.runtime.service.server.authority import Authority
 

@@ -20,12 +20,12 @@ from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.service.caller import Caller
+from lightpage.runtime.service.caller import Call, Caller
 from lightpage.runtime.service.frames.inference_calls import INFERENCE
 from lightpage.runtime.service.limits import Limits
 from lightpage.runtime.service.pages import page_calls
 from lightpage.runtime.service.pages.page_calls import PageCalls
-from lightpage.runtime.service.server.call import SERVICE, Call
+from lightpage.runtime.service.server.dispatcher import SERVICE
 from tests.clock import HandClock
 from tests.runtime import toy
 from tests.runtime.service.conftest import begun
@@ -179,7 +179,7 @@ def test_a_page_that_is_read_on_though_its_caller_left_has_the_services_own_dead
     monkeypatch.setattr(page_calls, "read_page", read_page)
     call = Call("ReadPage", Caller(lambda: 1.0), ThreadPoolExecutor(1))
     with pytest.raises(CallerLeft):
-        PageCalls(running.plane, clock.now).ReadPage(pb.ReadPageRequest(request_id="a"), call)
+        PageCalls(running.plane, clock).ReadPage(pb.ReadPageRequest(request_id="a"), call)
     running.end()
     assert left == [7.0, 5.0]
 

@@ -25,8 +25,8 @@ from lightpage.runtime.commands.service.healthcheck import is_serving
 from lightpage.runtime.service.caller import Role
 from lightpage.runtime.service.frames.inference_calls import INFERENCE, PREFIX
 from lightpage.runtime.service.models.audit import AuditLog
-from lightpage.runtime.service.server.call import SERVICE
 from lightpage.runtime.service.server.certificates import Certificates
+from lightpage.runtime.service.server.dispatcher import SERVICE
 from lightpage.runtime.service.server.health_server import HealthServer
 from lightpage.runtime.service.server.roles import NEEDED
 from lightpage.runtime.service.server.server import LightpageServer

@@ -15,7 +15,7 @@ import time
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Generator, Sequence
 from concurrent.futures import Executor, Future
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
 
@@ -27,14 +27,14 @@ from google.protobuf.message_factory import GetMessageClass
 from lightpage.errors import CallerLeft, MalformedError, OverloadedError, StalledError, StoppingError, let_go
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import parsed_part
-from lightpage.runtime.client.wire.status import status_of, told, trailers
-from lightpage.runtime.service.caller import LOCAL, STRANGER, Actor, Caller, Identity, Role, named_session, own_name
+from lightpage.runtime.client.wire.status import reason_told, status_of, told, trailers
+from lightpage.runtime.service.caller import LOCAL, STRANGER, Call, Caller, Identity, Role
 from lightpage.runtime.service.limits import Limits
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
-from lightpage.runtime.service.monitoring.stages import CallTimes
 from lightpage.runtime.service.monitoring.traces import MOST_PAGES, EndedCall, Traces
-from lightpage.runtime.service.server.call_log import log_end, reason_told
+from lightpage.runtime.service.server.call_log import log_end
 from lightpage.runtime.service.server.roles import NEEDED, identity_of
+from lightpage.runtime.service.stages import CallTimes
 
 SERVICE = pb.DESCRIPTOR.services_by_name["Lightpage"]
 
@@ -54,66 +54,6 @@ _GONE_S = 0.05
 """From the end of a stream to the word that its caller has gone, rather than closed it, at most."""
 
 T = TypeVar("T")
-
-
-@dataclass
-class Call:
-    """What a handler knows of its call beside the request.
-
-    Attributes:
-        method: name of the RPC.
-        caller: who waits for the answer.
-        pool: threads for what blocks.
-        peer: address and connection that it came from.
-        correlation_id: the caller's own text for the log, empty where it gave none.
-        begun: when its first byte came, by `time.perf_counter`.
-        times: of its pages.
-        identity: who calls.
-    """
-
-    method: str
-    caller: Caller
-    pool: Executor
-    peer: str = ""
-    correlation_id: str = ""
-    begun: float = field(default_factory=time.perf_counter)
-    times: CallTimes = field(default_factory=CallTimes)
-    identity: Identity = LOCAL
-
-    @property
-    def actor(self) -> Actor:
-        """Who calls, for records."""
-        return Actor(f"{self.identity.name} at {self.peer}" if self.identity.name else self.peer, self.correlation_id)
-
-    def own(self, name: str) -> str:
-        """A name that the caller gave to a session or a request, where other callers' are others; empty for none."""
-        return name and own_name(name, self.identity.name)
-
-    def session(self, name: str) -> str:
-        """Where the pages of a session that the caller named are followed; empty for none."""
-        return name and named_session(name, self.identity.name)
-
-    @property
-    def connection_session(self) -> str:
-        """Where the pages of its connection are followed; empty where gRPC has one name for all connections."""
-        return "" if self.peer.startswith("unix:") else f"connection {self.own(self.peer)}"
-
-    @property
-    def is_watch(self) -> bool:
-        """Whether it lasts as long as its caller likes."""
-        return self.method in ENDLESS
-
-    async def in_thread(self, work: Callable[[], T], otherwise: Callable[[], None] | None = None) -> T:
-        """Do in a thread what blocks or computes; when the call ends before, the work goes on by itself.
-
-        Args:
-            work: what.
-            otherwise: called if the call ends before the work has begun, which it then never does.
-        """
-        future = self.pool.submit(work)
-        if otherwise is not None:
-            future.add_done_callback(lambda done: otherwise() if done.cancelled() else None)
-        return await asyncio.wrap_future(future)
 
 
 @dataclass(frozen=True)
@@ -315,7 +255,7 @@ class Dispatcher:
     async def _call(self, name: str, context: Any) -> AsyncIterator[Call]:
         """Admit a call, count it, and turn what it raises into its status."""
         caller = Caller(partial(_seconds_left, context))
-        call = Call(name, caller, self._pool, context.peer())
+        call = Call(name, caller, self._pool, context.peer(), is_watch=name in ENDLESS)
         call.times = CallTimes(call.begun, partial(self._metrics.timed, name), MOST_PAGES if self._traces else 0)
         headers = dict(context.invocation_metadata() or ()) if self._traces else {}
         task = asyncio.current_task()
