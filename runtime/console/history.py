@@ -132,7 +132,7 @@ def _row(observation: Observation) -> PageRow:
         seconds=observation.seconds,
         lost=None if observation.lost is None else observation.lost.value,
         unread=unread,
-        margin_bits=observation.margin_bits,
+        margin_bits=None if data is None else data.margin_bits,
         air_bits=None if page is None else page.information_bits,
         trust=None if page is None else page.pilot_trust,
         share=None if page is None else page.check.share,

@@ -18,11 +18,19 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import frame_type
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import FramePart
-from lightpage.runtime.client.wire.requests import check_options, pilots_of, pixel_type
 from lightpage.runtime.client.wire.status import reason_told, refusal_of
 from lightpage.runtime.service.caller import Call, Caller
 from lightpage.runtime.service.dataplane import DataPlane, levels_for
-from lightpage.runtime.service.frames.frames import PairReceiver, check_format, decode, decode_reply, receiver_for
+from lightpage.runtime.service.frames.frames import (
+    PairReceiver,
+    check_format,
+    check_options,
+    decode,
+    decode_reply,
+    pilots_of,
+    pixel_type,
+    receiver_for,
+)
 from lightpage.runtime.service.stages import Stage, Stages
 
 _ON_THEIR_WAY = 2

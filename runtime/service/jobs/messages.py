@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.requests import image_message
 from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome
+from lightpage.runtime.service.frames.frames import image_message
 
 
 def result_message(outcome: RecalibrationOutcome) -> pb.RecalibrationResult:

@@ -16,11 +16,10 @@ from lightpage.recording.black_level import without_black
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import frame_type
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.requests import pixel_type
 from lightpage.runtime.recalibration.known_pages import MIN_PAGES, KnownPages
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.frames.frame_calls import check_black
-from lightpage.runtime.service.frames.frames import PairReceiver, check_format
+from lightpage.runtime.service.frames.frames import PairReceiver, check_format, pixel_type
 
 _WHERE = "message of RecalibrateFrames"
 

@@ -204,8 +204,8 @@ def _note(kept: _Kept) -> dict[str, str | float]:
     }
     if seen.page_index is not None:
         note["page_index"] = seen.page_index
-    if seen.margin_bits is not None:
-        note["margin_bits"] = seen.margin_bits
+    if seen.user_data is not None:
+        note["margin_bits"] = seen.user_data.margin_bits
     if seen.page is not None:
         note |= {"pilot_share": seen.page.check.share, "pilot_trust": seen.page.pilot_trust}
     return note

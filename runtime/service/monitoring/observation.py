@@ -59,11 +59,6 @@ class Observation:
     symbols: NDArray[np.uint8] | None = None
     pilot_mask: NDArray[np.bool_] | None = None
 
-    @property
-    def margin_bits(self) -> float | None:
-        """Information beyond what the code needs, bits a symbol; None where its bytes were not read."""
-        return None if self.user_data is None else self.user_data.margin_bits
-
 
 class Observer(Protocol):
     """Is told of every page, by the thread that decoded it: it must be quick, and may be called by many at once."""

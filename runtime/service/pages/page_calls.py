@@ -10,11 +10,10 @@ from lightpage.clock import Clock
 from lightpage.errors import CallerLeft, InvalidInputError, LimitError, SlotsTakenError
 from lightpage.recording.layout import FrameInfo
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.requests import check_options
 from lightpage.runtime.client.wire.status import detail_of, reason_told, refusal_of
 from lightpage.runtime.service.caller import Call, Caller
 from lightpage.runtime.service.dataplane import DataPlane
-from lightpage.runtime.service.frames.frames import decode_reply, user_data_message
+from lightpage.runtime.service.frames.frames import check_options, decode_reply, user_data_message
 from lightpage.runtime.service.pages.reading import DataPage, ReadAnswer, read_data, read_page
 from lightpage.runtime.service.pages.replays import Replays
 from lightpage.runtime.service.stages import Stage, Stages

@@ -279,7 +279,7 @@ def test_a_second_training_in_the_same_folder_is_refused(device: list[str], tmp_
 
 
 def test_what_a_training_is_of_is_what_was_there_when_it_began(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    tree, program = Path(origin.__file__).parents[2], tmp_path / "programs" / "git"
+    tree, program = Path(origin.__file__).resolve().parents[2], tmp_path / "programs" / "git"
     program.parent.mkdir()
     monkeypatch.setenv("PATH", str(program.parent))
 
