@@ -111,7 +111,7 @@ def test_the_fields_own_graph_shows_the_decoders_field(
     np.testing.assert_allclose(field, expected, atol=1e-4)
     np.testing.assert_allclose(left, expected_left, atol=1e-4)
     # as a decoder that looks at the field more coarsely would have it
-    monkeypatch.setattr("lightpage.runtime.model.decoding.field_solver.field_grid", partial(field_grid, step_px=3))
+    monkeypatch.setattr("lightpage.runtime.model.decoding.decoder.field_grid", partial(field_grid, step_px=3))
     with pytest.raises(BundleError, match="output field"):
         without.field_solver(*asked)
 
