@@ -19,7 +19,8 @@ import click
 import numpy as np
 from scipy.stats import binom
 
-from analysis.comparison.kept_bundle import data_set_of, export_kept
+from analysis.comparison.data_set import data_set_of
+from analysis.comparison.kept_bundle import export_kept
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFolder
 from lightpage.codec.code import load_code

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,13 +11,14 @@ from lightpage.calibration.calibrate import calibrate
 from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.calibration.known_pages import known_pages
 from lightpage.cli.progress_bar import percent_bar
-from lightpage.device.profile import Profile
+from lightpage.device.profile import Profile, parse_profile
 from lightpage.device.state import Device, Sensor
+from lightpage.errors import InvalidInputError
 from lightpage.recording.reader import Recording, hash_frames
 from lightpage.simulator.recording_job import RecordingJob
 from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
 from lightpage.train.models.twin import RayTwin, TorchTwin
-from lightpage.train.runs import begin
+from lightpage.train.runs import BEGUN, begin
 
 LEVELS = 256
 CALIBRATED = 2
@@ -39,6 +41,23 @@ def data_set_name(device: Device, symbol_size_px: int, apart: str = "") -> str:
     geometry, sensor = device.geometry, device.sensor
     dimmed = "" if sensor.exposure_relative == Sensor().exposure_relative else f"-{sensor.exposure_relative:g}x"
     return f"{geometry.pipe_angle_deg:g}deg-{sensor.full_well_e:g}e-{symbol_size_px}px{dimmed}{apart}"
+
+
+def data_set_of(kept: Path) -> tuple[Profile, Device, int]:
+    """Profile, true device and seed of a kept data set.
+
+    Raises:
+        InvalidInputError: nothing is kept there.
+    """
+    try:
+        begun = json.loads((kept / BEGUN).read_text())
+        profile = parse_profile(begun["--profile"], f"{kept / BEGUN}: profile")
+        return profile, Device.model_validate(begun["device"]), int(begun["--seed"])
+    except KeyError as error:
+        expected = "that of a data set, as analysis/weights has them"
+        raise InvalidInputError(f"{kept / BEGUN}", f"no key {error}", expected) from None
+    except (OSError, ValueError) as error:
+        raise InvalidInputError(f"--kept {kept}", error, f"the folder of a kept data set with its {BEGUN}") from None
 
 
 @contextmanager

@@ -25,7 +25,8 @@ import click
 import h5py
 import numpy as np
 
-from analysis.comparison.kept_bundle import data_set_of, export_kept
+from analysis.comparison.data_set import data_set_of
+from analysis.comparison.kept_bundle import export_kept
 from analysis.hardware.drifting import TrueTable, Truth, direction, moved
 from analysis.hardware.rows import append_row, kept_rows
 from lightpage.cli.main import EXIT_AGAIN, EXIT_ERROR

@@ -19,7 +19,8 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.comparison.kept_bundle import LEVELS, data_set_of, export_kept
+from analysis.comparison.data_set import LEVELS, data_set_of
+from analysis.comparison.kept_bundle import export_kept
 from analysis.speed.speed import opened, seconds_of
 from lightpage.calibration.sampling_table import sampling_table
 from lightpage.cli.main import run as run_command

@@ -26,7 +26,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from analysis.comparison.kept_bundle import data_set_of, export_kept
+from analysis.comparison.data_set import data_set_of
+from analysis.comparison.kept_bundle import export_kept
 from analysis.comparison.weight_store import TRAINED
 from analysis.tracking.figure import POINTS, draw
 from analysis.tracking.tables import (
