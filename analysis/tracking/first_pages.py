@@ -20,10 +20,8 @@ def offsets(point: Point, seeds: int) -> Figures:
     for seed in track(range(seeds), f"{point.name}: offsets", unit="seed"):
         rng = np.random.default_rng([OFFSETS_STREAM, seed])
         written = [point.symbols(OFFSETS_STREAM, seed, page) for page in range(2)]
-        settled, simulators = (
-            point.tracker.fork(),
-            {stays: point.simulator(seed, reference_stays=stays) for stays in (False, True)},
-        )
+        settled = point.tracker.fork()
+        simulators = {stays: point.simulator(seed, reference_stays=stays) for stays in (False, True)}
         point.air(settled, simulators[False].page(written[0]), written[0])
         tracked, told = point.air(settled, simulators[False].page(written[1]), written[1])
         for offset in OFFSETS_PX:
