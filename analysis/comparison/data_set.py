@@ -60,6 +60,16 @@ def data_set_of(kept: Path) -> tuple[Profile, Device, int]:
         raise InvalidInputError(f"--kept {kept}", error, f"the folder of a kept data set with its {BEGUN}") from None
 
 
+def simulate(
+    out: Path, profile: Profile, device: Device, pages: int, seed: int, levels: int = LEVELS, *, truth: bool = False
+) -> None:
+    """Simulate a recording of random symbols; one that is there stays."""
+    if not out.exists():
+        job = RecordingJob(profile, device, levels, seed, truth, out)
+        job.claim(force=False)
+        job.run(pages)
+
+
 @contextmanager
 def recorded(
     profile: Profile, device: Device, pages: int, seed: int, folder: Path, levels: int = LEVELS
@@ -68,9 +78,6 @@ def recorded(
     folder.mkdir(parents=True, exist_ok=True)
     begin(folder, {"--profile": profile.to_toml(), "device": device.model_dump(), "--pages": pages, "--seed": seed})
     path = folder / "recording.h5"
-    if not path.exists():
-        job = RecordingJob(profile, device, levels, seed, truth=True, out=path)
-        job.claim(force=False)
-        job.run(CALIBRATED + pages)
+    simulate(path, profile, device, CALIBRATED + pages, seed, levels, truth=True)
     with Recording.open(path) as recording:
         yield recording

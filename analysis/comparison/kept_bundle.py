@@ -13,7 +13,7 @@ from pathlib import Path
 
 import click
 
-from analysis.comparison.data_set import CALIBRATED, LEVELS, data_set_of
+from analysis.comparison.data_set import CALIBRATED, data_set_of, simulate
 from analysis.comparison.kept_decoder import kappa_scale, kept_decoder, validation_air
 from analysis.comparison.weight_store import CALIBRATION
 from lightpage.calibration.document import load_calibration
@@ -23,7 +23,6 @@ from lightpage.errors import InvalidInputError
 from lightpage.export.command import export_run
 from lightpage.page.symbols import pilot_mask
 from lightpage.recording.reader import Recording, hash_frames
-from lightpage.simulator.recording_job import RecordingJob
 from lightpage.train.fitting.fitted import FITTED
 from lightpage.train.models.decoder import COHERENT
 from lightpage.train.models.presets import FAST
@@ -55,10 +54,7 @@ def export_kept(kept: Path, work: Path, out: Path, method: str = COHERENT, refin
     work.mkdir(parents=True, exist_ok=True)
     calibration = load_calibration(kept / CALIBRATION)
     path = work / "recording.h5"
-    if not path.exists():
-        job = RecordingJob(profile, device, LEVELS, seed, truth=False, out=path)
-        job.claim(force=False)
-        job.run(CALIBRATED + MATCHED_PAGES + JUDGED)
+    simulate(path, profile, device, CALIBRATED + MATCHED_PAGES + JUDGED, seed)
     with Recording.open(path) as recording:
         decoder = kept_decoder(trained, profile, calibration, recording, localizer, refinements)
         references, mask = recording.references(), pilot_mask(profile)
