@@ -13,7 +13,7 @@ from lightpage.calibration.calibrate import calibrate
 from lightpage.calibration.document import Calibration, load_calibration, parse_calibration
 from lightpage.calibration.known_pages import known_pages
 from lightpage.errors import CalibrationError, InvalidInputError
-from lightpage.export.command import export_run
+from lightpage.export.from_run import export_run
 from lightpage.progress import Progress, note
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.run.task import FineTuning

@@ -20,7 +20,7 @@ from lightpage.calibration.document import load_calibration
 from lightpage.cli.main import run as run_command
 from lightpage.cli.paths import NewPath, OutputFolder
 from lightpage.errors import InvalidInputError
-from lightpage.export.command import export_run
+from lightpage.export.from_run import export_run
 from lightpage.page.symbols import pilot_mask
 from lightpage.recording.reader import Recording, hash_frames
 from lightpage.train.fitting.fitted import FITTED

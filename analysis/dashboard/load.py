@@ -15,7 +15,9 @@ import numpy as np
 
 from analysis.service.overload import capacity
 from analysis.service.running import PagesToSend, RunningService, stub
-from lightpage.demo.demo import SPOILT_PAGE, drifted, write_pages
+from lightpage.demo.drift import drifted
+from lightpage.demo.pages import SPOILT_PAGE, write_pages
+from lightpage.demo.picture import picture
 from lightpage.device.state import Device
 from lightpage.errors import LightpageError
 from lightpage.progress import track
@@ -45,7 +47,7 @@ class Shots:
 
 def shots(decoder: Decoder, folder: Path) -> tuple[Shots, Shots]:
     """Pages of user bytes on the bench device, as it was calibrated and after a drift."""
-    write_pages(decoder, folder / "pages.h5", 0)
+    write_pages(decoder, picture(), folder / "pages.h5", 0)
     source = SimulatorSource(decoder.bundle.profile, Device(), written=Pages.open(folder / "pages.h5"))
     taken = []
     with source:
