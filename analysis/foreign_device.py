@@ -73,7 +73,6 @@ class Design:
 
 
 BENCH = Design()
-PAGE_SHAPE, FRAME_SHAPE = BENCH.page_shape, BENCH.frame_shape
 HALF = Design(
     focal_length=10.0,
     pipe_length=9.375,

@@ -9,7 +9,8 @@ import click
 
 from lightpage.cli.paths import OutputFile, OutputFolder
 from lightpage.cli.progress_bar import percent_bar
-from lightpage.demo.demo import DemoResult, run_demo
+from lightpage.demo.demo import run_demo
+from lightpage.demo.result import DemoResult
 from lightpage.errors import InvalidInputError
 from lightpage.files import write_json
 from lightpage.runtime.archives.recordings.coded_pages import AIR_LEVELS

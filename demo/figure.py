@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from lightpage.demo.demo import DemoResult
+from lightpage.demo.result import DemoResult
 
 _LEAST_BITS, _MOST_BITS = 0.0, 8.0
 _PILOTS = "white"

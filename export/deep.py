@@ -9,12 +9,10 @@ from pathlib import Path
 
 import torch
 
-from lightpage.calibration.calibrate import calibrate
-from lightpage.calibration.document import Calibration, load_calibration, parse_calibration
-from lightpage.calibration.known_pages import known_pages
-from lightpage.errors import CalibrationError, InvalidInputError
-from lightpage.export.command import export_run
-from lightpage.progress import Progress, note
+from lightpage.errors import InvalidInputError
+from lightpage.export.device_geometry import device_geometry
+from lightpage.export.from_run import export_run
+from lightpage.progress import Progress
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.run.task import FineTuning
 from lightpage.runtime.archives.workers.fine_tuning import DeepRecalibration
@@ -25,11 +23,8 @@ from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.recalibration.judgement import JudgedPage, Verdict, judge, judged_pages
 from lightpage.runtime.recalibration.known_pages import KnownPages, read_recorded
 from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome, RefitReport, next_version
-from lightpage.runtime.recalibration.refit import refit
 from lightpage.train.fitting.memory import keep_freed_memory
-from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
 from lightpage.train.models.hyperparameters import Hyperparameters
-from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.train.processes import ONE
 from lightpage.train.runs import WEIGHTS, load_run, sole_writer
 from lightpage.train.trainers.symbols import SymbolTrainer
@@ -83,7 +78,7 @@ class TorchRecalibration:
         before = _judged(decoder, held_back)
         folder.mkdir(parents=True, exist_ok=True)
         fitted = split.training[:_CALIBRATED_PAGES]
-        calibration = _calibration(decoder, recording, fitted, folder / _CALIBRATION, progress)
+        calibration = device_geometry(decoder, recording, fitted, folder / _CALIBRATION, progress)
         tuned = replace(before_it, steps=choices.steps, learning_rate=choices.learning_rate, seed=choices.seed)
         trainer = SymbolTrainer(localizer, tuned, choices.synthetic_pages, run)
         with sole_writer(folder / _RUN):
@@ -150,31 +145,6 @@ def _choices_of(bundle: Bundle, run: Path) -> tuple[str, Hyperparameters]:
 def _judged(decoder: Decoder, pages: KnownPages) -> list[JudgedPage]:
     """The pages as a service reads them that has just been started."""
     return judged_pages(tracker_for(decoder), decoder.bundle, pages, lambda share: None)
-
-
-def _calibration(
-    decoder: Decoder, recording: Recording, pages: list[int], kept: Path, progress: Progress
-) -> Calibration:
-    """The device's geometry by these pages: kept from before, near the bundle's, or else found from nominal.
-
-    Raises:
-        CalibrationError: the pages fit no geometry.
-    """
-    hashes = tuple(recording.page_hash(page) for page in pages)
-    if kept.exists() and (before := load_calibration(kept)).calibrated_pages[-len(hashes) :] == hashes:
-        return before
-    profile = decoder.bundle.profile
-    twin, solve_field = TorchTwin(RayTwin(profile)), TorchFieldSolver(FieldRecovery(profile))
-    try:
-        near = refit(decoder.bundle, read_recorded(recording, pages), progress, decoder, twin, solve_field)
-        found = parse_calibration(near.calibration_toml)
-    except CalibrationError as error:
-        note(f"{error}; calibrating from nominal")
-        known = known_pages(recording, profile, pages)
-        anew = calibrate(twin, solve_field, profile, recording.references(), known, progress)
-        found = Calibration.from_registered(anew, profile, hashes)
-    found.save(kept)
-    return found
 
 
 def _manifest(before: Manifest, made: Manifest, judged_by: tuple[str, ...], verdict: Verdict, seed: int) -> Manifest:

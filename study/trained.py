@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,35 +10,23 @@ from typing import Any
 import h5py
 import lightning as L
 import numpy as np
-import torch
 from lightning.pytorch.callbacks import Callback
 from numpy.typing import NDArray
-from torch import Tensor
-from torch.nn import functional
 
 from lightpage.device.profile import Profile
 from lightpage.device.state import Device
-from lightpage.metrics.information import decide, page_kilobytes
-from lightpage.metrics.measures import measure, symbol_maps
-from lightpage.metrics.reliability import expected_calibration_error
+from lightpage.metrics.information import page_kilobytes
 from lightpage.page.symbols import pilot_mask
 from lightpage.progress import Progress, reporting
 from lightpage.recording.reader import Recording
 from lightpage.simulator.recording_job import RecordingJob
+from lightpage.study.judged import estimates, figures_of_classes, figures_of_p
 from lightpage.study.study import Result, Settings
 from lightpage.train.data.features import PageState
-from lightpage.train.fitting.concentration_scale import calibrating_factor, decode_pages, most_likely_factor
+from lightpage.train.fitting.concentration_scale import calibrating_factor
 from lightpage.train.fitting.curves import curves_of
-from lightpage.train.fitting.validation import without_piston
-from lightpage.train.models.parts import turned
 from lightpage.train.published.trainer import published_choices, train_published
-from lightpage.train.published.training import (
-    FramePages,
-    PublishedChoices,
-    PublishedTraining,
-    nearest_class,
-    rate_of_classes,
-)
+from lightpage.train.published.training import FramePages, PublishedChoices
 from lightpage.train.runs import begin
 
 LEVELS = 256
@@ -124,12 +111,12 @@ def trained(
             fitted = train_published(
                 work, localizer, choices, profile, quadrature_phase, mask, training, validation, callbacks=[tell]
             )
-        p, phases = _estimates(fitted.module, validation, mask, knows_piston)
+        p, phases = estimates(fitted.module, validation, mask, knows_piston)
         scale = calibrating_factor(p.reshape(2, -1), phases.ravel())
-        p, phases = _estimates(fitted.module, unseen, mask, knows_piston)
-        figures = _of_p(scale * p, phases, mask, levels)
+        p, phases = estimates(fitted.module, unseen, mask, knows_piston)
+        figures = figures_of_p(scale * p, phases, mask, levels)
         if choices.classes:
-            of_classes = _of_classes(fitted.module, validation, unseen, mask)
+            of_classes = figures_of_classes(fitted.module, validation, unseen, mask)
             figures = {"air_of_p": _mean(figures["air_map"])} | figures | of_classes
     angle = getattr(fitted.module.network.localizer, "angle", None)
     air, own, data = _mean(figures["air_map"]), _mean(figures["own_mi_map"]), int((~mask).sum())
@@ -173,76 +160,6 @@ def _true_states(path: Path) -> list[PageState]:
 
 def _mean(values: NDArray[np.float32]) -> float:
     return float(np.nanmean(values))
-
-
-def _estimates(
-    module: PublishedTraining, pages: FramePages, mask: NDArray[np.bool_], knows_piston: bool
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """p [2, pages, N] of the data symbols, the piston taken off, and their true phases [pages, N].
-
-    What classes learn of a piston is the class that is nearest to it.
-    """
-    classes = module.choices.classes
-
-    def still(p: NDArray[np.float32], phases: NDArray[np.float32], state: PageState) -> NDArray[np.float32]:
-        if knows_piston:
-            known = np.array(state.piston_rad)
-            piston = float(decide(known, classes)) * 2 * np.pi / classes if classes else state.piston_rad
-            return np.asarray(turned(torch.from_numpy(p), -piston).numpy())
-        return without_piston(p, phases, mask)
-
-    decoded = decode_pages(module, pages)
-    p = [still(*page)[:, ~mask] for page in zip(*decoded, pages.states, strict=True)]
-    return np.stack(p, axis=1), decoded[1][:, ~mask]
-
-
-def _of_p(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.bool_], levels: int) -> dict[str, Any]:
-    """What von Mises estimates [2, pages, N] carry, claim and miss, as means over the pages by symbol; their ECE."""
-    mu, kappa = np.arctan2(p[1], p[0]), np.hypot(p[0], p[1])
-    symbols = decide(phases, levels)
-    maps = symbol_maps(mu, kappa, symbols, levels, ~mask)
-    figures = measure(mu, kappa, symbols, levels)
-    return {"air_map": maps.air, "own_mi_map": maps.own_mi, "error_map": maps.error_rad, "ece": figures.ece}
-
-
-def _of_classes(
-    module: PublishedTraining, validation: FramePages, unseen: FramePages, mask: NDArray[np.bool_]
-) -> dict[str, Any]:
-    """The same of posteriors over classes, without phase errors; the validation pages choose their temperature."""
-    classes, data = module.choices.classes, torch.from_numpy(~mask)
-    known = list(_scored(module, validation, data))
-
-    scale = most_likely_factor(
-        lambda factor: float(sum(functional.cross_entropy(factor * scores.T, symbols) for scores, symbols in known))
-    )
-    rates, claims, confidences, right = [], [], [], []
-    for page, truth in _scored(module, unseen, data):
-        log = torch.log_softmax(page.double() * scale, dim=0)
-        rates.append(rate_of_classes(-log.gather(0, truth[None])[0], classes).numpy())
-        claims.append(rate_of_classes(-(log.exp() * log).sum(0), classes).numpy())
-        confidence, decided = log.exp().max(0)
-        confidences.append(confidence.numpy())
-        right.append((decided == truth).numpy())
-    return {
-        "air_map": _over_pages(rates, mask),
-        "own_mi_map": _over_pages(claims, mask),
-        "ece": expected_calibration_error(np.concatenate(confidences), np.concatenate(right)),
-    }
-
-
-def _scored(module: PublishedTraining, pages: FramePages, data: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-    """Scores [classes, N] and true classes [N] of the data symbols of each page."""
-    with torch.no_grad():
-        for frames, state, phases in (pages[index] for index in range(len(pages))):
-            scores = module.network.scores(frames[None], state[None, :2])[0]
-            yield scores[:, data].float(), nearest_class(phases + state[2], module.choices.classes)[data]
-
-
-def _over_pages(values: Sequence[NDArray[np.floating]], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Means over pages of what data symbols have, [ny, nx], NaN at pilots."""
-    over = np.full(mask.shape, np.nan, dtype=np.float32)
-    over[~mask] = np.mean(values, axis=0)
-    return over
 
 
 def _curves(work: Path) -> dict[str, NDArray[np.float64]]:

@@ -95,7 +95,7 @@ def small_bundle(small_run: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     """The bundle of that training, version small-1."""
 
     def make(out: Path) -> None:
-        from lightpage.export.command import export_run
+        from lightpage.export.from_run import export_run
 
         export_run(small_run, out, version="small-1")
 

@@ -60,7 +60,6 @@ class Killed:
     """
 
     def __init__(self, out: Path) -> None:
-        self._out = out
         self.store, self.temporary = out / "store", out / "tmp"
         self.temporary.mkdir(parents=True, exist_ok=True)
         self._arguments = ("--source", f"recording:{out / 'known.h5'}", "--store", str(self.store), "--threads", "1")

@@ -19,7 +19,8 @@ import click
 import numpy as np
 from scipy.stats import binom
 
-from analysis.comparison.kept_bundle import data_set_of, export_kept
+from analysis.comparison.data_set import data_set_of, simulate
+from analysis.comparison.kept_bundle import export_kept
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFolder
 from lightpage.codec.code import load_code
@@ -96,14 +97,9 @@ def data_sets(pages: int) -> dict[str, DataSet]:
     return {each.name: each for each in sets}
 
 
-def record(data: DataSet, path: Path, seed: int, pages: int, symbols: Path | None = None) -> None:
-    """Record random pages, or pages to write, unless that is done."""
+def photograph(data: DataSet, symbols: Path, path: Path, seed: int) -> None:
+    """Record the pages of a file on the device of a data set; a recording that is there stays."""
     if path.exists():
-        return
-    if symbols is None:
-        job = RecordingJob(data.profile, data.device, 256, seed, truth=False, out=path)
-        job.claim(force=False)
-        job.run(pages)
         return
     with Pages.open(symbols) as written:
         job = RecordingJob(data.profile, data.device, written.levels, seed, truth=False, out=path, written=written)
@@ -119,7 +115,7 @@ def through(data: DataSet, folder: Path) -> Recovery:
     if decoder.bundle.code is not None:
         decoder.bundle.code.save(code_path)
     elif not code_path.exists():
-        record(data, folder / "known.h5", _SEED, data.known)
+        simulate(folder / "known.h5", data.profile, data.device, data.known, _SEED)
         with Recording.open(folder / "known.h5") as recording:
             best, _ = choose_code(decoder, recording, tracker_for(decoder))
         best.code.save(code_path)
@@ -136,7 +132,7 @@ def through(data: DataSet, folder: Path) -> Recovery:
             with PagesWriter(pages, data.profile, code.levels, code.model_dump() | volume.to_json()) as writer:
                 for some in encode_volume(codec, volume, file, decoder.bundle.written_pilots(code.levels)):
                     writer.append(some)
-    record(data, folder / "shown.h5", _SEED + 1, 0, pages)
+    photograph(data, pages, folder / "shown.h5", _SEED + 1)
     read = folder / "read.bin"
     with Recording.open(folder / "shown.h5") as recording:
         found = recover(decoder, recording, tracker_for(decoder), code, read)

@@ -16,8 +16,9 @@ from pathlib import Path
 import click
 from torch import nn
 
-from analysis.comparison.bench import Bench
 from analysis.comparison.data_set import LEVELS, data_set_name, recorded
+from analysis.comparison.methods.bench import Bench
+from analysis.comparison.methods.judgement import judged
 from analysis.comparison.outcome import HEADER, Outcome
 from analysis.comparison.weight_store import TRAINED, WeightStore
 from lightpage.cli.main import run
@@ -93,7 +94,7 @@ def without(part: str, bench: Bench, choices: Hyperparameters) -> Outcome:
     fitted = fit_network(folder, choices, bench.mask, LEVELS, training, validation, kind=kind, processes=ONE)
     drawn = choices.drawn(bench.profile.page_shape)
     size = f"{choices.channels}x{choices.blocks}x{choices.depth}"
-    return bench.outcome(part, size, choices.steps, folder, fitted, validation, unseen, preparing, drawn)
+    return judged(bench, part, size, choices.steps, folder, fitted, validation, unseen, preparing, drawn)
 
 
 @click.command()

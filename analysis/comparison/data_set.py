@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,13 +11,14 @@ from lightpage.calibration.calibrate import calibrate
 from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.calibration.known_pages import known_pages
 from lightpage.cli.progress_bar import percent_bar
-from lightpage.device.profile import Profile
+from lightpage.device.profile import Profile, parse_profile
 from lightpage.device.state import Device, Sensor
+from lightpage.errors import InvalidInputError
 from lightpage.recording.reader import Recording, hash_frames
 from lightpage.simulator.recording_job import RecordingJob
 from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
 from lightpage.train.models.twin import RayTwin, TorchTwin
-from lightpage.train.runs import begin
+from lightpage.train.runs import BEGUN, begin
 
 LEVELS = 256
 CALIBRATED = 2
@@ -41,6 +43,33 @@ def data_set_name(device: Device, symbol_size_px: int, apart: str = "") -> str:
     return f"{geometry.pipe_angle_deg:g}deg-{sensor.full_well_e:g}e-{symbol_size_px}px{dimmed}{apart}"
 
 
+def data_set_of(kept: Path) -> tuple[Profile, Device, int]:
+    """Profile, true device and seed of a kept data set.
+
+    Raises:
+        InvalidInputError: nothing is kept there.
+    """
+    try:
+        begun = json.loads((kept / BEGUN).read_text())
+        profile = parse_profile(begun["--profile"], f"{kept / BEGUN}: profile")
+        return profile, Device.model_validate(begun["device"]), int(begun["--seed"])
+    except KeyError as error:
+        expected = "that of a data set, as analysis/weights has them"
+        raise InvalidInputError(f"{kept / BEGUN}", f"no key {error}", expected) from None
+    except (OSError, ValueError) as error:
+        raise InvalidInputError(f"--kept {kept}", error, f"the folder of a kept data set with its {BEGUN}") from None
+
+
+def simulate(
+    out: Path, profile: Profile, device: Device, pages: int, seed: int, levels: int = LEVELS, *, truth: bool = False
+) -> None:
+    """Simulate a recording of random symbols; one that is there stays."""
+    if not out.exists():
+        job = RecordingJob(profile, device, levels, seed, truth, out)
+        job.claim(force=False)
+        job.run(pages)
+
+
 @contextmanager
 def recorded(
     profile: Profile, device: Device, pages: int, seed: int, folder: Path, levels: int = LEVELS
@@ -49,9 +78,6 @@ def recorded(
     folder.mkdir(parents=True, exist_ok=True)
     begin(folder, {"--profile": profile.to_toml(), "device": device.model_dump(), "--pages": pages, "--seed": seed})
     path = folder / "recording.h5"
-    if not path.exists():
-        job = RecordingJob(profile, device, levels, seed, truth=True, out=path)
-        job.claim(force=False)
-        job.run(CALIBRATED + pages)
+    simulate(path, profile, device, CALIBRATED + pages, seed, levels, truth=True)
     with Recording.open(path) as recording:
         yield recording

@@ -25,10 +25,12 @@ from typing import Any
 
 import click
 
-from analysis.comparison.bench import METHODS, ORACLE, Bench
 from analysis.comparison.data_set import data_set_name, recorded
 from analysis.comparison.decoders_figure import draw, title
 from analysis.comparison.levels import LEVEL_HEADER
+from analysis.comparison.methods.bench import ORACLE, Bench
+from analysis.comparison.methods.published import published_method
+from analysis.comparison.methods.symbols import SYMBOL_METHODS, symbol_method
 from analysis.comparison.outcome import FOOTNOTE, HEADER, Outcome
 from analysis.comparison.weight_store import TRAINED, WeightStore
 from lightpage.cli.main import run
@@ -55,6 +57,7 @@ class Size(click.ParamType[str]):
         return value
 
 
+METHODS = (*PUBLISHED, *SYMBOL_METHODS)
 DEFAULT_SIZE = f"{Hyperparameters.channels}x{Hyperparameters.blocks}x{Hyperparameters.depth}"
 
 
@@ -167,11 +170,11 @@ def main(
                     authors = replace(published_choices(name, profile, len(bench.training)), seed=seed)
                     authors = authors if published_steps is None else replace(authors, steps=published_steps)
                     widths = [replace(authors, channels=(width, 2 * width)) for width in published_channels]
-                    runs += [partial(bench.published_method, name, choices) for choices in widths]
+                    runs += [partial(published_method, bench, name, choices) for choices in widths]
                 else:
                     common = Hyperparameters(steps=steps, seed=seed, refinements=refinements)
                     own = sizes[:1] if name == FAST else sizes  # whose size is fixed
-                    runs += [partial(bench.symbol_method, name, size, common) for size in own]
+                    runs += [partial(symbol_method, bench, name, size, common) for size in own]
             outcomes: list[Outcome] = []
             data_set: dict[str, Any] = {}
             for run in runs:

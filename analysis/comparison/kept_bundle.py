@@ -8,64 +8,29 @@ concentrations are.
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 
 import click
-import numpy as np
-import torch
 
-from analysis.comparison.data_set import CALIBRATED
+from analysis.comparison.data_set import CALIBRATED, data_set_of, simulate
+from analysis.comparison.kept_decoder import kappa_scale, kept_decoder, validation_air
 from analysis.comparison.weight_store import CALIBRATION
-from lightpage.calibration.calibrated_device import CalibratedDevice
-from lightpage.calibration.document import Calibration, load_calibration
-from lightpage.calibration.known_pages import known_pages
-from lightpage.calibration.sampling_table import sampling_table
+from lightpage.calibration.document import load_calibration
 from lightpage.cli.main import run as run_command
 from lightpage.cli.paths import NewPath, OutputFolder
-from lightpage.device.profile import Profile, parse_profile
-from lightpage.device.state import Device
 from lightpage.errors import InvalidInputError
-from lightpage.export.command import export_run
-from lightpage.export.graph import DecoderGraph, table_tensors
-from lightpage.export.parity import torch_answer
-from lightpage.page.symbols import pilot_mask, symbol_phases
+from lightpage.export.from_run import export_run
+from lightpage.page.symbols import pilot_mask
 from lightpage.recording.reader import Recording, hash_frames
-from lightpage.simulator.recording_job import RecordingJob
-from lightpage.train.data.features import FeatureExtractor
-from lightpage.train.data.known_light import explained
-from lightpage.train.fitting.concentration_scale import calibrating_factor
-from lightpage.train.fitting.fitted import FITTED, FITTED_WEIGHTS
-from lightpage.train.fitting.validation import without_piston
-from lightpage.train.models.decoder import COHERENT, SymbolDecoder
-from lightpage.train.models.hyperparameters import Hyperparameters
+from lightpage.train.fitting.fitted import FITTED
+from lightpage.train.models.decoder import COHERENT
 from lightpage.train.models.presets import FAST
-from lightpage.train.models.twin import RayTwin, TorchTwin
-from lightpage.train.runs import BEGUN, GOLDEN, REFERENCES, Run, renamed, save_arrays, save_weights
-from lightpage.train.trainers.refinement import fit_prediction
+from lightpage.train.runs import GOLDEN, REFERENCES, Run, save_arrays, save_weights
 from lightpage.train.trainers.symbols import MATCHED_PAGES
 
-LEVELS = 256
 JUDGED = 3
 """Pages by which concentrations are calibrated: thousands of symbols each."""
-
-
-def data_set_of(kept: Path) -> tuple[Profile, Device, int]:
-    """Profile, true device and seed of a kept data set.
-
-    Raises:
-        InvalidInputError: nothing is kept there.
-    """
-    try:
-        begun = json.loads((kept / BEGUN).read_text())
-        profile = parse_profile(begun["--profile"], f"{kept / BEGUN}: profile")
-        return profile, Device.model_validate(begun["device"]), int(begun["--seed"])
-    except KeyError as error:
-        expected = "that of a data set, as analysis/weights has them"
-        raise InvalidInputError(f"{kept / BEGUN}", f"no key {error}", expected) from None
-    except (OSError, ValueError) as error:
-        raise InvalidInputError(f"--kept {kept}", error, f"the folder of a kept data set with its {BEGUN}") from None
 
 
 def export_kept(kept: Path, work: Path, out: Path, method: str = COHERENT, refinements: int = 1) -> None:
@@ -89,12 +54,9 @@ def export_kept(kept: Path, work: Path, out: Path, method: str = COHERENT, refin
     work.mkdir(parents=True, exist_ok=True)
     calibration = load_calibration(kept / CALIBRATION)
     path = work / "recording.h5"
-    if not path.exists():
-        job = RecordingJob(profile, device, LEVELS, seed, truth=False, out=path)
-        job.claim(force=False)
-        job.run(CALIBRATED + MATCHED_PAGES + JUDGED)
+    simulate(path, profile, device, CALIBRATED + MATCHED_PAGES + JUDGED, seed)
     with Recording.open(path) as recording:
-        decoder = _decoder(trained, profile, calibration, recording, localizer, refinements)
+        decoder = kept_decoder(trained, profile, calibration, recording, localizer, refinements)
         references, mask = recording.references(), pilot_mask(profile)
         judged = range(CALIBRATED + MATCHED_PAGES, recording.pages)
         run = Run(
@@ -104,8 +66,8 @@ def export_kept(kept: Path, work: Path, out: Path, method: str = COHERENT, refin
             hyperparameters=decoder.choices,
             camera_bit_depth=recording.bit_depth,
             trained_pages=tuple(hash_frames(recording.frames(page)) for page in judged),
-            validation_air=_validation_air(trained, refinements),
-            kappa_scale=_kappa_scale(decoder, profile, calibration, recording, judged),
+            validation_air=validation_air(trained, refinements),
+            kappa_scale=kappa_scale(decoder, profile, calibration, recording, judged),
             seconds=0.0,
             provenance={"command": f"python -m analysis.comparison.kept_bundle --kept {kept.name}", "seed": seed},
         )
@@ -118,51 +80,6 @@ def export_kept(kept: Path, work: Path, out: Path, method: str = COHERENT, refin
         save_arrays(work / GOLDEN, {"in_phase": golden.in_phase, "quadrature": golden.quadrature})
     run.save(work)
     export_run(work, out, name=kept.name, version="kept")
-
-
-def _decoder(
-    trained: Path, profile: Profile, calibration: Calibration, recording: Recording, localizer: str, refinements: int
-) -> SymbolDecoder:
-    """The trained decoder, put together as training does it."""
-    begun = renamed(json.loads((trained / BEGUN).read_text()))
-    options = {name: value for name, value in begun.items() if name != "format"} | {"refinements": refinements}
-    choices = Hyperparameters(**options)
-    decoder = SymbolDecoder(profile, calibration.vector, localizer, choices)
-    decoder.network.load_state_dict(_weights(trained))
-    if refinements:
-        extractor = FeatureExtractor(CalibratedDevice.of(profile, calibration, recording.references()), localizer)
-        pages = known_pages(recording, profile, range(CALIBRATED, CALIBRATED + MATCHED_PAGES))
-        decoder.prediction = fit_prediction(extractor, explained(extractor, pages))
-        decoder.refiners[0].load_state_dict(_weights(trained / "refinement-1"))
-    return decoder.float().eval()
-
-
-def _weights(folder: Path) -> dict[str, torch.Tensor]:
-    kept: dict[str, torch.Tensor] = torch.load(folder / FITTED_WEIGHTS, map_location="cpu", weights_only=True)
-    return kept
-
-
-def _validation_air(trained: Path, refinements: int) -> float:
-    folder = trained / f"refinement-{refinements}" if refinements else trained
-    return float(json.loads((folder / FITTED).read_text())["validation_air"])
-
-
-def _kappa_scale(
-    decoder: SymbolDecoder, profile: Profile, calibration: Calibration, recording: Recording, pages: range
-) -> float:
-    """Factor on p under which pages are most likely, their piston off."""
-    table = sampling_table(TorchTwin(RayTwin(profile)), calibration.vector, calibration.turn_rad, profile)
-    graph = DecoderGraph(profile, decoder, 1.0).eval()
-    tensors = table_tensors(graph, table, recording.references())
-    mask, shown, truths = pilot_mask(profile), [], []
-    for page in pages:
-        symbols = recording.symbols(page)
-        assert symbols is not None
-        truth = symbol_phases(symbols, LEVELS).astype(np.float32)
-        p = torch_answer(graph, recording.frames(page), tensors)["p"]
-        shown.append(without_piston(p, truth, mask)[:, ~mask])
-        truths.append(truth[~mask])
-    return calibrating_factor(np.concatenate(shown, axis=1), np.concatenate(truths))
 
 
 @click.command()

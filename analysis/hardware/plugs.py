@@ -19,7 +19,7 @@ from typing import Any
 
 import click
 
-from analysis.hardware.pairs import Stage, small_cameras, source_of
+from analysis.hardware.faulty_chain import Stage, numbers_shown, small_cameras, source_of
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.errors import LostShotError, SourceError
@@ -70,8 +70,7 @@ def unplugged(
         except LostShotError as error:
             lost[error.reason.value] += 1
         else:
-            seen = {int(frame[0, 0]) | int(frame[0, 1]) << 8 for frame in (pair.in_phase, pair.quadrature)}
-            wrong += seen != {page}
+            wrong += numbers_shown(pair) != [page, page]
             timer.join()
             back.append(time.monotonic() - plugged[0])
         timer.join()

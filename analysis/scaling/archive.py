@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from analysis.comparison.kept_bundle import data_set_of
+from analysis.comparison.data_set import data_set_of
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device
 from lightpage.page.symbols import random_symbols

@@ -16,49 +16,30 @@ import json
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 import click
-import h5py
-import numpy as np
 
-from analysis.comparison.kept_bundle import data_set_of, export_kept
-from analysis.hardware.drifting import TrueTable, Truth, direction, moved
+from analysis.comparison.data_set import data_set_of
+from analysis.comparison.kept_bundle import export_kept
 from analysis.hardware.rows import append_row, kept_rows
+from analysis.scaling.fleet_device import NOISE, POISONED, FleetDevice
 from lightpage.cli.main import EXIT_AGAIN, EXIT_ERROR
 from lightpage.cli.main import run as run_command
 from lightpage.cli.paths import OutputFile, OutputFolder
-from lightpage.device.profile import Profile, load_profile
+from lightpage.device.profile import load_profile
 from lightpage.device.state import Device
-from lightpage.errors import LightpageError
 from lightpage.files import write_json
 from lightpage.helper_process import same_packages
-from lightpage.page.pilots import Pilots
 from lightpage.progress import track
-from lightpage.recording.reader import Recording
-from lightpage.runtime.archives.recordings.coded_pages import air_bits
 from lightpage.runtime.archives.run.totals import DeviceState
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.model.decoding.image_tracker import tracker_for
-from lightpage.simulator.recording_job import RecordingJob
-from lightpage.simulator.simulator import Simulator
-
-LEVELS = 256
-KNOWN, HELD_OUT = 3, 5
-"""Pages of a device: known ones to recalibrate with, and others to measure on."""
 
 DEEP_KNOWN = 40
 """Known pages of a device that is trained on."""
-
-UNITS = 2.0, 8.0
-"""Least and most that a device has drifted, see `analysis.hardware.drifting.UNITS`."""
-
-IMAGE_PX = 4.0
-"""The most that its image has moved along an axis, camera pixels."""
 
 WANTED = 0.98
 """AIR of a recalibrated device over that of the same network with the true table."""
@@ -67,102 +48,9 @@ KEPT = Path(__file__).parents[1] / "weights" / "bench" / "-0.6deg-32e-4px"
 """Data set of the kept network that is trained on."""
 
 LIMIT_S = 24 * 3600.0
-_POISONED, _NOISE = "poisoned", "noise"
 
 
-@dataclass(frozen=True)
-class Simulated:
-    """A device of the fleet.
-
-    Attributes:
-        name: of it.
-        seed: of its drift, pages and noise.
-        profile: the nominal device.
-        before: its state as its bundle has it.
-        folder: of its recordings.
-        known: how many known pages it has.
-    """
-
-    name: str
-    seed: int
-    profile: Profile
-    before: Device
-    folder: Path
-    known: int = KNOWN
-
-    @property
-    def state(self) -> Device:
-        """What it is now."""
-        rng = np.random.default_rng([self.seed, 2])
-        drifted = moved(self.before, direction(self.seed) * rng.uniform(*UNITS))
-        shifts = zip("xy", rng.uniform(-IMAGE_PX, IMAGE_PX, 2), strict=True)
-        data = drifted.model_dump()
-        settings = [
-            f"{camera}.shift_{axis}_px={float(data[camera][f'shift_{axis}_px']) + float(by)!r}"
-            for axis, by in shifts
-            for camera in ("in_phase_camera", "quadrature_camera")
-        ]
-        return drifted.with_settings(settings)
-
-    @property
-    def recording(self) -> Path:
-        """Its known pages."""
-        return self.folder / f"{self.name}.h5"
-
-    @property
-    def held_out(self) -> Path:
-        """Its other pages, with what only a simulator knows."""
-        return self.folder / f"{self.name}-held-out.h5"
-
-    def make(self) -> None:
-        """Simulate what is missing; a poisoned device and noise are spoilt before they get their names."""
-        for path, pages, seed in (
-            (self.recording, self.known, 2 * self.seed),
-            (self.held_out, HELD_OUT, 2 * self.seed + 1),
-        ):
-            if path.exists():
-                continue
-            begun = path.with_name(f"{path.stem}-begun.h5")
-            if not begun.exists():
-                job = RecordingJob(self.profile, self.state, LEVELS, seed, path == self.held_out, begun)
-                job.claim(force=False)
-                job.run(pages)
-            with h5py.File(str(begun), "r+") as file:
-                if self.name == _POISONED:
-                    file["symbols"][:] = np.roll(file["symbols"][()], 1, axis=0)
-                elif self.name == _NOISE:
-                    rng = np.random.default_rng(self.seed)
-                    for name in ("in_phase", "quadrature"):
-                        file[name][:] = rng.integers(0, 128, file[name].shape, np.uint8)
-            begun.rename(path)
-
-    def air(self, old: Decoder, bundles: dict[str, str]) -> dict[str, Any]:
-        """Mean AIR of its held-out pages by bundle, bits a symbol; `true` is the old network with the true table."""
-        decoders = {"before": old} | {name: Decoder.load(path, old.threads) for name, path in bundles.items()}
-        true = TrueTable(old)
-        airs: dict[str, list[float]] = {"true": []}
-        with Recording.open(self.held_out) as recording, h5py.File(str(self.held_out), "r") as file:
-            shifts = file["truth/shift_px"][()]
-            simulator = Simulator(self.profile, self.state, LEVELS, 2 * self.seed + 1)
-            shown = [recording.shown(page) for page in range(recording.pages)]
-            for (pair, symbols), (x, y) in zip(shown, shifts, strict=True):
-                assert symbols is not None  # it has been simulated
-                truth = Truth(symbols, pair, self.state, (float(x), float(y)), simulator.references)
-                airs["true"].append(true.air(truth, LEVELS))
-            for name, decoder in decoders.items():
-                tracker, airs[name] = tracker_for(decoder), []
-                for pair, symbols in shown:
-                    assert symbols is not None
-                    pilots = Pilots.of_symbols(decoder.bundle.pilot_mask, symbols, LEVELS)
-                    try:
-                        page = tracker.decode(pair, LEVELS, pilots)
-                        airs[name].append(air_bits(page, symbols, ~decoder.bundle.pilot_mask, LEVELS))
-                    except LightpageError:
-                        airs[name].append(0.0)
-        return {name: fmean(values) for name, values in airs.items()}
-
-
-def fleet_file(path: Path, devices: Sequence[Simulated], bundle: Path, run: Path | None = None) -> Path:
+def fleet_file(path: Path, devices: Sequence[FleetDevice], bundle: Path, run: Path | None = None) -> Path:
     """Write the file that names the devices."""
     tables = []
     for device in devices:
@@ -192,7 +80,7 @@ def recalibrated(folder: Path, fleet: Path, options: Sequence[str], threads: int
 
 
 def measured(
-    devices: Sequence[Simulated], made: dict[str, dict[str, str]], old: Decoder, kept: Path
+    devices: Sequence[FleetDevice], made: dict[str, dict[str, str]], old: Decoder, kept: Path
 ) -> list[dict[str, Any]]:
     """A row for each device that has new bundles, from its file where it is there."""
     rows = {row["device"]: row for row in kept_rows(kept)}
@@ -211,8 +99,8 @@ def _bundles(rows: Sequence[dict[str, Any]], form: str) -> dict[str, dict[str, s
 def quick(devices: int, out: Path, workers: int, threads: int) -> dict[str, Any]:
     """The quick form on the whole fleet."""
     profile = load_profile("bench")
-    names = [*(f"device-{number:02}" for number in range(1, devices - 1)), _POISONED, _NOISE]
-    fleet = [Simulated(name, 100 + number, profile, Device(), out) for number, name in enumerate(names)]
+    names = [*(f"device-{number:02}" for number in range(1, devices - 1)), POISONED, NOISE]
+    fleet = [FleetDevice(name, 100 + number, profile, Device(), out) for number, name in enumerate(names)]
     for device in track(fleet, "simulate", unit="device"):
         device.make()
     bundle = bundle_path(DEFAULT)
@@ -237,7 +125,8 @@ def deep(devices: int, steps: int, out: Path, threads: int) -> dict[str, Any]:
     if not bundle.exists():
         export_kept(KEPT, run, bundle)
     fleet = [
-        Simulated(f"deep-{number}", 500 + number, profile, before, out, DEEP_KNOWN) for number in range(1, devices + 1)
+        FleetDevice(f"deep-{number}", 500 + number, profile, before, out, DEEP_KNOWN)
+        for number in range(1, devices + 1)
     ]
     for device in track(fleet, "simulate", unit="device"):
         device.make()

@@ -25,7 +25,7 @@ from analysis.scaling.processes import children
 from analysis.service.running import until
 from lightpage.cli.main import run as run_command
 from lightpage.cli.paths import OutputFile, OutputFolder
-from lightpage.demo.demo import drifted
+from lightpage.demo.drift import drifted
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device
 from lightpage.errors import InvalidInputError

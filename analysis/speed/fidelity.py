@@ -19,8 +19,9 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.comparison.kept_bundle import LEVELS, data_set_of, export_kept
-from analysis.speed.speed import opened, seconds_of
+from analysis.comparison.data_set import data_set_of, simulate
+from analysis.comparison.kept_bundle import export_kept
+from analysis.speed.decode_time import opened, seconds_of
 from lightpage.calibration.sampling_table import sampling_table
 from lightpage.cli.main import run as run_command
 from lightpage.cli.paths import OutputFolder
@@ -35,7 +36,6 @@ from lightpage.recording.reader import Recording
 from lightpage.runtime.model.decoding.decoder import PAGE_INPUTS, Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.execution.cpus import available_cpus
-from lightpage.simulator.recording_job import RecordingJob
 from lightpage.train.models.decoder import SymbolDecoder
 from lightpage.train.models.prediction import Prediction
 from lightpage.train.models.twin import RayTwin, TorchTwin
@@ -171,10 +171,7 @@ def main(kept: Path, pages: int, repeats: int, out: Path) -> None:
         export_kept(kept, work, bundle)
     models, half = graphs(work)
     shown = work / f"pages-{pages}.h5"
-    if not shown.exists():
-        job = RecordingJob(profile, device, LEVELS, _SEED, truth=False, out=shown)
-        job.claim(force=False)
-        job.run(pages)
+    simulate(shown, profile, device, pages, _SEED)
     with Recording.open(shown) as recording:
         forms = measured(Decoder.load(bundle), models, half, recording, repeats, name_of((EXACT, ROUGH)))
     click.echo(f"{'to the cameras; back':<28} {'AIR':>7} {'ms':>8} {'p off, p99':>11}")

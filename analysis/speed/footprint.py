@@ -20,8 +20,8 @@ import click
 import numpy as np
 
 from analysis.speed.footprint_process import Taken
-from analysis.speed.speed import OWN
 from analysis.speed.untrained import Seen, recorded, simulated, untrained_bundle
+from analysis.speed.untrained_graphs import OWN
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import Profile, load_profile
@@ -103,7 +103,7 @@ def footprint(name: str, profile: Profile, seen: Seen, pages: int, threads: int)
     """Make, weigh and measure the bundle of one decoder.
 
     Args:
-        name: one of `analysis.speed.speed.OWN`.
+        name: one of `analysis.speed.untrained_graphs.OWN`.
         profile: the nominal device.
         seen: what its cameras saw.
         pages: to decode.

@@ -22,7 +22,7 @@ import click
 import onnx
 from onnx import helper, shape_inference
 
-from analysis.speed.speed import makers_of
+from analysis.speed.untrained_graphs import makers_of
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import Profile, load_profile

@@ -14,7 +14,8 @@ from pathlib import Path
 import click
 import numpy as np
 
-from analysis.speed.speed import frames_of, makers, makers_of, opened, seconds_of
+from analysis.speed.decode_time import frames_of, opened, seconds_of
+from analysis.speed.untrained_graphs import makers, makers_of
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import load_profile

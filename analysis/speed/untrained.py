@@ -14,7 +14,7 @@ from lightpage.calibration.document import Calibration
 from lightpage.calibration.parameters import NAMES
 from lightpage.device.profile import Profile
 from lightpage.device.state import Device
-from lightpage.export.command import export_run
+from lightpage.export.from_run import export_run
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.page.symbols import pilot_mask, random_symbols
 from lightpage.recording.frame_pair import FramePair

@@ -2,50 +2,32 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import nn
-from torch.utils.data import Dataset
 
-from lightpage.errors import InvalidInputError, RecordingError
+from lightpage.errors import InvalidInputError
 from lightpage.metrics.accumulator import Accumulator
 from lightpage.metrics.information import decide
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.reader import Recording, page_hashes
 from lightpage.report.contents.data import Golden, Rays, ReportData
+from lightpage.report.contents.run_pages import decodable, passes_of
 from lightpage.report.words import how_long
-from lightpage.train.data.feature_store import FeatureStore
-from lightpage.train.data.features import PageState
-from lightpage.train.data.pages import Page
 from lightpage.train.fitting.concentration_scale import decode_pages
 from lightpage.train.fitting.curves import Curve, curves_of
 from lightpage.train.fitting.fitted import fitted_curves
-from lightpage.train.fitting.modules import DecoderTraining, SymbolTraining
+from lightpage.train.fitting.modules import DecoderTraining
 from lightpage.train.fitting.validation import without_piston
-from lightpage.train.models.network import Refiner, SymbolUNet
 from lightpage.train.published.localizers import RayLocalizer
-from lightpage.train.published.trainer import published_decoder
-from lightpage.train.published.training import FramePages, PublishedChoices, PublishedTraining
-from lightpage.train.runs import GOLDEN, REFERENCES, Run, load_arrays, load_decoder, load_run, load_weights
+from lightpage.train.published.training import PublishedChoices
+from lightpage.train.runs import GOLDEN, REFERENCES, Run, load_arrays, load_run
 
 _PHASE_TOLERANCE = 1e-2
 """Of a level: phases are kept in float32, which knows 2 pi to 1e-5 of 256 levels."""
-
-
-class _Decodable(NamedTuple):
-    """What decodes the validation pages as it takes them, and how many parameters the whole decoder has."""
-
-    module: DecoderTraining[Any]
-    pages: Dataset[Page]
-    parameters: int
 
 
 def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportData:
@@ -60,9 +42,9 @@ def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportDat
     """
     run, kept = load_run(folder), load_arrays(folder / REFERENCES)
     mask = kept["pilots"]
-    with _decodable(folder, run, kept, recording_path) as decodable:
-        module = decodable.module
-        outputs, phases = decode_pages(module.eval(), decodable.pages)
+    with decodable(folder, run, kept, recording_path) as decoded:
+        module = decoded.module
+        outputs, phases = decode_pages(module.eval(), decoded.pages)
     levels = levels_of(phases)
     p = np.stack([without_piston(run.kappa_scale * o, t, mask) for o, t in zip(outputs, phases, strict=True)])
     symbols = decide(phases[:, ~mask], levels)
@@ -76,7 +58,7 @@ def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportDat
         pages=f"All figures are of the validation pages of this run ({len(p)}). No weights were fitted to them, but "
         "which weights were kept and how their concentrations are scaled was chosen by them: they are no held-out "
         "test. For that, make the report of an evaluation.",
-        facts=_facts(run, decodable.parameters),
+        facts=_facts(run, decoded.parameters),
         profile=run.profile,
         calibration=run.calibration,
         rays=_rays(run, module),
@@ -89,90 +71,10 @@ def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportDat
     )
 
 
-@contextmanager
-def _decodable(
-    folder: Path, run: Run, kept: dict[str, NDArray[Any]], recording_path: Path | None
-) -> Iterator[_Decodable]:
-    """The trained decoder and the validation pages, as long as the recording is open."""
-    choices = run.hyperparameters
-    if recording_path is None:
-        if isinstance(choices, PublishedChoices):
-            expected = f"the recording of the run: its decoder, {run.localizer}, reads camera frames"
-            raise InvalidInputError("--recording", "none", expected)
-        yield _at_symbol_pitch(folder, run, kept)
-        return
-    with Recording.open(recording_path) as recording:
-        validation = validation_pages(run, recording)
-        if not isinstance(choices, PublishedChoices):
-            yield _at_symbol_pitch(folder, run, kept)
-            return
-        references = FramePair(kept["in_phase"], kept["quadrature"])
-        decoder = published_decoder(run.localizer, choices, run.profile, references, run.calibration.turn_rad)
-        module = PublishedTraining(load_weights(folder, decoder), choices, kept["pilots"], recording.levels)
-        yield _Decodable(module, FramePages(recording, validation, _states(folder, run)), _size(decoder))
-
-
-def _at_symbol_pitch(folder: Path, run: Run, kept: dict[str, NDArray[Any]]) -> _Decodable:
-    first, validated, _ = run.pages
-    choices = run.hyperparameters
-    assert not isinstance(choices, PublishedChoices)
-    try:
-        store = FeatureStore(_passes(folder, run)[-1] / "features", range(first, first + validated))
-        _ = store[0]
-    except (OSError, ValueError, IndexError) as error:
-        raise InvalidInputError(f"run {folder}: features", error, "the features that training left there") from None
-    decoder = load_decoder(folder, run)
-    network = decoder.refiners[-1] if choices.refinements else decoder.network
-    assert isinstance(network, SymbolUNet | Refiner)
-    size = _size(decoder.network) + _size(decoder.refiners)
-    return _Decodable(SymbolTraining(network, choices, kept["pilots"], MAX_LEVELS), store, size)
-
-
-def _passes(folder: Path, run: Run) -> list[Path]:
-    """Folders of all that was trained, one pass behind the other."""
-    choices = run.hyperparameters
-    again = 0 if isinstance(choices, PublishedChoices) else choices.refinements
-    return [folder, *(folder / f"refinement-{number}" for number in range(1, again + 1))]
-
-
 def _curves(folder: Path, run: Run) -> list[dict[str, Curve]]:
     """Those of each pass; none unless they were kept for all."""
-    found = [curves_of(at) or fitted_curves(at) for at in _passes(folder, run)]
+    found = [curves_of(at) or fitted_curves(at) for at in passes_of(folder, run)]
     return found if all(found) else []
-
-
-def _size(network: nn.Module) -> int:
-    return sum(parameter.numel() for parameter in network.parameters())
-
-
-def validation_pages(run: Run, recording: Recording) -> list[int]:
-    """Where the validation pages of a run lie in its recording.
-
-    Raises:
-        RecordingError: it is not that recording.
-    """
-    recording.check_against(run.profile)
-    subject = f"recording {recording.path}"
-    if not recording.has_symbols:
-        raise RecordingError(subject, "no symbols", "the recording that the run was trained on")
-    expected = run.trained_pages[run.pages[0] :]
-    found: dict[str, int] = {}
-    for page in range(recording.pages):
-        for page_hash in page_hashes(recording.frames(page)):
-            found.setdefault(page_hash, page)
-        if all(page_hash in found for page_hash in expected):
-            return [found[page_hash] for page_hash in expected]
-    there = f"{sum(page_hash in found for page_hash in expected)} of {len(expected)} validation pages"
-    raise RecordingError(subject, there, "the recording that the run was trained on")
-
-
-def _states(folder: Path, run: Run) -> list[PageState]:
-    path = folder / "states.json"
-    try:
-        kept = json.loads(path.read_text())["states"][run.pages[0] :]
-        return [PageState((s["shift_px"][0], s["shift_px"][1]), s["piston_rad"]) for s in kept]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InvalidInputError(f"states {path}", error, "the states of the pages that training left there") from None
 
 
 def levels_of(phases: NDArray[np.floating]) -> int:

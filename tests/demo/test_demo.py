@@ -11,8 +11,11 @@ import pytest
 from click.testing import CliRunner
 
 from lightpage.demo.command import demo
-from lightpage.demo.demo import drifted, pgm, run_demo, summarise
+from lightpage.demo.demo import run_demo
+from lightpage.demo.drift import drifted
+from lightpage.demo.pages import pgm
 from lightpage.demo.picture import picture
+from lightpage.demo.reading import summarise
 from lightpage.device.state import Device
 from lightpage.errors import BundleError, CalibrationError, InvalidInputError
 from lightpage.page.symbols import pilot_mask, symbol_phases
@@ -71,8 +74,9 @@ def test_a_picture_is_lost_by_drift_and_won_back_with_the_shipped_bundle(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     small = picture()[:ROWS]
-    for name, value in {"picture": lambda: small, "DRIFT_STEPS": (0.3,), "GROUPS": 1, "PARITY_PAGES": 1}.items():
-        monkeypatch.setattr(f"lightpage.demo.demo.{name}", value)
+    shorter = {"demo.picture": lambda: small, "drift.DRIFT_STEPS": (0.3,), "pages.GROUPS": 1, "pages.PARITY_PAGES": 1}
+    for name, value in shorter.items():
+        monkeypatch.setattr(f"lightpage.demo.{name}", value)
     result = CliRunner().invoke(demo, ["--out", str(tmp_path)], standalone_mode=False, catch_exceptions=False)
     assert result.exception is None
     figures = json.loads((tmp_path / "demo.json").read_text())

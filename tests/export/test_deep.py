@@ -60,7 +60,7 @@ def test_a_device_without_what_it_needs_is_told(tmp_path: Path) -> None:
 def test_a_drifted_device_is_found_trained_on_and_judged_by_pages_of_its_own(
     small_device: list[str], tmp_path: Path
 ) -> None:
-    from lightpage.export.command import export_run
+    from lightpage.export.from_run import export_run
 
     run = tmp_path / "run"
     small = [*small_device, "--channels", "8", "--blocks", "1", "--refinements", "0", "--synthetic-pages", "0"]

@@ -18,7 +18,8 @@ from lightpage.calibration.sampling_table import sampling_table
 from lightpage.device.state import Device
 from lightpage.errors import BundleError, InvalidInputError
 from lightpage.export import command as cli_export
-from lightpage.export.command import export, export_run
+from lightpage.export.command import export
+from lightpage.export.from_run import export_run
 from lightpage.export.graph import TABLE_INPUTS, angle
 from lightpage.export.operators.check import fallbacks, page_part
 from lightpage.export.operators.operator_list import PROVIDERS

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from lightpage.errors import BundleError
-from lightpage.export.command import export_run
+from lightpage.export.from_run import export_run
 from lightpage.recording.reader import Recording
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.known_pages import KnownPages

@@ -10,6 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from analysis.comparison import calibration, decoders
+from analysis.comparison.calibration_bench import Bench, Outcome
 from analysis.comparison.outcome import symbols_by_walls
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.document import Calibration
@@ -68,16 +69,16 @@ def test_calibrations_that_are_done_are_not_done_again_and_what_failed_is(
 ) -> None:
     drawn = list[int]()
 
-    def outcome(bench: calibration.Bench, seed: int) -> calibration.Outcome:
+    def outcome(bench: Bench, seed: int) -> Outcome:
         drawn.append(seed)
         failure = "not found" if drawn.count(6) == 1 and seed == 6 else None
         error = None if failure else 0.001 * seed
-        return calibration.Outcome(seed, -0.6, angle_error_deg=error, seconds=2.0, failure=failure)
+        return Outcome(seed, -0.6, angle_error_deg=error, seconds=2.0, failure=failure)
 
     def run(*words: str) -> None:
         CliRunner().invoke(calibration.main, words, standalone_mode=False, catch_exceptions=False)
 
-    monkeypatch.setattr(calibration.Bench, "own", outcome)
+    monkeypatch.setattr(Bench, "own", outcome)
     path = tmp_path / "F.json"
     for devices, calibrated in (("2", 1), ("3", 3)):
         run("--symbol-size", "2", "--first-seed", "5", "--json", str(path), "--devices", devices)

@@ -1,0 +1,1 @@
+"""Methods of the comparison: each is trained on the same pages and judged by the same ones."""

@@ -1,0 +1,158 @@
+"""A service and its drifting device through a simulated week."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from analysis.hardware.drifting import DriftingSource, TrueTable, direction, moved
+from analysis.hardware.rows import Rows, append_row, kept_rows
+from analysis.hardware.watched_recalibrator import WatchedRecalibrator
+from lightpage.clock import Clock
+from lightpage.device.state import Device
+from lightpage.errors import FramesDisagreeError, LightpageError, LostPageError
+from lightpage.progress import track
+from lightpage.runtime.archives.recordings.coded_pages import air_bits
+from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.image_tracker import tracker_for
+from lightpage.runtime.service.caller import Caller
+from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.jobs.self_calibration import SelfCalibration, SelfCalibrationSettings
+from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.models.store import ModelStore
+from lightpage.runtime.service.monitoring.flight_recorder import FlightRecorder
+from lightpage.runtime.service.monitoring.monitor import Monitor
+from lightpage.runtime.service.pages.reading import read_page
+
+PAGE_S = 300.0
+"""Simulated time from one page to the next."""
+
+DAY_PAGES = 288.0
+DAILY_UNITS = 0.7
+"""Amplitude of the daily cycle: 0.7 units cost 0.05 bit a symbol, and from evening to morning 0.2 bit, where a page has
+0.13 to spare."""
+
+WARM_UP_UNITS, WARM_UP_PAGES = 3.0, 144.0
+"""Of the warm-up, 0.9 bit in all, and the pages (twelve hours) in which it falls to 1/e."""
+
+KNOCK_SHARE = 0.5
+"""Of the week, when somebody knocks against the table."""
+KNOCK_PX, KNOCK_DEG = (2.0, -2.0), 0.02
+"""Shift of the image on both cameras, and turn of the pipe."""
+
+CALIBRATION_PAGES = (1_000_000, 1_000_001)
+"""Numbers of the fully known pages, which nobody else reads."""
+
+
+def state(moment: float, pages: int) -> Device:
+    """The true device at a time of a week of `pages`, in pages: it was calibrated cold, at its beginning."""
+    day = np.sin(2 * np.pi * moment / DAY_PAGES)
+    warm_up = 1 - np.exp(-moment / WARM_UP_PAGES)
+    device = moved(Device(), WARM_UP_UNITS * warm_up * direction(1) + DAILY_UNITS * day * direction(2))
+    if moment < KNOCK_SHARE * pages:
+        return device
+    angle = device.geometry.pipe_angle_deg + KNOCK_DEG
+    return device.model_copy(update={"geometry": device.geometry.model_copy(update={"pipe_angle_deg": angle})})
+
+
+class SimulatedClock(Clock):
+    """The seconds of a week that is simulated; what waits by it waits real ones."""
+
+    def __init__(self, week: Week) -> None:
+        self._week = week
+
+    def now(self) -> float:
+        """Return the simulated seconds."""
+        return self._week.moment * PAGE_S
+
+
+@dataclass
+class Week:
+    """A service and its device through a week.
+
+    Args:
+        out: where models, frames and rows are kept.
+        pages: of the week.
+        pages_during: that are read while a recalibration runs, at most.
+        threads: of an inference.
+    """
+
+    out: Path
+    pages: int
+    pages_during: int
+    threads: int | None
+    rows: Rows = field(default_factory=list)
+    moment: int = 0
+
+    def read_until(self, end: int) -> None:
+        """Read the pages before number `end` that are not kept yet."""
+        path = self.out / "rows.jsonl"
+        self.rows = kept_rows(path)
+        base = Decoder.load(bundle_path(DEFAULT), self.threads)
+        store = ModelStore(self.out / "models", base.bundle)
+        registry = ModelRegistry(base, tracker_for)
+        note = store.read()
+        if (last := note.history[note.cursor]) is not None:
+            registry.swap(Decoder.load(store.folder / last, self.threads))
+        source = DriftingSource(base, lambda moment: state(moment, self.pages), seed=7)
+        knock = int(KNOCK_SHARE * self.pages)
+        if self.rows:
+            source.skip(int(self.rows[-1]["shots"]))
+            if self.rows[-1]["page"] >= knock:
+                source.knock(KNOCK_PX)
+        true_table, monitor = TrueTable(base), Monitor()
+        with ExitStack() as stack:
+            recorder = stack.enter_context(FlightRecorder(self.out / "flight", registry, monitor=monitor))
+            plane = DataPlane(registry, source, store, observers=[recorder], monitor=monitor)
+            watched = WatchedRecalibrator(plane)
+            stack.callback(watched.close)
+            settings = SelfCalibrationSettings(CALIBRATION_PAGES, busy_s=0.05)
+            stack.enter_context(SelfCalibration(plane, monitor, watched, settings, SimulatedClock(self)))
+            begun = len(self.rows)
+            numbers = track(range(begun, end), "week", total=end, done=begun)
+            for number in numbers:
+                self.moment = number
+                source.moment = float(number)
+                if number == knock:
+                    source.knock(KNOCK_PX)
+                row = self._read(number, plane, monitor, source, true_table)
+                row |= {"restarted": number == begun > 0, "during": watched.running, "ended": watched.ended()}
+                self.rows.append(row)
+                append_row(path, row)
+                watched.settle(monitor, self.pages_during)
+
+    def _read(
+        self, number: int, plane: DataPlane, monitor: Monitor, source: DriftingSource, true_table: TrueTable
+    ) -> dict[str, Any]:
+        """Read a page; what it was like, and what it would have been like with the true table."""
+        row: dict[str, Any] = {"page": number, "air": 0.0, "margin": None, "shift_px": None, "failed": False}
+        before = plane.registry.current.version
+        try:
+            found = read_page(plane, number, None, Caller(), user_data=True)
+        except LightpageError as error:
+            disagree = isinstance(error.__cause__, FramesDisagreeError)
+            failed = not (isinstance(error, LostPageError) or disagree)
+            row |= {"lost": type(error).__name__, "failed": failed, "version": before}
+        else:
+            answer, symbols = found.answer, source.truth(number).symbols
+            data, page = answer.user_data, answer.page
+            assert data is not None  # asked for
+            row |= {
+                "air": air_bits(page, symbols, true_table.data, source.levels),
+                "margin": data.margin_bits,
+                "lost": "" if data.loss is None else data.loss.value,
+                "version": answer.model_version,
+                "shift_px": None if page.image is None else [page.image.shift_x_px, page.image.shift_y_px],
+            }
+        row |= {
+            "true_air": true_table.air(source.truth(number), source.levels),
+            "due": monitor.due,
+            "reasons": list(monitor.state().reasons),
+            "shots": source.shots,
+        }
+        return row

@@ -1,0 +1,90 @@
+"""The simulated device of the demo, and how it drifts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from lightpage.demo.result import DriftStep
+from lightpage.device.profile import Profile
+from lightpage.device.state import CameraPose, Device
+from lightpage.errors import InvalidInputError, LostPageError
+from lightpage.recording.pages import Pages
+from lightpage.runtime.client.client import LightpageClient
+from lightpage.runtime.device.acquisition.page_store import PageStore
+from lightpage.runtime.device.acquisition.simulator import SimulatorSource
+from lightpage.runtime.device.acquisition.source import FrameSource, open_source
+from lightpage.runtime.device.modulator.simulated import SimulatedModulator
+
+DRIFT_STEPS = (0.04, 0.06, 0.08, 0.1, 0.15, 0.3, 1.0)
+"""Of the change of temperature of `drifted`; the first that loses a page ends the drift."""
+
+
+def drifted(device: Device, share: float = 1.0) -> Device:
+    """The device after a change of temperature: more than following the image's shift can make good."""
+
+    def moved(pose: CameraPose) -> CameraPose:
+        return pose.model_copy(
+            update={
+                "scale_relative_error": pose.scale_relative_error + 5e-4 * share,
+                "rotation_deg": pose.rotation_deg + 0.03 * share,
+            }
+        )
+
+    geometry = device.geometry.model_copy(
+        update={
+            "pipe_angle_deg": device.geometry.pipe_angle_deg + 0.03 * share,
+            "focal_length_relative_error": device.geometry.focal_length_relative_error + 3e-4 * share,
+        }
+    )
+    return device.model_copy(
+        update={
+            "geometry": geometry,
+            "in_phase_camera": moved(device.in_phase_camera),
+            "quadrature_camera": moved(device.quadrature_camera),
+        }
+    )
+
+
+def simulated_device(spec: str | None, profile: Profile, pages: Path) -> tuple[FrameSource, Callable[[Device], None]]:
+    """A simulated device that shows these pages, and what lets it drift.
+
+    Args:
+        spec: ``camera:DEVICE.toml`` of a simulated device that runs as hardware; None for one in this process.
+        profile: nominal.
+        pages: file.
+
+    Raises:
+        InvalidInputError: a source that is no simulated device.
+    """
+    if spec is None:
+        simulator = SimulatorSource(profile, Device(), written=Pages.open(pages))
+        return simulator, simulator.set_device
+    source = open_source(spec)
+    modulator = source.modulator
+    if not isinstance(modulator, SimulatedModulator):
+        source.close()
+        raise InvalidInputError(f"source {spec}", "no simulated device", "one of `lightpage virtual-device`")
+    source.show_pages(PageStore(profile, Pages.open(pages)))
+    return source, modulator.drift
+
+
+def drift_until_lost(
+    client: LightpageClient, drift: Callable[[Device], None], told: Callable[[], None]
+) -> tuple[DriftStep, ...]:
+    """Let the device drift in steps, reading one page after each, until that page is lost."""
+    steps: list[DriftStep] = []
+    for share in DRIFT_STEPS:
+        told()
+        drift(drifted(Device(), share))
+        try:
+            page = client.read_page(0, user_data=True)
+        except LostPageError as error:
+            steps.append(DriftStep(share, None, error.recalibration_due, True))
+            break
+        found = page.user_data
+        assert found is not None  # it was asked for
+        steps.append(DriftStep(share, found.margin_bits, page.recalibration_due, found.data is None))
+        if found.data is None:
+            break
+    return tuple(steps)

@@ -1,0 +1,134 @@
+"""What the demo came to: its phases, the drift between them, and the recalibration."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.codec.code import Code
+from lightpage.codec.volume import Volume
+from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.archives.recordings.coded_pages import AIR_LEVELS
+from lightpage.runtime.client.answers import Recalibrated
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Phase:
+    """What was decoded in one state of the device.
+
+    Attributes:
+        name: the state.
+        model_version: the last page's.
+        air: per data symbol, bits, mean over the pages that were decoded, [ny, nx]; not a number at pilots.
+        confidence: mean over them, [ny, nx].
+        symbol_error_rate: of data symbols.
+        seconds: of one decode in the service, median.
+        pages: that were read.
+        unread: of them, how many gave no bytes.
+        restored, lost: pages of the picture that parity gave back, and that are lost.
+        margin_bits: least margin of the pages that gave bytes, bits a symbol; None where none did.
+        picture: as it was read, lost bytes black, [rows, columns].
+        exact: whether it is the picture that was written.
+    """
+
+    name: str
+    model_version: str
+    air: Floats
+    confidence: Floats
+    symbol_error_rate: float
+    seconds: float
+    pages: int = 0
+    unread: int = 0
+    restored: int = 0
+    lost: int = 0
+    margin_bits: float | None = None
+    picture: NDArray[np.uint8] | None = None
+    exact: bool = False
+
+    @property
+    def air_bits_per_symbol(self) -> float:
+        """AIR over all data symbols."""
+        return float(np.nanmean(self.air))
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures under names that other programs read."""
+        return {
+            "name": self.name,
+            "model_version": self.model_version,
+            "air_bits_per_symbol": self.air_bits_per_symbol,
+            "mean_confidence": float(self.confidence.mean()),
+            "symbol_error_rate": self.symbol_error_rate,
+            "seconds_per_page": self.seconds,
+            "pages": self.pages,
+            "pages_unread": self.unread,
+            "pages_restored": self.restored,
+            "pages_lost": self.lost,
+            "margin_bits_least": self.margin_bits,
+            "picture_exact": self.exact,
+        }
+
+
+@dataclass(frozen=True)
+class DriftStep:
+    """What one page told while the device drifted.
+
+    Attributes:
+        share: of the drift of `drifted`.
+        margin_bits: of the page, bits a symbol; None where it was not decoded.
+        recalibration_due: whether its pilots show the drift.
+        lost: whether it gave no bytes.
+    """
+
+    share: float
+    margin_bits: float | None
+    recalibration_due: bool
+    lost: bool
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """All of the demo: three phases, the drift and the recalibration between them, and one frame pair with its page."""
+
+    phases: tuple[Phase, ...]
+    drift: tuple[DriftStep, ...]
+    recalibrated: Recalibrated
+    frames: FramePair
+    symbols: NDArray[np.uint8]
+    code: Code
+    volume: Volume
+    seed: int
+    source: str = ""
+    shots: dict[str, int] = field(default_factory=dict)
+    """Shots of the cameras by how they ended; empty without cameras."""
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures under names that other programs read."""
+        recalibrated = self.recalibrated
+        return {
+            "seed": self.seed,
+            "source": self.source,
+            "shots": self.shots,
+            "pages": self.volume.pages,
+            "levels": self.code.levels,
+            "air_levels": AIR_LEVELS,
+            "code": self.code.model_dump(),
+            "volume": self.volume.to_json(),
+            "phases": [phase.to_json() for phase in self.phases],
+            "drift": [asdict(step) for step in self.drift],
+            "recalibration": {
+                "model_version": recalibrated.model_version,
+                "previous_version": recalibrated.previous_version,
+                "pages_used": recalibrated.pages_used,
+                "seconds": recalibrated.seconds,
+                "angle_deg": recalibrated.angle_deg,
+                "air_before": recalibrated.air_before,
+                "air_after": recalibrated.air_after,
+                "coherence_before": recalibrated.coherence_before,
+                "coherence_after": recalibrated.coherence_after,
+            },
+        }
