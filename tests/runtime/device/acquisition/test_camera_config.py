@@ -12,7 +12,8 @@ from pydantic import BaseModel
 
 from lightpage.device.problems import tables_in, tag_of
 from lightpage.errors import InvalidInputError, LightpageError, SourceError
-from lightpage.runtime.device.acquisition.camera_config import KEYS, DeviceTable, load_device_table, open_camera
+from lightpage.runtime.device.acquisition.camera_config import KEYS, DeviceTable, load_device_table
+from lightpage.runtime.device.acquisition.camera_devices import open_camera
 from lightpage.runtime.device.acquisition.camera_source import CameraSource
 from lightpage.runtime.device.cameras.aravis import AravisCamera
 from lightpage.runtime.device.cameras.gentl import GenTLCamera

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lightpage.errors import InvalidInputError, SourceError
 from lightpage.page.symbols import random_symbols
-from lightpage.runtime.device.acquisition.camera_config import open_camera
+from lightpage.runtime.device.acquisition.camera_devices import open_camera
 from lightpage.runtime.device.modulator.lookup_table import linear_table
 from lightpage.runtime.device.modulator.screen.raster import ScreenSettings
 from lightpage.runtime.device.modulator.screen.screen import ScreenModulator

@@ -12,7 +12,7 @@ import pytest
 from tests.runtime import toy
 from tests.skips import NO_FILTERS
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 SERVE = """
 import builtins, importlib, os, pkgutil, sys
 load, telemetry = builtins.__import__, []

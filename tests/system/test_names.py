@@ -16,7 +16,7 @@ import pytest
 
 from tests.runtime import toy
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = sorted(path.name for path in (ROOT / "lightpage").iterdir() if path.is_symlink())
 """Folders at the top that are linked into the package."""
 CALLERS = (*FOLDERS, "analysis", "release", "tests", "proto", "client", "wire", "errors", "model", "service", "toy")
