@@ -16,16 +16,7 @@ from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.evaluation import check_recording
 from lightpage.runtime.archives.run.job import bundle_sha256
 from lightpage.runtime.archives.run.shard import Findings, ShardRecord
-from lightpage.runtime.archives.run.task import (
-    Done,
-    Failed,
-    NamedBundle,
-    Outcome,
-    Problem,
-    Stamp,
-    Step,
-    Task,
-)
+from lightpage.runtime.archives.run.task import Done, Failed, NamedBundle, Outcome, Problem, Stamp, Step, Task
 from lightpage.runtime.archives.workers.device import recalibrated
 from lightpage.runtime.archives.workers.fine_tuning import DeepRecalibration, deep_recalibration
 from lightpage.runtime.archives.workers.page_range import PageRange, lost_page
@@ -154,10 +145,6 @@ def _recording_of(task: Task) -> Iterator[Recording]:
         joined.unlink(missing_ok=True)
 
 
-class Changed(RecordingError):
-    """A recording that is not the one that the run began with."""
-
-
 def _check_stamp(task: Task) -> None:
     """Check that recordings are those that the run began with.
 
@@ -172,4 +159,4 @@ def _check_stamp(task: Task) -> None:
             raise os_failure(subject, error, "the file that the run began with", RecordingError) from None
         if found != file.stamp:
             expected = f"{file.stamp.size} bytes, changed when the run began: begin another run with the new file"
-            raise Changed(subject, f"{found.size} bytes, changed since", expected)
+            raise RecordingError(subject, f"{found.size} bytes, changed since", expected)

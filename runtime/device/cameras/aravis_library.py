@@ -113,9 +113,7 @@ _PLAIN: Signatures = {
     "g_quark_to_string": (c_char_p, (c_uint32,)),
     "g_error_free": (None, (POINTER(_GError),)),
 }
-_OPTIONAL: Signatures = {
-    "arv_buffer_get_image_padding": (None, (c_void_p, POINTER(c_int), POINTER(c_int))),
-}
+_OPTIONAL: Signatures = {"arv_buffer_get_image_padding": (None, (c_void_p, POINTER(c_int), POINTER(c_int)))}
 """What earlier versions lack."""
 
 

@@ -201,11 +201,7 @@ class ScpiPort:
         path = next((path for path, adapter in adapters.items() if adapter == self._adapter), self._path)
         try:
             self._port = serial.serial_for_url(
-                path,
-                baudrate=self._baud,
-                timeout=_POLL_S,
-                write_timeout=self._times.answer_s,
-                exclusive=alone,
+                path, baudrate=self._baud, timeout=_POLL_S, write_timeout=self._times.answer_s, exclusive=alone
             )
         except ValueError as error:
             raise SourceError(self.name, error, "a serial port or a pyserial URL, and a baud rate") from None

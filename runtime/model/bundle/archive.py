@@ -22,18 +22,16 @@ MAX_FILES = 32
 MAX_BYTES = 1 << 30
 """All files together, unpacked: a full-scale decoder with two float32 reference frames needs about 200 MB."""
 
-_LITTER = frozenset(
-    {
-        "__macosx",
-        "icon\r",
-        "thumbs.db",
-        "desktop.ini",
-        "$recycle.bin",
-        "system volume information",
-        "@eadir",
-        "lost+found",
-    }
-)
+_LITTER = {
+    "__macosx",
+    "icon\r",
+    "thumbs.db",
+    "desktop.ini",
+    "$recycle.bin",
+    "system volume information",
+    "@eadir",
+    "lost+found",
+}
 """Names that systems put beside files, in lower case; names that begin with a dot are litter too."""
 
 _MAX_LITTER = 4 * MAX_FILES

@@ -21,7 +21,7 @@ from lightpage.runtime.model.decoding.image_drift import SHIFT, TILT, BundleSear
 from lightpage.runtime.model.decoding.image_position import ImagePosition
 from lightpage.runtime.model.decoding.page import DecodedPage, Inference, Timings
 from lightpage.runtime.model.decoding.tracking import NoTracker, Tracker, TrackerMemory, confirmed
-from lightpage.runtime.model.execution.twin import TWIN_THREADS, OnnxTwin
+from lightpage.runtime.model.execution.twin import OnnxTwin
 
 Real = NDArray[np.float64]
 
@@ -221,7 +221,7 @@ class ImageTracker:
 
     def refitted(self, decoder: Decoder) -> ImageTracker:
         """See `Tracker`: what drift does to phases is taken to be as before."""
-        twin = OnnxTwin(decoder.bundle, TWIN_THREADS)
+        twin = OnnxTwin(decoder.bundle)
         search = None if self._search is None else BundleSearch(decoder, twin)
         return ImageTracker(decoder, self._model, BundleTables(decoder, twin), search)
 
@@ -379,7 +379,7 @@ def tracker_for(decoder: Decoder, memory: TrackerMemory | None = None) -> Tracke
     """
     if "registration" not in decoder.graph.ports:
         return NoTracker(decoder)
-    twin, search = OnnxTwin(decoder.bundle, TWIN_THREADS), None
+    twin, search = OnnxTwin(decoder.bundle), None
     if FIELD in decoder.bundle.files:
         search = BundleSearch(decoder, twin)
     else:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,15 +22,6 @@ from lightpage.errors import BundleError, ProviderError, SurroundingsError
 from lightpage.failures import short_resource
 from lightpage.runtime.model.execution.cpus import available_cpus
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
-
-
-class Node(Protocol):
-    """An input or output of a graph; `shape` holds a name or None for a free dimension."""
-
-    name: str
-    type: str
-    shape: Sequence[int | str | None]
-
 
 _TYPES = {
     "tensor(float)": "float32",
@@ -51,8 +42,8 @@ class Port:
     shape: tuple[int | None, ...]
 
     @classmethod
-    def of(cls, node: Node) -> Port:
-        """As a session describes it."""
+    def of(cls, node: onnxruntime.NodeArg) -> Port:
+        """As a session describes it; a name or None stands for a free dimension."""
         shape = tuple(size if isinstance(size, int) else None for size in node.shape)
         return cls(_TYPES.get(node.type, node.type), shape)
 
@@ -65,31 +56,7 @@ class Port:
         )
 
 
-class Session(Protocol):
-    """The part of onnxruntime's session that Lightpage uses; `run` may be called from many threads at once."""
-
-    def get_inputs(self) -> Sequence[Node]:
-        """Inputs that must be fed."""
-
-    def get_outputs(self) -> Sequence[Node]:
-        """Outputs."""
-
-    def run(self, output_names: Sequence[str], input_feed: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
-        """Outputs of the names asked for."""
-
-    def io_binding(self) -> Any:
-        """Where one run takes its inputs from and puts its outputs, see `BoundSession`."""
-
-    def run_with_iobinding(self, iobinding: Any) -> None:
-        """One run of what is bound."""
-
-    def get_providers(self) -> Sequence[str]:
-        """Execution providers that it was opened with, the preferred one first."""
-
-    def end_profiling(self) -> str:
-        """Path of the profile, where one is kept, with all runs so far."""
-
-
+Session: TypeAlias = onnxruntime.InferenceSession
 VERSION: str = onnxruntime.__version__
 _USABLE = "a GPU of that number with room for the model, its driver and its libraries"
 _VERSION_DIGITS = 16
@@ -144,9 +111,7 @@ def open_session(
     try:
         with running(subject, provider):
             # by default it would print the cause, and compute elsewhere
-            session: Session = onnxruntime.InferenceSession(
-                model, options, providers=provider.chain(version), enable_fallback=0
-            )
+            session = onnxruntime.InferenceSession(model, options, providers=provider.chain(version), enable_fallback=0)
     except (ProviderError, SurroundingsError):
         raise
     except Exception as error:  # onnxruntime's errors share no base class
@@ -213,7 +178,7 @@ class BoundSession:
     """
 
     def __init__(
-        self, session: Session, provider: Provider, constants: Mapping[str, NDArray[Any]], subject: str = "onnxruntime"
+        self, session: Session, provider: Provider, constants: Mapping[str, NDArray[Any]], subject: str
     ) -> None:
         self.session, self._subject, self._provider = session, subject, provider
         with running(subject, provider):
