@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from functools import cached_property
 
 from lightpage.errors import BundleError, RecordingError, StorageError
-from lightpage.failures import may_pass, os_failure, understood
+from lightpage.failures import may_pass, os_errors, understood
 from lightpage.recording.joined import join
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.evaluation import check_recording
@@ -153,10 +153,8 @@ def _check_stamp(task: Task) -> None:
     """
     for file in task.files:
         subject = f"recording {file.path}"
-        try:
+        with os_errors(subject, "the file that the run began with", RecordingError):
             found = Stamp.of(file.path)
-        except OSError as error:
-            raise os_failure(subject, error, "the file that the run began with", RecordingError) from None
         if found != file.stamp:
             expected = f"{file.stamp.size} bytes, changed when the run began: begin another run with the new file"
             raise RecordingError(subject, f"{found.size} bytes, changed since", expected)

@@ -19,7 +19,7 @@ from lightpage.codec.page_codec import PageCodec
 from lightpage.codec.volume import DATA_PAGES, PARITY_PAGES, Volume, encode_volume
 from lightpage.device.profile import Profile, load_profile
 from lightpage.errors import InvalidInputError
-from lightpage.failures import os_failure
+from lightpage.failures import os_errors
 from lightpage.files import STDOUT, write_json
 from lightpage.page.symbols import pilot_mask, pilot_symbols
 from lightpage.progress import track
@@ -63,15 +63,13 @@ def _opened(file: Path) -> BinaryIO:
     Raises:
         InvalidInputError, StorageError, SurroundingsError: it cannot be read or kept.
     """
-    try:
+    with os_errors(f"file {file}", "a file that can be read"):
         if file != STDOUT:
             return file.open("rb")
         kept = cast(BinaryIO, tempfile.TemporaryFile())  # noqa: SIM115  # the caller closes it
         shutil.copyfileobj(sys.stdin.buffer, kept)
         kept.seek(0)
         return kept
-    except OSError as error:
-        raise os_failure(f"file {file}", error, "a file that can be read") from None
 
 
 @click.command()

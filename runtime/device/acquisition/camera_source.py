@@ -16,7 +16,7 @@ from pydantic import ConfigDict, Field
 
 from lightpage.clock import SYSTEM, Clock
 from lightpage.device.profile import Profile, TomlTable
-from lightpage.errors import LostShotError, Reason, SourceError
+from lightpage.errors import LostShotError, Reason, SourceError, raised_as
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.progress import warn
 from lightpage.recording.alignment import describe, greatest_count, unused_low_bits
@@ -182,12 +182,9 @@ class CameraSource(FrameSource):
 
     def _open_modulator(self) -> None:
         """Connect what shows the pages: settings that are wrong are not to be found after minutes of other shots."""
-        if self.modulator is None:
-            return
-        try:
-            self.modulator.open(SHOT_S, self.pages.levels)
-        except LostShotError as error:
-            raise SourceError(error.subject, error.got, error.expected) from None
+        if self.modulator is not None:
+            with raised_as(SourceError, LostShotError):
+                self.modulator.open(SHOT_S, self.pages.levels)
 
     def _arm(self, device: Camera | Trigger, reason: Reason) -> None:
         """Make one device ready. One that was ready before and cannot be found now has gone, and may come back."""

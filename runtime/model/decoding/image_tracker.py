@@ -174,16 +174,11 @@ class ImageTracker:
         self._decoder, self._model, self._tables, self._search = decoder, model, tables, search
         start = np.diag([SEARCH_ERROR_PX, SEARCH_ERROR_PX, START_TILT, START_TILT]) ** 2
         self._lock = threading.Lock()
-        """Guards the state; never held while anything is computed."""
-        self._state = ImageState(np.zeros(4), start, decoder, {}, np.zeros(2), WALK**2)
-        if memory is not None:
-            self._state = self._remembered(memory)
-
-    @property
-    def state(self) -> ImageState:
+        """Of who replaces the state; never held while anything is computed."""
+        self.state = ImageState(np.zeros(4), start, decoder, {}, np.zeros(2), WALK**2)
         """What the next page is decoded with."""
-        with self._lock:
-            return self._state
+        if memory is not None:
+            self.state = self._remembered(memory)
 
     @property
     def image_px(self) -> tuple[float, float]:
@@ -215,8 +210,8 @@ class ImageTracker:
 
     def fork(self) -> ImageTracker:
         """See `Tracker`."""
-        other = ImageTracker(self._decoder, self._model, self._tables, self._search)
-        other._state = self.state
+        other = self.anew()
+        other.state = self.state
         return other
 
     def refitted(self, decoder: Decoder) -> ImageTracker:
@@ -357,8 +352,8 @@ class ImageTracker:
             after = replace(best.after, settled=True, walk=walk, share=lately)
         after = replace(after, covariance=after.covariance + np.diag(after.walk))
         with self._lock:
-            if self._state is begun:
-                self._state = after
+            if self.state is begun:
+                self.state = after
 
     @staticmethod
     def _around(state: ImageState) -> Real:

@@ -23,15 +23,8 @@ from lightpage.failures import short_resource
 from lightpage.runtime.model.execution.cpus import available_cpus
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
 
-_TYPES = {
-    "tensor(float)": "float32",
-    "tensor(float16)": "float16",
-    "tensor(double)": "float64",
-    "tensor(int32)": "int32",
-    "tensor(int64)": "int64",
-    "tensor(uint8)": "uint8",
-    "tensor(uint16)": "uint16",
-}
+_NUMPY_NAMES = {"float": "float32", "double": "float64"}
+"""Of the types whose names differ in ONNX."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +38,8 @@ class Port:
     def of(cls, node: onnxruntime.NodeArg) -> Port:
         """As a session describes it; a name or None stands for a free dimension."""
         shape = tuple(size if isinstance(size, int) else None for size in node.shape)
-        return cls(_TYPES.get(node.type, node.type), shape)
+        kind = node.type.removeprefix("tensor(").removesuffix(")")
+        return cls(_NUMPY_NAMES.get(kind, kind), shape)
 
     def admits(self, dtype: str, shape: tuple[int, ...]) -> bool:
         """Whether an array of this type and shape fits."""

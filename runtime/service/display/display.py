@@ -68,10 +68,7 @@ class Display:
         """
         if self._modulator is None:
             raise self._alone()
-        if page is None:
-            self._modulator.withdrawn()
-        else:
-            self._modulator.shown(page)
+        self._modulator.announce(page)
 
     def beams_set(self, state: BeamState) -> None:
         """The beams are so now.
@@ -81,7 +78,7 @@ class Display:
         """
         if self._beams is None:
             raise self._alone()
-        self._beams.beams_set(signal=state.signal, reference=state.reference)
+        self._beams.announce(state)
 
     def _alone(self) -> NoSourceError:
         expected = 'a source whose modulator or beams have kind = "external"'
