@@ -175,12 +175,10 @@ class XWindow:
 
     def _check_monitor(self) -> Monitor:
         """The monitor, which must have the modulator's pixels: what has others is scaled on its way."""
-        monitors = self._monitors()
-        number = self._settings.monitor
-        if number >= len(monitors):
-            sizes = ", ".join(f"{which} of {monitor} pixels" for which, monitor in enumerate(monitors))
-            raise SourceError("screen", f"monitors {sizes}" if sizes else "no monitor at all", f"monitor {number}")
-        monitor = monitors[number]
+        if (monitor := self._find_monitor()) is None:
+            sizes = ", ".join(f"{which} of {there} pixels" for which, there in enumerate(self._monitors()))
+            got = f"monitors {sizes}" if sizes else "no monitor at all"
+            raise SourceError("screen", got, f"monitor {self._settings.monitor}")
         if (monitor.rows, monitor.columns) != (self._settings.rows_px, self._settings.columns_px):
             raise SourceError(
                 "screen",
