@@ -156,8 +156,8 @@ class Bench:
             choices = replace(choices, channels=channels, blocks=blocks, depth=depth)
         base = FIRST_PASSES.get(name, name)
         folder, features, first, preparing = self.first_pass(base, size, choices)
+        self.kept.keep(folder, first, self.held_out(features)[0])
         if name not in FIRST_PASSES:
-            self.kept.keep(folder)
             drawn = choices.drawn(self.profile.page_shape)
             outcome = self.outcome(name, size, choices.steps, folder, first, *self.held_out(features), preparing, drawn)
             return replace(outcome, by_levels=self.at_levels(name, folder, [first], outcome.kappa_scale))
@@ -168,7 +168,9 @@ class Bench:
         inputs = RefinementPages(self.recording, self.pages, *counts, features)
         key = self.key(base)
         refined = fit_refinements(folder, choices, inputs, extractor, prediction, first, key, processes=ONE)
-        self.kept.keep(folder)
+        for number, one in enumerate(refined.trained, 1):
+            run = folder / f"refinement-{number}"
+            self.kept.keep(run, one, self.held_out(run / "features")[0])
         at = folder / f"refinement-{choices.refinements}"
         held_out = self.held_out(at / "features")
         preparing = refined.seconds - sum(one.seconds for one in refined.trained)
@@ -269,7 +271,7 @@ class Bench:
         trained = train_published(
             folder, name, choices, self.profile, phase, self.mask, training, validation, processes=ONE
         )
-        self.kept.keep(folder)
+        self.kept.keep(folder, trained, validation)
         drawn = choices.steps * choices.batch
         return self.outcome(name, size, choices.steps, folder, trained, validation, unseen, preparing, drawn)
 
@@ -323,6 +325,7 @@ class Bench:
             steps=steps,
             air=figures.air_bits_per_symbol,
             own_mi=figures.own_mi_bits_per_symbol,
+            symbol_error_rate=figures.symbol_error_rate,
             own_mi_unscaled=float(own_information(np.arctan2(py, px), np.hypot(px, py) / scale, LEVELS).mean()),
             page_kB=page_kilobytes(figures.air_bits_per_symbol, data),
             own_mi_kB=page_kilobytes(figures.own_mi_bits_per_symbol, data),

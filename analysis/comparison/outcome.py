@@ -56,6 +56,7 @@ class Outcome:
     size: str
     steps: int
     air: float
+    symbol_error_rate: float
     own_mi: float
     own_mi_unscaled: float
     page_kB: float

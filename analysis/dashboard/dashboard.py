@@ -41,6 +41,7 @@ from lightpage.cli.paths import OutputFile
 from lightpage.demo.demo import SPOILT_PAGE, drifted, write_pages
 from lightpage.device.state import Device
 from lightpage.errors import LightpageError
+from lightpage.pictures import write_figure_png
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.pages import Pages
@@ -242,7 +243,7 @@ class Drawing:
                 axes = frame.inset_axes(inner, facecolor=_PANEL)
                 _series(axes, frame, panel, found)
                 axes.set_xlim(_moment(self._start), _moment(self._end))  # type: ignore[arg-type]
-        figure.savefig(out, dpi=_DOTS, facecolor=_BACK, metadata={"Software": None})
+        write_figure_png(out, figure, dpi=_DOTS, facecolor=_BACK)
         plt.close(figure)
         return empty
 
