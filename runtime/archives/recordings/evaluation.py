@@ -116,9 +116,7 @@ def check_recording(decoder: Decoder, recording: Recording) -> None:
     recording.check_against(decoder.bundle.profile)
     depth = decoder.bundle.manifest.camera_bit_depth
     if recording.bit_depth != depth:
-        raise RecordingError(
-            f"recording {recording.path}", f"{recording.bit_depth} bits", f"{depth} bits, as the bundle"
-        )
+        raise RecordingError(f"recording {recording.path}", f"{recording.bit_depth} bits", f"{depth}, as the bundle")
 
 
 def check_symbols(recording: Recording, purpose: str = "measure against") -> None:
@@ -208,11 +206,8 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
         }
         raise NothingReadError(told, figures)
     if not timings:
-        raise InvalidInputError(
-            f"recording {recording.path}",
-            f"{recording.pages} pages, all of them used to make {decoder.version}",
-            "pages that the bundle has not seen",
-        )
+        got = f"{recording.pages} pages, all of them used to make {decoder.version}"
+        raise InvalidInputError(f"recording {recording.path}", got, "pages that the bundle has not seen")
     return Evaluation(
         bundle_version=decoder.version,
         figures=accumulator.figures(),

@@ -6,7 +6,7 @@ import os
 import socket
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import cached_property
 
 from lightpage.errors import BundleError, RecordingError, StorageError
@@ -91,9 +91,7 @@ class Worker:
         if self._warm is None or self._warm[:2] != (bundle, provider):
             self._warm = None
             if (found := bundle_sha256(bundle.path)) != bundle.sha256:
-                raise BundleError(
-                    f"bundle {bundle.path}", f"SHA-256 {found}", f"{bundle.sha256}, as the run began with"
-                )
+                raise BundleError(f"bundle {bundle.path}", f"SHA-256 {found}", f"{bundle.sha256}, as at the start")
             self._warm = bundle, provider, _Warm(Decoder.load(bundle.path, self._threads, Provider.parse(provider)))
         return self._warm[2]
 
@@ -120,9 +118,7 @@ def _written(task: Task, found: Findings, start: float, read_bytes: int) -> Done
         read_bytes=read_bytes,
     )
     record.write(task.shard)
-    return Done(
-        task=task, lost=found.lost, left_out=found.left_out, seconds=record.seconds, read_bytes=record.read_bytes
-    )
+    return Done(task=task, lost=found.lost, left_out=found.left_out, seconds=record.seconds, read_bytes=read_bytes)
 
 
 @contextmanager
@@ -132,17 +128,13 @@ def _recording_of(task: Task) -> Iterator[Recording]:
     Raises:
         RecordingError: see `Recording.open` and `join`.
     """
-    if len(task.files) == 1:
-        with Recording.open(task.recording) as recording:
-            yield recording
-        return
-    joined = task.shard.with_name(f".{task.shard.name}-joined.h5")  # swept where the worker is killed
-    try:
-        join([file.path for file in task.files], joined)
-        with Recording.open(joined) as recording:
-            yield recording
-    finally:
-        joined.unlink(missing_ok=True)
+    with ExitStack() as stack:
+        path = task.recording
+        if len(task.files) > 1:
+            path = task.shard.with_name(f".{task.shard.name}-joined.h5")  # swept where the worker is killed
+            stack.callback(path.unlink, missing_ok=True)
+            join([file.path for file in task.files], path)
+        yield stack.enter_context(Recording.open(path))
 
 
 def _check_stamp(task: Task) -> None:

@@ -33,6 +33,7 @@ from lightpage.runtime.device.modulator.modulator import Beams, Modulator
 from lightpage.runtime.device.trigger.trigger import Trigger
 
 Counts = NDArray[np.unsignedinteger[Any]]
+_Attempt = Callable[[], tuple[Frame, ...]]
 
 _log = logging.getLogger(__name__)
 
@@ -289,9 +290,7 @@ class CameraSource(FrameSource):
             return page, None
         return page, self.pages[page]
 
-    def _attempt(
-        self, index: int, symbols: NDArray[np.uint8] | None, deadline: float
-    ) -> Callable[[], tuple[Frame, ...]]:
+    def _attempt(self, index: int, symbols: NDArray[np.uint8] | None, deadline: float) -> _Attempt:
         """What takes a pair of a page. A further attempt leaves the page as it stands, where it still does."""
         modulator, shown = self.modulator, False
         if modulator is None or symbols is None:
@@ -307,7 +306,7 @@ class CameraSource(FrameSource):
         return lambda: self._pairing.shot(deadline, display, modulator.shows)
 
     def _persistent(
-        self, subject: str, index: int, deadline: float, attempt: Callable[[], tuple[Frame, ...]], repeats: int
+        self, subject: str, index: int, deadline: float, attempt: _Attempt, repeats: int
     ) -> tuple[Frame, ...]:
         """A pair of one page: lost shots are repeated, and devices that have gone are waited for."""
         while True:

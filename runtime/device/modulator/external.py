@@ -96,12 +96,8 @@ class ExternalModulator(Announcement[int]):
         self._at_last_show = -1
         there, changes = self.wait(page, timeout_s)
         if there != page:
-            raise LostShotError(
-                f"page {page} on {self.name}",
-                f"{'no page' if there is None else f'page {there}'} announced after {timeout_s:g} s",
-                f"word that page {page} is on display",
-                Reason.NOT_ON_DISPLAY,
-            )
+            got = f"{'no page' if there is None else f'page {there}'} announced after {timeout_s:g} s"
+            raise LostShotError(f"page {page} on {self.name}", got, "word that it is on display", Reason.NOT_ON_DISPLAY)
         self._at_last_show = changes
 
     def shows(self) -> bool:
@@ -140,12 +136,8 @@ class ExternalBeams(Announcement[BeamState]):
         if there != wanted:
             if self.heard_of:
                 self.want(BOTH)
-            raise LostShotError(
-                self.name,
-                f"{there or 'nothing'} announced after {self._timeout_s:g} s",
-                str(wanted),
-                Reason.BEAM_CONTROL_FAILED,
-            )
+            got = f"{there or 'nothing'} announced after {self._timeout_s:g} s"
+            raise LostShotError(self.name, got, str(wanted), Reason.BEAM_CONTROL_FAILED)
 
     def close(self) -> None:
         """Ask for both beams if the controller has blocked one; nobody waits for it."""

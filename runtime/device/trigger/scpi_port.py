@@ -295,9 +295,7 @@ class ScpiPort:
             told = f"{told}: {_quoted(self.identity or '')} came after {self._slowest_s:.2f} s"
             return self._gone(told, f"it within answer_s = {times.answer_s:g} s: raise answer_s")
         if self._heard:
-            return self._gone(
-                f"{told}, but {self._heard}", "its identification: is it this device, and this baud rate?"
-            )
+            return self._gone(f"{told}, but {self._heard}", "its identification: is it this device and baud rate?")
         return self._gone(f"{told}: nothing came", "its identification: look at its power, its cable and the baud rate")
 
     def _identified(self, line: str) -> bool:

@@ -316,14 +316,8 @@ class ImageTracker:
         decoder, traced = like.decoder, like.traced_tilt
         if np.any((away > RETRACE_RAD) & (away > SIGNIFICANT_DEVIATIONS * error)):
             decoder, traced = self._tables.traced(drift[TILT]), drift[TILT].copy()
-        return replace(
-            like,
-            drift=drift,
-            covariance=covariance,
-            decoder=decoder,
-            table=self._tables.shifted(drift[SHIFT]),
-            traced_tilt=traced,
-        )
+        table = self._tables.shifted(drift[SHIFT])
+        return replace(like, drift=drift, covariance=covariance, decoder=decoder, table=table, traced_tilt=traced)
 
     def _moved_to(self, found: FoundImage, state: ImageState) -> ImageState:
         """The state where the image was found; the same one where that is nothing new."""

@@ -148,11 +148,8 @@ def check_provider(provider: Provider) -> None:
     """
     available = onnxruntime.get_available_providers()
     if provider.runtime_name not in available:
-        raise ProviderError(
-            f"provider {provider}",
-            f"an onnxruntime with {', '.join(available)}",
-            "onnxruntime-gpu in place of onnxruntime (docs/gpu.md), or provider cpu",
-        )
+        expected = "onnxruntime-gpu in place of onnxruntime (docs/gpu.md), or provider cpu"
+        raise ProviderError(f"provider {provider}", f"an onnxruntime with {', '.join(available)}", expected)
 
 
 class BoundSession:
@@ -163,7 +160,7 @@ class BoundSession:
     Args:
         session: opened with this provider.
         provider: what it runs on.
-        constants: by input.
+        fixed: by input.
         subject: what it is, for errors.
 
     Raises:
@@ -171,16 +168,14 @@ class BoundSession:
         SurroundingsError: memory is short.
     """
 
-    def __init__(
-        self, session: Session, provider: Provider, constants: Mapping[str, NDArray[Any]], subject: str
-    ) -> None:
+    def __init__(self, session: Session, provider: Provider, fixed: Mapping[str, NDArray[Any]], subject: str) -> None:
         self.session, self._subject, self._provider = session, subject, provider
         with running(subject, provider):
-            self._constants = {
+            self._fixed = {
                 name: onnxruntime.OrtValue.ortvalue_from_numpy(
                     np.asarray(value, order="C"), provider.memory, provider.device
                 )
-                for name, value in constants.items()
+                for name, value in fixed.items()
             }
 
     def run(self, outputs: Iterable[str], feeds: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
@@ -192,7 +187,7 @@ class BoundSession:
         """
         with running(self._subject, self._provider):
             binding = self.session.io_binding()
-            for name, value in self._constants.items():
+            for name, value in self._fixed.items():
                 if name not in feeds:
                     binding.bind_ortvalue_input(name, value)
             for name, array in feeds.items():
