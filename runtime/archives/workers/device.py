@@ -51,12 +51,13 @@ def recalibrated(
     Raises:
         LightpageError: something that says nothing of the device.
     """
-    findings = _REFUSED if task.choices.fine_tuning is None else _REFUSED_DEEPLY
+    tuning, pages = task.choices.fine_tuning, len(task.pages)
+    findings = _REFUSED if tuning is None else _REFUSED_DEEPLY
     out = with_end(task.shard, BUNDLE)
     out.unlink(missing_ok=True)  # of a worker that was killed before it wrote the record
     try:
-        if task.choices.fine_tuning is None:
-            known = read_recorded(recording, first_lit_pages(recording, len(task.pages), warn))
+        if tuning is None:
+            known = read_recorded(recording, first_lit_pages(recording, pages, warn))
             outcome = recalibrate(decoder, known, out, next_version(decoder.version), fit, lambda *_: None)
         else:
             if task.run is None:
@@ -65,16 +66,8 @@ def recalibrated(
             name = task.device or task.name
             log = StepLog(with_end(task.shard, LOG), lambda what: tell(Step(device=name, what=what)))
             with reporting(log):
-                outcome = deep().recalibrate(
-                    decoder,
-                    recording,
-                    task.run,
-                    with_end(task.shard, TRAINING),
-                    out,
-                    task.choices.fine_tuning,
-                    len(task.pages),
-                    log.progress,
-                )
+                folder = with_end(task.shard, TRAINING)
+                outcome = deep().recalibrate(decoder, recording, task.run, folder, out, tuning, pages, log.progress)
     except findings as error:
         lost = PageRecord(page=0, state=PageState.LOST, loss=type(error).__name__, reason=str(error))
         return Findings(pages=(lost,))
