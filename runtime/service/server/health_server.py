@@ -9,12 +9,11 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from types import TracebackType
 from typing import Self
 
 from lightpage.errors import InvalidInputError
 from lightpage.helper_process import HelperProcess
-from lightpage.runtime.client.wire.address import check_address, check_free, is_local
+from lightpage.runtime.client.wire.address import check_address, check_free, is_local, target_of
 from lightpage.runtime.client.wire.channel import TlsFiles
 
 _PROCESS = "lightpage.runtime.service.server.health_process"
@@ -60,10 +59,7 @@ class HealthServer:
     @property
     def target(self) -> str:
         """Where it is asked on this machine."""
-        if self._address.startswith("unix:"):
-            return self._address
-        host = self._address.rpartition(":")[0]
-        return f"{'127.0.0.1' if host in ('0.0.0.0', '[::]', '') else host}:{self.port}"
+        return target_of(self._address, self.port)
 
     @property
     def pid(self) -> int | None:
@@ -115,9 +111,7 @@ class HealthServer:
     def __enter__(self) -> Self:
         return self.start()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
     def _beat(self) -> None:

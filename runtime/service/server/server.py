@@ -7,7 +7,6 @@ import logging
 import threading
 from collections.abc import Coroutine, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from types import TracebackType
 from typing import Any, Self, TypeVar
 
 import grpc
@@ -15,7 +14,7 @@ from grpc_health.v1 import health, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from lightpage.errors import InvalidInputError
-from lightpage.runtime.client.wire.address import check_free
+from lightpage.runtime.client.wire.address import check_free, target_of
 from lightpage.runtime.client.wire.channel import SERVER_KEEPALIVE, add_port
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.frames.inference_calls import (
@@ -112,10 +111,7 @@ class LightpageServer:
     @property
     def target(self) -> str:
         """Where a client on this machine finds it."""
-        if self._address.startswith("unix:"):
-            return self._address
-        host = self._address.rpartition(":")[0]
-        return f"{'127.0.0.1' if host in ('0.0.0.0', '[::]', '') else host}:{self.port}"
+        return target_of(self._address, self.port)
 
     def health(self) -> dict[str, bool]:
         """Whether the service as a whole, by its name, and its store serve now; checks of this server say the same.
@@ -143,9 +139,7 @@ class LightpageServer:
     def __enter__(self) -> Self:
         return self.start()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
     async def _open(self) -> None:
