@@ -21,7 +21,6 @@ from lightpage.runtime.service.admission import ReceiveBudget
 from lightpage.runtime.service.caller import Call
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.frames.frame_calls import FrameCalls
-from lightpage.runtime.service.frames.frames import check_format
 from lightpage.runtime.service.frames.infer_message import take_apart
 from lightpage.runtime.service.frames.tensors import (
     Tensor,
@@ -195,7 +194,6 @@ class InferenceCalls:
         bundle = self._plane.registry.current.decoder.bundle
         depth, dtype = bundle.manifest.camera_bit_depth, bundle.manifest.frame_dtype
         rows, columns = bundle.profile.frame_shape
-        check_format(self._plane, (rows, columns), dtype, depth)
         names = list(outputs_of(request, [*OUTPUTS, USER_DATA], list(OUTPUTS)))
         asked = parameters_of(request, PARAMETERS)
         options = message_of(
