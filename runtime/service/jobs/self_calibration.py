@@ -14,7 +14,6 @@ from lightpage.errors import (
     CallerLeft,
     InvalidInputError,
     LightpageError,
-    LimitError,
     RecalibrationRefusedError,
     StoppingError,
 )
@@ -50,16 +49,6 @@ class SelfCalibrationSettings:
     longest_s: float = 3600.0
     busy_s: float = 5.0
 
-    def __post_init__(self) -> None:
-        """Check the pages.
-
-        Raises:
-            InvalidInputError: one page alone, or the same one twice.
-        """
-        if self.pages and (len(self.pages) < MIN_PAGES or len(set(self.pages)) < len(self.pages)):
-            expected = f"at least {MIN_PAGES} that differ: one to fit, one to judge by"
-            raise InvalidInputError("calibration pages", ", ".join(map(str, self.pages)), expected)
-
 
 class SelfCalibration:
     """A thread that recalibrates when the monitor says so; to be used in a `with` statement, or started and stopped.
@@ -85,8 +74,6 @@ class SelfCalibration:
     ) -> None:
         self._plane, self._monitor, self._recalibrator = plane, monitor, recalibrator
         self._settings, self._clock = settings or SelfCalibrationSettings(), clock
-        if (count := len(self._settings.pages)) > (most := plane.limits.recalibration_pages):
-            raise LimitError("calibration pages", count, f"at most {most}")
         _check_pages(plane, self._settings.pages)
         self._interval_s, self._not_before = self._settings.least_s, -float("inf")
         self._wake, self._stopping = threading.Event(), threading.Event()
@@ -146,8 +133,9 @@ class SelfCalibration:
         self._pinned = False
         reasons = "; ".join(self._monitor.state().reasons) or "the monitor says so"
         _log.info("self-calibration: begins, since %s", reasons)
+        pages = self._settings.pages
         try:
-            outcome = self._recalibrated()
+            *_, outcome = self._recalibrator.from_source(len(pages) or MIN_PAGES, pages, self._caller)
         except (CallerLeft, StoppingError):
             _log.info("self-calibration: dropped, the service stops")
             self._wait(self._settings.busy_s)
@@ -157,6 +145,7 @@ class SelfCalibration:
         except Exception as error:
             self._back_off(error)
         else:
+            assert isinstance(outcome, RecalibrationOutcome)  # the last thing that it tells
             cured = outcome.air_after - outcome.air_before >= WORTH_BITS
             least_s, longest_s = self._settings.least_s, self._settings.longest_s
             self._interval_s = least_s if cured else min(2 * self._interval_s, longest_s)
@@ -168,12 +157,6 @@ class SelfCalibration:
                 outcome.air_after,
                 outcome.air_before,
             )
-
-    def _recalibrated(self) -> RecalibrationOutcome:
-        pages = self._settings.pages
-        *_, last = self._recalibrator.from_source(len(pages) or MIN_PAGES, pages, self._caller)
-        assert isinstance(last, RecalibrationOutcome)  # the last thing that it tells
-        return last
 
     def _back_off(self, error: Exception) -> None:
         self._interval_s = min(2 * self._interval_s, self._settings.longest_s)

@@ -124,7 +124,7 @@ class Models:
             OtherModelError: another version is in service.
         """
         with self._audited("rollback", actor):
-            return self.registry.rollback(expected, self._note)
+            return self.registry.step(-1, expected, self._note)
 
     def roll_forward(self, expected: str = "", actor: Actor = NOBODY) -> tuple[Model, Model]:
         """The opposite of `rollback`; raises as that does."""

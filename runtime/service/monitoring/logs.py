@@ -207,11 +207,7 @@ def _thread_broke(found: threading.ExceptHookArgs) -> None:
 
 @contextmanager
 def logging_to_stderr(
-    form: Literal["text", "json"],
-    level: str,
-    lines_per_second: int,
-    stream: TextIO | None = None,
-    clock: Clock = SYSTEM,
+    form: Literal["text", "json"], level: str, lines_per_second: int, stream: TextIO | None = None
 ) -> Iterator[LimitedHandler]:
     """Have everything that is logged in the `with` statement written, and what ends threads that nobody waits for.
 
@@ -220,10 +216,9 @@ def logging_to_stderr(
         level: `debug`, `info`, `warning` or `error`; lesser lines are left out.
         lines_per_second: of one kind.
         stream: where to, stderr by default.
-        clock: by which lines are counted.
     """
     root = logging.getLogger()
-    handler = LimitedHandler(sys.stderr if stream is None else stream, lines_per_second, clock)
+    handler = LimitedHandler(sys.stderr if stream is None else stream, lines_per_second)
     handler.setFormatter(JsonFormatter() if form == "json" else TextFormatter())
     before, hook = root.level, threading.excepthook
     root.addHandler(handler)

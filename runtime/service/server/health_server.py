@@ -73,20 +73,18 @@ class HealthServer:
             InvalidInputError: the address cannot be listened on.
         """
         check_free("health address", self._address)
-        try:
-            self._process, self.port = self._started(self._address)
-        except InvalidInputError:
-            self.stop()
-            raise
+        self._process, self.port = self._started()
+        if not self._address.startswith("unix:"):
+            self._address = f"{self._address.rpartition(':')[0]}:{self.port}"  # where another process follows it
         self._thread.start()
         return self
 
-    def _started(self, address: str) -> tuple[HelperProcess, int]:
-        """A process that answers at an address, and the port."""
-        subject = f"health address {address}"
+    def _started(self) -> tuple[HelperProcess, int]:
+        """A process that answers, and its port."""
+        subject = f"health address {self._address}"
         process: HelperProcess | None = None
         try:
-            process = HelperProcess(_PROCESS, address, *self._files, subject="the process of health checks")
+            process = HelperProcess(_PROCESS, self._address, *self._files, subject="the process of health checks")
             answer = json.loads(process.line(time.monotonic() + _START_S))
             if "port" in answer:
                 return process, int(answer["port"])
@@ -134,11 +132,8 @@ class HealthServer:
         except OSError as error:
             _log.error("health checks: %s; their process is started again", error or "nobody listens")
         self._process.end()
-        host = self._address.rpartition(":")[0]
         try:
-            self._process, _ = self._started(
-                self._address if self._address.startswith("unix:") else f"{host}:{self.port}"
-            )
+            self._process, _ = self._started()
         except InvalidInputError as error:
             _log.error("health checks: %s", error)
             self._stop.wait(_AGAIN_S)

@@ -147,12 +147,12 @@ def test_a_slot_that_is_taken_at_once_is_waited_for_by_nobody() -> None:
 
 def test_many_sessions_are_bounded() -> None:
     made = list[object]()
-    sessions = Sessions(lambda: made.append(object()) or made[-1], most=3)  # type: ignore[arg-type,return-value,func-returns-value]
-    first = sessions.tracker("0")
+    sessions = Sessions(lambda _: made.append(object()) or made[-1], most=3)  # type: ignore[arg-type,return-value,func-returns-value]
+    first = sessions.of("0")
     for name in "1203":
-        sessions.tracker(name)
-    assert sessions.tracker("0") is first
-    sessions.tracker("1")
+        sessions.of(name)
+    assert sessions.of("0") is first
+    sessions.of("1")
     assert len(made) == 5
 
 
