@@ -1,11 +1,12 @@
-"""What may be at work at once: slots, first come, first served, and bytes of frames that were received."""
+"""What may be at work at once: slots, first come, first served, bytes of frames that were received, what has hung."""
 
 from __future__ import annotations
 
 import sys
 import threading
+import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import ceil
@@ -200,6 +201,39 @@ class Slots:
             return OverloadedError(subject, told, f"at least {needed_s:.2f} s")
         expected = f"at least {needed_s:.2f} s, {wait_s:.2f} s of it in the queue; try again later"
         return OverloadedError(subject, told, expected, max(self.usual_s / self.count, needed_s - left_s))
+
+
+class Heart:
+    """Knows of every decode that runs.
+
+    Args:
+        longest_s: a decode that takes longer has hung.
+        clock: seconds that never go back.
+    """
+
+    def __init__(self, longest_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._longest_s, self._clock = longest_s, clock
+        self._lock = threading.Lock()
+        self._begun: dict[object, float] = {}
+
+    @contextmanager
+    def at_work(self) -> Iterator[None]:
+        """A decode runs within the `with` statement."""
+        key = object()
+        with self._lock:
+            self._begun[key] = self._clock()
+        try:
+            yield
+        finally:
+            with self._lock:
+                del self._begun[key]
+
+    def trouble(self) -> str:
+        """Why the service cannot be said to serve; empty where it can."""
+        with self._lock:
+            oldest = min(self._begun.values(), default=None)
+        taken_s = 0.0 if oldest is None else self._clock() - oldest
+        return f"a decode has been running for {taken_s:.0f} s" if taken_s > self._longest_s else ""
 
 
 class ReceiveBudget:

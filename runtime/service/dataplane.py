@@ -28,14 +28,13 @@ from lightpage.runtime.device.acquisition.source import FrameSource
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.page import DecodedPage
 from lightpage.runtime.model.decoding.tracking import unconfirmed_page
-from lightpage.runtime.service.admission import ReceiveBudget, Slots
+from lightpage.runtime.service.admission import Heart, ReceiveBudget, Slots
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.limits import Limits
 from lightpage.runtime.service.models.audit import AuditLog
 from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.models.registry import Model, ModelRegistry
 from lightpage.runtime.service.models.store import ModelStore
-from lightpage.runtime.service.monitoring.heart import Heart
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor, SessionMonitors
 from lightpage.runtime.service.monitoring.observation import Observation, Observer

@@ -20,20 +20,8 @@ from lightpage.runtime.model.decoding.image_position import ImagePosition
 from lightpage.runtime.service.admission import Bytes, ReceiveBudget
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import Answer, DataPlane, Seen, levels_for, observed
-from lightpage.runtime.service.monitoring.monitor import (
-    AIR,
-    CHANGED,
-    MARGIN,
-    PISTON_WALK,
-    RESIDUAL,
-    SHARE,
-    SHIFT,
-    TRUST,
-    UNREAD,
-)
+from lightpage.runtime.service.monitoring import monitor as signs
 from lightpage.runtime.service.stages import Stage, Stages
-
-_CONFIDENCE_FORMATS = (pb.CONFIDENCE_FORMAT_UNSPECIFIED, pb.CONFIDENCE_FORMAT_FLOAT32, pb.CONFIDENCE_FORMAT_UINT8)
 
 SESSION_CHARACTERS = 1024
 """Of the name of a session, at most: the service remembers it."""
@@ -69,7 +57,7 @@ def check_options(options: pb.DecodeOptions) -> None:
     """
     if options.levels:
         check_levels(options.levels)
-    if options.confidence_format not in _CONFIDENCE_FORMATS:
+    if options.confidence_format not in pb.ConfidenceFormat.values():
         expected = "CONFIDENCE_FORMAT_FLOAT32 or CONFIDENCE_FORMAT_UINT8"
         raise InvalidInputError("confidence_format", options.confidence_format, expected)
     if options.tracking not in pb.Tracking.values():
@@ -276,15 +264,15 @@ def decode_reply(answer: Answer, options: pb.DecodeOptions) -> pb.DecodeReply:
 
 
 _SIGNS = {
-    MARGIN.name: pb.RECALIBRATION_REASON_MARGIN,
-    AIR.name: pb.RECALIBRATION_REASON_INFORMATION,
-    TRUST.name: pb.RECALIBRATION_REASON_TRUST,
-    SHARE.name: pb.RECALIBRATION_REASON_PILOT_SHARE,
-    CHANGED.name: pb.RECALIBRATION_REASON_PAGES,
-    UNREAD.name: pb.RECALIBRATION_REASON_UNREAD,
-    RESIDUAL.name: pb.RECALIBRATION_REASON_RESIDUAL,
-    SHIFT.name: pb.RECALIBRATION_REASON_SHIFT,
-    PISTON_WALK.name: pb.RECALIBRATION_REASON_PISTON,
+    signs.MARGIN.name: pb.RECALIBRATION_REASON_MARGIN,
+    signs.AIR.name: pb.RECALIBRATION_REASON_INFORMATION,
+    signs.TRUST.name: pb.RECALIBRATION_REASON_TRUST,
+    signs.SHARE.name: pb.RECALIBRATION_REASON_PILOT_SHARE,
+    signs.CHANGED.name: pb.RECALIBRATION_REASON_PAGES,
+    signs.UNREAD.name: pb.RECALIBRATION_REASON_UNREAD,
+    signs.RESIDUAL.name: pb.RECALIBRATION_REASON_RESIDUAL,
+    signs.SHIFT.name: pb.RECALIBRATION_REASON_SHIFT,
+    signs.PISTON_WALK.name: pb.RECALIBRATION_REASON_PISTON,
 }
 
 

@@ -9,10 +9,9 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from lightpage.errors import CallerLeft, OverloadedError, SlotsTakenError
-from lightpage.runtime.service.admission import FORGET_S, Slots
+from lightpage.runtime.service.admission import FORGET_S, Heart, Slots
 from lightpage.runtime.service.caller import Caller, named_session, own_name
 from lightpage.runtime.service.models.registry import Sessions
-from lightpage.runtime.service.monitoring.heart import Heart
 from tests.clock import HandClock
 from tests.waiting import eventually
 
