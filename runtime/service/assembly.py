@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from lightpage.errors import LostShotError, SourceError
+from lightpage.errors import LightpageError, LostShotError, SourceError
 from lightpage.recording.pages import Pages
 from lightpage.runtime.device.acquisition.page_store import PageStore
 from lightpage.runtime.device.acquisition.source import FrameSource, open_source
@@ -94,8 +94,10 @@ def assembled(settings: ServiceSettings, history: Observer) -> Iterator[Assembly
         )
         plane.models.resume()
         recalibrator = Recalibrator(plane, recordings=service.recordings)
-        if (trouble := recalibrator.no_room()) is not None:
-            _log.warning("recalibrations will be refused: %s", trouble)
+        try:
+            recalibrator.check_start()
+        except LightpageError as error:
+            _log.warning("recalibrations will be refused: %s", error)
         yield Assembly(plane, recalibrator, monitor, "no source" if source is None else source.name)
 
 

@@ -7,7 +7,7 @@ import math
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from copy import copy
@@ -70,7 +70,8 @@ class Identity:
         if now >= self.until:
             raise NotAllowedError(what, f"a certificate of {self.name} that has expired", "one that is valid")
         if not self.may(role):
-            got = f"{self.name} with {_listed(self.roles)}"
+            roles = ", ".join(f"role {role}" for role in sorted(self.roles)) or "no role"
+            got = f"{self.name} with {roles}"
             raise NotAllowedError(what, got, f"a certificate with {ROLE_URI}{role}")
 
 
@@ -78,10 +79,6 @@ LOCAL = Identity("", frozenset(Role))
 """Whoever reaches a service that asks for no certificates: a process of this machine."""
 STRANGER = Identity("nobody", frozenset())
 """Whoever has no certificate where one is asked for."""
-
-
-def _listed(roles: Iterable[Role]) -> str:
-    return ", ".join(f"role {role}" for role in sorted(roles)) or "no role"
 
 
 def own_name(name: str, caller: str) -> str:

@@ -238,7 +238,7 @@ class DataPlane:
             yield
         except (LostPageError, FrameError):
             if user_data:
-                self.metrics.no_user_data(Loss.OPTICS)
+                self.metrics.data_pages.labels(Loss.OPTICS.value).inc()
             raise
 
     def user_data(

@@ -18,7 +18,6 @@ from lightpage.errors import (
     CallerLeft,
     InvalidInputError,
     JobCancelledError,
-    LightpageError,
     LimitError,
     NoSourceError,
     OtherModelError,
@@ -223,14 +222,6 @@ class Recalibrator:
         self.jobs.check_free()
         _check_version(self._plane.registry.current, expected_version)
         self._store()
-
-    def no_room(self) -> LightpageError | None:
-        """Why no recalibration can keep its model, None where one can."""
-        try:
-            self._store()
-        except LightpageError as error:
-            return error
-        return None
 
     def close(self, wait_s: float = GRACE_S) -> None:
         """Stop a running recalibration at its next step, which is waited for at most `wait_s`; drop temporary bundles.
