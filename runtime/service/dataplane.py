@@ -242,12 +242,7 @@ class DataPlane:
             raise
 
     def user_data(
-        self,
-        model: Model,
-        page: DecodedPage,
-        stages: Stages,
-        monitor: Monitor | None,
-        expected: Header | None = None,
+        self, model: Model, page: DecodedPage, stages: Stages, monitor: Monitor | None, expected: Header | None = None
     ) -> PageBytes:
         """The bytes of a page that was decoded, counted."""
         stages.begin(Stage.CODE)

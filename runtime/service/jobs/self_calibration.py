@@ -51,7 +51,7 @@ class SelfCalibrationSettings:
 
 
 class SelfCalibration:
-    """A thread that recalibrates when the monitor says so; to be used in a `with` statement, or started and stopped.
+    """A thread that recalibrates when the monitor says so; to be used in a `with` statement.
 
     A recalibration that is refused or fails changes nothing, and no request fails because of one. Its pages are
     photographed between those that are read.
@@ -83,26 +83,19 @@ class SelfCalibration:
         """Whether it was said that the model in service is pinned."""
         monitor.listen(self._wake.set)
 
-    def start(self) -> Self:
-        """Begin to wait for the monitor."""
+    def __enter__(self) -> Self:
         self._thread.start()
         return self
 
-    def stop(self, wait_s: float | None = None) -> None:
-        """Drop a recalibration that runs, and end the thread, which is waited for at most `wait_s`, as calls are."""
-        wait_s = self._plane.limits.grace_s if wait_s is None else wait_s
+    def __exit__(self, *_: object) -> None:
+        """Drop a recalibration that runs, and end the thread, which is waited for as calls are."""
+        wait_s = self._plane.limits.grace_s
         self._stopping.set()
         self._caller.leave()
         self._wake.set()
         self._thread.join(wait_s)
         if self._thread.is_alive():
             _log.warning("self-calibration: not stopped after %.1f s, left to itself", wait_s)
-
-    def __enter__(self) -> Self:
-        return self.start()
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
 
     def _run(self) -> None:
         while True:

@@ -297,7 +297,7 @@ class Models:
             raise StoreError("model store", "none", "a service started with --store")
         try:
             decoder = self.registry.opened(path, signature)
-            self.registry.check(decoder)
+            self.registry.tracked(decoder)  # as if it were put in service
         except BundleError as error:
             subject = error.subject.replace(f"bundle {path}", "new bundle")
             raise type(error)(subject, error.got, error.expected) from None

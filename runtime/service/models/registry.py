@@ -290,14 +290,6 @@ class ModelRegistry:
         """
         return self.current.decoder.of_another(Bundle.open(path, key=self._key, signature=signature))
 
-    def check(self, decoder: Decoder) -> None:
-        """Check that a decoder could be put in service.
-
-        Raises:
-            BundleError: it is for another device, or cannot be tracked.
-        """
-        self._tracked(decoder)
-
     def _model(self, place: Place) -> Model:
         """A model, loaded if it is not."""
         with self._lock:
@@ -315,9 +307,14 @@ class ModelRegistry:
             decoder = self.opened(place.path)
         if decoder.version != place.version:
             raise BundleError(f"{decoder.bundle.subject}: version", decoder.version, place.version)
-        return self._tracked(decoder)
+        return self.tracked(decoder)
 
-    def _tracked(self, decoder: Decoder) -> Model:
+    def tracked(self, decoder: Decoder) -> Model:
+        """A model that could be put in service.
+
+        Raises:
+            BundleError: the decoder is for another device, or cannot be tracked.
+        """
         self._check_replaces(decoder, self.current.decoder)
         try:
             return Model(decoder, self._make_tracker(decoder))

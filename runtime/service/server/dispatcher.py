@@ -59,7 +59,7 @@ class Served:
 
     Attributes:
         descriptor: of it.
-        handlers: objects whose methods answer; of two with the same method the first counts.
+        handlers: objects whose methods answer.
         prefix: of its methods' names in metrics and logs.
     """
 

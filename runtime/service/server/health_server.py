@@ -66,7 +66,7 @@ class HealthServer:
         """Number of the process, None before there is one."""
         return None if self._process is None else self._process.pid
 
-    def start(self) -> Self:
+    def __enter__(self) -> Self:
         """Answer health checks.
 
         Raises:
@@ -95,22 +95,15 @@ class HealthServer:
             process.end()
         raise InvalidInputError(subject, got, expected)
 
-    def stop(self) -> None:
+    def __exit__(self, *_: object) -> None:
         """Answer no more."""
         self._stop.set()
-        if self._thread.is_alive():
-            self._thread.join(2 * _SEND_S)
+        self._thread.join(2 * _SEND_S)
         if self._process is not None:
             self._process.end()
             if self._address.startswith("unix:"):
                 with suppress(OSError):
                     os.unlink(self._address.removeprefix("unix:"))
-
-    def __enter__(self) -> Self:
-        return self.start()
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
 
     def _beat(self) -> None:
         while True:

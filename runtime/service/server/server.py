@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-from collections.abc import Coroutine, Sequence
+from collections.abc import Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Self, TypeVar
 
@@ -57,7 +57,6 @@ class LightpageServer:
         plane: the service's logic.
         recalibrator: what recalibrates it.
         address: HOST:PORT; port 0 takes a free one.
-        more: further handlers.
         certificates: with which it meets its callers, who must have some too; None for no TLS.
         inference: whether the Open Inference Protocol is served too.
         traces: are told of every call, None for none.
@@ -68,7 +67,6 @@ class LightpageServer:
         plane: DataPlane,
         recalibrator: Recalibrator,
         address: str = "127.0.0.1:0",
-        more: Sequence[object] = (),
         certificates: Certificates | None = None,
         inference: bool = True,
         traces: Traces | None = None,
@@ -78,7 +76,7 @@ class LightpageServer:
         self._credentials = None if certificates is None else certificates.server_credentials()
         if certificates is not None:
             plane.metrics.watch_certificates(certificates.ends_s)
-        self._services = [Served(SERVICE, (*more, *handlers(plane, recalibrator)))]
+        self._services = [Served(SERVICE, handlers(plane, recalibrator))]
         if inference:
             self._services.append(Served(INFERENCE, (InferenceCalls(plane),), PREFIX))
         self._inference = inference

@@ -470,12 +470,11 @@ def test_never_while_another_recalibration_runs(make: Make) -> None:
 def test_reads_go_on_while_it_recalibrates_and_it_stops_in_the_middle(make: Make) -> None:
     fit = SlowFit()
     loop = make(fit)
-    running = loop.running.start()
-    loop.drift()
-    assert fit.entered.wait(60)
-    loop.source.device.offsets = toy.OFFSETS
-    assert loop.read(5) == 0
-    running.stop(60.0)
+    with loop.running:
+        loop.drift()
+        assert fit.entered.wait(60)
+        loop.source.device.offsets = toy.OFFSETS
+        assert loop.read(5) == 0
     assert fit.ended.wait(60)
     assert loop.version == "toy-1"
     assert eventually(lambda: loop.count("dropped") == 1)

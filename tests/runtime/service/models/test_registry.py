@@ -142,7 +142,7 @@ def test_other_devices_and_bundles_that_cannot_be_tracked_are_refused(decoder: D
         return NoTracker(made)
 
     with pytest.raises(BundleError, match="calibration"):
-        ModelRegistry(decoder, tracker).check(same)
+        ModelRegistry(decoder, tracker).tracked(same)
     with pytest.raises(BundleError, match="got 10 bits"):
-        ModelRegistry(decoder).check(deep)
-    ModelRegistry(decoder).check(same)
+        ModelRegistry(decoder).tracked(deep)
+    ModelRegistry(decoder).tracked(same)
