@@ -41,7 +41,6 @@ APART = {
     "*/history.py": "figures of the last pages, for the console",
     "*/stages.py": "times of a page, for metrics, traces and the reply",
     "*/traces.py": "traces",
-    "*/heart.py": "health: whether a decode hangs",
     "*/errors.py": "errors",
     "*/failures.py": "errors: what those of the system mean",
     "*/status.py": "errors as gRPC says them",

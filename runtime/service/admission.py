@@ -1,11 +1,12 @@
-"""What may be at work at once: slots, first come, first served, and bytes of frames that were received."""
+"""What may be at work at once: slots, first come, first served, bytes of frames that were received, what has hung."""
 
 from __future__ import annotations
 
 import sys
 import threading
+import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import ceil
@@ -56,20 +57,18 @@ class Slots:
         what: they are for, for the error, e.g. ``"decodes"``.
         deadline_s: longest wait, seconds.
         clock: by which callers wait.
+
+    Attributes:
+        count: how many there are.
     """
 
     def __init__(self, count: int, what: str, deadline_s: float, clock: Clock = SYSTEM) -> None:
-        self._count, self._what, self._deadline_s, self._clock = count, what, deadline_s, clock
+        self.count, self._what, self._deadline_s, self._clock = count, what, deadline_s, clock
         self._lock = threading.Lock()
         self._free = count
         self._queue: deque[_Ticket] = deque()
         self._lately: deque[tuple[float, float]] = deque(maxlen=REMEMBERED)
         """When calls ended, and how long they took, seconds."""
-
-    @property
-    def count(self) -> int:
-        """How many there are."""
-        return self._count
 
     @property
     def queued(self) -> int:
@@ -81,7 +80,7 @@ class Slots:
     def busy(self) -> int:
         """Slots that are taken."""
         with self._lock:
-            return self._count - self._free
+            return self.count - self._free
 
     @property
     def usual_s(self) -> float:
@@ -93,7 +92,7 @@ class Slots:
         """How long whoever comes now will wait for a slot, seconds."""
         with self._lock:
             ahead = len(self._queue) + (0 if self._free else 1)
-        return self.usual_s * ahead / self._count
+        return self.usual_s * ahead / self.count
 
     def check(self, caller: Caller) -> None:
         """Turn a caller away for whom it would be too late, before anything is spent on the call.
@@ -156,7 +155,7 @@ class Slots:
         """
         with self._lock:
             if not self._free:
-                raise SlotsTakenError(self._what, "all taken", f"at most {self._count} at once", retry_s=1.0)
+                raise SlotsTakenError(self._what, "all taken", f"at most {self.count} at once", retry_s=1.0)
             self._free -= 1
         try:
             yield
@@ -201,7 +200,40 @@ class Slots:
         if not in_queue:
             return OverloadedError(subject, told, f"at least {needed_s:.2f} s")
         expected = f"at least {needed_s:.2f} s, {wait_s:.2f} s of it in the queue; try again later"
-        return OverloadedError(subject, told, expected, max(self.usual_s / self._count, needed_s - left_s))
+        return OverloadedError(subject, told, expected, max(self.usual_s / self.count, needed_s - left_s))
+
+
+class Heart:
+    """Knows of every decode that runs.
+
+    Args:
+        longest_s: a decode that takes longer has hung.
+        clock: seconds that never go back.
+    """
+
+    def __init__(self, longest_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._longest_s, self._clock = longest_s, clock
+        self._lock = threading.Lock()
+        self._begun: dict[object, float] = {}
+
+    @contextmanager
+    def at_work(self) -> Iterator[None]:
+        """A decode runs within the `with` statement."""
+        key = object()
+        with self._lock:
+            self._begun[key] = self._clock()
+        try:
+            yield
+        finally:
+            with self._lock:
+                del self._begun[key]
+
+    def trouble(self) -> str:
+        """Why the service cannot be said to serve; empty where it can."""
+        with self._lock:
+            oldest = min(self._begun.values(), default=None)
+        taken_s = 0.0 if oldest is None else self._clock() - oldest
+        return f"a decode has been running for {taken_s:.0f} s" if taken_s > self._longest_s else ""
 
 
 class ReceiveBudget:
@@ -211,29 +243,17 @@ class ReceiveBudget:
 
     Args:
         size: bytes.
+
+    Attributes:
+        size: bytes that there are.
+        used: bytes that are taken.
+        taken: bytes that were ever taken.
     """
 
     def __init__(self, size: int) -> None:
-        self._size, self._used, self._taken = size, 0, 0
+        self.size, self.used, self.taken = size, 0, 0
         self._spare: Bytes | None = None
         self._lock = threading.Lock()
-
-    @property
-    def used(self) -> int:
-        """Bytes that are taken."""
-        with self._lock:
-            return self._used
-
-    @property
-    def size(self) -> int:
-        """Bytes that there are."""
-        return self._size
-
-    @property
-    def taken(self) -> int:
-        """Bytes that were ever taken."""
-        with self._lock:
-            return self._taken
 
     def take(self, count: int) -> None:
         """Take bytes.
@@ -242,16 +262,16 @@ class ReceiveBudget:
             OverloadedError: they are not there.
         """
         with self._lock:
-            if self._used + count > self._size:
-                got, expected = f"{self._used} bytes", f"at most {self._size} with {count} more; try again later"
+            if self.used + count > self.size:
+                got, expected = f"{self.used} bytes", f"at most {self.size} with {count} more; try again later"
                 raise OverloadedError("frames that are being received", got, expected, retry_s=_RETRY_S)
-            self._used += count
-            self._taken += count
+            self.used += count
+            self.taken += count
 
     def give_back(self, count: int) -> None:
         """Give bytes back."""
         with self._lock:
-            self._used -= count
+            self.used -= count
 
     def memory(self, size: int) -> Bytes:
         """Memory for a pair, uint8 [size]: that of one before, where nobody holds a view of it any more.

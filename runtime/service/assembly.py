@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from lightpage.errors import LostShotError, SourceError
+from lightpage.errors import LightpageError, LostShotError, SourceError
 from lightpage.recording.pages import Pages
 from lightpage.runtime.device.acquisition.page_store import PageStore
 from lightpage.runtime.device.acquisition.source import FrameSource, open_source
@@ -17,11 +17,12 @@ from lightpage.runtime.model.bundle.shipped import bundle_path
 from lightpage.runtime.model.bundle.signature import BundleKey
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
+from lightpage.runtime.model.decoding.tracking import NoTracker
 from lightpage.runtime.model.execution.providers import Provider
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 from lightpage.runtime.service.models.audit import AuditLog
-from lightpage.runtime.service.models.registry import ModelRegistry, no_tracker
+from lightpage.runtime.service.models.registry import ModelRegistry
 from lightpage.runtime.service.models.store import ModelStore
 from lightpage.runtime.service.monitoring.flight_recorder import FlightRecorder
 from lightpage.runtime.service.monitoring.logs import PageLog
@@ -65,7 +66,7 @@ def assembled(settings: ServiceSettings, history: Observer) -> Iterator[Assembly
     key = None if service.bundle_key is None else BundleKey(service.bundle_key)
     provider = Provider.parse(service.provider, service.engine_cache)
     base = Decoder(Bundle.open(bundle_path(service.bundle), key=key), service.threads, provider=provider)
-    registry = ModelRegistry(base, tracker_for if service.tracking else no_tracker, key=key)
+    registry = ModelRegistry(base, tracker_for if service.tracking else NoTracker, key=key)
     metrics = ServiceMetrics()
     monitor = Monitor(metrics=metrics)
     observers = [history, PageLog()]
@@ -93,8 +94,10 @@ def assembled(settings: ServiceSettings, history: Observer) -> Iterator[Assembly
         )
         plane.models.resume()
         recalibrator = Recalibrator(plane, recordings=service.recordings)
-        if (trouble := recalibrator.no_room()) is not None:
-            _log.warning("recalibrations will be refused: %s", trouble)
+        try:
+            recalibrator.check_start()
+        except LightpageError as error:
+            _log.warning("recalibrations will be refused: %s", error)
         yield Assembly(plane, recalibrator, monitor, "no source" if source is None else source.name)
 
 

@@ -6,13 +6,14 @@ import asyncio
 import math
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 from lightpage.errors import CallerLeft, NotAllowedError
 from lightpage.runtime.service.stages import CallTimes
@@ -69,7 +70,8 @@ class Identity:
         if now >= self.until:
             raise NotAllowedError(what, f"a certificate of {self.name} that has expired", "one that is valid")
         if not self.may(role):
-            got = f"{self.name} with {_listed(self.roles)}"
+            roles = ", ".join(f"role {role}" for role in sorted(self.roles)) or "no role"
+            got = f"{self.name} with {roles}"
             raise NotAllowedError(what, got, f"a certificate with {ROLE_URI}{role}")
 
 
@@ -77,10 +79,6 @@ LOCAL = Identity("", frozenset(Role))
 """Whoever reaches a service that asks for no certificates: a process of this machine."""
 STRANGER = Identity("nobody", frozenset())
 """Whoever has no certificate where one is asked for."""
-
-
-def _listed(roles: Iterable[Role]) -> str:
-    return ", ".join(f"role {role}" for role in sorted(roles)) or "no role"
 
 
 def own_name(name: str, caller: str) -> str:
@@ -99,7 +97,35 @@ def named_session(name: str, caller: str) -> str:
 
 
 MOST_SESSIONS = 256
-"""Sessions that are remembered; of more, the one that was silent for longest is forgotten, and begins anew."""
+"""Sessions that are remembered."""
+
+
+class Sessions(Generic[T]):
+    """What belongs to each session: what the pages of different callers show is kept apart.
+
+    Args:
+        make: makes what belongs to a new one.
+        most: that are remembered; of more, the one that was silent for longest is forgotten, and begins anew.
+    """
+
+    def __init__(self, make: Callable[[str], T], most: int = MOST_SESSIONS) -> None:
+        self._make, self._most, self._lock = make, most, threading.Lock()
+        self._known: OrderedDict[str, T] = OrderedDict()
+
+    def of(self, session: str) -> T:
+        """What belongs to a session."""
+        with self._lock:
+            if (found := self._known.pop(session, None)) is None:
+                found = self._make(session)
+            self._known[session] = found
+            if len(self._known) > self._most:
+                self._known.popitem(last=False)
+            return found
+
+    def all(self) -> list[T]:
+        """What belongs to those that are remembered."""
+        with self._lock:
+            return list(self._known.values())
 
 
 @dataclass(frozen=True)

@@ -28,14 +28,13 @@ from lightpage.runtime.device.acquisition.source import FrameSource
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.page import DecodedPage
 from lightpage.runtime.model.decoding.tracking import unconfirmed_page
-from lightpage.runtime.service.admission import ReceiveBudget, Slots
+from lightpage.runtime.service.admission import Heart, ReceiveBudget, Slots
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.limits import Limits
 from lightpage.runtime.service.models.audit import AuditLog
 from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.models.registry import Model, ModelRegistry
 from lightpage.runtime.service.models.store import ModelStore
-from lightpage.runtime.service.monitoring.heart import Heart
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor, SessionMonitors
 from lightpage.runtime.service.monitoring.observation import Observation, Observer
@@ -239,16 +238,11 @@ class DataPlane:
             yield
         except (LostPageError, FrameError):
             if user_data:
-                self.metrics.no_user_data(Loss.OPTICS)
+                self.metrics.data_pages.labels(Loss.OPTICS.value).inc()
             raise
 
     def user_data(
-        self,
-        model: Model,
-        page: DecodedPage,
-        stages: Stages,
-        monitor: Monitor | None,
-        expected: Header | None = None,
+        self, model: Model, page: DecodedPage, stages: Stages, monitor: Monitor | None, expected: Header | None = None
     ) -> PageBytes:
         """The bytes of a page that was decoded, counted."""
         stages.begin(Stage.CODE)

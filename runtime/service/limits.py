@@ -10,78 +10,11 @@ from lightpage.device.profile import TomlTable
 from lightpage.runtime.client.wire.messages import CHUNK_BYTES, MESSAGE_BYTES, REPLY_BYTES
 from lightpage.runtime.device.acquisition.page_store import UPLOADED_BYTES
 
-PAIR_BYTES = 256 << 20
-"""Both frames of a pair: three times a full-scale 20-megapixel pair of 16 bits."""
-
-RECEIVE_BYTES = 1 << 30
-"""Bytes of pairs that were received and are not yet decoded, of all callers together: bounds the memory."""
-
-CONCURRENT_DECODES = 2
-"""Decodes at once: inference uses all cores, a second page fills the gaps around it, a third would only wait inside."""
-
-CONCURRENT_CALLS = 192
-"""Calls at once; beyond them the service refuses at once. A call that waits for its turn holds a thread, and one that
-sends its frames does not."""
-
-RECEIVE_S = 30.0
-"""A client that has not sent its frames by then is too slow, and its buffer is given back."""
-
-STALL_S = 5.0
-"""A client that sends nothing for so long in the middle of its frames has stalled."""
-
-SHARED_BYTES = 1 << 30
-"""Memory shared with clients, all of it together: a dozen full-size pairs of 16 bits."""
-
-SHARED_REGIONS = 64
-"""Regions of it at once."""
-
-REPLAY_S = 600.0
-"""An answer with a request id is kept for so long: a controller that lost its connection has time to come back."""
-
-REPLAY_BYTES = 64 << 20
-"""All such answers together: some 300 full-size pages of symbols and confidences."""
-
-MODEL_BYTES = 1 << 30
-"""An uploaded bundle: five times a full-size one."""
-
-MODEL_S = 600.0
-"""A bundle that has not come by then is dropped: a full-size one comes over a slow line in that time."""
-
 JOBS_KEPT = 64
 """Results of jobs that are kept."""
 
-DECODE_S = 120.0
-"""A decode that takes longer has hung, and health checks fail: three times a full-size page by waves on two cores."""
-
-DEADLINE_S = 60.0
-"""Wait for a free slot where the caller set no deadline of its own."""
-
-RECALIBRATION_PAGES = 16
-"""Pages that one recalibration reads into memory."""
-
-RECALIBRATION_S = 300.0
-"""One recalibration in its own process. On two cores a bench device's takes 8 s beside an idle service, and 90 s beside
-reads without a pause on both cores, since its priority leaves it what they do not use and a tenth of a core."""
-
-CONCURRENT_RANGES = 4
-"""Ranges of pages of which a page is being read. A range whose caller takes its time to read a reply does not count."""
-
-RANGE_PAGES = 4096
-"""Pages of one range."""
-
-RANGE_S = 3600.0
-"""A range that is not read to its end by then is dropped."""
-
-READER_S = 60.0
-"""A caller that does not take a reply of a stream for so long has stalled, and its call is ended: until then the reply
-and what was read ahead for it lie in memory."""
-
-CONCURRENT_WATCHES = 2
-"""Controllers that watch what is to be shown: one, and one whose connection has been lost."""
-
 GRACE_S = 10.0
 """Time that calls in flight get when the service is told to stop."""
-
 
 _Bytes = Annotated[int, Field(ge=1, le=(1 << 31) - 1)]
 """Of a message: gRPC counts them in 32 bits."""
@@ -93,38 +26,66 @@ _Count = Annotated[int, Field(ge=1, le=4096)]
 class Limits(TomlTable):
     """The limits that one service runs under: the table [limits] of its settings.
 
-    Each default has its reason above, where it is named. A connection has no longest age unless one is set: a device's
-    only controller would gain nothing by a new one, and lose its session. Nor are calls ended for it.
+    Each default has its reason below it, or where it is named. A connection has no longest age unless one is set: a
+    device's only controller would gain nothing by a new one, and lose its session. Nor are calls ended for it.
     """
 
     model_config = ConfigDict(strict=True)
 
     message_bytes: _Bytes = MESSAGE_BYTES
     chunk_bytes: _Bytes = CHUNK_BYTES
-    pair_bytes: _MemoryBytes = PAIR_BYTES
+    pair_bytes: _MemoryBytes = 256 << 20
+    """Both frames of a pair: three times a full-scale 20-megapixel pair of 16 bits."""
     reply_bytes: _Bytes = REPLY_BYTES
-    receive_bytes: _MemoryBytes = RECEIVE_BYTES
-    concurrent_decodes: Annotated[int, Field(ge=1, le=256)] = CONCURRENT_DECODES
-    concurrent_calls: _Count = CONCURRENT_CALLS
-    receive_s: _Seconds = RECEIVE_S
-    stall_s: _Seconds = STALL_S
-    shared_bytes: _MemoryBytes = SHARED_BYTES
-    shared_regions: _Count = SHARED_REGIONS
-    replay_s: _Seconds = REPLAY_S
-    replay_bytes: _MemoryBytes = REPLAY_BYTES
-    model_bytes: _MemoryBytes = MODEL_BYTES
-    model_s: _Seconds = MODEL_S
+    receive_bytes: _MemoryBytes = 1 << 30
+    """Bytes of pairs that were received and are not yet decoded, of all callers together: bounds the memory."""
+    concurrent_decodes: Annotated[int, Field(ge=1, le=256)] = 2
+    """Decodes at once: inference uses all cores, a second page fills the gaps around it, a third would only wait
+    inside."""
+    concurrent_calls: _Count = 192
+    """Calls at once; beyond them the service refuses at once. A call that waits for its turn holds a thread, and one
+    that sends its frames does not."""
+    receive_s: _Seconds = 30.0
+    """A client that has not sent its frames by then is too slow, and its buffer is given back."""
+    stall_s: _Seconds = 5.0
+    """A client that sends nothing for so long in the middle of its frames has stalled."""
+    shared_bytes: _MemoryBytes = 1 << 30
+    """Memory shared with clients, all of it together: a dozen full-size pairs of 16 bits."""
+    shared_regions: _Count = 64
+    """Regions of it at once."""
+    replay_s: _Seconds = 600.0
+    """An answer with a request id is kept for so long: a controller that lost its connection has time to come back."""
+    replay_bytes: _MemoryBytes = 64 << 20
+    """All such answers together: some 300 full-size pages of symbols and confidences."""
+    model_bytes: _MemoryBytes = 1 << 30
+    """An uploaded bundle: five times a full-size one."""
+    model_s: _Seconds = 600.0
+    """A bundle that has not come by then is dropped: a full-size one comes over a slow line in that time."""
     jobs_kept: Annotated[int, Field(ge=1, le=1_000_000)] = JOBS_KEPT
-    decode_s: _Seconds = DECODE_S
-    deadline_s: _Seconds = DEADLINE_S
-    recalibration_pages: _Count = RECALIBRATION_PAGES
-    recalibration_s: _Seconds = RECALIBRATION_S
+    decode_s: _Seconds = 120.0
+    """A decode that takes longer has hung, and health checks fail: three times a full-size page by waves on two
+    cores."""
+    deadline_s: _Seconds = 60.0
+    """Wait for a free slot where the caller set no deadline of its own."""
+    recalibration_pages: _Count = 16
+    """Pages that one recalibration reads into memory."""
+    recalibration_s: _Seconds = 300.0
+    """One recalibration in its own process. On two cores a bench device's takes 8 s beside an idle service, and 90 s
+    beside reads without a pause on both cores, since its priority leaves it what they do not use and a tenth of a
+    core."""
     uploaded_bytes: _MemoryBytes = UPLOADED_BYTES
-    concurrent_ranges: _Count = CONCURRENT_RANGES
-    range_pages: Annotated[int, Field(ge=1, le=1 << 32)] = RANGE_PAGES
-    range_s: _Seconds = RANGE_S
-    reader_s: _Seconds = READER_S
-    concurrent_watches: _Count = CONCURRENT_WATCHES
+    concurrent_ranges: _Count = 4
+    """Ranges of pages of which a page is being read. A range whose caller takes its time to read a reply does not
+    count."""
+    range_pages: Annotated[int, Field(ge=1, le=1 << 32)] = 4096
+    """Pages of one range."""
+    range_s: _Seconds = 3600.0
+    """A range that is not read to its end by then is dropped."""
+    reader_s: _Seconds = 60.0
+    """A caller that does not take a reply of a stream for so long has stalled, and its call is ended: until then the
+    reply and what was read ahead for it lie in memory."""
+    concurrent_watches: _Count = 2
+    """Controllers that watch what is to be shown: one, and one whose connection has been lost."""
     grace_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] = GRACE_S
     connection_age_s: _Seconds | None = None
     connection_grace_s: _Seconds | None = None

@@ -8,14 +8,12 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Generic, Literal, Self, TypeVar, get_args, get_origin
+from typing import Annotated, Any, Literal, Self, get_args, get_origin
 
 from pydantic import (
-    BaseModel,
     BeforeValidator,
     ConfigDict,
     Field,
-    SecretStr,
     TypeAdapter,
     ValidationError,
     field_validator,
@@ -53,13 +51,8 @@ AUDIT_FILE = "audit.jsonl"
 LINES_PER_SECOND = 5
 """Lines of one kind in a log: enough to see that it goes on, and too few to fill a disk in a night."""
 
-_MASK = "********"
 _HEADER_BYTES = 1 << 10
 """Of a message beside the chunk in it, at most."""
-
-
-class Secret(SecretStr):
-    """Text that nobody shall read in a log, in an error, or among the printed settings: a key, a password."""
 
 
 def _not_empty(value: Any) -> Any:
@@ -377,12 +370,7 @@ class ServiceSettings(TomlTable):
             own.device_sessions,
             "CALLER/SESSION with [tls], since sessions belong to the name in a certificate",
         )
-        _want(
-            self.service.address != OFF,
-            "service.address",
-            OFF,
-            "an address: only health_address may be off",
-        )
+        _want(self.service.address != OFF, "service.address", OFF, "an address: only health_address may be off")
         _want(
             not self.service.shared_memory or self.service.address.startswith("unix:"),
             "service.shared_memory",
@@ -432,7 +420,6 @@ def _want(right: bool, key: str, got: Any, wanted: str) -> None:
 
 Key = tuple[str, str]
 """Table and key."""
-T = TypeVar("T", bound=TomlTable)
 
 
 @dataclass(frozen=True)
@@ -445,16 +432,16 @@ class Option:
 
 
 @dataclass(frozen=True)
-class Effective(Generic[T]):
+class Effective:
     """Settings, and where each that is no default comes from."""
 
-    settings: T
+    settings: ServiceSettings
     origins: Mapping[Key, str]
 
     def to_toml(self) -> str:
-        """All settings as TOML text, each with its origin as a comment; secrets are masked."""
+        """All settings as TOML text, each with its origin as a comment."""
         lines = ["# The settings in effect, and where each of them comes from."]
-        for name in type(self.settings).model_fields:
+        for name in ServiceSettings.model_fields:
             table = getattr(self.settings, name)
             lines += ["", f"[{name}]"]
             for key in type(table).model_fields:
@@ -466,38 +453,16 @@ class Effective(Generic[T]):
 
 def service_settings(
     file: Path | None = None, environment: Mapping[str, str] | None = None, options: Iterable[Option] = ()
-) -> Effective[ServiceSettings]:
-    """The settings of a service; see `read_settings`.
-
-    Args:
-        file: TOML, None for none.
-        environment: variables, by default those of this process; `STORE_VARIABLE` counts too.
-        options: of the command line.
-
-    Raises:
-        InvalidInputError: the file cannot be read, or a setting is wrong.
-    """
-    environment = os.environ if environment is None else environment
-    return read_settings(ServiceSettings, file, environment, options, {STORE_VARIABLE: ("service", "store")})
-
-
-def read_settings(
-    model: type[T],
-    file: Path | None,
-    environment: Mapping[str, str],
-    options: Iterable[Option] = (),
-    short_names: Mapping[str, Key] | None = None,
-) -> Effective[T]:
+) -> Effective:
     """Settings of a file, of the environment and of options, checked together; the later of these count.
 
     An empty variable of the environment counts as one that is not set.
 
     Args:
-        model: its fields are tables.
         file: TOML, None for none.
-        environment: variables; those named `PREFIX` + TABLE__KEY count.
+        environment: variables, by default those of this process; those named `PREFIX` + TABLE__KEY count, and before
+            them, where it is not named so, `STORE_VARIABLE`.
         options: of the command line.
-        short_names: further variables and the keys that they set; the long names count before them.
 
     Raises:
         InvalidInputError: the file cannot be read, or a setting is wrong.
@@ -507,9 +472,10 @@ def read_settings(
     for name, table in data.items():
         if isinstance(table, dict):
             origins |= {(name, key): f"file {file}" for key in table}
-    named = {name: key for name, key in (short_names or {}).items() if environment.get(name)}
+    environment = os.environ if environment is None else environment
+    named = {STORE_VARIABLE: ("service", "store")} if environment.get(STORE_VARIABLE) else {}
     named |= {name: key for name in sorted(environment) if (key := _key_of(name)) is not None and environment[name]}
-    given = [Option(name, key, _from_text(model, name, key, environment[name])) for name, key in named.items()]
+    given = [Option(name, key, _from_text(name, key, environment[name])) for name, key in named.items()]
     for origin, option in [*(("environment", each) for each in given), *(("option", each) for each in options)]:
         table_name, key_name = option.key
         if isinstance(data.setdefault(table_name, {}), dict):
@@ -517,9 +483,9 @@ def read_settings(
         origins[option.key] = f"{origin} {option.name}"
     subject = "settings" if file is None else f"settings {file}"
     try:
-        return Effective(model.model_validate(data), origins)
+        return Effective(ServiceSettings.model_validate(data), origins)
     except ValidationError as error:
-        problems = [_told(model, each, origins) for each in error.errors(include_url=False)]
+        problems = [_told(each, origins) for each in error.errors(include_url=False)]
     if len(problems) == 1:
         origin, got, wanted = problems[0]
         raise InvalidInputError(origin or subject, got, wanted)
@@ -541,17 +507,10 @@ def _key_of(variable: str) -> Key | None:
     return (table, key) if variable.startswith(PREFIX) and apart else None
 
 
-def _field(model: type[BaseModel], key: Key) -> FieldInfo | None:
-    """The field of a key, None where there is no such key."""
-    table = model.model_fields.get(key[0])
-    kind = None if table is None else table.annotation
-    return kind.model_fields.get(key[1]) if isinstance(kind, type) and issubclass(kind, BaseModel) else None
-
-
-def _from_text(model: type[BaseModel], variable: str, key: Key, text: str) -> Any:
+def _from_text(variable: str, key: Key, text: str) -> Any:
     """A value of the environment in the type of its key, not yet checked for its bounds."""
-    if (field := _field(model, key)) is None:
-        raise InvalidInputError(variable, f"no setting {'.'.join(key)}", _meant(model, key))
+    if (field := _fields(key[0]).get(key[1])) is None:
+        raise InvalidInputError(variable, f"no setting {'.'.join(key)}", _meant(key))
     kind: Any = field.annotation
     try:
         if get_origin(kind) is not tuple:
@@ -560,13 +519,12 @@ def _from_text(model: type[BaseModel], variable: str, key: Key, text: str) -> An
         parts = text.strip("[] ").split(",")
         return tuple(one.validate_strings(part.strip()) for part in parts if part.strip())
     except ValidationError as error:
-        shown = _MASK if _is_secret(kind) else repr(text)
-        raise InvalidInputError(variable, shown, expected_of(error.errors(include_url=False)[0])) from None
+        raise InvalidInputError(variable, repr(text), expected_of(error.errors(include_url=False)[0])) from None
 
 
-def _meant(model: type[BaseModel], key: Key) -> str:
+def _meant(key: Key) -> str:
     """What may have been meant by a key that is not there."""
-    tables = {name: set(_keys(model, name)) for name in model.model_fields}
+    tables = {name: set(_fields(name)) for name in ServiceSettings.model_fields}
     table, name = key
     if table not in tables:
         found = difflib.get_close_matches(table, tables, 1)
@@ -577,24 +535,24 @@ def _meant(model: type[BaseModel], key: Key) -> str:
     return f"{elsewhere[0]}.{name}" if elsewhere else f"one of {', '.join(sorted(tables[table]))}"
 
 
-def _keys(model: type[BaseModel], table: str) -> Iterable[str]:
-    kind = model.model_fields[table].annotation
-    return kind.model_fields if isinstance(kind, type) and issubclass(kind, BaseModel) else ()
+def _fields(table: str) -> Mapping[str, FieldInfo]:
+    """The fields of a table by their keys, none of one that is not there."""
+    field = ServiceSettings.model_fields.get(table)
+    kind: Any = None if field is None else field.annotation
+    return {} if kind is None else kind.model_fields
 
 
-def _told(model: type[BaseModel], error: ErrorDetails, origins: Mapping[Key, str]) -> tuple[str, str, str]:
-    """Where one wrong setting comes from, what came, and what was wanted; a secret is not shown."""
-    problem = problem_of(model, error)
+def _told(error: ErrorDetails, origins: Mapping[Key, str]) -> tuple[str, str, str]:
+    """Where one wrong setting comes from, what came, and what was wanted."""
+    problem = problem_of(ServiceSettings, error)
     place = problem.place or problem.got.partition(" = ")[0]  # of settings that do not go together
     table, _, name = place.partition(".")
-    key = (table, name.partition(".")[0])
-    origin, field = origins.get(key, ""), _field(model, key)
+    origin = origins.get((table, name.partition(".")[0]), "")
     if problem.kind == "unknown":
-        return origin, f"unknown {place}", _meant(model, (table, name))
+        return origin, f"unknown {place}", _meant((table, name))
     if problem.kind == "missing" or not problem.place:
         return origin, problem.got, problem.expected
-    got = _MASK if field is not None and _is_secret(field.annotation) else problem.got
-    return origin, f"{place} = {got}", problem.expected
+    return origin, f"{place} = {problem.got}", problem.expected
 
 
 def _shown(value: Any) -> str:
@@ -603,15 +561,7 @@ def _shown(value: Any) -> str:
     return repr(str(value) if isinstance(value, Path) else value)
 
 
-def _is_secret(annotation: Any) -> bool:
-    if isinstance(annotation, type) and issubclass(annotation, SecretStr):
-        return True
-    return any(_is_secret(part) for part in get_args(annotation))
-
-
 def _toml(value: Any) -> str:
-    if isinstance(value, SecretStr):
-        return toml_value(_MASK)
     if isinstance(value, tuple):
         return f"[{', '.join(map(_toml, value))}]"
     return toml_value(str(value) if isinstance(value, Path) else value)

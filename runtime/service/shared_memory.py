@@ -11,11 +11,10 @@ import selectors
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from lightpage.errors import InvalidInputError, LightpageError, LimitError, OverloadedError
@@ -116,19 +115,13 @@ class SharedMemory:
         most_bytes: of all regions together.
         most_regions: at once.
         silence_s: a client that does not say how much it wants is hung up on after so long.
-        clock: seconds that never go back.
     """
 
-    def __init__(
-        self,
-        path: str,
-        most_bytes: int,
-        most_regions: int,
-        silence_s: float,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._path, self._most_bytes, self._most_regions = Path(path), most_bytes, most_regions
-        self.most_bytes, self._silence_s, self._clock = most_bytes, silence_s, clock
+    def __init__(self, path: str, most_bytes: int, most_regions: int, silence_s: float) -> None:
+        self._path, self._most_regions, self._silence_s = Path(path), most_regions, silence_s
+        self.most_bytes = most_bytes
+        self._clients: dict[socket.socket, _Client] = {}
+        self._selector = selectors.DefaultSelector()
         self._regions: dict[bytes, Region] = {}
         self._lock = threading.Lock()
         self._stopping = threading.Event()
@@ -147,12 +140,6 @@ class SharedMemory:
             raise unknown_region()
         with region.reading(offset, size) as part:
             yield part
-
-    @property
-    def used_bytes(self) -> int:
-        """Of all regions together."""
-        with self._lock:
-            return sum(region.size for region in self._regions.values())
 
     def __enter__(self) -> Self:
         """Listen.
@@ -176,9 +163,7 @@ class SharedMemory:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stopping.set()
         self._thread.join()
         self._socket.close()
@@ -186,29 +171,28 @@ class SharedMemory:
             self._path.unlink()
 
     def _run(self) -> None:
-        clients: dict[socket.socket, _Client] = {}
-        with selectors.DefaultSelector() as selector:
-            selector.register(self._socket, selectors.EVENT_READ)
+        with self._selector:
+            self._selector.register(self._socket, selectors.EVENT_READ)
             while not self._stopping.is_set():
-                for key, _ in selector.select(_LOOK_S):
+                for key, _ in self._selector.select(_LOOK_S):
                     try:
-                        self._serve(key.fileobj, selector, clients)
+                        self._serve(key.fileobj)
                     except Exception:  # one client's trouble is nobody else's
                         _log.exception("shared memory: a client could not be served")
                         self._stopping.wait(_PAUSE_S)
-                late = self._clock() - self._silence_s
-                for connection in [one for one, client in clients.items() if not client.region and client.begun < late]:
-                    self._hang_up(selector, connection, clients)
-            for connection in list(clients):
-                self._hang_up(selector, connection, clients)
+                late, clients = time.monotonic() - self._silence_s, list(self._clients.items())
+                for connection in [one for one, client in clients if not client.region and client.begun < late]:
+                    self._hang_up(connection)
+            for connection in list(self._clients):
+                self._hang_up(connection)
 
-    def _serve(self, source: Any, selector: selectors.BaseSelector, clients: dict[socket.socket, _Client]) -> None:
+    def _serve(self, source: Any) -> None:
         if source is self._socket:
-            self._accept(selector, clients)
-        elif not self._hear(source, clients[source]):
-            self._hang_up(selector, source, clients)
+            self._accept()
+        elif not self._hear(source, self._clients[source]):
+            self._hang_up(source)
 
-    def _accept(self, selector: selectors.BaseSelector, clients: dict[socket.socket, _Client]) -> None:
+    def _accept(self) -> None:
         try:
             connection, _ = self._socket.accept()
         except OSError as error:  # the client has gone, or there are too many files
@@ -216,17 +200,15 @@ class SharedMemory:
             self._stopping.wait(_PAUSE_S)
             return
         connection.setblocking(False)
-        if len(clients) >= 2 * self._most_regions:
+        if len(self._clients) >= 2 * self._most_regions:
             connection.close()
             return
-        clients[connection] = _Client(self._clock())
-        selector.register(connection, selectors.EVENT_READ)
+        self._clients[connection] = _Client(time.monotonic())
+        self._selector.register(connection, selectors.EVENT_READ)
 
-    def _hang_up(
-        self, selector: selectors.BaseSelector, connection: socket.socket, clients: dict[socket.socket, _Client]
-    ) -> None:
-        region = clients.pop(connection).region
-        selector.unregister(connection)
+    def _hang_up(self, connection: socket.socket) -> None:
+        region = self._clients.pop(connection).region
+        self._selector.unregister(connection)
         connection.close()
         if region is not None:
             with self._lock:
@@ -261,13 +243,13 @@ class SharedMemory:
     def _made(self, size: int) -> Region:
         """A new region."""
         subject = "shared memory"
-        if not 0 < size <= self._most_bytes:
-            raise LimitError(subject, f"{size} bytes", f"1 to {self._most_bytes}")
+        if not 0 < size <= self.most_bytes:
+            raise LimitError(subject, f"{size} bytes", f"1 to {self.most_bytes}")
         with self._lock:
             used = sum(region.size for region in self._regions.values())
-            if len(self._regions) >= self._most_regions or used + size > self._most_bytes:
+            if len(self._regions) >= self._most_regions or used + size > self.most_bytes:
                 got = f"{len(self._regions)} regions of {used} bytes, and {size} more"
-                expected = f"at most {self._most_regions} of {self._most_bytes} bytes together; try again later"
+                expected = f"at most {self._most_regions} of {self.most_bytes} bytes together; try again later"
                 raise OverloadedError(subject, got, expected, retry_s=_RETRY_S)
             try:
                 region = Region(size)

@@ -48,13 +48,16 @@ class Stages:
     Args:
         start: when the page's way began, seconds of `clock`; now if None.
         clock: seconds that never go back.
+
+    Attributes:
+        laps: the stages that have ended, in their order.
     """
 
     def __init__(self, start: float | None = None, clock: Callable[[], float] = time.perf_counter) -> None:
         self._clock = clock
         self.start = self._since = clock() if start is None else start
         self._lock = threading.Lock()
-        self._laps: list[Lap] = []
+        self.laps: list[Lap] = []
         self._running: Stage | None = None
         self._end: float | None = None
 
@@ -74,24 +77,14 @@ class Stages:
                 self._close(now)
             self._running = stage
 
-    def end(self, at: float | None = None) -> None:
-        """The page's way has ended, seconds of the clock; now if None."""
+    def end(self, at: float | None = None) -> float:
+        """The page's way has ended, seconds of the clock; now if None. Returns when it first did."""
         with self._lock:
             if self._end is None:
                 self._end = max(self._since, self._clock() if at is None else at)
                 if self._running is not None:
                     self._close(self._end)
-
-    @property
-    def laps(self) -> tuple[Lap, ...]:
-        """The stages that have ended, in their order."""
-        with self._lock:
-            return tuple(self._laps)
-
-    @property
-    def ended(self) -> float | None:
-        """When it ended, seconds of the clock, None before."""
-        return self._end
+            return self._end
 
     @property
     def elapsed_s(self) -> float:
@@ -101,7 +94,7 @@ class Stages:
     def seconds(self) -> dict[Stage, float]:
         """How long each stage took until now, those left out that never ran."""
         with self._lock:
-            laps = list(self._laps)
+            laps = list(self.laps)
             if self._end is None and self._running is not None:
                 laps.append(Lap(self._running, self._since, self._clock()))
         taken: dict[Stage, float] = {}
@@ -113,9 +106,9 @@ class Stages:
         """End the running stage; a stage that goes on is one lap."""
         assert self._running is not None  # of whoever calls
         lap = Lap(self._running, self._since, now)
-        if self._laps and self._laps[-1].stage is lap.stage:
-            lap = Lap(lap.stage, self._laps.pop().start, now)
-        self._laps.append(lap)
+        if self.laps and self.laps[-1].stage is lap.stage:
+            lap = Lap(lap.stage, self.laps.pop().start, now)
+        self.laps.append(lap)
         self._since = now
 
 
@@ -126,6 +119,10 @@ class CallTimes:
         begun: when the call began, `time.perf_counter` seconds.
         observe: is told of each page that has ended.
         keep: pages that are remembered, the first ones.
+
+    Attributes:
+        count: pages that were begun.
+        pages: those that are remembered.
     """
 
     def __init__(
@@ -135,28 +132,27 @@ class CallTimes:
         self._observe, self._keep = observe, keep
         self._lock = threading.Lock()
         self._open: list[Stages] = []
-        self._kept: list[Stages] = []
-        self._count = 0
+        self.pages: list[Stages] = []
+        self.count = 0
 
     def page(self, start: float | None = None) -> Stages:
         """Begin to time a page: from `start`, or from where the page before it ended, the first from the call's own."""
         stages = Stages(self._next if start is None else start)
         with self._lock:
             self._open.append(stages)
-            self._count += 1
+            self.count += 1
         return stages
 
     def done(self, stages: Stages, at: float | None = None) -> None:
         """A page has ended, `time.perf_counter` seconds; now if None."""
-        stages.end(at)
+        ended = stages.end(at)
         with self._lock:
             if stages not in self._open:
                 return
             self._open.remove(stages)
-            if len(self._kept) < self._keep:
-                self._kept.append(stages)
-            if stages.ended is not None:
-                self._next = stages.ended
+            if len(self.pages) < self._keep:
+                self.pages.append(stages)
+            self._next = ended
         self._observe(stages)
 
     def end(self, at: float | None = None) -> None:
@@ -165,15 +161,3 @@ class CallTimes:
             still = list(self._open)
         for stages in still:
             self.done(stages, at)
-
-    @property
-    def count(self) -> int:
-        """Pages that were begun."""
-        with self._lock:
-            return self._count
-
-    @property
-    def pages(self) -> tuple[Stages, ...]:
-        """Those that are remembered."""
-        with self._lock:
-            return tuple(self._kept)

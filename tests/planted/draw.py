@@ -29,7 +29,7 @@ AREAS = {
     "registry": {"runtime/service": "models/registry models/models pages/replays"},
     "store": {
         "runtime/service/models": "store store_health",
-        "runtime/service/monitoring": "file_ring flight_recorder",
+        "runtime/service/monitoring": "flight_recorder",
         "runtime/service/jobs": "jobs",
     },
     "pairing": {"runtime/device/acquisition": "pairing camera_source beam_keeper page_store source"},

@@ -35,6 +35,14 @@ def host_and_port(host: str, port: int | str) -> str:
     return f"[{host}]:{port}" if ":" in host and not host.startswith("[") else f"{host}:{port}"
 
 
+def target_of(address: str, port: int) -> str:
+    """Where a client on this machine finds what listens at an address, HOST:PORT or unix:PATH, and got a port."""
+    if address.startswith(_UNIX):
+        return address
+    host = address.rpartition(":")[0]
+    return f"{'127.0.0.1' if host in ('0.0.0.0', '[::]', '') else host}:{port}"
+
+
 def names_machine(host: str, known: Collection[str]) -> bool:
     """Whether a request's ``Host`` names this machine in a way that no stranger can choose.
 

@@ -38,6 +38,9 @@ _SHOT_S = 30.0
 @click.option("--symbols", type=click.Path(path_type=Path), help="Pages to show, PAGES.h5, as `encode` makes them.")
 @click.option("--profile", "profile_name", metavar="P", help="Nominal device, where the source does not know it.")
 @click.option("--out", required=True, type=OutputFile(), help="The recording, R.h5.")
+@click.option(
+    "--shot-seconds", type=click.FloatRange(0, min_open=True), help="Longest wait for one page, 30 s or the source's."
+)
 @click.option("--dark/--no-dark", default=True, show_default=True, help="Take dark frames first; mend hot pixels.")
 @click.option("--force", is_flag=True, help="Overwrite a recording that exists.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
@@ -47,6 +50,7 @@ def record(
     symbols: Path | None,
     profile_name: str | None,
     out: Path,
+    shot_seconds: float | None,
     dark: bool,
     force: bool,
     json_path: Path | None,
@@ -71,9 +75,10 @@ def record(
         _check_room(count, there)
         _tell_where(out, there)
         source.on_lost = _tell_loss
+        longest_s = max(_SHOT_S, source.shot_s) if shot_seconds is None else shot_seconds
         try:
             with source:
-                _record(source, profile, count, out, dark, force, json_path)
+                _record(source, profile, count, out, longest_s, dark, force, json_path)
         except LostShotError as error:  # of dark or reference frames
             raise LostDataError(error.subject, error.got, f"{error.expected} ({error.reason.value})") from None
 
@@ -119,7 +124,14 @@ def _tell_loss(page: int, error: LostShotError) -> None:
 
 
 def _record(
-    source: FrameSource, profile: Profile, count: int, out: Path, dark: bool, force: bool, json_path: Path | None
+    source: FrameSource,
+    profile: Profile,
+    count: int,
+    out: Path,
+    shot_seconds: float,
+    dark: bool,
+    force: bool,
+    json_path: Path | None,
 ) -> None:
     """Record pages of a source that is armed; see `record`."""
     if dark:
@@ -130,7 +142,6 @@ def _record(
     if references is None:
         raise InvalidInputError(f"source {source.name}", "no reference frames", "a source that can block its signal")
     losses: list[LostShot] = []
-    longest_s = max(_SHOT_S, source.shot_s)
     repeated = 0
     begun = time.perf_counter()
     with RecordingWriter.resume(
@@ -156,7 +167,7 @@ def _record(
         source.on_lost = keep
         begun_at = writer.pages
         for index in track(range(begun_at, count), "record", total=count, done=begun_at):
-            shot, attempts = _good_shot(source, index, longest_s)
+            shot, attempts = _good_shot(source, index, shot_seconds)
             repeated += attempts - 1
             writer.append(shot.symbols, shot.pair, infos=shot.infos)
             _tell_where(out, writer.pages)

@@ -36,7 +36,6 @@ from lightpage.runtime.service.settings import (
     Effective,
     MetricsTable,
     Option,
-    ServiceSettings,
     service_settings,
 )
 
@@ -146,7 +145,7 @@ def _given(context: click.Context) -> list[Option]:
     ]
 
 
-def _serve(effective: Effective[ServiceSettings], wait_for_stop: Callable[[], None]) -> None:
+def _serve(effective: Effective, wait_for_stop: Callable[[], None]) -> None:
     settings = effective.settings
     files = settings.tls.files()
     certificates = None if files is None else Certificates(files)

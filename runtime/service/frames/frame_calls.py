@@ -6,7 +6,6 @@ import asyncio
 import time
 from collections.abc import AsyncIterator, Awaitable
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -29,27 +28,11 @@ from lightpage.runtime.service.frames.frames import (
     decode_reply,
     pilots_of,
     pixel_type,
-    receiver_for,
 )
 from lightpage.runtime.service.stages import Stage, Stages
 
 _ON_THEIR_WAY = 2
 """Pairs of one DecodePages that are received or decoded at a time: one is decoded while the next one comes."""
-
-
-@dataclass
-class _Received:
-    """A pair that has come.
-
-    Attributes:
-        header: of it.
-        receiver: that holds it, to be closed once it is decoded.
-        stages: times it.
-    """
-
-    header: pb.DecodeHeader
-    receiver: PairReceiver
-    stages: Stages
 
 
 class _Counted:
@@ -82,15 +65,15 @@ class FrameCalls:
         stages = call.times.page()
         stages.begin(Stage.RECEIVE)
         header = _header(await anext(requests, None), call)
-        received = await self._receive(header, requests, call, stages)
+        receiver = await self._receive(header, requests, call)
         try:
             async with self._in_time():
                 async for part in requests:
-                    received.receiver.add(self._chunk(part))  # says that it is too much
+                    receiver.add(self._chunk(part))  # says that it is too much
         except BaseException:
-            received.receiver.close()
+            receiver.close()
             raise
-        return await call.in_thread(partial(self._decode, received, call), received.receiver.close)
+        return await call.in_thread(partial(self._decode, receiver, header, call, stages), receiver.close)
 
     async def DecodePages(self, requests: AsyncIterator[FramePart], call: Call) -> AsyncIterator[pb.DecodePagesReply]:
         """Receive frame pairs, one after another, and decode each while the next one comes."""
@@ -126,13 +109,13 @@ class FrameCalls:
         """Receive a pair of many, and begin to decode it. One that is refused is read to its end: others follow."""
         counted = _Counted(requests)
         try:
-            received = await self._receive(header, counted, call, stages)
+            receiver = await self._receive(header, counted, call)
         except (MalformedError, StalledError):
             raise  # where the next pair would begin is not known
         except LightpageError as error:
             await self._skip(header, counted, error)
             return self._refused(error, header, stages)
-        return call.in_thread(partial(self._outcome, received, call), received.receiver.close)
+        return call.in_thread(partial(self._outcome, receiver, header, call, stages), receiver.close)
 
     async def _skip(self, header: pb.DecodeHeader, requests: _Counted, error: LightpageError) -> None:
         """Drop what is left of a pair."""
@@ -145,20 +128,24 @@ class FrameCalls:
             while requests.bytes < size and (part := await anext(requests, None)) is not None:
                 self._chunk(part)
 
-    async def _receive(
-        self, header: pb.DecodeHeader, requests: AsyncIterator[FramePart], call: Call, stages: Stages
-    ) -> _Received:
-        """Take in the chunks of a pair, as soon as its header is known to be right and there will be time for it."""
+    async def _receive(self, header: pb.DecodeHeader, requests: AsyncIterator[FramePart], call: Call) -> PairReceiver:
+        """Take in the chunks of a pair, as soon as its header is known to be right and there will be time for it.
+
+        Returns:
+            what holds the pair, to be closed once that is decoded.
+        """
         self.check(header)
-        shape, dtype = (header.rows_px, header.columns_px), pixel_type(header.pixel_type)
-        receiver = receiver_for(self._plane, shape, dtype, header.bit_depth, _caller(header, call))
+        self._plane.decodes.check(_caller(header, call))
+        shape = header.rows_px, header.columns_px
+        receiver = PairReceiver(shape, pixel_type(header.pixel_type), self._plane.received)
         try:
             if header.HasField("shared"):
                 await call.in_thread(partial(self._take_shared, header.shared, receiver))
             async with self._in_time():
                 while not receiver.complete and (part := await anext(requests, None)) is not None:
                     receiver.add(self._chunk(part))
-            return _Received(header, receiver.checked(), stages)
+            receiver.check()
+            return receiver
         except BaseException:
             receiver.close()
             raise
@@ -189,17 +176,19 @@ class FrameCalls:
             raise LimitError("chunk", f"{part.nbytes} bytes", f"at most {limit}")
         return part
 
-    def _outcome(self, received: _Received, call: Call) -> pb.DecodePagesReply:
+    def _outcome(
+        self, receiver: PairReceiver, header: pb.DecodeHeader, call: Call, stages: Stages
+    ) -> pb.DecodePagesReply:
         try:
-            return pb.DecodePagesReply(decoded=self._decode(received, call))
+            return pb.DecodePagesReply(decoded=self._decode(receiver, header, call, stages))
         except Exception as error:
-            return self._refusal(error, received.header, received.stages)
+            return self._refusal(error, header, stages)
 
     def check(self, header: pb.DecodeHeader) -> None:
         """Check what a header says of its frames, and what it asks for.
 
         Raises:
-            LimitError, FrameError: see `DataPlane.check_format`.
+            LimitError, FrameError: see `check_format`.
             InvalidInputError: what is not to be had of any page.
         """
         shape, dtype = (header.rows_px, header.columns_px), pixel_type(header.pixel_type)
@@ -244,12 +233,12 @@ class FrameCalls:
             return None
         return pilots_of(header.pilots, decoder.bundle.profile.page_shape, levels)
 
-    def _decode(self, received: _Received, call: Call) -> pb.DecodeReply:
+    def _decode(self, receiver: PairReceiver, header: pb.DecodeHeader, call: Call, stages: Stages) -> pb.DecodeReply:
         """Decode a pair that was received, and let go of it."""
         try:
-            return self.decode(received.receiver.pair(), received.header, call, received.stages)
+            return self.decode(receiver.pair(), header, call, stages)
         finally:
-            received.receiver.close()
+            receiver.close()
 
     async def _refused(self, error: Exception, header: pb.DecodeHeader, stages: Stages) -> pb.DecodePagesReply:
         return self._refusal(error, header, stages)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import asdict
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,20 +20,8 @@ from lightpage.runtime.model.decoding.image_position import ImagePosition
 from lightpage.runtime.service.admission import Bytes, ReceiveBudget
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import Answer, DataPlane, Seen, levels_for, observed
-from lightpage.runtime.service.monitoring.monitor import (
-    AIR,
-    CHANGED,
-    MARGIN,
-    PISTON_WALK,
-    RESIDUAL,
-    SHARE,
-    SHIFT,
-    TRUST,
-    UNREAD,
-)
+from lightpage.runtime.service.monitoring import monitor as signs
 from lightpage.runtime.service.stages import Stage, Stages
-
-_CONFIDENCE_FORMATS = (pb.CONFIDENCE_FORMAT_UNSPECIFIED, pb.CONFIDENCE_FORMAT_FLOAT32, pb.CONFIDENCE_FORMAT_UINT8)
 
 SESSION_CHARACTERS = 1024
 """Of the name of a session, at most: the service remembers it."""
@@ -70,7 +57,7 @@ def check_options(options: pb.DecodeOptions) -> None:
     """
     if options.levels:
         check_levels(options.levels)
-    if options.confidence_format not in _CONFIDENCE_FORMATS:
+    if options.confidence_format not in pb.ConfidenceFormat.values():
         expected = "CONFIDENCE_FORMAT_FLOAT32 or CONFIDENCE_FORMAT_UINT8"
         raise InvalidInputError("confidence_format", options.confidence_format, expected)
     if options.tracking not in pb.Tracking.values():
@@ -101,33 +88,26 @@ class PairReceiver:
     Args:
         shape: (rows, columns) of a frame.
         dtype: "uint8" or "uint16" (little-endian on the wire).
-        max_bytes: most bytes of a pair.
-        budget: that it takes its bytes from until it is closed; None for none.
+        budget: that it takes its bytes from until it is closed.
 
-    Raises:
-        LimitError: the pair would be larger than `max_bytes`; nothing is allocated then.
+    Attributes:
+        size: bytes of the pair.
+        filled: bytes that have come.
     """
 
-    def __init__(self, shape: tuple[int, int], dtype: str, max_bytes: int, budget: ReceiveBudget | None = None) -> None:
+    def __init__(self, shape: tuple[int, int], dtype: str, budget: ReceiveBudget) -> None:
         self._shape, self._budget = shape, budget
         self._dtype = np.dtype(dtype).newbyteorder("<")
         self.size = 2 * shape[0] * shape[1] * self._dtype.itemsize
-        if self.size > max_bytes:
-            raise LimitError("frame pair", f"{self.size} bytes", f"at most {max_bytes}")
         self._lock = threading.Lock()
         """Held while bytes are taken in, so that nobody lets go of them meanwhile."""
         self._buffer: Bytes | None = None
-        self._filled, self._closed = 0, False
-
-    @property
-    def filled(self) -> int:
-        """Bytes that have come."""
-        return self._filled
+        self.filled, self._closed = 0, False
 
     @property
     def complete(self) -> bool:
         """Whether every pixel has come."""
-        return self._filled == self.size
+        return self.filled == self.size
 
     def add(self, chunk: bytes | memoryview) -> None:
         """Take in the next bytes.
@@ -140,33 +120,26 @@ class PairReceiver:
         with self._lock:
             if self._closed:
                 raise CallerLeft
-            end = self._filled + len(chunk)
+            end = self.filled + len(chunk)
             if end > self.size:
                 raise FrameError("frame pair", f"at least {end} bytes", f"{self.size} bytes, as the header says")
-            if self._budget is not None:
-                self._budget.take(len(chunk))
+            self._budget.take(len(chunk))
             if self._buffer is None:
-                self._buffer = np.empty(self.size, np.uint8) if self._budget is None else self._budget.memory(self.size)
-            self._buffer[self._filled : end] = np.frombuffer(chunk, np.uint8)
-            self._filled = end
+                self._buffer = self._budget.memory(self.size)
+            self._buffer[self.filled : end] = np.frombuffer(chunk, np.uint8)
+            self.filled = end
 
-    def checked(self) -> Self:
-        """Itself, if every pixel has come.
+    def check(self) -> None:
+        """Check that every pixel has come.
 
         Raises:
             FrameError: bytes are missing.
         """
         if not self.complete:
-            raise FrameError("frame pair", f"{self._filled} bytes", f"{self.size} bytes, as the header says")
-        return self
+            raise FrameError("frame pair", f"{self.filled} bytes", f"{self.size} bytes, as the header says")
 
     def pair(self) -> FramePair:
-        """The two frames, views of the one buffer.
-
-        Raises:
-            FrameError: bytes are missing.
-        """
-        self.checked()
+        """The two frames, views of the one buffer, once every pixel has come."""
         assert self._buffer is not None  # of what is complete
         halves = self._buffer.reshape(2, -1)
         native = self._dtype.newbyteorder("=")
@@ -179,11 +152,10 @@ class PairReceiver:
         """Give back what it took from the budget, and take no more."""
         with self._lock:
             self._closed = True
-            if self._budget is not None:
-                self._budget.give_back(self._filled)
-                if self._buffer is not None:
-                    self._budget.spare(self._buffer)
-            self._filled, self._buffer = 0, None
+            self._budget.give_back(self.filled)
+            if self._buffer is not None:
+                self._budget.spare(self._buffer)
+            self.filled, self._buffer = 0, None
 
 
 def check_format(plane: DataPlane, shape: tuple[int, int], dtype: str, bit_depth: int) -> None:
@@ -194,8 +166,8 @@ def check_format(plane: DataPlane, shape: tuple[int, int], dtype: str, bit_depth
         FrameError: not this device's size, type or bit depth.
     """
     # Size first: a header may claim anything, and a limit is the service's, not the camera's.
-    if 2 * shape[0] * shape[1] * np.dtype(dtype).itemsize > plane.limits.pair_bytes:
-        PairReceiver(shape, dtype, plane.limits.pair_bytes)
+    if (size := 2 * shape[0] * shape[1] * np.dtype(dtype).itemsize) > (most := plane.limits.pair_bytes):
+        raise LimitError("frame pair", f"{size} bytes", f"at most {most}")
     bundle = plane.registry.current.decoder.bundle
     expected = (bundle.profile.frame_shape, bundle.manifest.frame_dtype, bundle.manifest.camera_bit_depth)
     if (shape, dtype, bit_depth) != expected:
@@ -204,18 +176,6 @@ def check_format(plane: DataPlane, shape: tuple[int, int], dtype: str, bit_depth
             f"{shape[0]}x{shape[1]} pixels, {dtype}, {bit_depth} bits",
             f"{expected[0][0]}x{expected[0][1]} pixels, {expected[1]}, {expected[2]} bits",
         )
-
-
-def receiver_for(plane: DataPlane, shape: tuple[int, int], dtype: str, bit_depth: int, caller: Caller) -> PairReceiver:
-    """A receiver for one pair, to be closed; see `check_format`.
-
-    Raises:
-        LimitError, FrameError: see `check_format`.
-        OverloadedError: there is so much to decode that the caller's deadline would pass.
-    """
-    check_format(plane, shape, dtype, bit_depth)
-    plane.decodes.check(caller)
-    return PairReceiver(shape, dtype, plane.limits.pair_bytes, plane.received)
 
 
 def decode(
@@ -304,15 +264,15 @@ def decode_reply(answer: Answer, options: pb.DecodeOptions) -> pb.DecodeReply:
 
 
 _SIGNS = {
-    MARGIN.name: pb.RECALIBRATION_REASON_MARGIN,
-    AIR.name: pb.RECALIBRATION_REASON_INFORMATION,
-    TRUST.name: pb.RECALIBRATION_REASON_TRUST,
-    SHARE.name: pb.RECALIBRATION_REASON_PILOT_SHARE,
-    CHANGED.name: pb.RECALIBRATION_REASON_PAGES,
-    UNREAD.name: pb.RECALIBRATION_REASON_UNREAD,
-    RESIDUAL.name: pb.RECALIBRATION_REASON_RESIDUAL,
-    SHIFT.name: pb.RECALIBRATION_REASON_SHIFT,
-    PISTON_WALK.name: pb.RECALIBRATION_REASON_PISTON,
+    signs.MARGIN.name: pb.RECALIBRATION_REASON_MARGIN,
+    signs.AIR.name: pb.RECALIBRATION_REASON_INFORMATION,
+    signs.TRUST.name: pb.RECALIBRATION_REASON_TRUST,
+    signs.SHARE.name: pb.RECALIBRATION_REASON_PILOT_SHARE,
+    signs.CHANGED.name: pb.RECALIBRATION_REASON_PAGES,
+    signs.UNREAD.name: pb.RECALIBRATION_REASON_UNREAD,
+    signs.RESIDUAL.name: pb.RECALIBRATION_REASON_RESIDUAL,
+    signs.SHIFT.name: pb.RECALIBRATION_REASON_SHIFT,
+    signs.PISTON_WALK.name: pb.RECALIBRATION_REASON_PISTON,
 }
 
 

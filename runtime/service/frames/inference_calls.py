@@ -9,9 +9,10 @@ from typing import Any
 
 import grpc
 import numpy as np
+from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from lightpage.errors import FrameError, NoSuchModelError, PageError
+from lightpage.errors import FrameError, LimitError, MalformedError, NoSuchModelError, PageError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.pb.inference import open_inference_pb2 as oip
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
@@ -21,8 +22,6 @@ from lightpage.runtime.service.admission import ReceiveBudget
 from lightpage.runtime.service.caller import Call
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.frames.frame_calls import FrameCalls
-from lightpage.runtime.service.frames.frames import check_format
-from lightpage.runtime.service.frames.infer_message import take_apart
 from lightpage.runtime.service.frames.tensors import (
     Tensor,
     inputs_of,
@@ -66,6 +65,16 @@ _TYPED_BYTES = 8 << 20
 """Typed contents of a message, at most: a pair of four million pixels. Parsed, they take many times their size."""
 _MOST_BYTES = (1 << 31) - 1
 """Of a message: gRPC counts them in 32 bits."""
+MOST_FIELDS = 256
+"""Of a message, the elements of lists counted one by one: each input, output and parameter is one."""
+
+_SUBJECT = "message of inference/ModelInfer"
+_RAW = oip.ModelInferRequest.DESCRIPTOR.fields_by_name["raw_input_contents"].number
+_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
+"""Wire types of protocol buffers."""
+_SIZES = {_FIXED64: 8, _FIXED32: 4}
+_MOST_VARINT = 10
+"""Bytes of one."""
 
 
 def model_inputs(bundle: Bundle) -> dict[str, Tensor]:
@@ -195,7 +204,6 @@ class InferenceCalls:
         bundle = self._plane.registry.current.decoder.bundle
         depth, dtype = bundle.manifest.camera_bit_depth, bundle.manifest.frame_dtype
         rows, columns = bundle.profile.frame_shape
-        check_format(self._plane, (rows, columns), dtype, depth)
         names = list(outputs_of(request, [*OUTPUTS, USER_DATA], list(OUTPUTS)))
         asked = parameters_of(request, PARAMETERS)
         options = message_of(
@@ -315,3 +323,68 @@ def _response(reply: pb.DecodeReply, names: list[str]) -> oip.ModelInferResponse
         response.outputs.add(name=name, datatype=datatype, shape=shape)
         response.raw_output_contents.append(content)
     return response
+
+
+def take_apart(data: bytes, most_beside: int) -> tuple[oip.ModelInferRequest, list[memoryview]]:
+    """The request without `raw_input_contents`, and these as views of `data`.
+
+    The library would copy the frames twice. It also takes many times a message's size where that is made of very many
+    small parts, so what it parses is bounded.
+
+    Args:
+        data: the message.
+        most_beside: bytes that it may have beside its raw contents.
+
+    Raises:
+        MalformedError: it cannot be parsed.
+        LimitError: more fields than make sense, or more bytes.
+    """
+    view, at = memoryview(data), 0
+    raw: list[memoryview] = []
+    rest: list[memoryview] = []
+    while at < len(data):
+        if len(raw) + len(rest) == MOST_FIELDS:
+            raise LimitError(_SUBJECT, f"more than {MOST_FIELDS} fields", f"at most {MOST_FIELDS}")
+        begun = at
+        tag, at = _varint(data, at)
+        content, at = _content(data, at, tag & 7)
+        if tag >> 3 == _RAW and tag & 7 == _BYTES:
+            raw.append(view[content:at])
+        else:
+            rest.append(view[begun:at])
+    if (beside := sum(map(len, rest))) > most_beside:
+        expected = f"at most {most_beside}, and raw_input_contents for larger frames"
+        raise LimitError(f"{_SUBJECT} beside raw_input_contents", f"{beside} bytes", expected)
+    try:
+        return oip.ModelInferRequest.FromString(b"".join(rest)), raw
+    except DecodeError as error:
+        raise _malformed(error) from None
+
+
+def _content(data: bytes, at: int, kind: int) -> tuple[int, int]:
+    """Where the content of a field begins and ends."""
+    if kind == _VARINT:
+        return at, _varint(data, at)[1]
+    if kind == _BYTES:
+        size, at = _varint(data, at)
+    elif kind in _SIZES:
+        size = _SIZES[kind]
+    else:
+        raise _malformed(f"a field of wire type {kind}")
+    if at + size > len(data):
+        raise _malformed("a field that ends behind the message")
+    return at, at + size
+
+
+def _varint(data: bytes, at: int) -> tuple[int, int]:
+    """A number, and where it ends."""
+    value = 0
+    for index, byte in enumerate(data[at : at + _MOST_VARINT]):
+        value |= (byte & 0x7F) << 7 * index
+        if byte < 0x80:
+            return value, at + index + 1
+    raise _malformed("a number that does not end")
+
+
+def _malformed(got: object) -> MalformedError:
+    return MalformedError(_SUBJECT, got, "one that can be parsed")

@@ -26,6 +26,8 @@ _SLICE = 1 << 16
 """Typed elements that are taken at a time: the interpreter does nothing else meanwhile."""
 _LARGEST_COUNT = (1 << 32) - 1
 """Of a parameter: the fields that parameters stand for have 32 bits."""
+_PARAMETERS: dict[type, str] = {bool: "bool_param", int: "int64_param", float: "double_param", str: "string_param"}
+"""Field of a parameter by the kind of its value."""
 _FEW = 8
 """Names or dimensions of a caller's that an error lists."""
 _TYPED_BYTES = {"bool_contents": 1, "uint_contents": 4}
@@ -154,8 +156,7 @@ def parameters_of(request: Request, kinds: Mapping[str, type]) -> dict[str, Any]
         choice = parameter.WhichOneof("parameter_choice")
         value: Any = None if choice is None else getattr(parameter, choice)
         if type(value) is not kind:
-            fields = {int: "int64_param", str: "string_param", bool: "bool_param"}
-            raise InvalidInputError(f"parameters.{name}", choice or "no value", fields[kind])
+            raise InvalidInputError(f"parameters.{name}", choice or "no value", _PARAMETERS[kind])
         found[name] = value
         if kind is int and not 0 <= found[name] <= _LARGEST_COUNT:
             raise InvalidInputError(f"parameters.{name}", value, f"0..{_LARGEST_COUNT}")
@@ -198,7 +199,7 @@ def parameters_message(message: Any, left_out: Collection[str] = (), prefix: str
             names = [_enum_name(field.enum_type, each) for each in (value if field.is_repeated else [value])]
             found[name] = oip.InferParameter(string_param=",".join(names))
         else:
-            found[name] = _parameter(value)
+            found[name] = oip.InferParameter(**{_PARAMETERS[type(value)]: value})
     return found
 
 
@@ -207,18 +208,6 @@ def _enum_name(enum: EnumDescriptor, number: int) -> str:
     prefix = values[0].name.removesuffix("UNSPECIFIED")
     name = values[number].name.removeprefix(prefix)
     return "" if name == "UNSPECIFIED" else name
-
-
-def _parameter(value: Any) -> oip.InferParameter:
-    match value:
-        case bool():
-            return oip.InferParameter(bool_param=value)
-        case int():
-            return oip.InferParameter(int64_param=value)
-        case float():
-            return oip.InferParameter(double_param=value)
-        case _:
-            return oip.InferParameter(string_param=value)
 
 
 def _told(datatype: str, shape: Sequence[int]) -> str:

@@ -113,8 +113,7 @@ class Jobs:
         """
         with self._lock:
             self._check_free()
-            taken = {job.id for job in self._jobs}
-            running = RunningJob(next(name for name in iter(_new_id, "") if name not in taken), caller)
+            running = RunningJob(secrets.token_hex(6), caller)
             job = pb.Job(
                 id=running.id,
                 state=pb.JOB_STATE_RUNNING,
@@ -229,10 +228,6 @@ class Jobs:
             replace_text(self._path, json.dumps({"format": _FORMAT, "version": _VERSION, "jobs": entries}), "jobs")
         except LightpageError as error:
             _log.warning("jobs: a restart will know less of them: %s", error)
-
-
-def _new_id() -> str:
-    return secrets.token_hex(6)
 
 
 def _copy(job: pb.Job) -> pb.Job:

@@ -14,10 +14,10 @@ from itertools import count as counting
 from pathlib import Path
 
 from lightpage.errors import (
+    BundleError,
     CallerLeft,
     InvalidInputError,
     JobCancelledError,
-    LightpageError,
     LimitError,
     NoSourceError,
     OtherModelError,
@@ -67,6 +67,9 @@ class Step:
 
     name: str
     fraction: float
+
+
+_Told = Step | RecalibrationOutcome | BaseException
 
 
 def _nothing() -> None:
@@ -126,11 +129,11 @@ class Recalibrator:
         source, slots = self._plane.source, self._plane.decodes
         self.check_count(len(pages) or count)
         expected: list[int | None] = list(pages) or [None] * count
-        return PagesToUse(
-            "source",
-            lambda heard, caller: read_known(source, expected, heard, lambda: slots.held(caller)),
-            len(expected),
-        )
+
+        def read(heard: Callable[[], None], caller: Caller) -> KnownPages:
+            return read_known(source, expected, heard, lambda: slots.held(caller))
+
+        return PagesToUse("source", read, len(expected))
 
     def recorded_pages(self, name: str, count: int) -> PagesToUse:
         """The first `count` pages (0: all) of a recording in the recordings folder.
@@ -192,10 +195,9 @@ class Recalibrator:
             InvalidInputError: too few pages, or the same one twice.
             JobCancelledError: somebody has cancelled the job.
         """
-        steps: queue.SimpleQueue[Step | RecalibrationOutcome | BaseException] = queue.SimpleQueue()
-        running = self._begin(
-            pages, Caller(caller.seconds_left, actor=caller.actor), steps.put, expected_version, correlation_id
-        )
+        steps: queue.SimpleQueue[_Told] = queue.SimpleQueue()
+        own = Caller(caller.seconds_left, actor=caller.actor)
+        running = self._begin(pages, own, steps.put, expected_version, correlation_id)
         try:
             yield from _follow(steps, caller)
         finally:
@@ -211,25 +213,15 @@ class Recalibrator:
             OtherModelError: another model is in service than `expected_version`; empty stands for any.
             StoppingError: the service is being stopped.
         """
-        return self.jobs.job(
-            self._begin(pages, Caller(actor=actor), lambda _: None, expected_version, correlation_id).id
-        )
+        running = self._begin(pages, Caller(actor=actor), lambda _: None, expected_version, correlation_id)
+        return self.jobs.job(running.id)
 
     def check_start(self, expected_version: str = "") -> None:
         """See whether a job may begin now; raises as `start` would, and `StoreError` without a folder for it."""
-        if self._stop.is_set():
-            raise StoppingError("recalibration", "a service that stops", "one that serves; nothing was changed")
+        self._check_serving()
         self.jobs.check_free()
         _check_version(self._plane.registry.current, expected_version)
         self._store()
-
-    def no_room(self) -> LightpageError | None:
-        """Why no recalibration can keep its model, None where one can."""
-        try:
-            self._store()
-        except LightpageError as error:
-            return error
-        return None
 
     def close(self, wait_s: float = GRACE_S) -> None:
         """Stop a running recalibration at its next step, which is waited for at most `wait_s`; drop temporary bundles.
@@ -243,13 +235,17 @@ class Recalibrator:
             self._temporary.cleanup()
             self._temporary = None
 
+    def _check_serving(self) -> None:
+        if self._stop.is_set():
+            raise StoppingError("recalibration", "a service that stops", "one that serves; nothing was changed")
+
     def _begin(
         self,
         pages: PagesToUse,
         caller: Caller,
-        tell: Callable[[Step | RecalibrationOutcome | BaseException], None],
-        expected_version: str = "",
-        correlation_id: str = "",
+        tell: Callable[[_Told], None],
+        expected_version: str,
+        correlation_id: str,
     ) -> RunningJob:
         """Begin a job in a thread of its own; `tell` is told of its steps, and of its outcome or error."""
         try:
@@ -267,15 +263,10 @@ class Recalibrator:
         return running
 
     def _run(
-        self,
-        running: RunningJob,
-        pages: PagesToUse,
-        expected_version: str,
-        tell: Callable[[Step | RecalibrationOutcome | BaseException], None],
+        self, running: RunningJob, pages: PagesToUse, expected_version: str, tell: Callable[[_Told], None]
     ) -> None:
         def check() -> None:
-            if self._stop.is_set():
-                raise StoppingError("recalibration", "a service that stops", "one that serves; nothing was changed")
+            self._check_serving()
             running.check()
 
         def progress(name: str, fraction: float) -> None:
@@ -385,26 +376,24 @@ class Recalibrator:
         Raises:
             LimitError: more than the service takes.
         """
-        if count > self._plane.limits.recalibration_pages:
-            limit = self._plane.limits.recalibration_pages
+        if count > (limit := self._plane.limits.recalibration_pages):
             raise LimitError("pages to recalibrate with", count, f"at most {limit}")
 
     def _path(self, name: str) -> Path:
+        subject = "recording to recalibrate with"
         if self._recordings is None:
-            raise NoSourceError("recording to recalibrate with", name, "a service started with --recordings")
+            raise NoSourceError(subject, name, "a service started with --recordings")
         try:
-            check_name(name, "recording to recalibrate with")
-        except Exception as error:
-            raise InvalidInputError(
-                "recording to recalibrate with", repr(name), "a plain file name without folders"
-            ) from error
+            check_name(name, subject)
+        except BundleError as error:
+            raise InvalidInputError(subject, repr(name), "a plain file name without folders") from error
         path = self._recordings / name
         try:
             is_there = not path.is_symlink() and path.is_file()
         except OSError:  # a name longer than the file system takes
             is_there = False
         if not is_there:
-            raise InvalidInputError("recording to recalibrate with", repr(name), "a file in the recordings folder")
+            raise InvalidInputError(subject, repr(name), "a file in the recordings folder")
         return path
 
 
@@ -425,8 +414,8 @@ def _cause(check: Callable[[], None], left: CallerLeft) -> BaseException:
 def read_known(
     source: FrameSource,
     pages: Sequence[int | None],
-    heard: Callable[[], None] = _nothing,
-    slot: Callable[[], AbstractContextManager[None]] = nullcontext,
+    heard: Callable[[], None],
+    slot: Callable[[], AbstractContextManager[None]],
 ) -> KnownPages:
     """Pages of a source with their symbols.
 
@@ -457,9 +446,7 @@ def read_known(
     return KnownPages(tuple(p.pair for p in found), tuple(symbols), source.levels, references, mask)
 
 
-def _follow(
-    steps: queue.SimpleQueue[Step | RecalibrationOutcome | BaseException], caller: Caller
-) -> Iterator[Step | RecalibrationOutcome]:
+def _follow(steps: queue.SimpleQueue[_Told], caller: Caller) -> Iterator[Step | RecalibrationOutcome]:
     """Hand on what the worker tells, until its outcome or error, or until the caller has gone."""
     while True:
         try:

@@ -6,7 +6,6 @@ import logging
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Self
 
 from lightpage.clock import SYSTEM, Clock
@@ -15,7 +14,6 @@ from lightpage.errors import (
     CallerLeft,
     InvalidInputError,
     LightpageError,
-    LimitError,
     RecalibrationRefusedError,
     StoppingError,
 )
@@ -51,19 +49,9 @@ class SelfCalibrationSettings:
     longest_s: float = 3600.0
     busy_s: float = 5.0
 
-    def __post_init__(self) -> None:
-        """Check the pages.
-
-        Raises:
-            InvalidInputError: one page alone, or the same one twice.
-        """
-        if self.pages and (len(self.pages) < MIN_PAGES or len(set(self.pages)) < len(self.pages)):
-            expected = f"at least {MIN_PAGES} that differ: one to fit, one to judge by"
-            raise InvalidInputError("calibration pages", ", ".join(map(str, self.pages)), expected)
-
 
 class SelfCalibration:
-    """A thread that recalibrates when the monitor says so; to be used in a `with` statement, or started and stopped.
+    """A thread that recalibrates when the monitor says so; to be used in a `with` statement.
 
     A recalibration that is refused or fails changes nothing, and no request fails because of one. Its pages are
     photographed between those that are read.
@@ -86,8 +74,6 @@ class SelfCalibration:
     ) -> None:
         self._plane, self._monitor, self._recalibrator = plane, monitor, recalibrator
         self._settings, self._clock = settings or SelfCalibrationSettings(), clock
-        if (count := len(self._settings.pages)) > (most := plane.limits.recalibration_pages):
-            raise LimitError("calibration pages", count, f"at most {most}")
         _check_pages(plane, self._settings.pages)
         self._interval_s, self._not_before = self._settings.least_s, -float("inf")
         self._wake, self._stopping = threading.Event(), threading.Event()
@@ -97,28 +83,19 @@ class SelfCalibration:
         """Whether it was said that the model in service is pinned."""
         monitor.listen(self._wake.set)
 
-    def start(self) -> Self:
-        """Begin to wait for the monitor."""
+    def __enter__(self) -> Self:
         self._thread.start()
         return self
 
-    def stop(self, wait_s: float | None = None) -> None:
-        """Drop a recalibration that runs, and end the thread, which is waited for at most `wait_s`, as calls are."""
-        wait_s = self._plane.limits.grace_s if wait_s is None else wait_s
+    def __exit__(self, *_: object) -> None:
+        """Drop a recalibration that runs, and end the thread, which is waited for as calls are."""
+        wait_s = self._plane.limits.grace_s
         self._stopping.set()
         self._caller.leave()
         self._wake.set()
         self._thread.join(wait_s)
         if self._thread.is_alive():
             _log.warning("self-calibration: not stopped after %.1f s, left to itself", wait_s)
-
-    def __enter__(self) -> Self:
-        return self.start()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
 
     def _run(self) -> None:
         while True:
@@ -149,8 +126,9 @@ class SelfCalibration:
         self._pinned = False
         reasons = "; ".join(self._monitor.state().reasons) or "the monitor says so"
         _log.info("self-calibration: begins, since %s", reasons)
+        pages = self._settings.pages
         try:
-            outcome = self._recalibrated()
+            *_, outcome = self._recalibrator.from_source(len(pages) or MIN_PAGES, pages, self._caller)
         except (CallerLeft, StoppingError):
             _log.info("self-calibration: dropped, the service stops")
             self._wait(self._settings.busy_s)
@@ -160,6 +138,7 @@ class SelfCalibration:
         except Exception as error:
             self._back_off(error)
         else:
+            assert isinstance(outcome, RecalibrationOutcome)  # the last thing that it tells
             cured = outcome.air_after - outcome.air_before >= WORTH_BITS
             least_s, longest_s = self._settings.least_s, self._settings.longest_s
             self._interval_s = least_s if cured else min(2 * self._interval_s, longest_s)
@@ -171,12 +150,6 @@ class SelfCalibration:
                 outcome.air_after,
                 outcome.air_before,
             )
-
-    def _recalibrated(self) -> RecalibrationOutcome:
-        pages = self._settings.pages
-        *_, last = self._recalibrator.from_source(len(pages) or MIN_PAGES, pages, self._caller)
-        assert isinstance(last, RecalibrationOutcome)  # the last thing that it tells
-        return last
 
     def _back_off(self, error: Exception) -> None:
         self._interval_s = min(2 * self._interval_s, self._settings.longest_s)

@@ -78,7 +78,7 @@ class SentPages:
         except TimeoutError:
             raise StalledError("frame pair", f"not all of it within {limit_s:g} s", "faster frames") from None
         if self._symbols:
-            self._receivers[-1].checked()
+            self._receivers[-1].check()
         if len(self._symbols) < self._header.pages:
             raise MalformedError("pages that came", len(self._symbols), f"{self._header.pages}, as the header says")
 
@@ -130,7 +130,7 @@ class SentPages:
         if not self._receivers[-1].filled:
             before = f"frames of page {number - 1}" if number else "reference frames"
             raise MalformedError(_WHERE, f"symbols of page {number}", f"{before} first")
-        self._receivers[-1].checked()
+        self._receivers[-1].check()
         if number == self._header.pages:
             raise MalformedError(_WHERE, f"symbols of page {number}", f"{number} pages, as the header says")
         subject, (rows, columns) = f"known page {number}: symbols", self._page_shape
@@ -143,7 +143,7 @@ class SentPages:
         self._receivers.append(self._receiver())
 
     def _receiver(self) -> PairReceiver:
-        return PairReceiver(self._shape, self._dtype, self._limits.pair_bytes, self._budget)
+        return PairReceiver(self._shape, self._dtype, self._budget)
 
     def _pair(self, receiver: PairReceiver) -> FramePair:
         """The frames of a pair without their black level, in the receiver's own memory."""

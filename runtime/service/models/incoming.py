@@ -6,7 +6,6 @@ import logging
 import os
 import threading
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from lightpage.clock import SYSTEM, Clock
@@ -51,9 +50,7 @@ class Incoming:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stopping.set()
         self._caller.leave()
         self._thread.join(GRACE_S)

@@ -124,7 +124,7 @@ class Models:
             OtherModelError: another version is in service.
         """
         with self._audited("rollback", actor):
-            return self.registry.rollback(expected, self._note)
+            return self.registry.step(-1, expected, self._note)
 
     def roll_forward(self, expected: str = "", actor: Actor = NOBODY) -> tuple[Model, Model]:
         """The opposite of `rollback`; raises as that does."""
@@ -297,7 +297,7 @@ class Models:
             raise StoreError("model store", "none", "a service started with --store")
         try:
             decoder = self.registry.opened(path, signature)
-            self.registry.check(decoder)
+            self.registry.tracked(decoder)  # as if it were put in service
         except BundleError as error:
             subject = error.subject.replace(f"bundle {path}", "new bundle")
             raise type(error)(subject, error.got, error.expected) from None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,7 +15,7 @@ from lightpage.runtime.model.bundle.signature import BundleKey
 from lightpage.runtime.model.bundle.signature_file import read_signature, signature_path
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.tracking import NoTracker, Tracker
-from lightpage.runtime.service.caller import MOST_SESSIONS, Caller
+from lightpage.runtime.service.caller import Caller, Sessions
 
 KEPT_MODELS = 4
 """Models held loaded, the current one included: enough to step back over a bad day, and a bound on the memory."""
@@ -25,34 +24,6 @@ HISTORY = 64
 """Steps of the history that are kept: beyond the bundles of a store there is nothing to go back to."""
 
 TrackerFactory = Callable[[Decoder], Tracker]
-
-
-def no_tracker(decoder: Decoder) -> Tracker:
-    """A tracker that follows nothing."""
-    return NoTracker(decoder)
-
-
-class Sessions:
-    """A tracker for each session: what the pages of different callers show is kept apart.
-
-    Args:
-        make: makes the tracker of a new one.
-        most: that are remembered.
-    """
-
-    def __init__(self, make: Callable[[], Tracker], most: int = MOST_SESSIONS) -> None:
-        self._make, self._most = make, most
-        self._lock = threading.Lock()
-        self._trackers: OrderedDict[str, Tracker] = OrderedDict()
-
-    def tracker(self, session: str) -> Tracker:
-        """The session's tracker."""
-        with self._lock:
-            found = self._trackers.pop(session, None) or self._make()
-            self._trackers[session] = found
-            while len(self._trackers) > self._most:
-                self._trackers.popitem(last=False)
-            return found
 
 
 @dataclass(frozen=True)
@@ -68,15 +39,15 @@ class Model:
     tracker: Tracker
 
     @cached_property
-    def sessions(self) -> Sessions:
+    def sessions(self) -> Sessions[Tracker]:
         """Follow the pages that callers send."""
-        return Sessions(self.tracker.anew)
+        return Sessions(lambda _: self.tracker.anew())
 
     def tracker_for(self, caller: Caller) -> Tracker:
         """What follows a caller's pages."""
         if caller.stateless:
             return self.tracker.anew()
-        return self.sessions.tracker(caller.session) if caller.session else self.tracker
+        return self.sessions.of(caller.session) if caller.session else self.tracker
 
     @property
     def version(self) -> str:
@@ -161,7 +132,7 @@ class ModelRegistry:
     def __init__(
         self,
         first: Decoder,
-        make_tracker: TrackerFactory = no_tracker,
+        make_tracker: TrackerFactory = NoTracker,
         kept: int = KEPT_MODELS,
         key: BundleKey | None = None,
     ) -> None:
@@ -207,7 +178,7 @@ class ModelRegistry:
             return tuple(self._loaded[version] for version in order if version in self._loaded)
 
     def swap(self, decoder: Decoder, expected: Model | None = None, note: ModelNote = no_note) -> Model:
-        """Put a loaded decoder in service and return its model; the previous one is kept for `rollback`.
+        """Put a loaded decoder in service and return its model; the previous one is kept to step back to.
 
         Args:
             decoder: loaded and checked.
@@ -251,10 +222,6 @@ class ModelRegistry:
             model = self._model(history.current)
             self._change(model, history, note)
             return model, before
-
-    def rollback(self, expected: str = "", note: ModelNote = no_note) -> tuple[Model, Model]:
-        """Put the model before the current one back in service; see `step`."""
-        return self.step(-1, expected, note)
 
     def go_to(self, place: Place, expected: str = "", note: ModelNote = no_note) -> tuple[Model, Model]:
         """Put a model in service that need not be loaded; returns (now current, before).
@@ -323,14 +290,6 @@ class ModelRegistry:
         """
         return self.current.decoder.of_another(Bundle.open(path, key=self._key, signature=signature))
 
-    def check(self, decoder: Decoder) -> None:
-        """Check that a decoder could be put in service.
-
-        Raises:
-            BundleError: it is for another device, or cannot be tracked.
-        """
-        self._tracked(decoder)
-
     def _model(self, place: Place) -> Model:
         """A model, loaded if it is not."""
         with self._lock:
@@ -348,9 +307,14 @@ class ModelRegistry:
             decoder = self.opened(place.path)
         if decoder.version != place.version:
             raise BundleError(f"{decoder.bundle.subject}: version", decoder.version, place.version)
-        return self._tracked(decoder)
+        return self.tracked(decoder)
 
-    def _tracked(self, decoder: Decoder) -> Model:
+    def tracked(self, decoder: Decoder) -> Model:
+        """A model that could be put in service.
+
+        Raises:
+            BundleError: the decoder is for another device, or cannot be tracked.
+        """
         self._check_replaces(decoder, self.current.decoder)
         try:
             return Model(decoder, self._make_tracker(decoder))

@@ -5,22 +5,23 @@ from __future__ import annotations
 import logging
 import queue
 import threading
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 import numpy as np
 
-from lightpage.errors import LightpageError, Reason
+from lightpage.errors import InvalidInputError, LightpageError, LimitError, Reason
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import frame_type
 from lightpage.recording.writer import RecordingWriter
 from lightpage.runtime.service.limits import GRACE_S
 from lightpage.runtime.service.models.registry import Model, ModelRegistry
-from lightpage.runtime.service.monitoring.file_ring import FileRing
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.monitoring.observation import Observation
@@ -38,6 +39,73 @@ RING_BYTES = 1 << 30
 
 _WAITING = 4
 """Pages that wait for the disk; each lies in memory."""
+_PATTERN = "page-*.h5"
+_UNFINISHED = "page-*.partial"
+
+
+class FileRing:
+    """Files whose names sort by time. It is for one thread of one process; other files of the folder are left alone.
+
+    Args:
+        folder: made if absent.
+        count: files at most.
+        most_bytes: of them all.
+
+    Raises:
+        InvalidInputError: the folder cannot be made.
+    """
+
+    def __init__(self, folder: Path, count: int, most_bytes: int) -> None:
+        self._folder, self._count, self._most_bytes = folder, count, most_bytes
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InvalidInputError(f"folder {folder}", error, "one that can be made") from None
+        for left in folder.glob(_UNFINISHED):
+            with suppress(OSError):
+                left.unlink()
+
+    def add(self, time_s: float, reason: str, write: Callable[[Path], None]) -> Path:
+        """Have `write` write a file, and drop the oldest ones beyond what is kept.
+
+        Args:
+            time_s: seconds since 1970.
+            reason: a word, part of the name.
+            write: is given the path.
+
+        Returns:
+            the file's path.
+
+        Raises:
+            LimitError: the file alone is larger than what is kept; it is dropped.
+            OSError: an old file cannot be dropped; whatever `write` raises comes through.
+        """
+        when = datetime.fromtimestamp(time_s, UTC).strftime("%Y%m%dT%H%M%S.%f")
+        path, number = self._folder / f"page-{when}-{reason}.h5", 1
+        while path.exists():
+            path, number = self._folder / f"page-{when}-{reason}-{number}.h5", number + 1
+        self._drop(self._count - 1, self._most_bytes)  # first, since a full disk may be full of them
+        try:
+            write(path)
+        except BaseException:
+            path.with_name(path.name + ".partial").unlink(missing_ok=True)
+            raise
+        if (size := path.stat().st_size) > self._most_bytes:
+            path.unlink()
+            raise LimitError(f"file {path}", f"{size} bytes", f"at most {self._most_bytes} in all")
+        self._drop(self._count, self._most_bytes)
+        return path
+
+    def files(self) -> list[Path]:
+        """The files that are there, the oldest first."""
+        return sorted(self._folder.glob(_PATTERN))
+
+    def _drop(self, count: int, most_bytes: int) -> None:
+        files = self.files()
+        sizes = [path.stat().st_size for path in files]
+        while files and (len(files) > count or sum(sizes) > most_bytes):
+            files.pop(0).unlink(missing_ok=True)
+            sizes.pop(0)
 
 
 @dataclass(frozen=True)
@@ -93,10 +161,8 @@ class FlightRecorder:
         metrics: ServiceMetrics | None = None,
     ) -> None:
         self._registry, self._settings, self._monitor = registry, settings or FlightSettings(), monitor
-        self._metrics, self._ring = (
-            metrics or ServiceMetrics(),
-            FileRing(folder, self._settings.pages, self._settings.ring_bytes),
-        )
+        self._metrics = metrics or ServiceMetrics()
+        self._ring = FileRing(folder, self._settings.pages, self._settings.ring_bytes)
         self._waiting: queue.Queue[_Kept | None] = queue.Queue(_WAITING)
         self._lock = threading.Lock()
         """Guards the time below."""
@@ -104,27 +170,18 @@ class FlightRecorder:
         self._well = True
         self._thread = threading.Thread(target=self._write_all, name="lightpage-flight-recorder", daemon=True)
 
-    def start(self) -> Self:
-        """Begin to write."""
+    def __enter__(self) -> Self:
         self._thread.start()
         return self
 
-    def stop(self, wait_s: float = GRACE_S) -> None:
-        """Write what waits, and end the thread, which is waited for at most `wait_s`."""
+    def __exit__(self, *_: object) -> None:
+        """Write what waits, and end the thread, which is waited for at most `GRACE_S`."""
         try:
-            self._waiting.put(None, timeout=wait_s)
+            self._waiting.put(None, timeout=GRACE_S)
         except queue.Full:
-            _log.warning("flight recorder: not stopped after %.1f s, left to itself", wait_s)
+            _log.warning("flight recorder: not stopped after %.1f s, left to itself", GRACE_S)
             return
-        self._thread.join(wait_s)
-
-    def __enter__(self) -> Self:
-        return self.start()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
+        self._thread.join(GRACE_S)
 
     def observe(self, observation: Observation) -> None:
         """See `Observer`."""

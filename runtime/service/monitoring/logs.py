@@ -129,7 +129,8 @@ class LimitedHandler(logging.StreamHandler[TextIO]):
         second = self._seconds.get(kind)
         if second is None or now - second.begun >= _WINDOW_S:
             self._tell(kind, now)
-            self._forget(now)
+            if len(self._seconds) >= _MOST_KINDS:
+                self._forget(now)
             shown = " ".join(filter(None, kind)) if _is_of_a_call(record) else record.getMessage()
             second = self._seconds[kind] = _Second(now, record.levelno, record.name, shown)
         second.lines += 1
@@ -143,11 +144,8 @@ class LimitedHandler(logging.StreamHandler[TextIO]):
         """Say what was left out in seconds that are over; `at_once`, in those that are not over too."""
         self.acquire()
         try:
-            now, self._waker = self._clock.now(), None
-            over = [kind for kind, each in self._seconds.items() if at_once or now - each.begun >= _WINDOW_S]
-            for kind in over:
-                self._tell(kind, now)
-                del self._seconds[kind]
+            self._waker = None
+            self._forget(self._clock.now(), at_once)
             if any(each.left_out for each in self._seconds.values()):
                 self._wake_later()
         finally:
@@ -179,11 +177,9 @@ class LimitedHandler(logging.StreamHandler[TextIO]):
         super().emit(record)
         second.left_out = 0
 
-    def _forget(self, now: float) -> None:
-        if len(self._seconds) < _MOST_KINDS:
-            return
-        old = [kind for kind, each in self._seconds.items() if now - each.begun >= _WINDOW_S]
-        for kind in old:
+    def _forget(self, now: float, at_once: bool = False) -> None:
+        """Say what was left out in seconds that are over, or `at_once` in all, and count anew."""
+        for kind in [kind for kind, each in self._seconds.items() if at_once or now - each.begun >= _WINDOW_S]:
             self._tell(kind, now)
             del self._seconds[kind]
 
@@ -207,11 +203,7 @@ def _thread_broke(found: threading.ExceptHookArgs) -> None:
 
 @contextmanager
 def logging_to_stderr(
-    form: Literal["text", "json"],
-    level: str,
-    lines_per_second: int,
-    stream: TextIO | None = None,
-    clock: Clock = SYSTEM,
+    form: Literal["text", "json"], level: str, lines_per_second: int, stream: TextIO | None = None
 ) -> Iterator[LimitedHandler]:
     """Have everything that is logged in the `with` statement written, and what ends threads that nobody waits for.
 
@@ -220,10 +212,9 @@ def logging_to_stderr(
         level: `debug`, `info`, `warning` or `error`; lesser lines are left out.
         lines_per_second: of one kind.
         stream: where to, stderr by default.
-        clock: by which lines are counted.
     """
     root = logging.getLogger()
-    handler = LimitedHandler(sys.stderr if stream is None else stream, lines_per_second, clock)
+    handler = LimitedHandler(sys.stderr if stream is None else stream, lines_per_second)
     handler.setFormatter(JsonFormatter() if form == "json" else TextFormatter())
     before, hook = root.level, threading.excepthook
     root.addHandler(handler)

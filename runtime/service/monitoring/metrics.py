@@ -157,10 +157,6 @@ class ServiceMetrics:
             self.margin.set(found.margin_bits)
             self.code_iterations.set(found.iterations)
 
-    def no_user_data(self, loss: Loss) -> None:
-        """Count a page whose bytes were asked for and that was not decoded."""
-        self.data_pages.labels(loss.value).inc()
-
     def lost(self, error: LostPageError, *, tells: bool = True) -> None:
         """Count a page that was not given out; where it `tells` of the device, that is a sign of drift too."""
         self.lost_pages.labels(error.reason.value).inc()

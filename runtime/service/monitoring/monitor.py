@@ -6,15 +6,16 @@ import logging
 import math
 import statistics
 import threading
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
 from lightpage.codec.page_bytes import Loss
 from lightpage.errors import Reason
-from lightpage.runtime.service.caller import MOST_SESSIONS
+from lightpage.runtime.service.caller import MOST_SESSIONS, Sessions
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.observation import Observation
 
@@ -130,7 +131,7 @@ class SignState:
         name: of the sign.
         value: what counts of the last pages, None before there are enough.
         baseline: what is usual, None before it is known.
-        raise_at, clear_at: where the sign is raised and taken back, None before the baseline is known.
+        raise_at: where the sign is raised, None before the baseline is known.
         raised: whether it is.
         decides: whether it makes a recalibration due.
     """
@@ -139,7 +140,6 @@ class SignState:
     value: float | None
     baseline: float | None
     raise_at: float | None
-    clear_at: float | None
     raised: bool
     decides: bool
 
@@ -226,11 +226,10 @@ class _Followed:
         return statistics.fmean(values) if self.sign.mean else statistics.median(values)
 
     def state(self) -> SignState:
-        ends: list[float | None] = [None, None]
+        raise_at = None
         if self.baseline is not None:
-            way = 1 if self.sign.rises else -1
-            ends = [self.baseline + way * self._distance(by) for by in (self.sign.raise_by, self.sign.clear_by)]
-        return SignState(self.sign.name, self.value, self.baseline, ends[0], ends[1], self.raised, self.sign.decides)
+            raise_at = self.baseline + (1 if self.sign.rises else -1) * self._distance(self.sign.raise_by)
+        return SignState(self.sign.name, self.value, self.baseline, raise_at, self.raised, self.sign.decides)
 
 
 class PageFigures:
@@ -365,34 +364,26 @@ class SessionMonitors:
 
     Args:
         settings: when a recalibration is due.
-        most: sessions that are remembered; of more, the one that was silent for longest is forgotten, and begins anew.
+        most: see `Sessions`.
     """
 
     def __init__(self, settings: MonitorSettings, most: int = MOST_SESSIONS) -> None:
-        self._settings, self._most, self._version = settings, most, ""
-        self._lock = threading.Lock()
-        self._monitors: OrderedDict[str, Monitor] = OrderedDict()
+        self._settings, self._most = settings, most
+        self.begin("")
 
     def begin(self, version: str) -> None:
         """Start anew with a model that is put in service."""
-        with self._lock:
-            self._version = version
-            self._monitors.clear()
+        self._monitors = Sessions(partial(self._begun, version), self._most)
 
     def of(self, session: str) -> Monitor:
         """The monitor of a session."""
-        with self._lock:
-            monitor = self._monitors.pop(session, None)
-            if monitor is None:
-                monitor = Monitor(self._settings, whose=f"{session}: ")
-                monitor.begin(self._version)
-            self._monitors[session] = monitor
-            while len(self._monitors) > self._most:
-                self._monitors.popitem(last=False)
-            return monitor
+        return self._monitors.of(session)
 
     def due(self) -> int:
         """Number of sessions whose pages say that a recalibration is due."""
-        with self._lock:
-            monitors = list(self._monitors.values())
-        return sum(monitor.due for monitor in monitors)
+        return sum(monitor.due for monitor in self._monitors.all())
+
+    def _begun(self, version: str, session: str) -> Monitor:
+        monitor = Monitor(self._settings, whose=f"{session}: ")
+        monitor.begin(version)
+        return monitor

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -14,8 +13,6 @@ from lightpage.errors import Reason
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import FrameInfo
 from lightpage.runtime.model.decoding.page import DecodedPage
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ import logging
 import threading
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from importlib.metadata import version as installed_version
 from typing import Any, Self
 from urllib.parse import urlsplit
@@ -18,8 +17,9 @@ from urllib.parse import urlsplit
 import grpc
 
 from lightpage.errors import InvalidInputError
+from lightpage.runtime.service.caller import Call
 from lightpage.runtime.service.monitoring.logs import MOST_TEXT
-from lightpage.runtime.service.stages import Lap, Stages
+from lightpage.runtime.service.stages import Lap
 
 MOST_PAGES = 64
 """Pages of a call that have spans, the first ones: a range may have thousands."""
@@ -44,35 +44,10 @@ _FAULTS = frozenset(
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class EndedCall:
-    """A call that has ended.
-
-    Attributes:
-        service, method: of gRPC.
-        peer: address that it came from.
-        correlation_id: the caller's own text.
-        code: its status.
-        reason: of an error, as callers read it, else empty.
-        begun, ended: `time.perf_counter` seconds.
-        pages: its pages, the first ones.
-        count: of all its pages.
-    """
-
-    service: str
-    method: str
-    peer: str
-    correlation_id: str
-    code: grpc.StatusCode
-    reason: str
-    begun: float
-    ended: float
-    pages: tuple[Stages, ...] = ()
-    count: int = 0
-
-
 class Traces:
-    """Sends spans to an endpoint until it is closed; use it in a `with` statement.
+    """Sends spans to an endpoint; use it in a `with` statement.
+
+    At the end it sends what waits, for a limited time.
 
     Args:
         endpoint: http://HOST:PORT or https://HOST:PORT of a collector that takes OTLP over gRPC.
@@ -105,57 +80,62 @@ class Traces:
         self._server, self._inside = SpanKind.SERVER, set_span_in_context
         self._status, self._error = Status, StatusCode.ERROR
 
-    def ended(self, call: EndedCall, headers: Mapping[str, Any]) -> None:
-        """Make the spans of a call.
+    def ended(
+        self, call: Call, service: str, headers: Mapping[str, Any], code: grpc.StatusCode, reason: str, ended: float
+    ) -> None:
+        """Make the spans of a call that has ended.
 
         Args:
-            call: that has ended.
+            call: whose `times` are those of its pages.
+            service: full name of its service.
             headers: of it; `traceparent` names the span of its caller.
+            code: its status.
+            reason: of an error, as callers read it, else empty.
+            ended: when it has, `time.perf_counter` seconds.
         """
         try:
-            self._make(call, headers)
+            method, times = call.method.rpartition("/")[2], call.times
+            before = time.time_ns() - round(1e9 * time.perf_counter())
+            parent = self._propagator.extract({key: value for key, value in headers.items() if isinstance(value, str)})
+            attributes: dict[str, Any] = {
+                "rpc.system": "grpc",
+                "rpc.service": service,
+                "rpc.method": method,
+                "rpc.grpc.status_code": code.value[0],
+                "lightpage.peer": call.peer,
+                "lightpage.pages": times.count,
+            }
+            named = {"lightpage.correlation_id": call.correlation_id, "lightpage.reason": reason}
+            attributes |= {name: text[:MOST_TEXT] for name, text in named.items() if text}
+
+            def at(seconds: float) -> int:
+                return before + round(1e9 * seconds)
+
+            def laps(within: Any, laps: Iterable[Lap]) -> None:
+                for lap in laps:
+                    self._tracer.start_span(lap.stage.value, within, start_time=at(lap.start)).end(at(lap.end))
+
+            name, begun = f"{service}/{method}", at(call.begun)
+            span = self._tracer.start_span(name, parent, self._server, attributes, start_time=begun)
+            if code in _FAULTS:
+                span.set_status(self._status(self._error, code.name))
+            if span.is_recording():
+                inside = self._inside(span)
+                for page in times.pages:
+                    if times.count == 1:
+                        laps(inside, page.laps)
+                    else:
+                        own = self._tracer.start_span("page", inside, start_time=at(page.start))
+                        laps(self._inside(own), page.laps)
+                        own.end(at(page.start + page.elapsed_s))
+            span.end(at(ended))
         except Exception:  # whatever becomes of its trace, a call has its answer
             _log.exception("no trace of %s", call.method)
 
-    def _make(self, call: EndedCall, headers: Mapping[str, Any]) -> None:
-        before = time.time_ns() - round(1e9 * time.perf_counter())
-        parent = self._propagator.extract({key: value for key, value in headers.items() if isinstance(value, str)})
-        attributes: dict[str, Any] = {
-            "rpc.system": "grpc",
-            "rpc.service": call.service,
-            "rpc.method": call.method,
-            "rpc.grpc.status_code": call.code.value[0],
-            "lightpage.peer": call.peer,
-            "lightpage.pages": call.count,
-        }
-        named = {"lightpage.correlation_id": call.correlation_id, "lightpage.reason": call.reason}
-        attributes |= {name: text[:MOST_TEXT] for name, text in named.items() if text}
+    def __enter__(self) -> Self:
+        return self
 
-        def at(seconds: float) -> int:
-            return before + round(1e9 * seconds)
-
-        def laps(within: Any, laps: Iterable[Lap]) -> None:
-            for lap in laps:
-                self._tracer.start_span(lap.stage.value, within, start_time=at(lap.start)).end(at(lap.end))
-
-        span = self._tracer.start_span(
-            f"{call.service}/{call.method}", parent, self._server, attributes, start_time=at(call.begun)
-        )
-        if call.code in _FAULTS:
-            span.set_status(self._status(self._error, call.code.name))
-        if span.is_recording():
-            inside = self._inside(span)
-            if call.count == 1:
-                for page in call.pages:
-                    laps(inside, page.laps)
-            else:
-                for page in call.pages:
-                    own = self._tracer.start_span("page", inside, start_time=at(page.start))
-                    laps(self._inside(own), page.laps)
-                    own.end(at(page.start + page.elapsed_s))
-        span.end(at(call.ended))
-
-    def close(self) -> None:
+    def __exit__(self, *_: object) -> None:
         """Send what waits, for a limited time."""
         ending = threading.Thread(target=self._provider.shutdown, name="lightpage-traces", daemon=True)
         ending.start()
@@ -163,12 +143,6 @@ class Traces:
         if ending.is_alive():
             self._exporter.shutdown()  # whoever still tries gives up
             ending.join(_END_S)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def check_endpoint(endpoint: str) -> str:

@@ -153,8 +153,5 @@ def read_reply(read: ReadAnswer, request: pb.ReadPageRequest) -> pb.ReadPageRepl
 
 def _camera_frame(info: FrameInfo) -> pb.CameraFrame:
     return pb.CameraFrame(
-        serial=info.serial,
-        frame_id=info.frame_id,
-        device_time_s=info.device_time_s,
-        host_time_s=info.host_time_s,
+        serial=info.serial, frame_id=info.frame_id, device_time_s=info.device_time_s, host_time_s=info.host_time_s
     )

@@ -14,7 +14,6 @@ from lightpage.codec.volume import Successor, Volume, restore_group
 from lightpage.errors import LightpageError, LostPageError, PageError, SourceError
 from lightpage.page.pilots import Pilots
 from lightpage.runtime.device.acquisition.source import FrameSource, Shot, own_fault
-from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import Answer, DataPlane, Seen, levels_for, observed
 from lightpage.runtime.service.stages import Stage, Stages
@@ -112,7 +111,7 @@ def read_page(
             subject = f"page {found.page_index} of {source.name}"
             seen.note(subject=subject, page_index=found.page_index, levels=source.levels)
             seen.note(pair=found.pair, infos=found.infos, symbols=found.symbols, pilot_mask=found.pilot_mask)
-            mask = _mask(found, model.decoder)
+            mask = model.decoder.bundle.pilot_mask if found.pilot_mask is None else found.pilot_mask
             levels = levels_for(model.decoder, levels, source.levels, user_data)
             if user_data and not np.array_equal(mask, model.decoder.bundle.pilot_mask):
                 raise SourceError(f"{source.name}: pilots", "other places", "those of the model in service")
@@ -138,10 +137,6 @@ def _shot(plane: DataPlane, source: FrameSource, page: int | None, caller: Calle
     except LostPageError as error:
         plane.metrics.lost(error)
         raise
-
-
-def _mask(found: Shot, decoder: Decoder) -> NDArray[np.bool_]:
-    return decoder.bundle.pilot_mask if found.pilot_mask is None else found.pilot_mask
 
 
 def read_data(

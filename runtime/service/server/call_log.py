@@ -11,11 +11,7 @@ import grpc
 from lightpage.runtime.client.wire.status import reason_told, told
 
 _FAULTS_OF_THE_SERVICE = frozenset(
-    [
-        grpc.StatusCode.FAILED_PRECONDITION,
-        grpc.StatusCode.RESOURCE_EXHAUSTED,
-        grpc.StatusCode.UNAVAILABLE,
-    ]
+    [grpc.StatusCode.FAILED_PRECONDITION, grpc.StatusCode.RESOURCE_EXHAUSTED, grpc.StatusCode.UNAVAILABLE]
 )
 """Ends of calls that the operator of the service may want to do something about. Of lost pages `PageLog` tells."""
 

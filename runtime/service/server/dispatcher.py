@@ -17,11 +17,10 @@ from concurrent.futures import Executor, Future
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 import grpc
 from google.protobuf.descriptor import ServiceDescriptor
-from google.protobuf.message import DecodeError, Message
 from google.protobuf.message_factory import GetMessageClass
 
 from lightpage.errors import CallerLeft, MalformedError, OverloadedError, StalledError, StoppingError, let_go
@@ -31,7 +30,7 @@ from lightpage.runtime.client.wire.status import reason_told, status_of, told, t
 from lightpage.runtime.service.caller import LOCAL, STRANGER, Call, Caller, Identity, Role
 from lightpage.runtime.service.limits import Limits
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
-from lightpage.runtime.service.monitoring.traces import MOST_PAGES, EndedCall, Traces
+from lightpage.runtime.service.monitoring.traces import MOST_PAGES, Traces
 from lightpage.runtime.service.server.call_log import log_end
 from lightpage.runtime.service.server.roles import NEEDED, identity_of
 from lightpage.runtime.service.stages import CallTimes
@@ -53,8 +52,6 @@ _EARLY_S = 0.05
 _GONE_S = 0.05
 """From the end of a stream to the word that its caller has gone, rather than closed it, at most."""
 
-T = TypeVar("T")
-
 
 @dataclass(frozen=True)
 class Served:
@@ -62,7 +59,7 @@ class Served:
 
     Attributes:
         descriptor: of it.
-        handlers: objects whose methods answer; of two with the same method the first counts.
+        handlers: objects whose methods answer.
         prefix: of its methods' names in metrics and logs.
     """
 
@@ -73,6 +70,25 @@ class Served:
     def handler(self, method: str) -> Callable[..., Any] | None:
         """What answers a method."""
         return next((found for one in self.handlers if (found := getattr(one, method, None))), None)
+
+
+@dataclass(frozen=True)
+class _Method:
+    """One RPC.
+
+    Attributes:
+        service: full name of its service.
+        name: in metrics and logs.
+        handler: answers it.
+        many: whether its callers send many messages.
+        serialise: a reply.
+    """
+
+    service: str
+    name: str
+    handler: Callable[..., Any]
+    many: bool
+    serialise: Callable[[Any], bytes]
 
 
 class Dispatcher:
@@ -99,8 +115,6 @@ class Dispatcher:
         self._secured = secured
         self._services, self._pool, self._limits = tuple(services), pool, limits
         self._metrics, self._traces = metrics, traces
-        self._full_names: dict[str, tuple[str, str]] = {}
-        """Of each name in metrics and logs that of the service and of the method."""
         self._active: set[asyncio.Task[Any]] = set()
         self._watching: set[asyncio.Task[Any]] = set()
         self._told: set[asyncio.Task[Any]] = set()
@@ -111,9 +125,10 @@ class Dispatcher:
     def rpc_handlers(self) -> tuple[grpc.GenericRpcHandler[Any, Any], ...]:
         """All RPCs of the services that have a handler, for the server.
 
-        Messages come as bytes: the library answers those that it cannot parse with INTERNAL and a traceback, and keeps
-        20 kB of each. They come as streams, even where there is but one: the library would read it before anybody could
-        refuse the call. They go as bytes, so that serialising them is a part of the call, and timed with it.
+        Messages are parsed by the gate before them: the library answers those that it cannot parse with INTERNAL and a
+        traceback, and keeps 20 kB of each. They come as streams, even where there is but one: the library would read it
+        before anybody could refuse the call. They go as bytes, so that serialising them is a part of the call, and
+        timed with it.
         """
         return tuple(map(self._rpc_handler, self._services))
 
@@ -127,11 +142,10 @@ class Dispatcher:
                 True: (grpc.stream_stream_rpc_method_handler, self._stream),
             }[method.server_streaming]
             name, message = f"{service.prefix}{method.name}", GetMessageClass(method.input_type)
-            self._full_names[name] = service.descriptor.full_name, method.name
             parse = parsed_part if message is pb.DecodeFramesRequest else message.FromString
             serialise = GetMessageClass(method.output_type).SerializeToString
-            serving = partial(serve, name, handler, parse, serialise, method.client_streaming)
-            methods[method.name] = make(serving, None, None)
+            rpc = _Method(service.descriptor.full_name, name, handler, method.client_streaming, serialise)
+            methods[method.name] = make(partial(serve, rpc), None if name in LATER else parse, None)
         return grpc.method_handlers_generic_handler(service.descriptor.full_name, methods)
 
     def refuse(self) -> None:
@@ -157,39 +171,21 @@ class Dispatcher:
         for task in tasks:
             task.cancel()
 
-    async def _unary(
-        self,
-        name: str,
-        handler: Callable[..., Any],
-        parse: Callable[[bytes], Any],
-        serialise: Callable[[Any], bytes],
-        many: bool,
-        data: Any,
-        context: Any,
-    ) -> bytes:
-        async with self._call(name, context) as call:
-            request = self._messages(data, parse, call) if many else await self._one(data, parse, call)
-            if inspect.iscoroutinefunction(handler):
-                return serialise(await handler(request, call))
-            return serialise(await asyncio.wrap_future(self._pool.submit(handler, request, call)))
+    async def _unary(self, rpc: _Method, data: AsyncGenerator[Any, None], context: Any) -> bytes:
+        async with self._call(rpc, context) as call:
+            request = self._messages(data, call) if rpc.many else await self._one(data, call)
+            if inspect.iscoroutinefunction(rpc.handler):
+                return rpc.serialise(await rpc.handler(request, call))
+            return rpc.serialise(await asyncio.wrap_future(self._pool.submit(rpc.handler, request, call)))
 
-    async def _stream(
-        self,
-        name: str,
-        handler: Callable[..., Any],
-        parse: Callable[[bytes], Any],
-        serialise: Callable[[Any], bytes],
-        many: bool,
-        data: Any,
-        context: Any,
-    ) -> AsyncIterator[bytes]:
-        async with self._call(name, context) as call:
-            request = self._messages(data, parse, call) if many else await self._one(data, parse, call)
-            if inspect.isasyncgenfunction(handler):
-                replies: AsyncGenerator[Any, None] = handler(request, call)
+    async def _stream(self, rpc: _Method, data: AsyncGenerator[Any, None], context: Any) -> AsyncIterator[bytes]:
+        async with self._call(rpc, context) as call:
+            request = self._messages(data, call) if rpc.many else await self._one(data, call)
+            if inspect.isasyncgenfunction(rpc.handler):
+                replies: AsyncGenerator[Any, None] = rpc.handler(request, call)
             else:
-                replies = self._stepped(handler(request, call), call)
-            longest_s, loop = self._longest_s.get(name), asyncio.get_running_loop()
+                replies = self._stepped(rpc.handler(request, call), call)
+            longest_s, loop = self._longest_s.get(rpc.name), asyncio.get_running_loop()
             end = None if longest_s is None else loop.time() + longest_s
             reader = _Reader(replies, partial(self._no_load, asyncio.current_task()))
             try:
@@ -200,12 +196,12 @@ class Dispatcher:
                         break
                     waiting = loop.call_later(self._limits.reader_s, reader.stalls)
                     try:
-                        yield serialise(reply)
+                        yield rpc.serialise(reply)
                     finally:
                         waiting.cancel()
-                    reader.check(name)
+                    reader.check(rpc.name)
             except TimeoutError:
-                raise _slow(name) from None
+                raise _slow(rpc.name) from None
             finally:
                 await reader.close()
 
@@ -231,33 +227,32 @@ class Dispatcher:
             if step is not None:
                 step.add_done_callback(lambda _: replies.close())  # one that is at work cannot be closed
 
-    async def _one(self, data: AsyncGenerator[bytes, None], parse: Callable[[bytes], Any], call: Call) -> Any:
+    async def _one(self, data: AsyncGenerator[Any, None], call: Call) -> Any:
         """The one message of a call, or what reads its bytes."""
 
-        async def receive() -> bytes:
+        async def receive() -> Any:
             if (message := await anext(data, None)) is None:
                 raise MalformedError(f"message of {call.method}", "none", "one")
             await data.aclose()
             return message
 
-        return receive if call.method in LATER else _parsed(parse, await receive(), call)
+        return receive if call.method in LATER else _noted(await receive(), call)
 
-    async def _messages(
-        self, data: AsyncIterator[bytes], parse: Callable[[bytes], Any], call: Call
-    ) -> AsyncIterator[Any]:
+    async def _messages(self, data: AsyncIterator[Any], call: Call) -> AsyncIterator[Any]:
         """The messages of a stream."""
         async for message in data:
-            yield _parsed(parse, message, call)
+            yield _noted(message, call)
         if call.method in UPLOADS:  # the library ends the stream of one who has gone too, and then cancels it
             await asyncio.sleep(_GONE_S)
 
     @asynccontextmanager
-    async def _call(self, name: str, context: Any) -> AsyncIterator[Call]:
+    async def _call(self, rpc: _Method, context: Any) -> AsyncIterator[Call]:
         """Admit a call, count it, and turn what it raises into its status."""
-        caller = Caller(partial(_seconds_left, context))
+        name, caller = rpc.name, Caller(partial(_seconds_left, context))
         call = Call(name, caller, self._pool, context.peer(), is_watch=name in ENDLESS)
         call.times = CallTimes(call.begun, partial(self._metrics.timed, name), MOST_PAGES if self._traces else 0)
         headers = dict(context.invocation_metadata() or ()) if self._traces else {}
+        ended = partial(self._ended, rpc, call, headers)
         task = asyncio.current_task()
         assert task is not None  # calls run in tasks
         mine = self._watching if call.is_watch else self._active
@@ -272,18 +267,18 @@ class Dispatcher:
                 got, expected = f"{len(self._active) - 1} at once", f"at most {self._limits.concurrent_calls}"
                 raise OverloadedError("calls", got, f"{expected}; try again later", retry_s=1.0)
             yield call
-            self._ended(call, headers, grpc.StatusCode.OK, None)
+            ended(grpc.StatusCode.OK, None)
         except (asyncio.CancelledError, GeneratorExit) as left:
             if task in self._told and isinstance(left, asyncio.CancelledError):
                 task.uncancel()
                 error = _stopping(name)
-                self._ended(call, headers, status_of(error), error)
+                ended(status_of(error), error)
                 await context.abort(status_of(error), told(error), trailers(error))
-            self._ended(call, headers, _code_of_leaving(context), left)
+            ended(_code_of_leaving(context), left)
             raise
         except Exception as error:
             code = _code_of_leaving(context) if isinstance(error, CallerLeft) else status_of(error)
-            self._ended(call, headers, code, error)
+            ended(code, error)
             let_go(error)  # the library keeps the error for a while, and so would it all that came
             await context.abort(code, told(error), trailers(error))
         finally:
@@ -303,29 +298,16 @@ class Dispatcher:
             return identity_of(found[0])
         return STRANGER if self._secured else LOCAL
 
-    def _ended(self, call: Call, headers: dict[str, Any], code: grpc.StatusCode, error: BaseException | None) -> None:
+    def _ended(
+        self, rpc: _Method, call: Call, headers: dict[str, Any], code: grpc.StatusCode, error: BaseException | None
+    ) -> None:
         """Count a call, before its caller hears of its end."""
         ended, reason = time.perf_counter(), reason_told(error)
         call.times.end(ended)
         self._metrics.in_flight.dec()
         self._metrics.call_ended(call.method, code.name, reason, None if call.is_watch else ended - call.begun)
         if self._traces is not None:
-            service, method = self._full_names[call.method]
-            self._traces.ended(
-                EndedCall(
-                    service=service,
-                    method=method,
-                    peer=call.peer,
-                    correlation_id=call.correlation_id,
-                    code=code,
-                    reason=reason,
-                    begun=call.begun,
-                    ended=ended,
-                    pages=call.times.pages,
-                    count=call.times.count,
-                ),
-                headers,
-            )
+            self._traces.ended(call, rpc.service, headers, code, reason, ended)
         fields = {"method": call.method, "peer": call.actor.name, "correlation_id": call.correlation_id}
         log_end(fields | {"seconds": round(ended - call.begun, 4)}, code, error, is_watch=call.is_watch)
 
@@ -367,11 +349,8 @@ def _slow(name: str) -> StalledError:
     return StalledError(f"answer of {name}", "a reply that is not taken in time", "a faster reader")
 
 
-def _parsed(parse: Callable[[bytes], Any], data: bytes, call: Call) -> Any:
-    try:
-        message: Message = parse(data)
-    except DecodeError as error:
-        raise MalformedError(f"message of {call.method}", str(error), "one that can be parsed") from None
+def _noted(message: Any, call: Call) -> Any:
+    """A message, whose correlation id is that of its call."""
     call.correlation_id = getattr(message, "correlation_id", "") or call.correlation_id
     call.caller.actor = call.actor
     return message

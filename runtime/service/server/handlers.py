@@ -43,6 +43,8 @@ class Describing:
         """What the service is."""
         plane, model = self._plane, self._plane.registry.current
         bundle, limits = model.decoder.bundle, self._plane.limits
+        told = limits.model_dump(include=set(pb.Limits.DESCRIPTOR.fields_by_name))
+        told["shared_bytes"] = 0 if plane.shared is None else plane.shared.most_bytes
         (rows_px, columns_px), (rows, columns) = bundle.profile.frame_shape, bundle.profile.page_shape
         return pb.DescribeReply(
             service_version=installed_version("lightpage"),
@@ -54,18 +56,7 @@ class Describing:
                 pixel_type=PIXEL_CODES[bundle.manifest.frame_dtype],
             ),
             page=pb.PageShape(rows=rows, columns=columns),
-            limits=pb.Limits(
-                message_bytes=limits.message_bytes,
-                chunk_bytes=limits.chunk_bytes,
-                pair_bytes=limits.pair_bytes,
-                concurrent_decodes=limits.concurrent_decodes,
-                replay_s=limits.replay_s,
-                replay_bytes=limits.replay_bytes,
-                recalibration_pages=limits.recalibration_pages,
-                model_bytes=limits.model_bytes,
-                range_pages=limits.range_pages,
-                shared_bytes=0 if plane.shared is None else plane.shared.most_bytes,
-            ),
+            limits=pb.Limits(**told),
             source=without_folders(plane.source.name) if plane.has_source else "",
             source_levels=plane.source.levels if plane.has_source else 0,
             default_levels=plane.default_levels,

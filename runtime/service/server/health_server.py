@@ -9,12 +9,11 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from types import TracebackType
 from typing import Self
 
 from lightpage.errors import InvalidInputError
 from lightpage.helper_process import HelperProcess
-from lightpage.runtime.client.wire.address import check_address, check_free, is_local
+from lightpage.runtime.client.wire.address import check_address, check_free, is_local, target_of
 from lightpage.runtime.client.wire.channel import TlsFiles
 
 _PROCESS = "lightpage.runtime.service.server.health_process"
@@ -60,37 +59,32 @@ class HealthServer:
     @property
     def target(self) -> str:
         """Where it is asked on this machine."""
-        if self._address.startswith("unix:"):
-            return self._address
-        host = self._address.rpartition(":")[0]
-        return f"{'127.0.0.1' if host in ('0.0.0.0', '[::]', '') else host}:{self.port}"
+        return target_of(self._address, self.port)
 
     @property
     def pid(self) -> int | None:
         """Number of the process, None before there is one."""
         return None if self._process is None else self._process.pid
 
-    def start(self) -> Self:
+    def __enter__(self) -> Self:
         """Answer health checks.
 
         Raises:
             InvalidInputError: the address cannot be listened on.
         """
         check_free("health address", self._address)
-        try:
-            self._process, self.port = self._started(self._address)
-        except InvalidInputError:
-            self.stop()
-            raise
+        self._process, self.port = self._started()
+        if not self._address.startswith("unix:"):
+            self._address = f"{self._address.rpartition(':')[0]}:{self.port}"  # where another process follows it
         self._thread.start()
         return self
 
-    def _started(self, address: str) -> tuple[HelperProcess, int]:
-        """A process that answers at an address, and the port."""
-        subject = f"health address {address}"
+    def _started(self) -> tuple[HelperProcess, int]:
+        """A process that answers, and its port."""
+        subject = f"health address {self._address}"
         process: HelperProcess | None = None
         try:
-            process = HelperProcess(_PROCESS, address, *self._files, subject="the process of health checks")
+            process = HelperProcess(_PROCESS, self._address, *self._files, subject="the process of health checks")
             answer = json.loads(process.line(time.monotonic() + _START_S))
             if "port" in answer:
                 return process, int(answer["port"])
@@ -101,24 +95,15 @@ class HealthServer:
             process.end()
         raise InvalidInputError(subject, got, expected)
 
-    def stop(self) -> None:
+    def __exit__(self, *_: object) -> None:
         """Answer no more."""
         self._stop.set()
-        if self._thread.is_alive():
-            self._thread.join(2 * _SEND_S)
+        self._thread.join(2 * _SEND_S)
         if self._process is not None:
             self._process.end()
             if self._address.startswith("unix:"):
                 with suppress(OSError):
                     os.unlink(self._address.removeprefix("unix:"))
-
-    def __enter__(self) -> Self:
-        return self.start()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
 
     def _beat(self) -> None:
         while True:
@@ -140,11 +125,8 @@ class HealthServer:
         except OSError as error:
             _log.error("health checks: %s; their process is started again", error or "nobody listens")
         self._process.end()
-        host = self._address.rpartition(":")[0]
         try:
-            self._process, _ = self._started(
-                self._address if self._address.startswith("unix:") else f"{host}:{self.port}"
-            )
+            self._process, _ = self._started()
         except InvalidInputError as error:
             _log.error("health checks: %s", error)
             self._stop.wait(_AGAIN_S)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import lru_cache
 
 from cryptography import x509
@@ -34,22 +35,17 @@ def identity_of(certificate: bytes) -> Identity:
     Raises:
         NotAllowedError: it cannot be read.
     """
+    load = x509.load_pem_x509_certificate if certificate.startswith(b"-----") else x509.load_der_x509_certificate
+    uris: list[str] = []
     try:
-        return _identity_of(certificate)
+        read = load(certificate)
+        names = read.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+        with suppress(x509.ExtensionNotFound):
+            told = read.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+            uris = told.get_values_for_type(x509.UniformResourceIdentifier)
     except (ValueError, x509.DuplicateExtension, x509.UnsupportedGeneralNameType) as error:
         raise NotAllowedError("certificate of the caller", error, "one that can be read") from None
-
-
-def _identity_of(certificate: bytes) -> Identity:
-    is_pem = certificate.startswith(b"-----")
-    read = x509.load_pem_x509_certificate(certificate) if is_pem else x509.load_der_x509_certificate(certificate)
-    names = read.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     name = str(names[0].value) if names else f"certificate {read.serial_number:x}"
     name = name if name.isprintable() else ascii(name)[1:-1]
-    try:
-        told = read.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-        uris = told.get_values_for_type(x509.UniformResourceIdentifier)
-    except x509.ExtensionNotFound:
-        uris = []
     roles = (Role(role) for uri in uris if (role := uri.removeprefix(ROLE_URI)) != uri and role in list(Role))
     return Identity(name, frozenset(roles), read.not_valid_after_utc.timestamp())

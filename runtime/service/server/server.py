@@ -5,9 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-from collections.abc import Coroutine, Sequence
+from collections.abc import Coroutine
 from concurrent.futures import ThreadPoolExecutor
-from types import TracebackType
 from typing import Any, Self, TypeVar
 
 import grpc
@@ -15,7 +14,7 @@ from grpc_health.v1 import health, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from lightpage.errors import InvalidInputError
-from lightpage.runtime.client.wire.address import check_free
+from lightpage.runtime.client.wire.address import check_free, target_of
 from lightpage.runtime.client.wire.channel import SERVER_KEEPALIVE, add_port
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.frames.inference_calls import (
@@ -58,7 +57,6 @@ class LightpageServer:
         plane: the service's logic.
         recalibrator: what recalibrates it.
         address: HOST:PORT; port 0 takes a free one.
-        more: further handlers.
         certificates: with which it meets its callers, who must have some too; None for no TLS.
         inference: whether the Open Inference Protocol is served too.
         traces: are told of every call, None for none.
@@ -69,7 +67,6 @@ class LightpageServer:
         plane: DataPlane,
         recalibrator: Recalibrator,
         address: str = "127.0.0.1:0",
-        more: Sequence[object] = (),
         certificates: Certificates | None = None,
         inference: bool = True,
         traces: Traces | None = None,
@@ -79,7 +76,7 @@ class LightpageServer:
         self._credentials = None if certificates is None else certificates.server_credentials()
         if certificates is not None:
             plane.metrics.watch_certificates(certificates.ends_s)
-        self._services = [Served(SERVICE, (*more, *handlers(plane, recalibrator)))]
+        self._services = [Served(SERVICE, handlers(plane, recalibrator))]
         if inference:
             self._services.append(Served(INFERENCE, (InferenceCalls(plane),), PREFIX))
         self._inference = inference
@@ -112,10 +109,7 @@ class LightpageServer:
     @property
     def target(self) -> str:
         """Where a client on this machine finds it."""
-        if self._address.startswith("unix:"):
-            return self._address
-        host = self._address.rpartition(":")[0]
-        return f"{'127.0.0.1' if host in ('0.0.0.0', '[::]', '') else host}:{self.port}"
+        return target_of(self._address, self.port)
 
     def health(self) -> dict[str, bool]:
         """Whether the service as a whole, by its name, and its store serve now; checks of this server say the same.
@@ -143,9 +137,7 @@ class LightpageServer:
     def __enter__(self) -> Self:
         return self.start()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
     async def _open(self) -> None:

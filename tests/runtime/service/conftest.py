@@ -10,12 +10,13 @@ import pytest
 
 from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.tracking import NoTracker
 from lightpage.runtime.recalibration.recalibration import Refit
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 from lightpage.runtime.service.limits import Limits
 from lightpage.runtime.service.models.audit import AuditLog
-from lightpage.runtime.service.models.registry import ModelRegistry, TrackerFactory, no_tracker
+from lightpage.runtime.service.models.registry import ModelRegistry, TrackerFactory
 from lightpage.runtime.service.models.store import ModelStore
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.server.server import LightpageServer
@@ -30,7 +31,7 @@ def begun(
     limits: Limits | None = None,
     fit: Refit = toy.fit_references,
     store: Path | None = None,
-    tracker: TrackerFactory = no_tracker,
+    tracker: TrackerFactory = NoTracker,
     source: Any = "toy",
     monitor: Monitor | None = None,
     audit: AuditLog | None = None,

@@ -9,10 +9,9 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from lightpage.errors import CallerLeft, OverloadedError, SlotsTakenError
-from lightpage.runtime.service.admission import FORGET_S, Slots
+from lightpage.runtime.service.admission import FORGET_S, Heart, Slots
 from lightpage.runtime.service.caller import Caller, named_session, own_name
 from lightpage.runtime.service.models.registry import Sessions
-from lightpage.runtime.service.monitoring.heart import Heart
 from tests.clock import HandClock
 from tests.waiting import eventually
 
@@ -147,12 +146,12 @@ def test_a_slot_that_is_taken_at_once_is_waited_for_by_nobody() -> None:
 
 def test_many_sessions_are_bounded() -> None:
     made = list[object]()
-    sessions = Sessions(lambda: made.append(object()) or made[-1], most=3)  # type: ignore[arg-type,return-value,func-returns-value]
-    first = sessions.tracker("0")
+    sessions = Sessions(lambda _: made.append(object()) or made[-1], most=3)  # type: ignore[arg-type,return-value,func-returns-value]
+    first = sessions.of("0")
     for name in "1203":
-        sessions.tracker(name)
-    assert sessions.tracker("0") is first
-    sessions.tracker("1")
+        sessions.of(name)
+    assert sessions.of("0") is first
+    sessions.of("1")
     assert len(made) == 5
 
 

@@ -8,23 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from lightpage.device.profile import TomlTable
 from lightpage.errors import InvalidInputError
-from lightpage.runtime.service.settings import (
-    Effective,
-    Option,
-    Secret,
-    ServiceSettings,
-    read_settings,
-    service_settings,
-)
+from lightpage.runtime.service.settings import Effective, Option, ServiceSettings, service_settings
 
 ROOT = Path(__file__).resolve().parents[3]
 EXAMPLE = ROOT / "docs" / "service-example.toml"
 DECODES = "LIGHTPAGE_LIMITS__CONCURRENT_DECODES"
 
 
-def of_file(folder: Path, text: str, *options: Option, **environment: str) -> Effective[ServiceSettings]:
+def of_file(folder: Path, text: str, *options: Option, **environment: str) -> Effective:
     file = folder / "service.toml"
     file.write_text(text)
     return service_settings(file, environment, options)
@@ -151,29 +143,6 @@ def test_printed_settings_are_the_settings_and_say_where_each_comes_from(tmp_pat
     assert f"pages = [3, 4]  # file {tmp_path / 'service.toml'}" in lines
     assert "tracking = true  # default" in lines
     assert "# recordings is not set  # default" in lines
-
-
-class Login(TomlTable):
-    key: Secret | None = None
-    keys: tuple[Secret, ...] = ()
-
-
-class Toy(TomlTable):
-    login: Login = Login()
-
-
-def test_a_secret_is_never_shown(tmp_path: Path) -> None:
-    file = tmp_path / "toy.toml"
-    file.write_text('[login]\nkey = "hunter2"\nkeys = ["hunter3"]')
-    effective = read_settings(Toy, file, {})
-    assert effective.settings.login.key == Secret("hunter2")
-    assert 'key = "********"' in effective.to_toml()
-    assert "hunter" not in effective.to_toml() + repr(effective)
-    for wrong in ("key = 5012345", "keys = [5012345]"):
-        file.write_text(f"[login]\n{wrong}")
-        with pytest.raises(InvalidInputError) as raised:
-            read_settings(Toy, file, {})
-        assert "5012345" not in str(raised.value)
 
 
 TLS = {"ca": "ca.pem", "certificate": "service.pem", "key": "service.key"}

@@ -16,7 +16,7 @@ from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.device.acquisition.camera_source import CameraSource, Exposures
 from lightpage.runtime.device.acquisition.page_store import PageStore
 from lightpage.runtime.device.modulator.external import ExternalBeams, ExternalModulator
-from lightpage.runtime.service.display.uploads import uploaded_pages
+from lightpage.runtime.service.display.display_calls import uploaded_pages
 from tests.runtime import toy
 from tests.runtime.device.acquisition.lab import PAIRING, Lab, LabModulator
 from tests.runtime.service.stage import Running, Start, refused, until_told

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from lightpage.codec.page_bytes import Loss, PageBytes
-from lightpage.errors import CalibrationError, InvalidInputError, LimitError, Reason, SourceError, UnconfirmedPageError
+from lightpage.errors import CalibrationError, InvalidInputError, Reason, SourceError, UnconfirmedPageError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.device.acquisition.source import SHOT_S, Shot
 from lightpage.runtime.model.decoding.decoder import Decoder
@@ -89,7 +89,7 @@ def test_hysteresis_it_is_taken_back_only_well_within_the_threshold() -> None:
     monitor = Monitor()
     followed(monitor, [MARGIN] * 20)
     (sign,) = [sign for sign in monitor.state().signs if sign.name == "margin_bits"]
-    assert (sign.raise_at, sign.clear_at) == (pytest.approx(0.5 * MARGIN), pytest.approx(0.7 * MARGIN))
+    assert sign.raise_at == pytest.approx(0.5 * MARGIN)
     assert not any(followed(monitor, [0.6 * MARGIN] * 20))
     assert followed(monitor, [0.45 * MARGIN] * 10)[-1]
     assert all(followed(monitor, [0.6 * MARGIN] * 20))
@@ -104,7 +104,6 @@ def test_where_pages_differ_much_a_sign_is_raised_further_off() -> None:
     noise = 1.25 * 1.4826 * 0.4 / math.sqrt(2 * sign.window)
     assert found.baseline == 0.5
     assert found.raise_at == pytest.approx(0.5 - sign.deviations * noise)
-    assert found.clear_at == pytest.approx(0.5 - sign.deviations * noise * sign.clear_by / sign.raise_by)
 
 
 def test_a_new_model_starts_anew_and_pages_of_the_old_one_say_nothing() -> None:
@@ -471,12 +470,11 @@ def test_never_while_another_recalibration_runs(make: Make) -> None:
 def test_reads_go_on_while_it_recalibrates_and_it_stops_in_the_middle(make: Make) -> None:
     fit = SlowFit()
     loop = make(fit)
-    running = loop.running.start()
-    loop.drift()
-    assert fit.entered.wait(60)
-    loop.source.device.offsets = toy.OFFSETS
-    assert loop.read(5) == 0
-    running.stop(60.0)
+    with loop.running:
+        loop.drift()
+        assert fit.entered.wait(60)
+        loop.source.device.offsets = toy.OFFSETS
+        assert loop.read(5) == 0
     assert fit.ended.wait(60)
     assert loop.version == "toy-1"
     assert eventually(lambda: loop.count("dropped") == 1)
@@ -484,11 +482,7 @@ def test_reads_go_on_while_it_recalibrates_and_it_stops_in_the_middle(make: Make
 
 
 def test_pages_that_cannot_serve_are_refused_at_the_start(loop: Loop) -> None:
-    for pages in ((1,), (1, 1)):
-        with pytest.raises(InvalidInputError, match="calibration pages"):
-            SelfCalibrationSettings(pages)
     loop.source.page_count = lambda: 102  # type: ignore[method-assign]
     SelfCalibration(loop.plane, loop.monitor, loop.recalibrator, SelfCalibrationSettings((100, 101)))
-    for pages, error in ((tuple(range(17)), LimitError), ((101, 102), InvalidInputError)):
-        with pytest.raises(error, match="calibration pages"):
-            SelfCalibration(loop.plane, loop.monitor, loop.recalibrator, SelfCalibrationSettings(pages))
+    with pytest.raises(InvalidInputError, match="calibration pages"):
+        SelfCalibration(loop.plane, loop.monitor, loop.recalibrator, SelfCalibrationSettings((101, 102)))

@@ -34,7 +34,7 @@ from lightpage.runtime.model.bundle.manifest import DECODER
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.tracking import NoTracker
 from lightpage.runtime.service.limits import Limits
-from lightpage.runtime.service.models.registry import KEPT_MODELS
+from lightpage.runtime.service.models.registry import KEPT_MODELS, Model
 from tests.runtime import toy
 from tests.runtime.service.stage import Running, Start, refused, until_told
 from tests.waiting import eventually
@@ -190,14 +190,14 @@ def test_a_caller_who_leaves_while_the_bundle_is_checked_leaves_nothing(
     stored: Start, new: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     service, data = stored(), new.read_bytes()
-    as_it_was, checking = service.plane.registry.check, threading.Event()
+    as_it_was, checking = service.plane.registry.tracked, threading.Event()
 
-    def slow_check(decoder: Decoder) -> None:
+    def slow_check(decoder: Decoder) -> Model:
         checking.set()
         eventually(lambda: service.plane.models.uploads.busy == 0)
-        as_it_was(decoder)
+        return as_it_was(decoder)
 
-    monkeypatch.setattr(service.plane.registry, "check", slow_check)
+    monkeypatch.setattr(service.plane.registry, "tracked", slow_check)
     call = service.stub.UploadModel.future(iter([header(data), chunk(data)]), timeout=60)
     assert checking.wait(60)
     call.cancel()

@@ -42,32 +42,32 @@ def test_a_model_that_was_rolled_back_stays_until_a_new_one_drops_what_lies_ahea
 ) -> None:
     registry = a_registry(decoder, tmp_path, "toy-2", "toy-3")
     later = registry.current
-    assert [model.version for model in registry.rollback()] == ["toy-2", "toy-3"]
+    assert [model.version for model in registry.step(-1)] == ["toy-2", "toy-3"]
     assert (registry.current.version, loaded(registry)) == ("toy-2", ["toy-1", "toy-2", "toy-3"])
     assert registry.step(1) == (later, registry.models[1])
     with pytest.raises(BundleError, match="later"):
         registry.step(1)
-    registry.rollback()
+    registry.step(-1)
     registry.swap(Decoder.load(a_place(tmp_path, "toy-4").path, threads=1))
     assert order(registry) == loaded(registry) == ["toy-1", "toy-2", "toy-4"]
-    assert registry.rollback()[0].version == "toy-2"
+    assert registry.step(-1)[0].version == "toy-2"
 
 
 def test_models_beyond_those_kept_are_loaded_again_where_they_can_be(decoder: Decoder, tmp_path: Path) -> None:
     registry = a_registry(decoder, tmp_path, "toy-2", "toy-3", "toy-4", kept=2)
     assert loaded(registry) == ["toy-3", "toy-4"]
-    registry.rollback()
+    registry.step(-1)
     good = (tmp_path / "toy-2.zip").read_bytes()
     (tmp_path / "toy-2.zip").write_bytes(b"damaged")
     with pytest.raises(BundleError, match="bundle"):
-        registry.rollback()
+        registry.step(-1)
     (tmp_path / "toy-2.zip").unlink()
     toy.write_toy_bundle(tmp_path / "toy-2.zip", version="toy-9")
     with pytest.raises(BundleError, match="got toy-9"):
-        registry.rollback()
+        registry.step(-1)
     assert registry.current.version == "toy-3"
     (tmp_path / "toy-2.zip").write_bytes(good)
-    assert [registry.rollback()[0].version for _ in range(2)] == ["toy-2", "toy-1"]
+    assert [registry.step(-1)[0].version for _ in range(2)] == ["toy-2", "toy-1"]
     assert loaded(registry) == ["toy-1", "toy-2"]
     assert registry.current.decoder.threads == 1
 
@@ -75,13 +75,13 @@ def test_models_beyond_those_kept_are_loaded_again_where_they_can_be(decoder: De
 def test_a_step_is_made_only_from_the_version_that_is_expected(decoder: Decoder, tmp_path: Path) -> None:
     registry = a_registry(decoder, tmp_path, "toy-2")
     for change in (
-        lambda: registry.rollback("toy-1"),
+        lambda: registry.step(-1, "toy-1"),
         lambda: registry.step(1, "toy-1"),
         lambda: registry.go_to(registry.base, "toy-1"),
     ):
         with pytest.raises(OtherModelError, match="got toy-2"):
             change()
-    assert registry.rollback("toy-2")[0].version == "toy-1"
+    assert registry.step(-1, "toy-2")[0].version == "toy-1"
 
 
 def test_a_model_anywhere_can_be_put_in_service_and_the_one_before_stays(decoder: Decoder, tmp_path: Path) -> None:
@@ -91,14 +91,14 @@ def test_a_model_anywhere_can_be_put_in_service_and_the_one_before_stays(decoder
     assert [model.version for model in registry.go_to(registry.base)] == ["toy-1", "toy-5"]
     assert order(registry) == ["toy-1", "toy-2", "toy-5", "toy-1"]
     assert registry.go_to(registry.base) == (registry.current, registry.current)
-    assert registry.rollback()[0].version == "toy-5"
+    assert registry.step(-1)[0].version == "toy-5"
     with pytest.raises(ModelExistsError, match="toy-2"):
         registry.swap(registry.models[1].decoder)
 
 
 def test_what_cannot_be_noted_changes_nothing(decoder: Decoder, tmp_path: Path) -> None:
     registry = a_registry(decoder, tmp_path, "toy-2")
-    registry.rollback()
+    registry.step(-1)
     before = (registry.history, registry.models)
     place = a_place(tmp_path, "toy-3")
     for change in (
@@ -142,7 +142,7 @@ def test_other_devices_and_bundles_that_cannot_be_tracked_are_refused(decoder: D
         return NoTracker(made)
 
     with pytest.raises(BundleError, match="calibration"):
-        ModelRegistry(decoder, tracker).check(same)
+        ModelRegistry(decoder, tracker).tracked(same)
     with pytest.raises(BundleError, match="got 10 bits"):
-        ModelRegistry(decoder).check(deep)
-    ModelRegistry(decoder).check(same)
+        ModelRegistry(decoder).tracked(deep)
+    ModelRegistry(decoder).tracked(same)

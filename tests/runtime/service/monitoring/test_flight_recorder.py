@@ -19,8 +19,7 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.models.registry import ModelRegistry
-from lightpage.runtime.service.monitoring.file_ring import FileRing
-from lightpage.runtime.service.monitoring.flight_recorder import FlightRecorder, FlightSettings
+from lightpage.runtime.service.monitoring.flight_recorder import FileRing, FlightRecorder, FlightSettings
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.monitoring.observation import Observation

@@ -145,7 +145,7 @@ def test_a_stage_is_never_longer_than_the_time_that_has_passed() -> None:
     stages.begin(Stage.RESPOND)  # too late
     stages.end()
     assert stages.elapsed_s == 3.0
-    assert stages.laps == (Lap(Stage.INFERENCE, 100.0, 101.0), Lap(Stage.POST_PROCESSING, 101.0, 103.0))
+    assert stages.laps == [Lap(Stage.INFERENCE, 100.0, 101.0), Lap(Stage.POST_PROCESSING, 101.0, 103.0)]
 
 
 def test_the_pages_of_a_call_follow_each_other_and_end_with_it() -> None:
@@ -162,4 +162,4 @@ def test_the_pages_of_a_call_follow_each_other_and_end_with_it() -> None:
     times.end(20.0)
     assert [page.seconds() for page in seen] == [{Stage.QUEUE: 2.0}, {Stage.QUEUE: 3.0}, {Stage.RECEIVE: 2.0}]
     assert times.count == 3
-    assert times.pages == (first,)
+    assert times.pages == [first]

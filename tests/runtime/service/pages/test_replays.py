@@ -160,7 +160,7 @@ SHAPE = (4, 5)
 
 
 def received(budget: ReceiveBudget, value: int) -> PairReceiver:
-    receiver = PairReceiver(SHAPE, "uint8", 1000, budget)
+    receiver = PairReceiver(SHAPE, "uint8", budget)
     receiver.add(bytes([value]) * receiver.size)
     return receiver
 
@@ -198,7 +198,7 @@ def test_another_size_takes_memory_of_its_own_and_one_pair_at_a_time_is_kept() -
     first, second = received(budget, 1), received(budget, 2)
     assert address(first) != address(second)
     first.close()
-    small = PairReceiver((2, 2), "uint16", 1000, budget)
+    small = PairReceiver((2, 2), "uint16", budget)
     small.add(bytes(16))
     assert small.pair().in_phase.shape == (2, 2)
     second.close()

@@ -61,8 +61,8 @@ def test_one_that_fails_to_say_does_not_serve_and_a_killed_process_is_started_ag
         assert before is not None
         os.kill(before, signal.SIGKILL)
         eventually(lambda: health.pid != before and is_serving(health.target)[0])
-        with pytest.raises(InvalidInputError) as error:
-            HealthServer(health.target, dict).start()
+        with pytest.raises(InvalidInputError) as error, HealthServer(health.target, dict):
+            pass
         assert health.target in error.value.subject
         said.clear()
         eventually(lambda: not is_serving(health.target)[0])

@@ -16,7 +16,7 @@ from lightpage.errors import LimitError, MalformedError
 from lightpage.runtime.client.pb.inference import open_inference_pb2 as oip
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import CHUNK_BYTES, chunks_of, parsed_part, serialized_part
-from lightpage.runtime.service.frames.infer_message import MOST_FIELDS, take_apart
+from lightpage.runtime.service.frames.inference_calls import MOST_FIELDS, take_apart
 
 MOST = 10_000
 ROOT = Path(__file__).resolve().parents[4]

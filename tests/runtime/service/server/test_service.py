@@ -277,7 +277,8 @@ def test_a_recalibration_without_any_folder_is_refused_before_it_begins(
 
     service = start()
     monkeypatch.setattr(tempfile, "mkdtemp", none)
-    assert isinstance(service.recalibrator.no_room(), StoreError)
+    with pytest.raises(StoreError):
+        service.recalibrator.check_start()
     with pytest.raises(StoreError):
         service.client.start_recalibration(count=2)
     assert service.client.jobs() == []
