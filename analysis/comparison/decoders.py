@@ -107,7 +107,7 @@ DEFAULT_SIZE = f"{Hyperparameters.channels}x{Hyperparameters.blocks}x{Hyperparam
     "--published-channels", type=click.IntRange(4), multiple=True, default=(32,), show_default=True, help="Network."
 )
 @click.option(
-    "--method", "--arm", "names", type=click.Choice(METHODS), multiple=True, default=METHODS, show_default=True
+    "--method", "names", type=click.Choice(METHODS), multiple=True, default=METHODS, show_default=True
 )
 @click.option(
     "--levels",
