@@ -85,7 +85,8 @@ format: $(STAMP)  ## let ruff put the code in order
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# What was trained is kept and only measured, which takes hours on two cores, most of them for the full-size page.
+# What was trained is kept and only measured, which takes hours on two cores, most of them for the full-size page. Two
+# decoders of the device without defects are trained, in an hour.
 COMPARE := $(BIN)/python -m analysis.comparison.decoders
 PASSES := --method wave --method wave-refined --method coherent --method refined --method oracle --method oracle-refined
 bench-decoders: $(STAMP)  ## decoders on the same data sets, against the oracles: the table of what is kept, resumed when run again

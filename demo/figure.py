@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from lightpage.demo.result import DemoResult
+from lightpage.pictures import write_figure_png
 
 _LEAST_BITS, _MOST_BITS = 0.0, 8.0
 _PILOTS = "white"
@@ -47,5 +48,4 @@ def write_figure(result: DemoResult, path: Path) -> None:
     for axis in axes.ravel():
         axis.set_xticks([])
         axis.set_yticks([])
-    # no date in the file: the same demo gives the same bytes
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    write_figure_png(path, figure, dpi=110)

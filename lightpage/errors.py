@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 from traceback import clear_frames
 from typing import ClassVar, Self
@@ -332,3 +334,12 @@ ERRORS: dict[str, type[LightpageError]] = {
     name: kind for name, kind in dict(globals()).items() if isinstance(kind, type) and issubclass(kind, LightpageError)
 }
 """Every error by its name, for one that another process has met."""
+
+
+@contextmanager
+def raised_as(kind: type[LightpageError], *caught: type[LightpageError], about: str = "") -> Iterator[None]:
+    """Raise errors of the classes `caught` as a `kind`, with `about` before what they name."""
+    try:
+        yield
+    except caught as error:
+        raise kind(about + error.subject, error.got, error.expected) from error

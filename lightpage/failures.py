@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from lightpage.errors import Cause, InvalidInputError, LightpageError, StorageError, SurroundingsError
 
@@ -136,6 +138,15 @@ def os_failure(
     if number is None:
         return otherwise(subject, error, expected)
     return otherwise(subject, OSError(number, os.strerror(number)), expected)
+
+
+@contextmanager
+def os_errors(subject: str, expected: object, otherwise: type[LightpageError] = InvalidInputError) -> Iterator[None]:
+    """Raise what failures of the operating system mean, see `os_failure`."""
+    try:
+        yield
+    except OSError as error:
+        raise os_failure(subject, error, expected, otherwise) from None
 
 
 def hdf5_failure(

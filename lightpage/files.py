@@ -12,6 +12,7 @@ import os
 import secrets
 import shutil
 import sys
+import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout, suppress
 from contextvars import ContextVar
@@ -247,6 +248,18 @@ def read_text(path: str | Path, subject: str, expected: str, failure: type[Light
         else:
             got = f"byte 0x{data[error.start]:02x} in line {line}, column {column}, which is no {encoding.upper()}"
         raise failure(subject, got, f"{expected}, in UTF-8") from None
+
+
+def read_toml(path: str | Path, subject: str, expected: str) -> dict[str, Any]:
+    """What a TOML file says.
+
+    Raises:
+        InvalidInputError, StorageError, SurroundingsError: it cannot be read, or is no TOML.
+    """
+    try:
+        return tomllib.loads(read_text(path, subject, expected))
+    except tomllib.TOMLDecodeError as error:
+        raise InvalidInputError(subject, error, expected) from None
 
 
 def matching(pattern: str) -> list[str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import io
-import subprocess
 import sys
 import tokenize
 import tomllib
@@ -19,9 +18,8 @@ _NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, to
 
 def figures() -> dict[str, float]:
     """Return each figure by its name in `limits.toml`."""
-    tracked = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    files = [ROOT / name for name in tracked.split("\0") if name and (ROOT / name).is_file()]
-    code = [path for path in files if path.suffix == ".py" and "pb" not in path.parts]
+    tops = [path for path in ROOT.iterdir() if path.is_dir() and path.name[0] != "." and path.name != "build"]
+    code = [path for top in tops for path in top.rglob("*.py") if "pb" not in path.parts]  # links are not followed
     product = [path for path in code if path.relative_to(ROOT).parts[0] != "tests"]
     graph = grimp.build_graph("lightpage", cache_dir=None)
     rooms = graph.find_children("lightpage.runtime")

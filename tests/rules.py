@@ -6,13 +6,14 @@
 - An error is known by its class, subject and status. Sentences are kept in one snapshot (`tests/messages`), so that
   they can be improved.
 - Private attributes of what is tested are left alone.
-- There are no more lines than `limits.toml` allows.
+- There are no more lines than `limits.toml` allows, and what git tracks has no more bytes.
 """
 
 from __future__ import annotations
 
 import ast
 import re
+import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -118,17 +119,24 @@ def main() -> int:
         if path.relative_to(HERE).as_posix() not in OWN_CLOCK
         for line, what in broken(path)
     ]
-    lines, most = sum(len(path.read_bytes().splitlines()) for path in paths), _limits()["lines"]
-    if lines > most:
-        found.append(f"tests: {lines} lines, wanted {most} or fewer (tests/limits.toml)")
+    limits = tomllib.loads((HERE / "limits.toml").read_text("utf-8"))
+    sizes = {"lines": sum(len(path.read_bytes().splitlines()) for path in paths), "bytes": tracked_bytes(HERE.parent)}
+    for unit, size in sizes.items():
+        if size > limits[unit]:
+            found.append(f"{size:,} {unit}, wanted {limits[unit]:,} or fewer (tests/limits.toml)")
     print(*found, sep="\n", end="\n" if found else "")
-    print(f"tests: {lines} of {most} lines; {len(found)} break a rule")
+    told = [f"{size:,} of {limits[unit]:,} {unit}" for unit, size in sizes.items()]
+    print(*told, f"{len(found)} rules broken", sep="; ")
     return bool(found)
 
 
-def _limits() -> dict[str, int]:
-    limits: dict[str, int] = tomllib.loads((HERE / "limits.toml").read_text("utf-8"))
-    return limits
+def tracked_bytes(root: Path) -> int:
+    """The size of all files that git tracks, as they lie there; 0 of a tree that is no repository."""
+    if not (root / ".git").exists():
+        return 0
+    listed = subprocess.run(["git", "-C", root, "ls-files", "-z"], check=True, stdout=subprocess.PIPE).stdout
+    paths = (root / name for name in listed.decode().split("\0") if name)
+    return sum(path.lstat().st_size for path in paths if path.is_file())
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from lightpage.pictures import write_figure_png
 from lightpage.train.published.localizers import NAMES as PUBLISHED
 
 MAP = "air_map.npy"
@@ -37,7 +38,7 @@ def draw(data_sets: list[dict[str, Any]], out: Path) -> None:
         _bars(bars, outcomes, top)
         _curves(curves, outcomes, top)
         _maps(maps, outcomes, out)
-    figure.savefig(out / "figure.png", dpi=_DOTS, metadata={"Software": None})
+    write_figure_png(out / "figure.png", figure, dpi=_DOTS)
 
 
 def title(data_set: dict[str, Any]) -> str:

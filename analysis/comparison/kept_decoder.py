@@ -6,9 +6,10 @@ import json
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from analysis.comparison.data_set import CALIBRATED, LEVELS
+from analysis.comparison.kept_weights import read_weights
+from analysis.comparison.weight_store import KEPT_WEIGHTS
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.document import Calibration
 from lightpage.calibration.known_pages import known_pages
@@ -21,7 +22,7 @@ from lightpage.recording.reader import Recording
 from lightpage.train.data.features import FeatureExtractor
 from lightpage.train.data.known_light import explained
 from lightpage.train.fitting.concentration_scale import calibrating_factor
-from lightpage.train.fitting.fitted import FITTED, FITTED_WEIGHTS
+from lightpage.train.fitting.fitted import FITTED
 from lightpage.train.fitting.validation import without_piston
 from lightpage.train.models.decoder import SymbolDecoder
 from lightpage.train.models.hyperparameters import Hyperparameters
@@ -39,18 +40,13 @@ def kept_decoder(
     options = {name: value for name, value in begun.items() if name != "format"} | {"refinements": refinements}
     choices = Hyperparameters(**options)
     decoder = SymbolDecoder(profile, calibration.vector, localizer, choices)
-    decoder.network.load_state_dict(_weights(trained))
+    decoder.network.load_state_dict(read_weights(trained / KEPT_WEIGHTS))
     if refinements:
         extractor = FeatureExtractor(CalibratedDevice.of(profile, calibration, recording.references()), localizer)
         pages = known_pages(recording, profile, range(CALIBRATED, CALIBRATED + MATCHED_PAGES))
         decoder.prediction = fit_prediction(extractor, explained(extractor, pages))
-        decoder.refiners[0].load_state_dict(_weights(trained / "refinement-1"))
+        decoder.refiners[0].load_state_dict(read_weights(trained / "refinement-1" / KEPT_WEIGHTS))
     return decoder.float().eval()
-
-
-def _weights(folder: Path) -> dict[str, torch.Tensor]:
-    kept: dict[str, torch.Tensor] = torch.load(folder / FITTED_WEIGHTS, map_location="cpu", weights_only=True)
-    return kept
 
 
 def validation_air(trained: Path, refinements: int) -> float:

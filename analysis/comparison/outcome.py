@@ -43,11 +43,11 @@ _KEYS = {"method": "arm", "passes": "looks"}
 class Outcome:
     """What one method reached with a network of one size.
 
-    Rates in bits per data symbol, `size` as `--size` has it; `run` is its folder, `kappa_scale` the factor on its
-    concentrations that the validation pages ask for, `own_mi_unscaled` what it claims without, `passes` how many it
-    makes, `by_levels` what it is worth among fewer levels, `by_walls` the AIR of the symbols whose light meets the
-    walls of `WALLS`, `pages_per_second` how fast it trained. The curves are AIR by step. The size is that of the
-    first pass's network, steps, times and curves are those of the last pass, which goes on from the ones before.
+    Rates in bits per data symbol, errors as a share, `size` as `--size` has it; `run` is its folder, `kappa_scale` the
+    factor on its concentrations that the validation pages ask for, `own_mi_unscaled` what it claims without, `passes`
+    how many it makes, `by_levels` what it is worth among fewer levels, `by_walls` the AIR of the symbols whose light
+    meets the walls of `WALLS`, `pages_per_second` how fast it trained. The curves are AIR by step. The size is that of
+    the first pass's network, steps, times and curves are those of the last pass, which goes on from the ones before.
     `analysis.comparison.decoders.compared` tells `over_oracle` and `over_published`.
     """
 
@@ -56,6 +56,7 @@ class Outcome:
     size: str
     steps: int
     air: float
+    symbol_error_rate: float
     own_mi: float
     own_mi_unscaled: float
     page_kB: float

@@ -13,16 +13,19 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch.utils.data import Dataset
 
+from analysis.comparison.kept_weights import read_weights, steps, write_weights
 from lightpage.errors import InvalidInputError
 from lightpage.files import replace_file
-from lightpage.train.fitting.fitted import CHECKPOINTS, FITTED, FITTED_WEIGHTS
+from lightpage.train.data.pages import Page
+from lightpage.train.fitting.fitted import CHECKPOINTS, FITTED, FITTED_WEIGHTS, Fitted
 from lightpage.train.runs import BEGUN, FORMAT, renamed
 
 TRAINED = Path(__file__).parents[1] / "weights"
 CALIBRATION = "calibration.toml"
-_LARGE = 1000
-"""Numbers of a tensor from which it is kept in half precision."""
+KEPT_WEIGHTS = "fitted.xz"
+"""Of a kept run, in place of its `FITTED_WEIGHTS`."""
 
 
 @dataclass(frozen=True)
@@ -75,14 +78,11 @@ class WeightStore:
             return False
         if (self.folder / CALIBRATION).read_text() != (self.data_set / CALIBRATION).read_text():
             return False
-        # what says that a training is finished comes last
-        for name in (BEGUN, FITTED_WEIGHTS, FITTED):
-            for path in sorted(kept.rglob(name)):
-                _copy(path, run / path.relative_to(kept))
+        place(kept, run)
         return True
 
-    def keep(self, run: Path) -> None:
-        """Copy a trained run, and what was trained on it, large tensors in half precision, if that was wanted.
+    def keep(self, run: Path, trained: Fitted[Any], pages: Dataset[Page]) -> None:
+        """Keep a trained run, if that was wanted, as small as `pages` allow (`analysis.comparison.kept_weights`).
 
         Raises:
             InvalidInputError: another data set, another calibration, or another training with the same options is kept.
@@ -92,20 +92,24 @@ class WeightStore:
         _copy_or_check(self.data_set / BEGUN, self.folder / BEGUN)
         _copy_or_check(self.data_set / CALIBRATION, self.folder / CALIBRATION)
         kept = self.folder / run.relative_to(self.data_set)
-        for path in sorted(run.rglob(FITTED), key=lambda path: len(path.parts)):
-            to = kept / path.parent.relative_to(run)
-            if not (to / FITTED).exists():
-                if (path.parent / BEGUN).exists():
-                    _copy(path.parent / BEGUN, to / BEGUN)
-                weights = torch.load(path.parent / FITTED_WEIGHTS, map_location="cpu", weights_only=True)
-                halved = {name: value.half() if _is_large(value) else value for name, value in weights.items()}
-                to.mkdir(parents=True, exist_ok=True)
-                replace_file(to / FITTED_WEIGHTS, partial(torch.save, halved), "weights")
-            _copy_or_check(path, to / FITTED)
+        if not (kept / FITTED).exists():
+            kept.mkdir(parents=True, exist_ok=True)
+            if (run / BEGUN).exists():
+                _copy(run / BEGUN, kept / BEGUN)
+            weights = trained.module.network.state_dict()
+            write_weights(kept / KEPT_WEIGHTS, weights, steps(trained.module, pages))
+        _copy_or_check(run / FITTED, kept / FITTED)
 
 
-def _is_large(value: torch.Tensor) -> bool:
-    return value.is_floating_point() and value.numel() >= _LARGE
+def place(kept: Path, run: Path) -> None:
+    """Put a kept run, and what was trained on it, where training leaves them; what says that it is finished, last."""
+    for path in sorted(kept.rglob(KEPT_WEIGHTS)):
+        to = run / path.parent.relative_to(kept)
+        to.mkdir(parents=True, exist_ok=True)
+        replace_file(to / FITTED_WEIGHTS, partial(torch.save, read_weights(path)), "weights")
+    for name in (BEGUN, FITTED):
+        for path in sorted(kept.rglob(name)):
+            _copy(path, run / path.relative_to(kept))
 
 
 def _copy(path: Path, to: Path) -> None:

@@ -17,6 +17,7 @@ from matplotlib.gridspec import GridSpec
 from matplotlib.ticker import FuncFormatter, Locator, MaxNLocator, MultipleLocator
 
 from analysis.dashboard.prometheus import RunningPrometheus
+from lightpage.pictures import write_figure_png
 
 _COLUMNS = 24
 _CELL_IN = (0.72, 0.3)
@@ -107,7 +108,7 @@ class Drawing:
                 axes = frame.inset_axes(inner, facecolor=_PANEL)
                 _series(axes, frame, panel, found)
                 axes.set_xlim(_moment(self._start), _moment(self._end))  # type: ignore[arg-type]
-        figure.savefig(out, dpi=_DOTS, facecolor=_BACK, metadata={"Software": None})
+        write_figure_png(out, figure, dpi=_DOTS, facecolor=_BACK)
         plt.close(figure)
         return empty
 

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from lightpage.pictures import write_figure_png
+
 
 def draw(rows: list[dict[str, Any]], path: Path, knock: int, page_s: float) -> None:
     """Draw the rows of `analysis.hardware.week` into the PNG file `path`."""
@@ -32,5 +34,5 @@ def draw(rows: list[dict[str, Any]], path: Path, knock: int, page_s: float) -> N
         each.axvline(knock * page_s / 86_400, color="black", linestyle="--", linewidth=0.8, label="knock")
         each.legend(loc="lower right")
     air.set_title("recalibrations: green, refused or failed: red")
-    figure.savefig(path, dpi=130)
+    write_figure_png(path, figure, dpi=130)
     plt.close(figure)

@@ -34,6 +34,7 @@ from lightpage.cli.main import run as run_command
 from lightpage.cli.paths import OutputFile, OutputFolder
 from lightpage.errors import InvalidInputError
 from lightpage.files import replace_text, write_json
+from lightpage.pictures import write_figure_png
 from lightpage.progress import track
 from lightpage.report.drawing import BLUE, ORANGE
 from lightpage.runtime.archives.workers.ray_engine import AHEAD
@@ -172,7 +173,7 @@ def picture(curves: dict[str, list[Rate]], limits: dict[str, dict[str, float]], 
     right.set(xlabel="nodes", ylabel="of what workers that never wait would read", xscale="log", ylim=(0, 1.05))
     left.legend(frameon=False)
     out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out, dpi=110)
+    write_figure_png(out, figure, dpi=110)
 
 
 def _table(name: str, rates: Sequence[Rate]) -> str:

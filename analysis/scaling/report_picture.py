@@ -31,6 +31,7 @@ from lightpage.device.state import Device
 from lightpage.errors import InvalidInputError
 from lightpage.helper_process import same_packages
 from lightpage.page.symbols import random_symbols
+from lightpage.pictures import write_png
 from lightpage.progress import track
 from lightpage.recording.reader import RecordingWriter
 from lightpage.report.contents.from_bulk import PAUSE_S
@@ -107,7 +108,7 @@ def photograph(page: Path, out: Path) -> None:
         seen = browser.new_page(viewport={"width": WIDTH_PX, "height": HEIGHT_PX}, color_scheme="light")
         seen.goto(page.absolute().as_uri())
         seen.add_style_tag(content=_SHOWN)
-        seen.screenshot(path=str(out), full_page=True)
+        write_png(out, seen.screenshot(full_page=True))
         browser.close()
 
 

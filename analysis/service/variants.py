@@ -11,13 +11,13 @@ from lightpage.runtime.model.bundle.bundle import Bundle, npz, write_bundle
 from lightpage.runtime.model.bundle.manifest import GOLDEN, TABLE
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_drift import BundleTables
-from lightpage.runtime.model.execution.twin import TWIN_THREADS, OnnxTwin
+from lightpage.runtime.model.execution.twin import OnnxTwin
 
 
 def write_variant(base: Bundle, version: str, shift_px: float, path: Path) -> Path:
     """The base bundle looking `shift_px` further right, as a zip of its own version; returns its path."""
     decoder = Decoder(base, 1)
-    tables = BundleTables(decoder, OnnxTwin(base, TWIN_THREADS))
+    tables = BundleTables(decoder, OnnxTwin(base))
     shifted = tables.shifted(np.array([shift_px, 0.0]))
     table = {**base.table, **shifted}
     golden = base.golden.pair

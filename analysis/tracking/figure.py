@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from lightpage.page.pilots import LEAST_CONFIRMED_SHARE, SOUND_SHARE
+from lightpage.pictures import write_figure_png
 
 POINTS = ("15,000 e-", "32 e-")
 _COLOURS = ("tab:blue", "tab:orange")
@@ -46,4 +47,4 @@ def draw(figures: dict[str, Any], path: Path) -> None:
     third.set(xlabel="claimed information that the pilots confirm", ylabel="pages", yscale="log")
     for axes in (first, second, third):
         axes.legend(fontsize=8, loc="lower left" if axes is first else "best")
-    figure.savefig(path, dpi=130)
+    write_figure_png(path, figure, dpi=130)

@@ -27,7 +27,7 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_drift import BundleSearch
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.decoding.tracking import Tracker
-from lightpage.runtime.model.execution.twin import TWIN_THREADS, OnnxTwin
+from lightpage.runtime.model.execution.twin import OnnxTwin
 from lightpage.simulator.simulator import Simulator
 
 Figures = dict[str, Any]
@@ -56,7 +56,7 @@ class Point:
     @cached_property
     def search(self) -> BundleSearch:
         """The decoder's search."""
-        return BundleSearch(self.decoder, OnnxTwin(self.decoder.bundle, TWIN_THREADS))
+        return BundleSearch(self.decoder, OnnxTwin(self.decoder.bundle))
 
     @cached_property
     def pilots(self) -> Pilots:

@@ -19,9 +19,6 @@ Real = NDArray[np.float64]
 SamplingTable = dict[str, NDArray[Any]]
 """Tensors by their names as inputs of an exported decoder, float32 where `sampling_table` makes them."""
 
-SAMPLING_TABLE = ("registration", "homodyne", "parameters", "places", "place_gradients", "phases", "positions")
-"""Names of the table's tensors, as inputs of an exported decoder."""
-
 _FIT_POINTS = 9
 _PLACE_BITS = 14
 """Fractional bits of places and gradients, grid samples. A float32 of thousands of samples has 12."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import binascii
 
-CRC16_BYTES = 2
 CRC32C_BYTES = 4
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import h5py
 import numpy as np
@@ -19,26 +19,6 @@ from lightpage.recording.hdf_file import open_to_write
 
 FORMAT = "lightpage-decoded"
 VERSION = 1
-
-
-class WrittenPage(Protocol):
-    """What is written of a page; see `lightpage.runtime.client.wire.pages.RemotePage`."""
-
-    @property
-    def symbols(self) -> NDArray[np.uint8]:
-        """Symbols [ny, nx]."""
-
-    @property
-    def confidence(self) -> NDArray[np.float32]:
-        """Of each symbol [ny, nx]."""
-
-    @property
-    def model_version(self) -> str:
-        """Which model decoded it."""
-
-    @property
-    def page(self) -> int | None:
-        """Its number; the one after the last if None."""
 
 
 class DecodedWriter:
@@ -69,20 +49,27 @@ class DecodedWriter:
         self._versions: list[str] = []
         self._pages: list[int] = []
 
-    def append(self, page: WrittenPage) -> None:
+    def append(
+        self, symbols: NDArray[np.uint8], confidence: NDArray[np.float32], model_version: str, page: int | None
+    ) -> None:
         """Add one page.
+
+        Args:
+            symbols, confidence: [ny, nx].
+            model_version: which model decoded it.
+            page: its number; the one after the last if None.
 
         Raises:
             InvalidInputError: it cannot be written.
         """
         with self._writing():
-            for name, values in (("symbols", page.symbols), ("confidence", page.confidence)):
+            for name, values in (("symbols", symbols), ("confidence", confidence)):
                 dataset = self._dataset(name, values.shape, values.dtype)
                 dataset.resize(len(self._versions) + 1, axis=0)
                 dataset[-1] = values
             self._disk.check()
-        self._pages.append(len(self._pages) if page.page is None else page.page)
-        self._versions.append(page.model_version)
+        self._pages.append(len(self._pages) if page is None else page)
+        self._versions.append(model_version)
 
     def __enter__(self) -> Self:
         return self

@@ -1,6 +1,6 @@
 """Subcommands of `lightpage` that need no torch: they read options, call other rooms, and alone know of terminals.
 
-`archives` works on files, `client` talks to a running service, `service` runs one.
+`archives` works on files, `client` talks to a running service, `service` runs one. This room imports all others.
 """
 
 import os

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.calibration.sampling_table import SamplingTable
-from lightpage.errors import CalibrationError, FrameError, RecalibrationRefusedError
+from lightpage.errors import CalibrationError, FrameError, RecalibrationRefusedError, raised_as
 from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import hash_frames
@@ -146,14 +146,12 @@ def recalibrate(
     measuring = partial(within, 0, judged_count, "measure the model in service")
     before = judged_pages(tracker, decoder.bundle, held_back, measuring)
     fitted = replace(fitted, image_px=tracker.image_px)
-    try:
+    with raised_as(RecalibrationRefusedError, CalibrationError, FrameError):
         result = fit(decoder.bundle, fitted, partial(within, judged_count, judged_count + FIT_WORTH), decoder)
         judging = partial(within, judged_count + FIT_WORTH, whole - WRITING_WORTH, "judge by the held-back pages")
         judging(0.0)
         refitted = decoder.of_bundle(_refitted(decoder.bundle, result))
         after = judged_pages(tracker.refitted(refitted), decoder.bundle, held_back, judging)
-    except (CalibrationError, FrameError) as error:
-        raise RecalibrationRefusedError(error.subject, error.got, error.expected) from error
     verdict = judge(before, after, pages.levels)
     within(whole - WRITING_WORTH, whole, "write the new bundle", 0.0)
     bundle = refitted.bundle

@@ -21,7 +21,7 @@ from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_drift import BundleSearch
 from lightpage.runtime.model.decoding.image_position import ImagePosition
-from lightpage.runtime.model.execution.twin import TWIN_THREADS, OnnxTwin
+from lightpage.runtime.model.execution.twin import OnnxTwin
 from lightpage.runtime.recalibration.known_pages import KnownPages
 from lightpage.runtime.recalibration.recalibration import RefitReport, RefitResult
 
@@ -66,7 +66,7 @@ def refit(
     references = pages.references or _kept_references(bundle)
     if references is None:
         raise CalibrationError("re-fit", "no reference frames", "reference-only frames taken with the known pages")
-    twin = OnnxTwin(bundle, TWIN_THREADS) if twin is None else twin
+    twin = OnnxTwin(bundle) if twin is None else twin
     progress("find the image", 0.0)
     image = _find(decoder, twin, pages, references)
     start = moved_cameras(earlier.vector, image)

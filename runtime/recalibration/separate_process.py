@@ -20,7 +20,7 @@ from typing import IO, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, TypeAdapter
 
-from lightpage.errors import ERRORS, BundleError, LightpageError, SurroundingsError, WorkerError
+from lightpage.errors import ERRORS, BundleError, LightpageError, SurroundingsError, WorkerError, raised_as
 from lightpage.failures import short_resource
 from lightpage.helper_process import HelperProcess, same_packages
 from lightpage.progress import Progress
@@ -190,10 +190,8 @@ def recalibrate_apart(
     out = out.absolute()
     if out.exists() or out.is_symlink():
         raise BundleError(f"bundle {out}", "something that exists", "a new path: bundles are never overwritten")
-    try:
+    with raised_as(WorkerError, SurroundingsError):
         private = temporary_folder(f"{_SUBJECT}, its folder", SCRATCH, scratch)
-    except SurroundingsError as error:
-        raise WorkerError(error.subject, error.got, error.expected) from error
     with private as name:
         folder = WorkFolder(Path(name))
         job = Job(bundle=decoder.bundle.path, out=out, version=version, memory=tracker.memory())

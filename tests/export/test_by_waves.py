@@ -55,7 +55,7 @@ def test_the_image_is_followed(small_bundle: Path, small_device: list[str]) -> N
     by = (0.0, 0.3)  # rows, columns
     moved = [np.rint(ndimage.shift(f.astype(float), by, mode="nearest")) for f in (pair.in_phase, pair.quadrature)]
     seen = decoder.infer(FramePair(*(frame.astype(np.uint8) for frame in moved)))
-    model, prior = DriftModel.of_decoder(decoder, OnnxTwin(decoder.bundle, 1)), np.diag(WIDEST**2)
+    model, prior = DriftModel.of_decoder(decoder, OnnxTwin(decoder.bundle)), np.diag(WIDEST**2)
     found, before = (model.estimate(page, 256, known, prior) for page in (seen, decoder.infer(pair)))
     assert found is not None
     assert before is not None

@@ -17,7 +17,7 @@ from lightpage.calibration.parameters import nominal
 from lightpage.calibration.sampling_table import sampling_table
 from lightpage.device.state import Device
 from lightpage.errors import BundleError, InvalidInputError
-from lightpage.export import command as cli_export
+from lightpage.export import from_run, run_graph
 from lightpage.export.command import export
 from lightpage.export.from_run import export_run
 from lightpage.export.graph import TABLE_INPUTS, angle
@@ -60,7 +60,7 @@ def frame_types(exported: Bundle, monkeypatch: pytest.MonkeyPatch) -> list[str]:
         return graph
 
     for function, name in (("decoder_onnx", DECODER), ("field_onnx", FIELD), ("twin_onnx", TWIN)):
-        monkeypatch.setattr(cli_export, function, ready(name))
+        monkeypatch.setattr(from_run, function, ready(name))
     return asked
 
 
@@ -147,13 +147,13 @@ def test_the_twin_in_the_bundle_traces_as_torch_does(exported: Bundle) -> None:
 def test_a_graph_that_differs_from_torch_leaves_no_bundle(
     small_run: Path, tmp_path: Path, frame_types: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    answer = cli_export.torch_answer
+    answer = run_graph.torch_answer
 
     def off(*arguments: object) -> dict[str, np.ndarray]:
         outputs = answer(*arguments)  # type: ignore[arg-type]
         return {**outputs, "p": outputs["p"] * 1.01}
 
-    monkeypatch.setattr(cli_export, "torch_answer", off)
+    monkeypatch.setattr(run_graph, "torch_answer", off)
     with pytest.raises(BundleError, match=r"0\.0099"):
         export_run(small_run, tmp_path / "bad.zip")
     assert list(tmp_path.iterdir()) == []

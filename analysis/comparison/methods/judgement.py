@@ -65,6 +65,7 @@ def judged(
         steps=steps,
         air=figures.air_bits_per_symbol,
         own_mi=figures.own_mi_bits_per_symbol,
+        symbol_error_rate=figures.symbol_error_rate,
         own_mi_unscaled=float(own_information(np.arctan2(py, px), np.hypot(px, py) / scale, LEVELS).mean()),
         page_kB=page_kilobytes(figures.air_bits_per_symbol, data),
         own_mi_kB=page_kilobytes(figures.own_mi_bits_per_symbol, data),

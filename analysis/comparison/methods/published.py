@@ -30,6 +30,6 @@ def published_method(bench: Bench, name: str, choices: PublishedChoices) -> Outc
     trained = train_published(
         folder, name, choices, bench.profile, phase, bench.mask, training, validation, processes=ONE
     )
-    bench.kept.keep(folder)
+    bench.kept.keep(folder, trained, validation)
     drawn = choices.steps * choices.batch
     return judged(bench, name, size, choices.steps, folder, trained, validation, unseen, preparing, drawn)

@@ -47,8 +47,8 @@ def symbol_method(bench: Bench, name: str, size: str, choices: Hyperparameters) 
         choices = replace(choices, channels=channels, blocks=blocks, depth=depth)
     base = FIRST_PASSES.get(name, name)
     folder, features, first, preparing = first_pass(bench, base, size, choices)
+    bench.kept.keep(folder, first, bench.held_out(features)[0])
     if name not in FIRST_PASSES:
-        bench.kept.keep(folder)
         drawn = choices.drawn(bench.profile.page_shape)
         held_out = bench.held_out(features)
         outcome = judged(bench, name, size, choices.steps, folder, first, *held_out, preparing, drawn)
@@ -60,7 +60,9 @@ def symbol_method(bench: Bench, name: str, size: str, choices: Hyperparameters) 
     inputs = RefinementPages(bench.recording, bench.pages, *counts, features)
     key = bench.key(base)
     refined = fit_refinements(folder, choices, inputs, extractor, prediction, first, key, processes=ONE)
-    bench.kept.keep(folder)
+    for number, one in enumerate(refined.trained, 1):
+        run = folder / f"refinement-{number}"
+        bench.kept.keep(run, one, bench.held_out(run / "features")[0])
     at = folder / f"refinement-{choices.refinements}"
     held_out = bench.held_out(at / "features")
     preparing = refined.seconds - sum(one.seconds for one in refined.trained)

@@ -46,9 +46,9 @@ class Evaluation:
         maps: means over the pages at every place of the page.
         confidence_bins: what confidences claim against what was right.
         bundle: what made the bundle and where it lay, as JSON can keep it.
-        recalibration_due: pages whose pilots show that the device is no longer as it was calibrated.
+        pages_recalibration_due: pages whose pilots show that the device is no longer as it was calibrated.
         refused: pages that could not be decoded, or were not confirmed; no figure counts them.
-        air_before_refit: AIR with the smooth phase errors that decoding takes off still in, bits per symbol.
+        air_before_refit_bits_per_symbol: AIR with the smooth phase errors that decoding takes off still in.
     """
 
     bundle_version: str
@@ -63,9 +63,9 @@ class Evaluation:
     maps: SymbolMaps
     confidence_bins: tuple[ConfidenceBin, ...]
     bundle: dict[str, Any]
-    recalibration_due: int = 0
+    pages_recalibration_due: int = 0
     refused: tuple[RefusedPage, ...] = ()
-    air_before_refit: float = float("nan")
+    air_before_refit_bits_per_symbol: float = float("nan")
 
     @property
     def page_kb(self) -> float:
@@ -74,25 +74,15 @@ class Evaluation:
 
     def to_json(self) -> dict[str, Any]:
         """The figures under the names that other programs read."""
-        figures = vars(self.figures).copy()
-        del figures["count"]
+        told = asdict(self)
+        figures = told.pop("figures")
+        del figures["count"], told["refused"]
         return {
-            "bundle_version": self.bundle_version,
-            "pages": self.pages,
-            "pages_left_out": self.pages_left_out,
-            "symbols_per_page": self.symbols_per_page,
+            **told,
             **figures,
-            "air_before_refit_bits_per_symbol": self.air_before_refit,
             "over_claim_bits_per_symbol": self.figures.over_claim_bits_per_symbol,
             "page_kB": self.page_kb,
-            "seconds_per_page": self.seconds_per_page,
-            "inference_seconds_per_page": self.inference_seconds_per_page,
-            "air_per_page": list(self.air_per_page),
-            "concentration_bins": [asdict(part) for part in self.concentration_bins],
-            "confidence_bins": [asdict(part) for part in self.confidence_bins],
             "maps": {name: page.round(_MAP_DECIMALS).tolist() for name, page in vars(self.maps).items()},
-            "bundle": self.bundle,
-            "pages_recalibration_due": self.recalibration_due,
             **refused_json(self.refused),
         }
 
@@ -126,9 +116,7 @@ def check_recording(decoder: Decoder, recording: Recording) -> None:
     recording.check_against(decoder.bundle.profile)
     depth = decoder.bundle.manifest.camera_bit_depth
     if recording.bit_depth != depth:
-        raise RecordingError(
-            f"recording {recording.path}", f"{recording.bit_depth} bits", f"{depth} bits, as the bundle"
-        )
+        raise RecordingError(f"recording {recording.path}", f"{recording.bit_depth} bits", f"{depth}, as the bundle")
 
 
 def check_symbols(recording: Recording, purpose: str = "measure against") -> None:
@@ -218,11 +206,8 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
         }
         raise NothingReadError(told, figures)
     if not timings:
-        raise InvalidInputError(
-            f"recording {recording.path}",
-            f"{recording.pages} pages, all of them used to make {decoder.version}",
-            "pages that the bundle has not seen",
-        )
+        got = f"{recording.pages} pages, all of them used to make {decoder.version}"
+        raise InvalidInputError(f"recording {recording.path}", got, "pages that the bundle has not seen")
     return Evaluation(
         bundle_version=decoder.version,
         figures=accumulator.figures(),
@@ -236,9 +221,9 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
         maps=accumulator.maps(),
         confidence_bins=tuple(accumulator.confidence_bins()),
         bundle=_describe(decoder, levels),
-        recalibration_due=due,
+        pages_recalibration_due=due,
         refused=tuple(refused),
-        air_before_refit=float(np.mean(before)),
+        air_before_refit_bits_per_symbol=float(np.mean(before)),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
@@ -179,9 +179,7 @@ def run(
     return made
 
 
-def _of_failures(
-    tasks: Iterable[Task], again: Iterable[Failed], settled: Sequence[Failed], give_up: bool
-) -> Iterator[Task]:
+def _of_failures(tasks: Iterable[Task], again: list[Failed], settled: list[Failed], give_up: bool) -> Iterator[Task]:
     """Tasks of the recordings that failures `again` are of, but for those that are `settled`."""
     recordings = {failed.task.origin for failed in again}
     recordings -= {failed.task.origin for failed in settled if failed.whole_recording}

@@ -167,9 +167,8 @@ class Job(Plain):
         for source in asked.sources:
             bundle = before_paths.pop((source.device, source.path), None)
             if self.choices.fine_tuning is not None and (run := runs.get(source.device)) != source.run:
-                raise InvalidInputError(
-                    f"{subject}: run of {source.device}", f"{source.run}, and {run} before", expected
-                )
+                got = f"{source.run}, and {run} before"
+                raise InvalidInputError(f"{subject}: run of {source.device}", got, expected)
             if bundle is None:
                 raise InvalidInputError(subject, f"recording {source.path}, which was not asked for before", expected)
             now = asked.bundles[source.bundle]

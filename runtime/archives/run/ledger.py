@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Self
 
 from lightpage.clock import SYSTEM, Clock
-from lightpage.errors import InvalidInputError, LightpageError, SurroundingsError, TakenError
-from lightpage.failures import os_failure
+from lightpage.errors import InvalidInputError, SurroundingsError, TakenError
+from lightpage.failures import os_errors, os_failure
 from lightpage.files import check_utf8, lock
 from lightpage.runtime.archives.run.job import Job, Source
 from lightpage.runtime.archives.run.shard import RECORD, PageRecord, ShardRecord, holds_losses
@@ -24,6 +24,7 @@ _LOCKING = "HDF5_USE_FILE_LOCKING"
 """Variable of the environment by which HDF5, and this, are told to go without locks."""
 
 _LOCK, _QUESTION, _SHARDS = "lock", "lock-job", "shards"
+_WRITABLE = "a folder that can be written"
 
 _AGAIN = ".again-"
 """In the names of shards of later rounds."""
@@ -95,10 +96,8 @@ class Ledger:
         self._subject = f"bulk run {self.folder}"
 
     def __enter__(self) -> Self:
-        try:
+        with os_errors(self._subject, _WRITABLE):
             self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise self._not_writable(error) from None
         with ExitStack() as stack:
             if self.part == WHOLE:
                 stack.callback(os.close, self._locked(_LOCK))
@@ -139,10 +138,8 @@ class Ledger:
             SurroundingsError: the storage has no locks, and nobody has said that this does not matter.
         """
         subject = f"lock {self.folder / name}"
-        try:
+        with os_errors(self._subject, _WRITABLE):
             descriptor = os.open(self.folder / name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-        except OSError as error:
-            raise self._not_writable(error) from None
         try:
             if not lock(descriptor, subject, shared=shared) and os.environ.get(_LOCKING) not in ("FALSE", "0"):
                 expected = f"storage that has locks, or {_LOCKING}=FALSE where no other run is at work there"
@@ -153,9 +150,6 @@ class Ledger:
                 raise TakenError(self._subject, "another run at work there", "its end, or another folder") from None
             raise
         return descriptor
-
-    def _not_writable(self, error: OSError) -> LightpageError:
-        return os_failure(self._subject, error, "a folder that can be written")
 
     def sweep(self, job: Job) -> None:
         """Remove what workers that were killed have left half-written; none of this part may be at work."""
@@ -181,7 +175,7 @@ class Ledger:
                 if self.recalibrated(index) or any(each.problem is not None for each in own):
                     continue
                 shard = self.shard(index, 0)
-                _make(shard.parent)
+                make_folder(shard.parent)
                 count = job.choices.device_pages or sum(each.pages for each in own)
                 yield _task(job, own, tuple(range(count)), shard)
             return
@@ -189,7 +183,7 @@ class Ledger:
             there = self.results(index)
             for task in self.ranges(job, index, source):
                 if task.shard.name not in there:
-                    _make(task.shard.parent)
+                    make_folder(task.shard.parent)
                     yield task
 
     def missing_again(self, job: Job, number: int) -> Iterator[Task]:
@@ -284,8 +278,7 @@ def _task(job: Job, own: tuple[Source, ...], pages: tuple[int, ...], shard: Path
     )
 
 
-def _make(folder: Path) -> None:
-    try:
+def make_folder(folder: Path) -> None:
+    """Make a folder, and those that it lies in, unless it is there."""
+    with os_errors(f"folder {folder}", _WRITABLE):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise os_failure(f"folder {folder}", error, "a folder that can be written") from None

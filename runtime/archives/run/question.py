@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import glob
 import os
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from pydantic import Field, ValidationError
 
 from lightpage.clock import Clock
 from lightpage.errors import InvalidInputError
-from lightpage.files import check_utf8, matching, read_text
+from lightpage.files import check_utf8, matching, read_toml
 from lightpage.progress import note
 from lightpage.runtime.archives.run.driver import AGAIN_S
 from lightpage.runtime.archives.run.job import Job, Source, bundle_as_it_is, look_at, named_bundle
@@ -146,8 +145,8 @@ def of_fleet(choices: Choices, path: Path, before: Job | None) -> Job:
     subject = f"fleet {path}"
     expected = "[[device]] tables with name, bundle and recordings"
     try:
-        fleet = _Fleet.model_validate(tomllib.loads(read_text(path, subject, expected)))
-    except (tomllib.TOMLDecodeError, ValidationError) as error:
+        fleet = _Fleet.model_validate(read_toml(path, subject, expected))
+    except ValidationError as error:
         raise InvalidInputError(subject, error, expected) from None
     names = [device.name for device in fleet.device]
     if not names or len(set(names)) < len(names):

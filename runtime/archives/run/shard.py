@@ -15,7 +15,7 @@ from pydantic import Field, ValidationError
 from lightpage.codec.header import parse_header
 from lightpage.codec.page_bytes import FILE_BYTES, FileFacts, PageBytes
 from lightpage.errors import InvalidInputError, LightpageError
-from lightpage.failures import os_failure
+from lightpage.failures import os_errors
 from lightpage.files import replace_file, replace_text
 from lightpage.metrics.reliability import ConfidenceBin
 from lightpage.runtime.archives.run.task import NamedBundle, Plain
@@ -147,10 +147,8 @@ def holds_losses(shard: Path) -> bool:
 
 
 def _content(path: Path) -> bytes:
-    try:
+    with os_errors(f"shard {path}", "a file that can be read"):
         return path.read_bytes()
-    except OSError as error:
-        raise os_failure(f"shard {path}", error, "a file that can be read") from None
 
 
 def record_of(shard: Path) -> Path:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
@@ -209,7 +208,6 @@ class Step(Plain):
         what: for people.
     """
 
-    kind: Literal["step"] = "step"
     device: str
     what: str
 
@@ -225,7 +223,6 @@ class Done(Plain):
         read_bytes: of frames, as they lie in the recording.
     """
 
-    kind: Literal["done"] = "done"
     task: Task
     lost: dict[str, int]
     left_out: int = 0
@@ -242,7 +239,6 @@ class Failed(Plain):
         whole_recording: whether no page of the recording can be read, and not only this range.
     """
 
-    kind: Literal["failed"] = "failed"
     task: Task
     problem: Problem
     whole_recording: bool = False

@@ -294,11 +294,7 @@ def totals(ledger: Ledger, job: Job, failures: Mapping[tuple[str, Path], Problem
 
 
 def _add_device(
-    found: Totals,
-    ledger: Ledger,
-    index: int,
-    own: tuple[Source, ...],
-    failures: Mapping[tuple[str, Path], Problem],
+    found: Totals, ledger: Ledger, index: int, own: tuple[Source, ...], failures: Mapping[tuple[str, Path], Problem]
 ) -> None:
     shard, first = ledger.shard(index, 0), own[0]
     row: dict[str, Any] = {"device": first.device, "recordings": [str(source.path) for source in own]}

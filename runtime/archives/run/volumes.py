@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter, defaultdict
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +12,10 @@ from typing import Any
 from lightpage.codec.volume import Volume
 from lightpage.codec.volume_file import PARTIAL, Restored, VolumeFile, ranges
 from lightpage.errors import InvalidInputError, LostDataError, StorageError, SurroundingsError
-from lightpage.failures import may_pass, os_failure
+from lightpage.failures import may_pass
 from lightpage.files import write_json
 from lightpage.runtime.archives.run.job import Job
-from lightpage.runtime.archives.run.ledger import Ledger
+from lightpage.runtime.archives.run.ledger import Ledger, make_folder
 from lightpage.runtime.archives.run.shard import read_user_bytes
 
 FOLDER, TOLD, HOLES = "files", "files.json", ".holes"
@@ -91,16 +92,14 @@ def recovered_files(ledger: Ledger, job: Job, wanted: Wanted = ALL_FILES) -> lis
     """
     for left in (ledger.folder / FOLDER).glob(f"*{PARTIAL}"):  # of a run that was killed
         left.unlink(missing_ok=True)
-    shards: dict[Volume, dict[Path, int]] = {}
+    shards: defaultdict[Volume, Counter[Path]] = defaultdict(Counter)
     seen: set[Volume] = set()
     for shard in _shards(ledger, job):
         for _, page in read_user_bytes(shard):
             if (volume := Volume.of_page(page)) is not None:
                 seen.add(volume)
-                if not wanted.takes(volume):
-                    continue
-                there = shards.setdefault(volume, {})
-                there[shard] = there.get(shard, 0) + 1
+                if wanted.takes(volume):
+                    shards[volume][shard] += 1
     known = known_files(ledger.folder) or []
     before = {file["file"]: tuple(file["restored"]) for file in known}
     if seen and not shards:
@@ -145,10 +144,7 @@ def _file(
     path, read = folder / f"{volume.id}-{volume.checksum:08x}", sum(shards.values())
     if path.exists():
         return RecoveredFile(volume, path, read, before.get(str(path), ()))
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise os_failure(f"folder {folder}", error, "a folder that can be written") from None
+    make_folder(folder)
     try:
         done = _written(path, volume, shards, despite_losses=False)
         # under a name of its own: whoever finds the other one may take it for whole

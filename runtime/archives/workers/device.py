@@ -17,12 +17,15 @@ from lightpage.runtime.archives.run.task import Step, Task
 from lightpage.runtime.archives.workers.fine_tuning import DeepRecalibration
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.known_pages import read_recorded
-from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome, Refit, next_version, recalibrate
+from lightpage.runtime.recalibration.recalibration import Refit, next_version, recalibrate
 
 T = TypeVar("T")
 
 EVERY_S = 30.0
 """Seconds from one line of a step to the next."""
+
+_TOLD = ("version", "previous_version", "air_before", "air_after", "air_limit", "pages_used", "pages_held_back")
+"""What a device's record has of the outcome, beside the angle."""
 
 _REFUSED = (RecalibrationRefusedError, CalibrationError, InvalidInputError)
 _REFUSED_DEEPLY = (RecalibrationRefusedError, CalibrationError, FrameError)
@@ -75,21 +78,8 @@ def recalibrated(
     except findings as error:
         lost = PageRecord(page=0, state=PageState.LOST, loss=type(error).__name__, reason=str(error))
         return Findings(pages=(lost,))
-    return Findings(pages=(PageRecord(page=0, state=PageState.READ),), summary=_summary(outcome))
-
-
-def _summary(outcome: RecalibrationOutcome) -> dict[str, float | str | None]:
-    """What became of a device, for people and programs."""
-    return {
-        "version": outcome.version,
-        "previous_version": outcome.previous_version,
-        "angle_deg": outcome.report.angle_deg,
-        "air_before": outcome.air_before,
-        "air_after": outcome.air_after,
-        "air_limit": outcome.air_limit,
-        "pages_used": outcome.pages_used,
-        "pages_held_back": outcome.pages_held_back,
-    }
+    summary = {name: getattr(outcome, name) for name in _TOLD} | {"angle_deg": outcome.report.angle_deg}
+    return Findings(pages=(PageRecord(page=0, state=PageState.READ),), summary=summary)
 
 
 class StepLog:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -64,19 +63,14 @@ class DeepRecalibration(Protocol):
         """
 
 
-def deep_recalibration(points: Iterable[EntryPoint] | None = None) -> DeepRecalibration:
+def deep_recalibration() -> DeepRecalibration:
     """The deep recalibration that is installed.
-
-    Args:
-        points: where it is looked for, by default among those that are installed.
 
     Raises:
         LightpageError: there is none.
         ModuleNotFoundError: what it needs is not installed: the extra train brings it.
     """
-    found = entry_points(group=GROUP) if points is None else points
-    for point in found:
-        if point.name == DEEP:
-            made: DeepRecalibration = point.load()
-            return made
+    for point in entry_points(group=GROUP, name=DEEP):
+        made: DeepRecalibration = point.load()
+        return made
     raise LightpageError("deep recalibration", f"no entry point {DEEP} of {GROUP}", "a complete installation")

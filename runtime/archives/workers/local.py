@@ -5,7 +5,6 @@ from __future__ import annotations
 import select
 import time
 from collections.abc import Callable, Generator, Iterable, Sized
-from typing import Protocol
 
 from pydantic import TypeAdapter
 
@@ -30,30 +29,7 @@ def default_workers() -> int:
     return max(1, available_cpus() // THREADS_OF_WORKER)
 
 
-class WorkerLink(Protocol):
-    """A worker as the engine needs it; see `lightpage.helper_process.HelperProcess`."""
-
-    @property
-    def status(self) -> int | None:
-        """Exit status of the worker; None while it runs."""
-
-    def send(self, data: bytes, deadline: float) -> None:
-        """Send it a task."""
-
-    def line(self, deadline: float) -> bytes:
-        """Return the next line of its answer."""
-
-    def has_line(self) -> bool:
-        """Return whether a line has come already."""
-
-    def fileno(self) -> int:
-        """Return the file descriptor of its socket."""
-
-    def end(self, grace_s: float = 0.0) -> None:
-        """End the worker after so many seconds of grace."""
-
-
-def started(module: str, threads: int) -> WorkerLink:
+def started(module: str, threads: int) -> HelperProcess:
     """Start a process that runs a module with so many threads.
 
     Raises:
@@ -84,7 +60,7 @@ class LocalEngine:
         workers: int,
         threads: int | None = None,
         module: str = WORKER,
-        start: Callable[[str, int], WorkerLink] = started,
+        start: Callable[[str, int], HelperProcess] = started,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.workers, self._module, self._start, self._clock = workers, module, start, clock
@@ -94,8 +70,8 @@ class LocalEngine:
     def run(self, tasks: Iterable[Task]) -> Generator[Outcome, None, None]:
         """See `Engine`."""
         attempts = Attempts(tasks)
-        busy: dict[WorkerLink, Attempt] = {}
-        free: list[WorkerLink] = []
+        busy: dict[HelperProcess, Attempt] = {}
+        free: list[HelperProcess] = []
         try:
             while True:
                 while len(busy) < self.workers and (attempt := attempts.next()):
@@ -132,7 +108,7 @@ class LocalEngine:
     def _count(self, busy: Sized, free: Sized) -> None:
         self.in_flight, self.workers_alive = len(busy), len(busy) + len(free)
 
-    def _hand_over(self, worker: WorkerLink, attempt: Attempt) -> None:
+    def _hand_over(self, worker: HelperProcess, attempt: Attempt) -> None:
         """Send a task; a worker that cannot take it has died, which its socket tells."""
         attempt.deadline = self._clock() + longest_s(attempt.task)
         try:
@@ -140,7 +116,7 @@ class LocalEngine:
         except OSError:
             worker.end()
 
-    def _heard(self, busy: dict[WorkerLink, Attempt]) -> list[WorkerLink]:
+    def _heard(self, busy: dict[HelperProcess, Attempt]) -> list[HelperProcess]:
         """Workers that have answered or ended, at least one; those whose time is up among them."""
         heard = [worker for worker in busy if worker.fileno() < 0 or worker.has_line()]
         if heard:
@@ -151,7 +127,7 @@ class LocalEngine:
         return ready or [worker for worker, attempt in busy.items() if attempt.deadline <= now]
 
 
-def _told(worker: WorkerLink, error: Exception) -> str:
+def _told(worker: HelperProcess, error: Exception) -> str:
     """How a worker has ended, for people."""
     if isinstance(error, TimeoutError):
         return "no answer in time"

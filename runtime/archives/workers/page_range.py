@@ -76,7 +76,7 @@ class PageRange:
                 writer = stack.enter_context(DecodedWriter(with_end(self.task.shard, SYMBOLS), levels))
             for page, found, symbols in self._read(decode, records):
                 if writer is not None:
-                    writer.append(_Page(found.symbols, found.confidence, self.decoder.version, page))
+                    writer.append(found.symbols, found.confidence, self.decoder.version, page)
                 measures = None
                 if symbols is not None and not mask.all():
                     measures = measure(found.phase[~mask], found.concentration[~mask], symbols[~mask], levels)
@@ -138,16 +138,6 @@ class PageRange:
                 records.append(lost_page(page, error))
                 continue
             yield page, found, symbols
-
-
-@dataclass(frozen=True)
-class _Page:
-    """A page as `DecodedWriter` takes it."""
-
-    symbols: Symbols
-    confidence: NDArray[np.float32]
-    model_version: str
-    page: int | None
 
 
 def lost_page(page: int, error: LightpageError) -> PageRecord:

@@ -120,9 +120,7 @@ class RayEngine:
         if self._gpus and not ray.cluster_resources().get("GPU"):
             raise InvalidInputError("the Ray cluster", "no GPU", "a node with one, or provider cpu")
         if self._threads is not None and self._threads > largest:
-            raise InvalidInputError(
-                "--threads", f"{self._threads}, and nodes of {largest} CPUs", "a node that has them"
-            )
+            raise InvalidInputError("--threads", f"{self._threads}, and nodes of {largest} CPUs", "one that has them")
         return self._threads or max(1, min(THREADS_OF_WORKER, largest))
 
     def _overdue(self, ray: Any, threads: int, busy: dict[Any, Attempt]) -> list[Any]:

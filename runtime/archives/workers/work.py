@@ -6,26 +6,17 @@ import os
 import socket
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import cached_property
 
 from lightpage.errors import BundleError, RecordingError, StorageError
-from lightpage.failures import may_pass, os_failure, understood
+from lightpage.failures import may_pass, os_errors, understood
 from lightpage.recording.joined import join
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.evaluation import check_recording
 from lightpage.runtime.archives.run.job import bundle_sha256
 from lightpage.runtime.archives.run.shard import Findings, ShardRecord
-from lightpage.runtime.archives.run.task import (
-    Done,
-    Failed,
-    NamedBundle,
-    Outcome,
-    Problem,
-    Stamp,
-    Step,
-    Task,
-)
+from lightpage.runtime.archives.run.task import Done, Failed, NamedBundle, Outcome, Problem, Stamp, Step, Task
 from lightpage.runtime.archives.workers.device import recalibrated
 from lightpage.runtime.archives.workers.fine_tuning import DeepRecalibration, deep_recalibration
 from lightpage.runtime.archives.workers.page_range import PageRange, lost_page
@@ -100,9 +91,7 @@ class Worker:
         if self._warm is None or self._warm[:2] != (bundle, provider):
             self._warm = None
             if (found := bundle_sha256(bundle.path)) != bundle.sha256:
-                raise BundleError(
-                    f"bundle {bundle.path}", f"SHA-256 {found}", f"{bundle.sha256}, as the run began with"
-                )
+                raise BundleError(f"bundle {bundle.path}", f"SHA-256 {found}", f"{bundle.sha256}, as at the start")
             self._warm = bundle, provider, _Warm(Decoder.load(bundle.path, self._threads, Provider.parse(provider)))
         return self._warm[2]
 
@@ -129,9 +118,7 @@ def _written(task: Task, found: Findings, start: float, read_bytes: int) -> Done
         read_bytes=read_bytes,
     )
     record.write(task.shard)
-    return Done(
-        task=task, lost=found.lost, left_out=found.left_out, seconds=record.seconds, read_bytes=record.read_bytes
-    )
+    return Done(task=task, lost=found.lost, left_out=found.left_out, seconds=record.seconds, read_bytes=read_bytes)
 
 
 @contextmanager
@@ -141,21 +128,13 @@ def _recording_of(task: Task) -> Iterator[Recording]:
     Raises:
         RecordingError: see `Recording.open` and `join`.
     """
-    if len(task.files) == 1:
-        with Recording.open(task.recording) as recording:
-            yield recording
-        return
-    joined = task.shard.with_name(f".{task.shard.name}-joined.h5")  # swept where the worker is killed
-    try:
-        join([file.path for file in task.files], joined)
-        with Recording.open(joined) as recording:
-            yield recording
-    finally:
-        joined.unlink(missing_ok=True)
-
-
-class Changed(RecordingError):
-    """A recording that is not the one that the run began with."""
+    with ExitStack() as stack:
+        path = task.recording
+        if len(task.files) > 1:
+            path = task.shard.with_name(f".{task.shard.name}-joined.h5")  # swept where the worker is killed
+            stack.callback(path.unlink, missing_ok=True)
+            join([file.path for file in task.files], path)
+        yield stack.enter_context(Recording.open(path))
 
 
 def _check_stamp(task: Task) -> None:
@@ -166,10 +145,8 @@ def _check_stamp(task: Task) -> None:
     """
     for file in task.files:
         subject = f"recording {file.path}"
-        try:
+        with os_errors(subject, "the file that the run began with", RecordingError):
             found = Stamp.of(file.path)
-        except OSError as error:
-            raise os_failure(subject, error, "the file that the run began with", RecordingError) from None
         if found != file.stamp:
             expected = f"{file.stamp.size} bytes, changed when the run began: begin another run with the new file"
-            raise Changed(subject, f"{found.size} bytes, changed since", expected)
+            raise RecordingError(subject, f"{found.size} bytes, changed since", expected)

@@ -59,11 +59,7 @@ def names_machine(host: str, known: Collection[str]) -> bool:
     try:
         ipaddress.ip_address(name)
     except ValueError:
-        return (
-            name == "localhost"
-            or name.endswith(".localhost")
-            or not {name, f"*.{name.partition('.')[2]}"}.isdisjoint(known)
-        )
+        return f".{name}".endswith(".localhost") or not {name, f"*.{name.partition('.')[2]}"}.isdisjoint(known)
     return True
 
 

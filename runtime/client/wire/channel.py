@@ -87,11 +87,6 @@ class TlsFiles:
         context.load_cert_chain(self.certificate, self.key)
         return context
 
-    def channel_credentials(self) -> grpc.ChannelCredentials:
-        """What a client connects with; raises as `read`."""
-        pem = self.read()
-        return grpc.ssl_channel_credentials(pem.ca, pem.key, pem.certificate)
-
 
 def _read(name: str, path: Path) -> bytes:
     try:
@@ -127,7 +122,9 @@ def open_channel(target: str, tls: TlsFiles | None = None) -> grpc.Channel:
     )
     if tls is None:
         return grpc.insecure_channel(target, options=options)
-    return grpc.secure_channel(target, tls.channel_credentials(), options=options)
+    pem = tls.read()
+    credentials = grpc.ssl_channel_credentials(pem.ca, pem.key, pem.certificate)
+    return grpc.secure_channel(target, credentials, options=options)
 
 
 def add_port(server: grpc.aio.Server, address: str, credentials: grpc.ServerCredentials | None) -> int:

@@ -6,7 +6,7 @@ Chunks of frames are written and read without the copies that protobuf makes of 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from google.protobuf.message import Message
@@ -28,13 +28,9 @@ REPLY_BYTES = 64 << 20
 PIXEL_TYPES = {pb.PIXEL_TYPE_UINT8: "uint8", pb.PIXEL_TYPE_UINT16: "uint16"}
 PIXEL_CODES = {name: code for code, name in PIXEL_TYPES.items()}
 
-DATA_LOSSES: dict[Loss | None, pb.DataLoss] = {
+DATA_LOSSES: dict[Loss | None, Any] = {
     None: pb.DATA_LOSS_UNSPECIFIED,
-    Loss.OPTICS: pb.DATA_LOSS_OPTICS,
-    Loss.HEADER: pb.DATA_LOSS_HEADER,
-    Loss.CODE: pb.DATA_LOSS_CODE,
-    Loss.BODY: pb.DATA_LOSS_BODY,
-    Loss.CHECKSUM: pb.DATA_LOSS_CHECKSUM,
+    **{loss: pb.DataLoss.Value(f"DATA_LOSS_{loss.name}") for loss in Loss if loss is not Loss.STORAGE},
 }
 FLOAT = np.dtype("<f4")
 """Of confidences, concentrations and phases."""

@@ -190,11 +190,8 @@ def error_of(rpc: grpc.RpcError, target: str) -> LightpageError:
     if code == grpc.StatusCode.RESOURCE_EXHAUSTED:
         return errors.LimitError(subject, text, "a smaller or a later request")
     if code == grpc.StatusCode.UNAVAILABLE:
-        return LightpageError(
-            subject,
-            f"no connection ({text})",
-            "a running Lightpage service at this address, and certificates where it asks for them",
-        )
+        expected = "a running Lightpage service at this address, and certificates where it asks for them"
+        return LightpageError(subject, f"no connection ({text})", expected)
     if code == grpc.StatusCode.UNIMPLEMENTED:
         return LightpageError(subject, f"no such call ({text})", "a Lightpage service, of this version or a later one")
     if code == grpc.StatusCode.DEADLINE_EXCEEDED:

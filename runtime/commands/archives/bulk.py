@@ -60,18 +60,14 @@ def _options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--part", metavar="K/N", help="Do every Nth recording or device from the Kth, K from 0; others do the rest."
         ),
-        click.option(
-            "--threads", type=click.IntRange(1), help="Threads of a worker; by default its share of the cores."
-        ),
+        click.option("--threads", type=click.IntRange(1), help="Threads of a worker; by default its share of cores."),
         PROVIDER,
         click.option("--workers", type=click.IntRange(1), help="How many; by default one for every two cores."),
         click.option("--address", help="With --engine ray: of the cluster, `auto` for the one that runs here."),
         click.option("--engine", type=click.Choice([LOCAL, RAY]), default=LOCAL, show_default=True, help="Who works."),
         click.option("--bundle", help=f"A bundle's path, or the name of a shipped one; {DEFAULT} by default."),
         click.option("--fleet", type=_FILE, help="TOML file of devices: name, bundle, recordings."),
-        click.option(
-            "--recordings", multiple=True, metavar="GLOB", help="HDF5 recordings; may be given several times."
-        ),
+        click.option("--recordings", multiple=True, metavar="GLOB", help="HDF5 recordings; may be given repeatedly."),
         click.argument("out", type=OutputFolder()),
     ):
         command = option(command)
@@ -122,9 +118,7 @@ def evaluate(**asked: Any) -> None:
 
 @bulk.command()
 @_options
-@click.option(
-    "--pages", type=click.IntRange(2), help=f"Known pages to use; {KNOWN_PAGES} by default, or all with --deep."
-)
+@click.option("--pages", type=click.IntRange(2), help=f"Known pages to use; {KNOWN_PAGES} by default, all with --deep.")
 @click.option("--deep", is_flag=True, help="Train the network on, too, from the run that the fleet names; needs torch.")
 @click.option(
     "--steps", type=click.IntRange(10), help=f"With --deep: of the optimiser; {FineTuning().steps} by default."

@@ -54,8 +54,8 @@ def watched(ledger: Ledger, operation: Operation, address: str | None, file: Pat
                 try:
                     server = stack.enter_context(ConsoleServer(make_wsgi_app(metrics.registry), int(port), host))
                 except OSError as error:
-                    got, expected = error.strerror or error, "an address of this machine and a free port"
-                    raise InvalidInputError(f"--metrics {address}", got, expected) from None
+                    expected = "an address of this machine and a free port"
+                    raise InvalidInputError(f"--metrics {address}", error, expected) from None
                 click.echo(f"metrics at http://{host}:{server.port}/metrics", err=True)
             yield metrics
     finally:

@@ -84,10 +84,7 @@ class Result:
                 gain = f"; AIR of them {each.air_before.value:.3f} before, {each.air_after.value:.3f} now"
             told = f"{each.pages} pages: {each.won} won, {each.better} better, {each.lost} lost still{gain}"
             rows.append((f"again, {each.model.version}", told))
-        rows += [
-            (f"volume {file.volume.id}", file.error or f"{file.path}, {file.volume.file_bytes} bytes")
-            for file in self.files
-        ]
+        rows += [(f"volume {f.volume.id}", f.error or f"{f.path}, {f.volume.file_bytes} bytes") for f in self.files]
         told = "\n".join(f"{name:<20} {value}" for name, value in rows if value)
         return f"{told}\n\n{_device_table(found.devices)}" if found.devices else told
 

@@ -19,7 +19,7 @@ from lightpage.codec.page_codec import PageCodec
 from lightpage.codec.volume import DATA_PAGES, PARITY_PAGES, Volume, encode_volume
 from lightpage.device.profile import Profile, load_profile
 from lightpage.errors import InvalidInputError
-from lightpage.failures import os_failure
+from lightpage.failures import os_errors
 from lightpage.files import STDOUT, write_json
 from lightpage.page.symbols import pilot_mask, pilot_symbols
 from lightpage.progress import track
@@ -63,24 +63,20 @@ def _opened(file: Path) -> BinaryIO:
     Raises:
         InvalidInputError, StorageError, SurroundingsError: it cannot be read or kept.
     """
-    try:
+    with os_errors(f"file {file}", "a file that can be read"):
         if file != STDOUT:
             return file.open("rb")
         kept = cast(BinaryIO, tempfile.TemporaryFile())  # noqa: SIM115  # the caller closes it
         shutil.copyfileobj(sys.stdin.buffer, kept)
         kept.seek(0)
         return kept
-    except OSError as error:
-        raise os_failure(f"file {file}", error, "a file that can be read") from None
 
 
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
 @click.option("--bundle", help="A bundle of the device: its path, or the name of a shipped one.")
 @click.option("--profile", "profile_name", metavar="P", help="Or its nominal profile: a shipped name or a file.")
-@click.option(
-    "--code", "code_path", type=click.Path(path_type=Path), help="Code of its pages; the bundle's by default."
-)
+@click.option("--code", "code_path", type=click.Path(path_type=Path), help="Its pages' code; the bundle's by default.")
 @click.option("--out", required=True, type=OutputFile(), help="The pages to write, PAGES.h5.")
 @click.option("--volume", "volume_id", type=int, help="Number that tells files on a medium apart; random if left out.")
 @click.option("--data-pages", default=DATA_PAGES, show_default=True, help="Data pages of a group.")

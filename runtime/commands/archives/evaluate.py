@@ -41,8 +41,8 @@ def evaluate(load: Load, recording: str, json_path: Path | None, tracking: bool)
     click.echo(describe(result))
     if result.figures.air_bits_per_symbol <= 0:
         warn(WORTH_NOTHING)
-    if result.recalibration_due:
-        warn(f"the pilots of {result.recalibration_due} of {result.pages} pages show that the device has changed")
+    if result.pages_recalibration_due:
+        warn(f"the pilots of {result.pages_recalibration_due} of {result.pages} pages show that the device has changed")
     if result.refused:
         raise refusal(f"recording {recording}", result.refused, count)
 
@@ -63,7 +63,7 @@ def describe(result: Evaluation) -> str:
         ("not confirmed", f"{lost} whose pilots do not bear out what is claimed"),
         ("data symbols a page", f"{result.symbols_per_page}"),
         ("AIR", f"{figures.air_bits_per_symbol:.3f} bit/symbol"),
-        ("before phase refit", f"{result.air_before_refit:.3f} bit/symbol"),
+        ("before phase refit", f"{result.air_before_refit_bits_per_symbol:.3f} bit/symbol"),
         ("own MI", f"{figures.own_mi_bits_per_symbol:.3f} bit/symbol"),
         ("over-claim", f"{figures.over_claim_bits_per_symbol:.3f} bit/symbol"),
         ("GMI", "no Gray labels" if gmi is None else f"{gmi:.3f} bit/symbol"),

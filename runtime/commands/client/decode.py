@@ -82,7 +82,7 @@ def decode(
                     refused.append(page)
                     continue
                 if writer is not None:
-                    writer.append(page)
+                    writer.append(page.symbols, page.confidence, page.model_version, page.page)
                 results.append(page_report(page))
         except (LightpageError, KeyboardInterrupt) as error:
             if not results or recording is not None:

@@ -17,9 +17,7 @@ from lightpage.runtime.commands.client.connection import tls_options
 DEFAULT_TARGET = "127.0.0.1:50052"
 
 
-def is_serving(
-    target: str, *, service: str = "", timeout_s: float = 3.0, tls: TlsFiles | None = None
-) -> tuple[bool, str]:
+def is_serving(target: str, service: str = "", timeout_s: float = 3.0, tls: TlsFiles | None = None) -> tuple[bool, str]:
     """Ask `target` (HOST:PORT) for the health of `service`, "" being the server as a whole.
 
     Returns whether it serves, and one line that says what was heard. An unreachable, silent or unknowing server is not

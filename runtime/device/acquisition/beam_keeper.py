@@ -32,16 +32,12 @@ class BeamKeeper:
 
     def __init__(self, beams: Beams, lock: AbstractContextManager[object], name: str, clock: Clock = SYSTEM) -> None:
         self._beams, self._lock, self._name, self._clock = beams, lock, name, clock
-        self._trouble = ""
+        self.trouble = ""
+        """Why the beams are not known to be open, empty where they are, or are blocked for a purpose."""
         self._moved = False
         """Whether they were let through once: an earlier process may have ended while it blocked them."""
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
-
-    @property
-    def trouble(self) -> str:
-        """Why the beams are not known to be open, empty where they are, or are blocked for a purpose."""
-        return self._trouble
 
     @contextmanager
     def blocked(self, *, signal: bool, reference: bool) -> Iterator[None]:
@@ -67,7 +63,7 @@ class BeamKeeper:
         Raises:
             LostShotError: see `open`.
         """
-        if self._trouble or not self._moved:
+        if self.trouble or not self._moved:
             self.open()
 
     def open(self) -> None:
@@ -77,19 +73,19 @@ class BeamKeeper:
             LostShotError: `Reason.BEAM_CONTROL_FAILED`: they are not known to be open; a thread tries on.
         """
         with self._lock:
-            before = self._trouble
+            before = self.trouble
             try:
                 self._beams.let_through(signal=True, reference=True)
             except BaseException as error:
-                self._trouble = f"a beam may be blocked: {str(error) or type(error).__name__}"
+                self.trouble = f"a beam may be blocked: {str(error) or type(error).__name__}"
                 if not before:
-                    _log.error("%s: no page is read until both beams are open: %s", self._name, self._trouble)
+                    _log.error("%s: no page is read until both beams are open: %s", self._name, self.trouble)
                     self._start()
                 if isinstance(error, LightpageError):
                     told = error.subject, error.got, error.expected
                     raise LostShotError(*told, Reason.BEAM_CONTROL_FAILED) from None
                 raise
-            self._trouble, self._moved = "", True
+            self.trouble, self._moved = "", True
             if before:
                 _log.warning("%s: both beams are open again", self._name)
 
@@ -114,10 +110,10 @@ class BeamKeeper:
                 if stop.is_set():
                     return
                 try:
-                    if self._trouble:
+                    if self.trouble:
                         self.open()
                 except Exception as error:
                     _log.debug("%s: beams still not open: %s", self._name, error)
-                if not self._trouble:
+                if not self.trouble:
                     self._thread = None
                     return

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -11,7 +10,7 @@ from pydantic import ConfigDict, Field, ValidationError, model_validator
 from lightpage.device.problems import Problem, problems_of
 from lightpage.device.profile import TomlTable
 from lightpage.errors import InvalidInputError
-from lightpage.files import read_text
+from lightpage.files import read_toml
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 from lightpage.runtime.device.acquisition.camera_source import Exposures, View
 from lightpage.runtime.device.acquisition.pairing import PairingSettings
@@ -153,11 +152,7 @@ def load_device_table(path: Path) -> DeviceTable:
         InvalidInputError: it cannot be read, or a key does not validate.
     """
     subject = f"camera configuration {path}"
-    expected = "a TOML file that can be read"
-    try:
-        data = tomllib.loads(read_text(path, subject, expected))
-    except tomllib.TOMLDecodeError as error:
-        raise InvalidInputError(subject, error, expected) from None
+    data = read_toml(path, subject, "a TOML file that can be read")
     try:
         return DeviceTable.model_validate(data)
     except ValidationError as error:

@@ -51,9 +51,7 @@ def _camera(table: CameraTable, folder: Path, profile: Profile, role: str) -> Ca
     return GenTLCamera(table.model_copy(update={"producer": producer}), profile.frame_shape, role)
 
 
-def _trigger(
-    table: PulseGeneratorTable | SoftwareTriggerTable, folder: Path, cameras: tuple[Camera, Camera]
-) -> Trigger:
+def _trigger(table: PulseGeneratorTable | SoftwareTriggerTable, folder: Path, cameras: tuple[Camera, ...]) -> Trigger:
     if isinstance(table, SoftwareTriggerTable):
         return SoftwareTrigger(cameras)
     if "://" not in table.port:

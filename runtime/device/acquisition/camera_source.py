@@ -16,7 +16,7 @@ from pydantic import ConfigDict, Field
 
 from lightpage.clock import SYSTEM, Clock
 from lightpage.device.profile import Profile, TomlTable
-from lightpage.errors import LostShotError, Reason, SourceError
+from lightpage.errors import LostShotError, Reason, SourceError, raised_as
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.progress import warn
 from lightpage.recording.alignment import describe, greatest_count, unused_low_bits
@@ -33,6 +33,7 @@ from lightpage.runtime.device.modulator.modulator import Beams, Modulator
 from lightpage.runtime.device.trigger.trigger import Trigger
 
 Counts = NDArray[np.unsignedinteger[Any]]
+_Attempt = Callable[[], tuple[Frame, ...]]
 
 _log = logging.getLogger(__name__)
 
@@ -182,12 +183,9 @@ class CameraSource(FrameSource):
 
     def _open_modulator(self) -> None:
         """Connect what shows the pages: settings that are wrong are not to be found after minutes of other shots."""
-        if self.modulator is None:
-            return
-        try:
-            self.modulator.open(SHOT_S, self.pages.levels)
-        except LostShotError as error:
-            raise SourceError(error.subject, error.got, error.expected) from None
+        if self.modulator is not None:
+            with raised_as(SourceError, LostShotError):
+                self.modulator.open(SHOT_S, self.pages.levels)
 
     def _arm(self, device: Camera | Trigger, reason: Reason) -> None:
         """Make one device ready. One that was ready before and cannot be found now has gone, and may come back."""
@@ -292,9 +290,7 @@ class CameraSource(FrameSource):
             return page, None
         return page, self.pages[page]
 
-    def _attempt(
-        self, index: int, symbols: NDArray[np.uint8] | None, deadline: float
-    ) -> Callable[[], tuple[Frame, ...]]:
+    def _attempt(self, index: int, symbols: NDArray[np.uint8] | None, deadline: float) -> _Attempt:
         """What takes a pair of a page. A further attempt leaves the page as it stands, where it still does."""
         modulator, shown = self.modulator, False
         if modulator is None or symbols is None:
@@ -310,7 +306,7 @@ class CameraSource(FrameSource):
         return lambda: self._pairing.shot(deadline, display, modulator.shows)
 
     def _persistent(
-        self, subject: str, index: int, deadline: float, attempt: Callable[[], tuple[Frame, ...]], repeats: int
+        self, subject: str, index: int, deadline: float, attempt: _Attempt, repeats: int
     ) -> tuple[Frame, ...]:
         """A pair of one page: lost shots are repeated, and devices that have gone are waited for."""
         while True:

@@ -25,6 +25,7 @@ class PageStore:
         levels: M, 2 to 256, where there is no file to say it; None leaves it to the first upload.
 
     Attributes:
+        levels: M of all pages; None before it is known.
         most_bytes: of uploaded pages; more are refused.
 
     Raises:
@@ -35,17 +36,12 @@ class PageStore:
         if written is not None:
             written.check_against(profile)
             levels = written.levels
-        self._shape, self._written, self._levels = profile.page_shape, written, levels
+        self._shape, self._written, self.levels = profile.page_shape, written, levels
         self._in_file = 0 if written is None else len(written)
         self.most_bytes = UPLOADED_BYTES
         self._uploaded: list[NDArray[np.uint8]] = []
         self._lock = threading.Lock()
         """Guards all of it; the file is read under it too."""
-
-    @property
-    def levels(self) -> int | None:
-        """M of all pages, None before it is known."""
-        return self._levels
 
     @property
     def code(self) -> str | None:
@@ -83,13 +79,13 @@ class PageStore:
         """
         pages = check_symbols(symbols, self._shape, levels, "uploaded pages").reshape(-1, *self._shape)
         with self._lock:
-            if self._levels is not None and levels != self._levels:
-                raise InvalidInputError("levels of uploaded pages", levels, f"{self._levels}, as the pages before have")
+            if self.levels is not None and levels != self.levels:
+                raise InvalidInputError("levels of uploaded pages", levels, f"{self.levels}, as the pages before have")
             held = sum(page.nbytes for page in self._uploaded) + pages.nbytes
             if held > self.most_bytes:
                 raise LimitError("uploaded pages", f"{held} bytes with those held", f"at most {self.most_bytes}")
             first = self._in_file + len(self._uploaded)
-            self._levels = levels
+            self.levels = levels
             self._uploaded.extend(page.copy() for page in pages)
             return first
 

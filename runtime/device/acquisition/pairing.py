@@ -196,9 +196,7 @@ class Pairing:
             frames, offsets_s = self._take(deadline)
             self._check_times(offsets_s)
             if displayed is not None and not displayed():
-                raise LostShotError(
-                    "page", "no longer on display", "there until both frames are in", Reason.NOT_ON_DISPLAY
-                )
+                raise LostShotError("page", "no longer on display", "there until both are in", Reason.NOT_ON_DISPLAY)
         except BaseException as error:
             self._settled = False
             if isinstance(error, LostShotError):
@@ -214,9 +212,7 @@ class Pairing:
 
     def _check_times(self, offsets_s: tuple[float, ...]) -> None:
         """Rule 4; the references follow where it holds."""
-        deviations = [
-            offset - (channel.reference_s or 0.0) for channel, offset in zip(self._channels, offsets_s, strict=True)
-        ]
+        deviations = [offset - (one.reference_s or 0.0) for one, offset in zip(self._channels, offsets_s, strict=True)]
         if max(map(abs, deviations)) > self.settings.tolerance_s:
             told = ", ".join(
                 f"{channel.camera.name} {1e3 * deviation:+.1f} ms"
@@ -292,9 +288,7 @@ class Pairing:
         fired = self.trigger.fire()
         self._next_at = self.clock.now() + settings.spacing_s
         end = self.clock.now() + settings.frame_s
-        frames = [
-            self._checked(channel, channel.frame(max(1e-3, end - self.clock.now()))) for channel in self._channels
-        ]
+        frames = [self._checked(one, one.frame(max(1e-3, end - self.clock.now()))) for one in self._channels]
         if self._drain():
             raise LostShotError("frame", "one more than the trigger asked for", "two", Reason.STRAY_FRAME)
         for channel, frame in zip(self._channels, frames, strict=True):

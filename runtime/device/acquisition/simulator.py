@@ -115,9 +115,8 @@ def open_simulator(rest: str) -> SimulatorSource:
     except ValueError as error:
         raise InvalidInputError(f"source {spec}", error, "whole numbers for levels and seed") from None
     if settings or seed < 0:
-        raise InvalidInputError(
-            f"source {spec}", sorted(settings) or seed, "levels, seed (at least 0), device and symbols only"
-        )
+        got = sorted(settings) or seed
+        raise InvalidInputError(f"source {spec}", got, "levels, seed (at least 0), device and symbols only")
     written = None if symbols is None else Pages.open(Path(symbols))
     nominal = load_profile(profile)
     return SimulatorSource(nominal, device.of_profile(nominal), levels, seed, spec, written)

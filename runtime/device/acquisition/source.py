@@ -6,8 +6,8 @@ Sources are entry points of the group `lightpage.sources`, so that another packa
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import Self
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile
-from lightpage.errors import FrameError, InvalidInputError, LostShotError, RecordingError, SourceError
+from lightpage.errors import FrameError, InvalidInputError, LostShotError, RecordingError, SourceError, raised_as
 from lightpage.recording.black_level import DarkFrame
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import FrameInfo
@@ -176,18 +176,14 @@ class FrameSource(ABC):
             self.close()
 
 
-@contextmanager
-def own_fault(subject: str = "") -> Iterator[None]:
+def own_fault(subject: str = "") -> AbstractContextManager[None]:
     """Turn what is wrong with a source's file or frames into the service's fault; no such page stays that.
 
     Raises:
         SourceError: in place of a `RecordingError` or `FrameError`; `subject` goes before what it names.
         StorageError: storage fails, which says nothing of the source.
     """
-    try:
-        yield
-    except (RecordingError, FrameError) as error:
-        raise SourceError(subject + error.subject, error.got, error.expected) from error
+    return raised_as(SourceError, RecordingError, FrameError, about=subject)
 
 
 def open_source(spec: str) -> FrameSource:

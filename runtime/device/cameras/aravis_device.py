@@ -151,8 +151,7 @@ class AravisSetup:
 
     def stop(self) -> None:
         """Stop the acquisition, whoever started it: cameras lock settings during one."""
-        with self._setting("acquisition", "stopped"):
-            self._do("stop_acquisition")
+        self._ask("acquisition", "stopped", "stop_acquisition")
 
     def set_image(self) -> None:
         """Set all that a frame depends on but its trigger, which is switched off."""
@@ -164,18 +163,16 @@ class AravisSetup:
         self._set_string("AcquisitionMode", "Continuous")
         for feature in sfnc.SWITCHED_OFF:
             if self._has(feature):
-                with self._setting(feature, "off"):
-                    self._do("set_boolean", feature.encode(), 0)
+                self._ask(feature, "off", "set_boolean", feature.encode(), 0)
         for feature in sfnc.AUTOMATIC:
             if self._has(feature):
                 self._set_string(feature, "Off")
         rows, columns = self.frame_shape
         self._set_string("PixelFormat", settings.pixel_format)
-        with self._setting("region", self._region()):
-            self._do("set_region", settings.offset_x_px, settings.offset_y_px, columns, rows)
+        offsets = settings.offset_x_px, settings.offset_y_px
+        self._ask("region", self._region(), "set_region", *offsets, columns, rows)
         for key, value in self._numbers():
-            with self._setting(key, value):
-                self._do(f"set_{_NUMBERS[key]}", value)
+            self._ask(key, value, f"set_{_NUMBERS[key]}", value)
         if self.connection.is_gige:
             self._set_packets()
 
@@ -193,8 +190,7 @@ class AravisSetup:
 
     def make_stream(self, payload: int) -> int:
         """A stream with empty buffers of `payload` bytes; it ends when it is let go of."""
-        with self._setting("stream", "one"):
-            stream: int = self._do("create_stream", None, None, None)
+        stream: int = self._ask("stream", "one", "create_stream", None, None, None)
         if self.connection.is_gige:
             self._library("g_object_set", stream, b"socket-buffer", c_int(SOCKET_BUFFER_AUTO), None)
         for _ in range(self.settings.buffers):
@@ -205,8 +201,7 @@ class AravisSetup:
         """Bytes of a frame: its pixels, and whatever the camera adds to them."""
         rows, columns = self.frame_shape
         expected = pixel_format(self.settings.pixel_format).nbytes(rows * columns)
-        with self._setting("PayloadSize", expected):
-            payload: int = self._do("get_payload")
+        payload: int = self._ask("PayloadSize", expected, "get_payload")
         if payload < expected:
             raise self._refused("PayloadSize", f"{expected} or more", payload, "")
         return payload
@@ -226,14 +221,12 @@ class AravisSetup:
                 got = self._library.text("arv_camera_get_string", self._camera, feature.encode())
             self._compare(feature, got, expected)
         corners = [c_int() for _ in range(4)]
-        with self._setting("region", self._region()):
-            self._do("get_region", *map(byref, corners))
+        self._ask("region", self._region(), "get_region", *map(byref, corners))
         x, y, columns, rows = (corner.value for corner in corners)
         self._compare("region", sfnc.describe_region(x, y, columns, rows), self._region())
         if self.connection.is_gige:
-            with self._setting("packet_bytes", self.packet_bytes):
-                got = self._do("gv_get_packet_size")
-            self._compare("packet_bytes", got, self.packet_bytes)
+            kept_bytes = self._ask("packet_bytes", self.packet_bytes, "gv_get_packet_size")
+            self._compare("packet_bytes", kept_bytes, self.packet_bytes)
         kept = {key: self._check_number(key, value) for key, value in self._numbers()}
         return 1e-6 * kept["exposure_us"]
 
@@ -244,11 +237,15 @@ class AravisSetup:
 
     def start(self) -> None:
         """Start the acquisition; from here on a trigger makes a frame."""
-        with self._setting("acquisition", "started"):
-            self._do("start_acquisition")
+        self._ask("acquisition", "started", "start_acquisition")
 
     def _do(self, what: str, *arguments: Any) -> Any:
         return self._library(f"arv_camera_{what}", self._camera, *arguments)
+
+    def _ask(self, setting: str, expected: object, what: str, *arguments: Any) -> Any:
+        """Do something about a setting, which a refusal names."""
+        with self._setting(setting, expected):
+            return self._do(what, *arguments)
 
     def _has(self, feature: str) -> bool:
         return bool(self._do("is_feature_available", feature.encode()))
@@ -266,12 +263,10 @@ class AravisSetup:
         return [(key, value) for key in _NUMBERS if (value := getattr(self.settings, key)) is not None]
 
     def _set_string(self, feature: str, value: str) -> None:
-        with self._setting(feature, value):
-            self._do("set_string", feature.encode(), value.encode())
+        self._ask(feature, value, "set_string", feature.encode(), value.encode())
 
     def _check_number(self, key: str, expected: float) -> float:
-        with self._setting(key, expected):
-            got = float(self._do(f"get_{_NUMBERS[key]}"))
+        got = float(self._ask(key, expected, f"get_{_NUMBERS[key]}"))
         if abs(got - expected) > sfnc.tolerance(key, expected):
             raise self._refused(key, expected, got, "")
         return got

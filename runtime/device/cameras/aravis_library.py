@@ -51,27 +51,22 @@ class _GError(ctypes.Structure):
 
 _ERROR = POINTER(POINTER(_GError))
 
+_NUMBERS = ("exposure_time", "gain", "black_level")
 _FALLIBLE: Signatures = {
     "arv_camera_new": (c_void_p, (c_char_p,)),
     "arv_camera_get_device_serial_number": (c_char_p, (c_void_p,)),
     "arv_camera_is_feature_available": (c_int, (c_void_p, c_char_p)),
     "arv_camera_is_enumeration_entry_available": (c_int, (c_void_p, c_char_p, c_char_p)),
     "arv_camera_dup_available_enumerations_as_strings": (POINTER(c_char_p), (c_void_p, c_char_p, POINTER(c_uint32))),
-    "arv_camera_get_exposure_time_bounds": (None, (c_void_p, POINTER(c_double), POINTER(c_double))),
-    "arv_camera_get_gain_bounds": (None, (c_void_p, POINTER(c_double), POINTER(c_double))),
-    "arv_camera_get_black_level_bounds": (None, (c_void_p, POINTER(c_double), POINTER(c_double))),
     "arv_camera_get_sensor_size": (None, (c_void_p, POINTER(c_int), POINTER(c_int))),
     "arv_camera_set_string": (None, (c_void_p, c_char_p, c_char_p)),
     "arv_camera_get_string": (c_char_p, (c_void_p, c_char_p)),
     "arv_camera_set_boolean": (None, (c_void_p, c_char_p, c_int)),
     "arv_camera_set_region": (None, (c_void_p, c_int, c_int, c_int, c_int)),
     "arv_camera_get_region": (None, (c_void_p, POINTER(c_int), POINTER(c_int), POINTER(c_int), POINTER(c_int))),
-    "arv_camera_set_exposure_time": (None, (c_void_p, c_double)),
-    "arv_camera_get_exposure_time": (c_double, (c_void_p,)),
-    "arv_camera_set_gain": (None, (c_void_p, c_double)),
-    "arv_camera_get_gain": (c_double, (c_void_p,)),
-    "arv_camera_set_black_level": (None, (c_void_p, c_double)),
-    "arv_camera_get_black_level": (c_double, (c_void_p,)),
+    **{f"arv_camera_set_{name}": (None, (c_void_p, c_double)) for name in _NUMBERS},
+    **{f"arv_camera_get_{name}": (c_double, (c_void_p,)) for name in _NUMBERS},
+    **{f"arv_camera_get_{name}_bounds": (None, (c_void_p, POINTER(c_double), POINTER(c_double))) for name in _NUMBERS},
     "arv_camera_get_payload": (c_uint32, (c_void_p,)),
     "arv_camera_gv_set_packet_size": (None, (c_void_p, c_int)),
     "arv_camera_gv_get_packet_size": (c_uint32, (c_void_p,)),
@@ -113,9 +108,7 @@ _PLAIN: Signatures = {
     "g_quark_to_string": (c_char_p, (c_uint32,)),
     "g_error_free": (None, (POINTER(_GError),)),
 }
-_OPTIONAL: Signatures = {
-    "arv_buffer_get_image_padding": (None, (c_void_p, POINTER(c_int), POINTER(c_int))),
-}
+_OPTIONAL: Signatures = {"arv_buffer_get_image_padding": (None, (c_void_p, POINTER(c_int), POINTER(c_int)))}
 """What earlier versions lack."""
 
 
@@ -196,10 +189,9 @@ class AravisLibrary:
 
 
 def _typed(library: ctypes.CDLL, name: str, result: Any, arguments: tuple[Any, ...]) -> Callable[..., Any]:
-    function: Any = getattr(library, name)
+    function = library[name]
     function.restype, function.argtypes = result, arguments
-    typed: Callable[..., Any] = function
-    return typed
+    return function
 
 
 def aravis() -> AravisLibrary:

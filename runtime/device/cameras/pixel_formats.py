@@ -48,19 +48,15 @@ class PixelFormat:
         return -(-pixels * self.group_bytes // _GROUP)
 
 
-def _mask(value: int) -> np.uint64:
-    return np.uint64(value)
-
-
 def _spread_p(bits: int) -> Callable[[_Words], _Words]:
     """Of GenICam's packing, which leaves no gaps between pixels."""
     pair, first = (1 << 2 * bits) - 1, (1 << bits) - 1
-    pairs_low, pairs_high = _mask(pair), _mask(pair << 2 * bits)
-    firsts, seconds = _mask(first | first << 32), _mask((first | first << 32) << bits)
+    pairs_low, pairs_high = np.uint64(pair), np.uint64(pair << 2 * bits)
+    firsts, seconds = np.uint64(first | first << 32), np.uint64((first | first << 32) << bits)
 
     def spread(word: _Words) -> _Words:
-        pairs = word & pairs_low | (word & pairs_high) << _mask(32 - 2 * bits)
-        lanes: _Words = pairs & firsts | (pairs & seconds) << _mask(16 - bits)
+        pairs = word & pairs_low | (word & pairs_high) << np.uint64(32 - 2 * bits)
+        lanes: _Words = pairs & firsts | (pairs & seconds) << np.uint64(16 - bits)
         return lanes
 
     return spread
@@ -69,12 +65,12 @@ def _spread_p(bits: int) -> Callable[[_Words], _Words]:
 def _spread_packed(low_bits: int) -> Callable[[_Words], _Words]:
     """Of GigE Vision's packing, with two or four low bits of each pixel in the middle byte."""
     low = (1 << low_bits) - 1
-    first, second = _mask(low << 8 | low << 40), _mask(low << 12 | low << 44)
-    high, up = _mask(0x00FF00FF00FF00FF), _mask(low_bits)
+    first, second = np.uint64(low << 8 | low << 40), np.uint64(low << 12 | low << 44)
+    high, up = np.uint64(0x00FF00FF00FF00FF), np.uint64(low_bits)
 
     def spread(word: _Words) -> _Words:
-        pairs = word & _mask(0xFFFFFF) | (word & _mask(0xFFFFFF000000)) << _mask(8)
-        lanes: _Words = (pairs & high) << up | (pairs & first) >> _mask(8) | (pairs & second) << _mask(4)
+        pairs = word & np.uint64(0xFFFFFF) | (word & np.uint64(0xFFFFFF000000)) << np.uint64(8)
+        lanes: _Words = (pairs & high) << up | (pairs & first) >> np.uint64(8) | (pairs & second) << np.uint64(4)
         return lanes
 
     return spread

@@ -42,11 +42,6 @@ class Announcement(Generic[T]):
         with self._changed:
             return self._asked or self._changes > 0
 
-    def announced(self) -> T | None:
-        """What there is by the last word; None for nothing, or before the first one."""
-        with self._changed:
-            return self._announced
-
     def announce(self, what: T | None) -> None:
         """Say what there is now, None for nothing."""
         with self._changed:
@@ -66,7 +61,7 @@ class Announcement(Generic[T]):
         """Ask for something until it is there or the time is up.
 
         Returns:
-            What there is then, and `changes` then: as long as that stays, so does what there is.
+            What there is then, and how often it has changed by then: as long as that stays, so does what there is.
         """
         with self._changed:
             self.want(what)
@@ -76,17 +71,12 @@ class Announcement(Generic[T]):
             finally:
                 self._wanted = None
 
-    def changes(self) -> int:
-        """How often what there is has changed."""
-        with self._changed:
-            return self._changes
 
-
-class ExternalModulator:
+class ExternalModulator(Announcement[int]):
     """A modulator whose controller shows pages by itself.
 
-    One thread uses `show`, `shows` and `close`; others say what the controller does, by `shown` and `withdrawn`, and
-    look at `wanted`. A page may be announced before it is asked for.
+    One thread uses `show`, `shows` and `close`; others look at `wanted` and `announce` the page that is on display, its
+    liquid crystal settled, or None. A page may be announced before it is asked for.
 
     Args:
         clock: by which it waits.
@@ -95,20 +85,8 @@ class ExternalModulator:
     name = "the controller's modulator"
 
     def __init__(self, clock: Clock = SYSTEM) -> None:
-        self._pages = Announcement[int](clock)
+        super().__init__(clock)
         self._at_last_show = -1
-
-    def wanted(self) -> int | None:
-        """The page that is being waited for, or None where none is."""
-        return self._pages.wanted()
-
-    def shown(self, page: int) -> None:
-        """The controller says: page number `page` is on display, and its liquid crystal has settled."""
-        self._pages.announce(page)
-
-    def withdrawn(self) -> None:
-        """The controller says: no page is on display, or will not be from now on."""
-        self._pages.announce(None)
 
     def open(self, timeout_s: float, levels: int | None = None) -> None:
         """See `Modulator`: the controller may come at any time."""
@@ -116,28 +94,24 @@ class ExternalModulator:
     def show(self, symbols: NDArray[np.uint8], levels: int, page: int, timeout_s: float) -> None:
         """Wait until the controller says that page number `page` is on display; see `Modulator`."""
         self._at_last_show = -1
-        there, changes = self._pages.wait(page, timeout_s)
+        there, changes = self.wait(page, timeout_s)
         if there != page:
-            raise LostShotError(
-                f"page {page} on {self.name}",
-                f"{'no page' if there is None else f'page {there}'} announced after {timeout_s:g} s",
-                f"word that page {page} is on display",
-                Reason.NOT_ON_DISPLAY,
-            )
+            got = f"{'no page' if there is None else f'page {there}'} announced after {timeout_s:g} s"
+            raise LostShotError(f"page {page} on {self.name}", got, "word that it is on display", Reason.NOT_ON_DISPLAY)
         self._at_last_show = changes
 
     def shows(self) -> bool:
         """See `Modulator`: no other page was announced, and none withdrawn, since `show`."""
-        return self._pages.changes() == self._at_last_show
+        return self._changes == self._at_last_show
 
     def close(self) -> None:
         """Forget what was announced."""
         self._at_last_show = -1
-        self._pages.announce(None)
+        self.announce(None)
 
 
-class ExternalBeams:
-    """Beams that a controller blocks and lets through by itself, and says so with `beams_set`.
+class ExternalBeams(Announcement[BeamState]):
+    """Beams that a controller blocks and lets through by itself, and announces how they are once they have settled.
 
     Args:
         timeout_s: longest wait for it.
@@ -147,16 +121,8 @@ class ExternalBeams:
     name = "the controller's beams"
 
     def __init__(self, timeout_s: float = 10.0, clock: Clock = SYSTEM) -> None:
+        super().__init__(clock)
         self._timeout_s = timeout_s
-        self._states = Announcement[BeamState](clock)
-
-    def wanted(self) -> BeamState | None:
-        """What is being waited for, or None where nothing is."""
-        return self._states.wanted()
-
-    def beams_set(self, *, signal: bool, reference: bool) -> None:
-        """The controller says: so are the beams now, and they have settled."""
-        self._states.announce(BeamState(signal, reference))
 
     def let_through(self, *, signal: bool, reference: bool) -> None:
         """Wait until the controller says that the beams are so; see `Beams`.
@@ -164,20 +130,16 @@ class ExternalBeams:
         Beams that nobody has heard an order for are open.
         """
         wanted = BeamState(signal, reference)
-        if wanted == BOTH and not self._states.heard_of:
+        if wanted == BOTH and not self.heard_of:
             return
-        there, _ = self._states.wait(wanted, self._timeout_s)
+        there, _ = self.wait(wanted, self._timeout_s)
         if there != wanted:
-            if self._states.heard_of:
-                self._states.want(BOTH)
-            raise LostShotError(
-                self.name,
-                f"{there or 'nothing'} announced after {self._timeout_s:g} s",
-                str(wanted),
-                Reason.BEAM_CONTROL_FAILED,
-            )
+            if self.heard_of:
+                self.want(BOTH)
+            got = f"{there or 'nothing'} announced after {self._timeout_s:g} s"
+            raise LostShotError(self.name, got, str(wanted), Reason.BEAM_CONTROL_FAILED)
 
     def close(self) -> None:
         """Ask for both beams if the controller has blocked one; nobody waits for it."""
-        if self._states.heard_of and self._states.announced() != BOTH:
-            self._states.want(BOTH)
+        if self.heard_of and self._announced != BOTH:
+            self.want(BOTH)

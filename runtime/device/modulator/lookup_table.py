@@ -85,11 +85,8 @@ def _of_levels(lines: list[Line], levels: int, subject: str) -> NDArray[np.uint8
         lines = lines[1:]
     greys = [_grey(word, f"{subject}, line {number}") for number, words in lines for word in words]
     if len(greys) != levels:
-        raise InvalidInputError(
-            subject,
-            f"{len(greys)} grey values",
-            f"{levels}, one per level, or a calibration below the line '{' '.join(CALIBRATION_HEADER)}'",
-        )
+        expected = f"{levels}, one per level, or a calibration below the line '{' '.join(CALIBRATION_HEADER)}'"
+        raise InvalidInputError(subject, f"{len(greys)} grey values", expected)
     return np.array(greys, np.uint8)
 
 
@@ -111,18 +108,13 @@ def _of_calibration(lines: list[Line], levels: int, subject: str) -> NDArray[np.
     steps = np.diff(phase)
     if not ((steps > 0).all() or (steps < 0).all()):
         turn = int(np.argmax(np.sign(steps) != np.sign(steps[0])))
-        raise InvalidInputError(
-            subject,
-            f"a phase that turns back, or stands still, between grey values {greys[turn]} and {greys[turn + 1]}",
-            "one that rises or falls all along; smooth a noisy calibration first",
-        )
+        got = f"a phase that turns back, or stands still, between grey values {greys[turn]} and {greys[turn + 1]}"
+        raise InvalidInputError(subject, got, "one that rises or falls all along; smooth a noisy calibration first")
     if steps[0] < 0:
         greys, phase = greys[::-1], phase[::-1]
     wanted = 2 * math.pi * np.arange(levels) / levels
     if (span := phase[-1] - phase[0]) < wanted[-1] - 1e-9:
-        raise InvalidInputError(
-            subject, f"phases that span {span:.4g} rad", f"{wanted[-1]:.4g} rad for {levels} levels"
-        )
+        raise InvalidInputError(subject, f"phases over {span:.4g} rad", f"{wanted[-1]:.4g} rad for {levels} levels")
     found: NDArray[np.float64] = np.interp(phase[0] + wanted, phase, greys)
     return found.round().astype(np.uint8)
 

@@ -208,10 +208,8 @@ class PulseGenerator:
     def _set_state(self, setting: str, on: bool, session: int) -> None:
         self._set(setting, "ON" if on else "OFF", _STATE, lambda found: (found.upper() in _ON) == on, session)
 
-    def _set(
-        self, setting: str, value: str, answer: re.Pattern[str], holds: Callable[[str], bool], session: int
-    ) -> None:
+    def _set(self, setting: str, value: str, form: re.Pattern[str], holds: Callable[[str], bool], session: int) -> None:
         self._line.send(f"{setting} {value}", session)
-        found = self._line.query(f"{setting}?", answer, session)
+        found = self._line.query(f"{setting}?", form, session)
         if not holds(found):
             raise SourceError(f"{self.name}: {setting}", f"{found} after {value} was set", value)

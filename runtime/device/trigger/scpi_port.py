@@ -201,11 +201,7 @@ class ScpiPort:
         path = next((path for path, adapter in adapters.items() if adapter == self._adapter), self._path)
         try:
             self._port = serial.serial_for_url(
-                path,
-                baudrate=self._baud,
-                timeout=_POLL_S,
-                write_timeout=self._times.answer_s,
-                exclusive=alone,
+                path, baudrate=self._baud, timeout=_POLL_S, write_timeout=self._times.answer_s, exclusive=alone
             )
         except ValueError as error:
             raise SourceError(self.name, error, "a serial port or a pyserial URL, and a baud rate") from None
@@ -299,9 +295,7 @@ class ScpiPort:
             told = f"{told}: {_quoted(self.identity or '')} came after {self._slowest_s:.2f} s"
             return self._gone(told, f"it within answer_s = {times.answer_s:g} s: raise answer_s")
         if self._heard:
-            return self._gone(
-                f"{told}, but {self._heard}", "its identification: is it this device, and this baud rate?"
-            )
+            return self._gone(f"{told}, but {self._heard}", "its identification: is it this device and baud rate?")
         return self._gone(f"{told}: nothing came", "its identification: look at its power, its cable and the baud rate")
 
     def _identified(self, line: str) -> bool:

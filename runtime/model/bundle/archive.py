@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import IO
 
 from lightpage.errors import BundleError
-from lightpage.failures import os_failure
+from lightpage.failures import os_errors, os_failure
 from lightpage.runtime.model.bundle.manifest import MANIFEST
 from lightpage.runtime.model.bundle.signature_file import read_plain_file
 
@@ -22,18 +22,16 @@ MAX_FILES = 32
 MAX_BYTES = 1 << 30
 """All files together, unpacked: a full-scale decoder with two float32 reference frames needs about 200 MB."""
 
-_LITTER = frozenset(
-    {
-        "__macosx",
-        "icon\r",
-        "thumbs.db",
-        "desktop.ini",
-        "$recycle.bin",
-        "system volume information",
-        "@eadir",
-        "lost+found",
-    }
-)
+_LITTER = {
+    "__macosx",
+    "icon\r",
+    "thumbs.db",
+    "desktop.ini",
+    "$recycle.bin",
+    "system volume information",
+    "@eadir",
+    "lost+found",
+}
 """Names that systems put beside files, in lower case; names that begin with a dot are litter too."""
 
 _MAX_LITTER = 4 * MAX_FILES
@@ -55,13 +53,11 @@ def read_files(path: Path, content: bytes | None = None) -> dict[str, bytes]:
     if content is not None:
         return _read_zip(path, io.BytesIO(content))
     expected = "a folder or a zip file"
-    try:
+    with os_errors(f"bundle {path}", expected, BundleError):
         if path.is_dir():
             return _read_folder(path)
         if path.is_file():
             return _read_zip(path, path)
-    except OSError as error:
-        raise os_failure(f"bundle {path}", error, expected, BundleError) from None
     raise BundleError(f"bundle {path}", "nothing", expected)
 
 
@@ -93,15 +89,12 @@ def _read_folder(path: Path) -> dict[str, bytes]:
     left = MAX_BYTES
     for name in names:
         check_name(name, subject)
-        try:
+        with os_errors(f"{subject}: {name}", "a readable plain file, no link or folder", BundleError):
             # Kubernetes mounts files as links into a hidden folder beside them. Any other link is refused by the
             # kernel, with no gap between a check and the use.
             target = os.path.realpath(path / name)
             inside = os.path.dirname(os.path.dirname(target)) == real and is_litter(Path(target).parent.name)
             files[name] = read_plain_file(target if inside else path / name, left + 1, f"{subject}: {name}")
-        except OSError as error:
-            expected = "a readable plain file, no link or folder"
-            raise os_failure(f"{subject}: {name}", error, expected, BundleError) from None
         left -= len(files[name])
         _check_left(left, subject)
     return files

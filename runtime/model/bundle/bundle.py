@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.codec.code import Code, parse_code
 from lightpage.device.profile import Profile, parse_profile
-from lightpage.errors import BundleError, CalibrationError, InvalidInputError, ProfileError
-from lightpage.failures import os_failure
+from lightpage.errors import BundleError, CalibrationError, InvalidInputError, ProfileError, raised_as
+from lightpage.failures import os_errors, os_failure
 from lightpage.files import move_to_new_name, sync_folder, synchronise
 from lightpage.metrics.information import decide
 from lightpage.page.symbols import check_levels, pilot_mask, pilot_symbols
@@ -129,10 +129,8 @@ class Bundle:
         Raises:
             BundleError: the manifest's profile does not validate.
         """
-        try:
+        with raised_as(BundleError, ProfileError):
             return parse_profile(self.manifest.profile, f"{self.subject}: profile")
-        except ProfileError as error:
-            raise BundleError(error.subject, error.got, error.expected) from None
 
     @cached_property
     def calibration(self) -> Calibration:
@@ -143,11 +141,9 @@ class Bundle:
         """
         from lightpage.calibration.document import parse_calibration
 
-        try:
+        with raised_as(CalibrationError, ProfileError):
             calibration = parse_calibration(self.manifest.calibration, f"{self.subject}: calibration")
             calibration.check_profile(self.profile)
-        except ProfileError as error:
-            raise CalibrationError(error.subject, error.got, error.expected) from None
         return calibration
 
     @cached_property
@@ -217,10 +213,8 @@ class Bundle:
         """
         if self.manifest.code is None:
             return None
-        try:
+        with raised_as(BundleError, InvalidInputError):
             return parse_code(self.manifest.code, f"{self.subject}: code")
-        except InvalidInputError as error:
-            raise BundleError(error.subject, error.got, error.expected) from None
 
     def written_pilots(self, levels: int) -> NDArray[np.uint8]:
         """Levels of the pilots on pages that are written for this device, in row order, uint8 [pilots].
@@ -348,11 +342,9 @@ def write_bundle(path: str | Path, manifest: Manifest, files: Mapping[str, bytes
     check_version(full.version, f"{subject}: version")
     parse_manifest(full.to_json(), f"{subject}: {MANIFEST}")
     contents = {MANIFEST: full.to_json(), **dict(sorted(files.items()))}
-    try:
+    with os_errors(subject, "a folder that can be written", BundleError):
         path.parent.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=f".{path.name[:100]}-", dir=path.parent))
-    except OSError as error:
-        raise os_failure(subject, error, "a folder that can be written", BundleError) from None
     try:
         if path.suffix == ".zip":
             _write_zip(work / "bundle.zip", contents)

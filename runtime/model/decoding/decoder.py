@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -22,6 +20,7 @@ from lightpage.errors import (
     NoCodeError,
     ProviderError,
     SurroundingsError,
+    raised_as,
 )
 from lightpage.failures import short_resource
 from lightpage.metrics.information import decide_with_confidence
@@ -53,15 +52,6 @@ GOLDEN_TOLERANCE = {FLOAT32: 1e-3, FLOAT16: 1e-2}
 for another net."""
 
 
-@contextmanager
-def _table_of(bundle: Bundle) -> Iterator[None]:
-    """What does not fit in a bundle's table is the bundle's fault."""
-    try:
-        yield
-    except InvalidInputError as error:
-        raise BundleError(f"{bundle.subject}: {error.subject}", error.got, error.expected) from None
-
-
 def open_graph(bundle: Bundle, threads: int | None = None, provider: Provider = ON_CPU) -> TableGraph:
     """The graph of a bundle's decoder with the bundle's table.
 
@@ -73,7 +63,7 @@ def open_graph(bundle: Bundle, threads: int | None = None, provider: Provider = 
     file = GraphFile(bundle.files[DECODER], subject)
     if set(file.table_inputs) != set(bundle.manifest.table_inputs):
         raise BundleError(f"{subject}: table inputs", sorted(file.table_inputs), sorted(bundle.manifest.table_inputs))
-    with _table_of(bundle):
+    with raised_as(BundleError, InvalidInputError, about=f"{bundle.subject}: "):
         return TableGraph(file, subject, PAGE_INPUTS, threads, bundle.table, provider=provider)
 
 
@@ -130,7 +120,7 @@ class Decoder:
         Raises:
             BundleError: its table does not fit.
         """
-        with _table_of(bundle):
+        with raised_as(BundleError, InvalidInputError, about=f"{bundle.subject}: "):
             return Decoder(bundle, self.threads, self.graph.with_table(bundle.table))
 
     @property
@@ -240,10 +230,8 @@ class Decoder:
 
         if self.bundle.code is None:
             raise NoCodeError(f"{self.bundle.subject}: code", "none", "one, as `lightpage code --out-bundle` adds it")
-        try:
+        with raised_as(BundleError, InvalidInputError, about=f"{self.bundle.subject}: "):
             return PageCodec(self.bundle.code, self.bundle.pilot_mask)
-        except InvalidInputError as error:
-            raise BundleError(f"{self.bundle.subject}: {error.subject}", error.got, error.expected) from None
 
     def written_pilots(self, levels: int) -> Pilots:
         """The pilots of pages that were written at `levels` levels, each on one of them.
@@ -328,9 +316,7 @@ class Decoder:
             raise BundleError(f"{subject}: p", f"shape {golden.p.shape}", f"shape {p.shape}")
         error_norm = float(np.linalg.norm(p - golden.p) / max(float(np.linalg.norm(golden.p)), 1e-30))
         if not error_norm <= (tolerance := GOLDEN_TOLERANCE[self.bundle.manifest.precision]):
-            raise BundleError(
-                subject, f"an answer off by {error_norm:.3g} of its norm", f"the expected p within {tolerance:g}"
-            )
+            raise BundleError(subject, f"an answer off by {error_norm:.3g} of its norm", f"p within {tolerance:g}")
 
 
 class BundleFieldSolver:

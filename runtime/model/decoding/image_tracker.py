@@ -21,7 +21,7 @@ from lightpage.runtime.model.decoding.image_drift import SHIFT, TILT, BundleSear
 from lightpage.runtime.model.decoding.image_position import ImagePosition
 from lightpage.runtime.model.decoding.page import DecodedPage, Inference, Timings
 from lightpage.runtime.model.decoding.tracking import NoTracker, Tracker, TrackerMemory, confirmed
-from lightpage.runtime.model.execution.twin import TWIN_THREADS, OnnxTwin
+from lightpage.runtime.model.execution.twin import OnnxTwin
 
 Real = NDArray[np.float64]
 
@@ -174,16 +174,11 @@ class ImageTracker:
         self._decoder, self._model, self._tables, self._search = decoder, model, tables, search
         start = np.diag([SEARCH_ERROR_PX, SEARCH_ERROR_PX, START_TILT, START_TILT]) ** 2
         self._lock = threading.Lock()
-        """Guards the state; never held while anything is computed."""
-        self._state = ImageState(np.zeros(4), start, decoder, {}, np.zeros(2), WALK**2)
-        if memory is not None:
-            self._state = self._remembered(memory)
-
-    @property
-    def state(self) -> ImageState:
+        """Of who replaces the state; never held while anything is computed."""
+        self.state = ImageState(np.zeros(4), start, decoder, {}, np.zeros(2), WALK**2)
         """What the next page is decoded with."""
-        with self._lock:
-            return self._state
+        if memory is not None:
+            self.state = self._remembered(memory)
 
     @property
     def image_px(self) -> tuple[float, float]:
@@ -215,13 +210,13 @@ class ImageTracker:
 
     def fork(self) -> ImageTracker:
         """See `Tracker`."""
-        other = ImageTracker(self._decoder, self._model, self._tables, self._search)
-        other._state = self.state
+        other = self.anew()
+        other.state = self.state
         return other
 
     def refitted(self, decoder: Decoder) -> ImageTracker:
         """See `Tracker`: what drift does to phases is taken to be as before."""
-        twin = OnnxTwin(decoder.bundle, TWIN_THREADS)
+        twin = OnnxTwin(decoder.bundle)
         search = None if self._search is None else BundleSearch(decoder, twin)
         return ImageTracker(decoder, self._model, BundleTables(decoder, twin), search)
 
@@ -321,14 +316,8 @@ class ImageTracker:
         decoder, traced = like.decoder, like.traced_tilt
         if np.any((away > RETRACE_RAD) & (away > SIGNIFICANT_DEVIATIONS * error)):
             decoder, traced = self._tables.traced(drift[TILT]), drift[TILT].copy()
-        return replace(
-            like,
-            drift=drift,
-            covariance=covariance,
-            decoder=decoder,
-            table=self._tables.shifted(drift[SHIFT]),
-            traced_tilt=traced,
-        )
+        table = self._tables.shifted(drift[SHIFT])
+        return replace(like, drift=drift, covariance=covariance, decoder=decoder, table=table, traced_tilt=traced)
 
     def _moved_to(self, found: FoundImage, state: ImageState) -> ImageState:
         """The state where the image was found; the same one where that is nothing new."""
@@ -357,8 +346,8 @@ class ImageTracker:
             after = replace(best.after, settled=True, walk=walk, share=lately)
         after = replace(after, covariance=after.covariance + np.diag(after.walk))
         with self._lock:
-            if self._state is begun:
-                self._state = after
+            if self.state is begun:
+                self.state = after
 
     @staticmethod
     def _around(state: ImageState) -> Real:
@@ -379,7 +368,7 @@ def tracker_for(decoder: Decoder, memory: TrackerMemory | None = None) -> Tracke
     """
     if "registration" not in decoder.graph.ports:
         return NoTracker(decoder)
-    twin, search = OnnxTwin(decoder.bundle, TWIN_THREADS), None
+    twin, search = OnnxTwin(decoder.bundle), None
     if FIELD in decoder.bundle.files:
         search = BundleSearch(decoder, twin)
     else:

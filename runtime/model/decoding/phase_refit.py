@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from lightpage.page.pilots import Pilots
 
+_Floats = NDArray[np.floating]
+
 ROUNDS = 5
 """Of expectation maximisation. More gain nothing where levels are told apart, and fit noise where they are not:
 `python -m analysis.codec.refit` prints it."""
@@ -40,7 +42,7 @@ class PhaseRefit:
             and the page is one zone.
     """
 
-    def __init__(self, page_shape: tuple[int, int], positions: NDArray[np.floating] | None = None) -> None:
+    def __init__(self, page_shape: tuple[int, int], positions: _Floats | None = None) -> None:
         ny, nx = page_shape
         y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
         walls = np.zeros((2, ny, nx)) if positions is None else np.rint(np.abs(positions)) % 2
@@ -56,12 +58,7 @@ class PhaseRefit:
         self._filled, self._sizes = own[self._starts], np.diff(self._starts, append=len(own))
 
     def error(
-        self,
-        phase: NDArray[np.floating],
-        concentration: NDArray[np.floating],
-        levels: int,
-        pilots: Pilots,
-        rounds: int = ROUNDS,
+        self, phase: _Floats, concentration: _Floats, levels: int, pilots: Pilots, rounds: int = ROUNDS
     ) -> NDArray[np.float32]:
         """The smooth error of a page's phases, radians [ny, nx]: to be taken off.
 

@@ -41,9 +41,7 @@ class Provider:
         if match is None or (match[1] == CPU and match[2] is not None):
             raise InvalidInputError("provider", repr(text), WANTED)
         if cache is not None and match[1] != TENSORRT:
-            raise InvalidInputError(
-                "engine cache", f"{cache} with provider {text}", f"provider {TENSORRT}, or no folder"
-            )
+            raise InvalidInputError("engine cache", f"{cache} with provider {text}", f"provider {TENSORRT}, or none")
         return cls(match[1], int(match[2] or 0), cache)
 
     def __str__(self) -> str:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,24 +23,8 @@ from lightpage.failures import short_resource
 from lightpage.runtime.model.execution.cpus import available_cpus
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
 
-
-class Node(Protocol):
-    """An input or output of a graph; `shape` holds a name or None for a free dimension."""
-
-    name: str
-    type: str
-    shape: Sequence[int | str | None]
-
-
-_TYPES = {
-    "tensor(float)": "float32",
-    "tensor(float16)": "float16",
-    "tensor(double)": "float64",
-    "tensor(int32)": "int32",
-    "tensor(int64)": "int64",
-    "tensor(uint8)": "uint8",
-    "tensor(uint16)": "uint16",
-}
+_NUMPY_NAMES = {"float": "float32", "double": "float64"}
+"""Of the types whose names differ in ONNX."""
 
 
 @dataclass(frozen=True)
@@ -51,10 +35,11 @@ class Port:
     shape: tuple[int | None, ...]
 
     @classmethod
-    def of(cls, node: Node) -> Port:
-        """As a session describes it."""
+    def of(cls, node: onnxruntime.NodeArg) -> Port:
+        """As a session describes it; a name or None stands for a free dimension."""
         shape = tuple(size if isinstance(size, int) else None for size in node.shape)
-        return cls(_TYPES.get(node.type, node.type), shape)
+        kind = node.type.removeprefix("tensor(").removesuffix(")")
+        return cls(_NUMPY_NAMES.get(kind, kind), shape)
 
     def admits(self, dtype: str, shape: tuple[int, ...]) -> bool:
         """Whether an array of this type and shape fits."""
@@ -65,31 +50,7 @@ class Port:
         )
 
 
-class Session(Protocol):
-    """The part of onnxruntime's session that Lightpage uses; `run` may be called from many threads at once."""
-
-    def get_inputs(self) -> Sequence[Node]:
-        """Inputs that must be fed."""
-
-    def get_outputs(self) -> Sequence[Node]:
-        """Outputs."""
-
-    def run(self, output_names: Sequence[str], input_feed: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
-        """Outputs of the names asked for."""
-
-    def io_binding(self) -> Any:
-        """Where one run takes its inputs from and puts its outputs, see `BoundSession`."""
-
-    def run_with_iobinding(self, iobinding: Any) -> None:
-        """One run of what is bound."""
-
-    def get_providers(self) -> Sequence[str]:
-        """Execution providers that it was opened with, the preferred one first."""
-
-    def end_profiling(self) -> str:
-        """Path of the profile, where one is kept, with all runs so far."""
-
-
+Session: TypeAlias = onnxruntime.InferenceSession
 VERSION: str = onnxruntime.__version__
 _USABLE = "a GPU of that number with room for the model, its driver and its libraries"
 _VERSION_DIGITS = 16
@@ -144,9 +105,7 @@ def open_session(
     try:
         with running(subject, provider):
             # by default it would print the cause, and compute elsewhere
-            session: Session = onnxruntime.InferenceSession(
-                model, options, providers=provider.chain(version), enable_fallback=0
-            )
+            session = onnxruntime.InferenceSession(model, options, providers=provider.chain(version), enable_fallback=0)
     except (ProviderError, SurroundingsError):
         raise
     except Exception as error:  # onnxruntime's errors share no base class
@@ -189,11 +148,8 @@ def check_provider(provider: Provider) -> None:
     """
     available = onnxruntime.get_available_providers()
     if provider.runtime_name not in available:
-        raise ProviderError(
-            f"provider {provider}",
-            f"an onnxruntime with {', '.join(available)}",
-            "onnxruntime-gpu in place of onnxruntime (docs/gpu.md), or provider cpu",
-        )
+        expected = "onnxruntime-gpu in place of onnxruntime (docs/gpu.md), or provider cpu"
+        raise ProviderError(f"provider {provider}", f"an onnxruntime with {', '.join(available)}", expected)
 
 
 class BoundSession:
@@ -204,7 +160,7 @@ class BoundSession:
     Args:
         session: opened with this provider.
         provider: what it runs on.
-        constants: by input.
+        fixed: by input.
         subject: what it is, for errors.
 
     Raises:
@@ -212,16 +168,14 @@ class BoundSession:
         SurroundingsError: memory is short.
     """
 
-    def __init__(
-        self, session: Session, provider: Provider, constants: Mapping[str, NDArray[Any]], subject: str = "onnxruntime"
-    ) -> None:
+    def __init__(self, session: Session, provider: Provider, fixed: Mapping[str, NDArray[Any]], subject: str) -> None:
         self.session, self._subject, self._provider = session, subject, provider
         with running(subject, provider):
-            self._constants = {
+            self._fixed = {
                 name: onnxruntime.OrtValue.ortvalue_from_numpy(
                     np.asarray(value, order="C"), provider.memory, provider.device
                 )
-                for name, value in constants.items()
+                for name, value in fixed.items()
             }
 
     def run(self, outputs: Iterable[str], feeds: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
@@ -233,7 +187,7 @@ class BoundSession:
         """
         with running(self._subject, self._provider):
             binding = self.session.io_binding()
-            for name, value in self._constants.items():
+            for name, value in self._fixed.items():
                 if name not in feeds:
                     binding.bind_ortvalue_input(name, value)
             for name, array in feeds.items():

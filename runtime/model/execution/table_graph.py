@@ -213,7 +213,8 @@ class TableGraph:
         provider: Provider = ON_CPU,
     ) -> None:
         self._file, self._subject, self._fed_names, self._threads = file, subject, fed, threads
-        self.provider = provider
+        self.provider, self.ports = provider, file.table_inputs
+        """What computes pages; and type and shape of every tensor of the table, by name."""
         self.table: SamplingTable = table or {}
         self.check(self.table)
         parts = file.cut(self.table, fed)
@@ -247,11 +248,6 @@ class TableGraph:
         """Type and shape of what must be fed with each page, by name."""
         nodes = self.session.get_inputs()
         return {node.name: Port.of(node) for node in nodes if node.name not in self._held}
-
-    @property
-    def ports(self) -> Mapping[str, Port]:
-        """Type and shape of every tensor of the table, by name."""
-        return self._file.table_inputs
 
     def value(self, name: str) -> NDArray[Any]:
         """A tensor of the table, as the graph is run with it.

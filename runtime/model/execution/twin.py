@@ -16,7 +16,7 @@ Real = NDArray[np.float64]
 
 INPUTS = {"parameters": 1, "points": 2, "anchors": 2, "camera_places": 2}
 """Inputs of the graph, all float64, with their number of axes."""
-TWIN_THREADS = 1
+_THREADS = 1
 """For few points at a time, where a second thread would only spin."""
 OUTPUTS = ("places", "phases", "positions", "pixels")
 
@@ -26,15 +26,14 @@ class OnnxTwin:
 
     Args:
         bundle: an opened bundle.
-        threads: threads of one run; by default the cores that this process may use.
 
     Raises:
         BundleError: the graph is no twin with the parameters of `lightpage.calibration.parameters`.
     """
 
-    def __init__(self, bundle: Bundle, threads: int | None = None) -> None:
+    def __init__(self, bundle: Bundle) -> None:
         self._subject = subject = f"{bundle.subject}: {TWIN}"
-        self._session = open_session(bundle.files[TWIN], subject, threads)
+        self._session = open_session(bundle.files[TWIN], subject, _THREADS)
         inputs = self._session.get_inputs()
         found = {node.name: (node.type, len(node.shape)) for node in inputs}
         if found != (expected := {name: ("tensor(double)", axes) for name, axes in INPUTS.items()}):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from lightpage.errors import InvalidInputError, LimitError, MalformedError, NoSourceError, PageError, StalledError
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.device.acquisition.source import FrameSource
+from lightpage.runtime.device.modulator.beam_state import BeamState
 from lightpage.runtime.device.modulator.external import ExternalBeams, ExternalModulator
 from lightpage.runtime.service.caller import Call
 from lightpage.runtime.service.dataplane import DataPlane
@@ -60,13 +61,11 @@ class DisplayCalls:
         if kind == "beams":
             if not isinstance(beams, ExternalBeams):
                 raise _alone(source)
-            beams.beams_set(signal=request.beams.signal, reference=request.beams.reference)
+            beams.announce(BeamState(request.beams.signal, request.beams.reference))
         elif not isinstance(modulator, ExternalModulator):
             raise _alone(source)
-        elif kind == "page":
-            modulator.shown(request.page)
         else:
-            modulator.withdrawn()
+            modulator.announce(request.page if kind == "page" else None)
         return pb.ReportDisplayReply()
 
     def _added(self, symbols: NDArray[np.uint8], levels: int) -> int:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from analysis.comparison import calibration, decoders
+from analysis.comparison import calibration, decoders, kept_figures
 from analysis.comparison.calibration_bench import Bench, Outcome
+from analysis.comparison.kept_figures import FOURTH_DIGIT
 from analysis.comparison.outcome import symbols_by_walls
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.document import Calibration
@@ -19,6 +21,7 @@ from lightpage.device.state import Device, ideal_device
 from lightpage.errors import InvalidInputError
 from lightpage.page.symbols import pilot_mask
 from lightpage.simulator.true_optics import true_parameters
+from lightpage.train.fitting.fitted import FITTED_WEIGHTS
 from lightpage.train.runs import BEGUN
 from tests.lightpage.small import small_profile
 
@@ -50,7 +53,8 @@ def test_the_command_compares_methods_and_says_what_the_device_is(tmp_path: Path
     (tmp_path / "small.toml").write_text(PROFILE.to_toml())
     words = ["--profile", str(tmp_path / "small.toml"), "--pages", "12", "--out", str(tmp_path)]
     words += ["--ideal", "--angle", "-0.3", "--method", "none", "--published-channels", "4", "--published-steps", "10"]
-    done = CliRunner().invoke(decoders.main, [*words, "--trained", str(tmp_path / "kept")], catch_exceptions=False)
+    words += ["--trained", str(tmp_path / "kept"), "--keep"]
+    done = CliRunner().invoke(decoders.main, words, catch_exceptions=False)
     assert done.exit_code == 0, done.output
     begun = json.loads((folder / BEGUN).read_text())
     ideal = ideal_device().with_settings(["geometry.pipe_angle_deg=-0.3", "sensor.full_well_e=32"])
@@ -62,6 +66,18 @@ def test_the_command_compares_methods_and_says_what_the_device_is(tmp_path: Path
     data = ~pilot_mask(PROFILE)
     assert none["own_mi_kB"] == pytest.approx(none["own_mi"] * data.sum() / 8000)
     assert (tmp_path / "figure.png").stat().st_size > 10_000
+    shutil.move(folder / "none", tmp_path / "trained" / "none")
+    done = CliRunner().invoke(decoders.main, words, catch_exceptions=False)
+    assert "trained before" in done.output
+    (found,) = json.loads((tmp_path / "figures.json").read_text())["lights"]
+    assert found["outcomes"][0]["air"] == pytest.approx(none["air"], abs=FOURTH_DIGIT)
+    both = ["--kept", str(tmp_path / "kept" / "small" / folder.name), "--trained", str(tmp_path / "trained")]
+    words = [*both, "--pages", "1", "--out", str(tmp_path / "figures")]
+    done = CliRunner().invoke(kept_figures.main, words, catch_exceptions=False)
+    (line,) = (line.split() for line in done.output.splitlines() if line.startswith("none"))
+    assert float(line[1]) == pytest.approx(float(line[2]), abs=FOURTH_DIGIT)
+    trained, kept = sorted((tmp_path / "figures").rglob(FITTED_WEIGHTS))
+    assert trained.read_bytes() != kept.read_bytes()
 
 
 def test_calibrations_that_are_done_are_not_done_again_and_what_failed_is(

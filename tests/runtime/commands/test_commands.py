@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
@@ -300,14 +299,6 @@ def test_decode_sends_a_recording_and_keeps_the_symbols(
     assert "carry nothing" in capsys.readouterr().err
 
 
-@dataclass(frozen=True)
-class Decoded:
-    symbols: np.ndarray
-    confidence: np.ndarray
-    model_version: str = "1"
-    page: int | None = None
-
-
 @pytest.mark.parametrize("room", [0, 3_000, 20_000])
 def test_a_full_disk_leaves_the_earlier_file_and_no_other(tmp_path: Path, room: int) -> None:
     path = tmp_path / "d.h5"
@@ -316,7 +307,8 @@ def test_a_full_disk_leaves_the_earlier_file_and_no_other(tmp_path: Path, room: 
     with full_disk(room), writing, DecodedWriter(path, 16) as writer:
         for seed in range(3):
             rng = np.random.default_rng(seed)
-            writer.append(Decoded(rng.integers(0, 16, (40, 50), dtype=np.uint8), rng.random((40, 50), np.float32)))
+            symbols = rng.integers(0, 16, (40, 50), dtype=np.uint8)
+            writer.append(symbols, rng.random((40, 50), np.float32), "1", None)
     assert path.read_text() == "earlier"
     assert list(tmp_path.iterdir()) == [path]
 

@@ -76,9 +76,6 @@ def _span(what: str, page_px: int, modulator_px: int, offset_px: int) -> slice:
     """Which of the modulator's rows or columns the page takes; what cannot be centred lies half a pixel further up."""
     start = (modulator_px - page_px) // 2 + offset_px
     if start < 0 or start + page_px > modulator_px:
-        raise InvalidInputError(
-            f"modulator: page of {page_px} {what}",
-            f"pixels {start} to {start + page_px - 1} at offset {offset_px}",
-            f"pixels from 0 to {modulator_px - 1}",
-        )
+        got = f"pixels {start} to {start + page_px - 1} at offset {offset_px}"
+        raise InvalidInputError(f"modulator: page of {page_px} {what}", got, f"pixels from 0 to {modulator_px - 1}")
     return slice(start, start + page_px)

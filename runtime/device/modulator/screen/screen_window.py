@@ -55,15 +55,15 @@ def _serve(settings: ScreenSettings, link: socket.socket, requests: Requests) ->
         from lightpage.runtime.device.modulator.screen.x_window import XWindow
     except (ImportError, OSError) as error:
         expected = "the screen extra (pip install 'lightpage[screen]') and the library libxcb"
-        link.sendall(Answer(0, got=str(error), expected=expected).to_line())
+        link.sendall(Answer(number=0, got=str(error), expected=expected).to_line())
         return 1
     try:
         try:
             window = XWindow(settings)
         except SourceError as error:
-            link.sendall(Answer(0, got=error.got, expected=error.expected).to_line())
+            link.sendall(Answer(number=0, got=error.got, expected=error.expected).to_line())
             return 1
-        link.sendall(Answer(0).to_line())
+        link.sendall(Answer(number=0).to_line())
         while True:
             try:
                 number, page = requests.get(timeout=LOOK_S)
@@ -74,7 +74,7 @@ def _serve(settings: ScreenSettings, link: socket.socket, requests: Requests) ->
                 window.look()
             else:
                 window.draw(page)
-            link.sendall(Answer(number, shows=window.shows).to_line())
+            link.sendall(Answer(number=number, shows=window.shows).to_line())
     except xcffib.XcffibException as error:
         print(f"window of the modulator: {error!r}", file=sys.stderr)
         return 1

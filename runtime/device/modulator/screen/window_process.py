@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import struct
-from dataclasses import asdict, dataclass
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel
 
 from lightpage.helper_process import HelperProcess
 from lightpage.runtime.device.modulator.screen.raster import ScreenSettings
@@ -17,8 +15,7 @@ REQUEST = struct.Struct("!?I")
 """Whether a page follows (one byte per pixel of the modulator, row by row), and the request's number, from 1."""
 
 
-@dataclass(frozen=True)
-class Answer:
+class Answer(BaseModel):
     """A line of JSON from the window's process.
 
     Attributes:
@@ -35,12 +32,7 @@ class Answer:
 
     def to_line(self) -> bytes:
         """As it is sent, the line's end included."""
-        return json.dumps(asdict(self)).encode() + b"\n"
-
-    @classmethod
-    def from_line(cls, line: bytes) -> Self:
-        """Read what `to_line` wrote."""
-        return cls(**json.loads(line))
+        return self.model_dump_json().encode() + b"\n"
 
 
 class WindowProcess(HelperProcess):
@@ -87,7 +79,7 @@ class WindowProcess(HelperProcess):
         return self._answer(self._number, deadline)
 
     def _answer(self, number: int, deadline: float) -> Answer:
-        answer = Answer.from_line(self.line(deadline))
+        answer = Answer.model_validate_json(self.line(deadline))
         if answer.number != number:
             raise ConnectionError(f"its window answers request {answer.number} for {number}")
         return answer

@@ -156,9 +156,7 @@ class XWindow:
         screen = self._screen
         bits = {form.depth: form.bits_per_pixel for form in self._connection.setup.pixmap_formats}
         if (depth := (screen.root_depth, bits[screen.root_depth])) != (24, 32):
-            raise SourceError(
-                "screen", f"a colour depth of {depth[0]} bits in {depth[1]}", "24 in 32: 8 bits of each colour"
-            )
+            raise SourceError("screen", f"a depth of {depth[0]} bits in {depth[1]}", "24 in 32: 8 bits of each colour")
         for extension in (randr.key, present.key):
             if not self._connection.core.QueryExtension(len(extension.name), extension.name).reply().present:
                 raise SourceError("screen", "an X server without the extension " + extension.name, "one with it")
@@ -175,12 +173,10 @@ class XWindow:
 
     def _check_monitor(self) -> Monitor:
         """The monitor, which must have the modulator's pixels: what has others is scaled on its way."""
-        monitors = self._monitors()
-        number = self._settings.monitor
-        if number >= len(monitors):
-            sizes = ", ".join(f"{which} of {monitor} pixels" for which, monitor in enumerate(monitors))
-            raise SourceError("screen", f"monitors {sizes}" if sizes else "no monitor at all", f"monitor {number}")
-        monitor = monitors[number]
+        if (monitor := self._find_monitor()) is None:
+            sizes = ", ".join(f"{which} of {there} pixels" for which, there in enumerate(self._monitors()))
+            got = f"monitors {sizes}" if sizes else "no monitor at all"
+            raise SourceError("screen", got, f"monitor {self._settings.monitor}")
         if (monitor.rows, monitor.columns) != (self._settings.rows_px, self._settings.columns_px):
             raise SourceError(
                 "screen",
@@ -232,8 +228,5 @@ def _connect(settings: ScreenSettings) -> Any:
     try:
         return xcffib.connect(display)
     except xcffib.ConnectionException as error:
-        raise SourceError(
-            "screen",
-            f"no connection to X display {display} ({str(error).rstrip('.')})",
-            "an X server that runs and lets this user in",
-        ) from None
+        got = f"no connection to X display {display} ({str(error).rstrip('.')})"
+        raise SourceError("screen", got, "an X server that runs and lets this user in") from None

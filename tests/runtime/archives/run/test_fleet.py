@@ -186,6 +186,7 @@ def test_what_a_device_is_refused_for_stays_and_all_else_is_tried_again(
     assert len(fleet.deep.asked) == again
 
 
-def test_without_the_other_package_there_is_no_deep_form() -> None:
+def test_without_the_other_package_there_is_no_deep_form(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lightpage.runtime.archives.workers.fine_tuning.entry_points", lambda **_: [])
     with pytest.raises(LightpageError, match="entry point"):
-        deep_recalibration([])
+        deep_recalibration()

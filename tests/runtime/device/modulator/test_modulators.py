@@ -43,14 +43,14 @@ class Window:
         if deadline - self.clock.now() < self.opens_s:
             raise TimeoutError
         self.opens_s = 0.0
-        return Answer(0, got=self.refusal, expected="another")
+        return Answer(number=0, got=self.refusal, expected="another")
 
     def ask(self, deadline: float, image: NDArray[np.uint8] | None = None) -> Answer:
         if self.fault is not None:
             return self.fault()
         if image is not None:
             self.pictures.append(image)
-        return Answer(1, shows=True)
+        return Answer(number=1, shows=True)
 
     def ended(self) -> bool:
         return self.dead
@@ -109,7 +109,7 @@ def test_a_page_counts_as_shown_when_the_liquid_crystal_has_settled(lab: Lab) ->
 
 
 @pytest.mark.parametrize(
-    "fault", [raising(TimeoutError()), raising(ConnectionError("gone")), lambda: Answer(1, shows=False)]
+    "fault", [raising(TimeoutError()), raising(ConnectionError("gone")), lambda: Answer(number=1, shows=False)]
 )
 @pytest.mark.parametrize("behind", [True, False])
 def test_a_window_that_fails_loses_a_page_and_is_opened_again(
@@ -123,7 +123,7 @@ def test_a_window_that_fails_loses_a_page_and_is_opened_again(
     assert lab.windows[0].closed
     lab.show()
     assert (len(lab.windows), len(lab.windows[1].pictures)) == (2, 1)
-    lab.windows[1].fault = lambda: Answer(1, shows=False)
+    lab.windows[1].fault = lambda: Answer(number=1, shows=False)
     assert not lab.screen.shows()
     lab.windows[1].fault = None  # what covered it has gone
     assert lab.screen.shows()
@@ -177,29 +177,29 @@ def test_show_waits_until_the_controller_says_that_the_page_is_on_display(start:
     assert modulator.wanted() is None
     shown = start(show, modulator, 5)
     assert eventually(modulator.wanted) == 5
-    modulator.shown(4)
+    modulator.announce(4)
     assert modulator.wanted() == 5
     assert not shown.done()
     assert not modulator.shows()
-    modulator.shown(5)
+    modulator.announce(5)
     shown.result(WAIT_S)
     assert modulator.shows()
     assert modulator.wanted() is None
-    modulator.shown(5)  # said twice
+    modulator.announce(5)  # said twice
     assert modulator.shows()
     show(modulator, 5, 0.0)  # it needs no wait
 
 
-@pytest.mark.parametrize("leave", [lambda m: m.withdrawn(), lambda m: m.shown(6), lambda m: m.close()])
+@pytest.mark.parametrize("leave", [lambda m: m.announce(None), lambda m: m.announce(6), lambda m: m.close()])
 def test_a_page_is_on_display_until_it_is_withdrawn_or_another_one_announced(
     leave: Callable[[ExternalModulator], None],
 ) -> None:
     modulator = ExternalModulator()
-    modulator.shown(5)
+    modulator.announce(5)
     show(modulator, 5, 0.0)
     leave(modulator)
     assert not modulator.shows()
-    modulator.shown(5)  # back again, but it was away
+    modulator.announce(5)  # back again, but it was away
     assert not modulator.shows()
     show(modulator, 5)
     assert modulator.shows()
@@ -210,7 +210,7 @@ def test_a_page_that_nobody_shows_in_time_is_lost_and_named(start: Start) -> Non
     modulator = ExternalModulator(clock)
     shown = start(show, modulator, 7)
     clock.until_somebody_waits()
-    modulator.shown(8)
+    modulator.announce(8)
     clock.advance(WAIT_S - 1)
     assert modulator.wanted() == 7
     clock.advance(1)
@@ -226,14 +226,14 @@ def test_beams_are_waited_for_in_the_same_way(start: Start) -> None:
     beams = ExternalBeams(WAIT_S)
     moved = start(beams.let_through, signal=False, reference=True)
     assert eventually(beams.wanted) == BeamState(signal=False, reference=True)
-    beams.beams_set(signal=True, reference=True)
+    beams.announce(BeamState(signal=True, reference=True))
     assert not moved.done()
-    beams.beams_set(signal=False, reference=True)
+    beams.announce(BeamState(signal=False, reference=True))
     moved.result(WAIT_S)
     assert beams.wanted() is None
     beams.close()
     assert beams.wanted() == BeamState(signal=True, reference=True)
-    beams.beams_set(signal=True, reference=True)
+    beams.announce(BeamState(signal=True, reference=True))
     assert beams.wanted() is None
     beams.close()
     assert beams.wanted() is None
@@ -260,7 +260,7 @@ def test_a_controller_that_may_have_blocked_a_beam_is_asked_to_open_it(start: St
         with pytest.raises(LostShotError):
             moved.result(WAIT_S)
         assert beams.wanted() == BeamState(signal=True, reference=True)
-    beams.beams_set(signal=True, reference=True)
+    beams.announce(BeamState(signal=True, reference=True))
     beams.let_through(signal=True, reference=True)
     assert beams.wanted() is None
 

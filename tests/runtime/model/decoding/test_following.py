@@ -74,7 +74,7 @@ def test_the_shipped_decoder_follows_an_image_that_moves_over_its_reference() ->
         if len(rates) == 1:
             simulator.knock((float(by[0]), float(by[1])))
     state = tracker.state
-    expected = BundleTables(decoder, OnnxTwin(decoder.bundle, 1)).tilt_of(by)
+    expected = BundleTables(decoder, OnnxTwin(decoder.bundle)).tilt_of(by)
     np.testing.assert_allclose(state.drift[SHIFT], by, atol=0.03)
     # the reference's ripple, of which other parts lie under the image now, adds a tilt of its own
     assert np.linalg.norm(state.drift[TILT] - expected) < 0.5 * np.linalg.norm(expected)

@@ -67,7 +67,7 @@ def test_constants_stay_bound_and_a_feed_stands_in_for_one() -> None:
     feeds = {name: rng.integers(20, 200, toy.SHAPE, dtype=np.uint8) for name in ("in_phase", "quadrature")}
     expected = session.run(["p", "phase"], feeds)
     others = {"in_phase": feeds["in_phase"][::-1], "quadrature": feeds["quadrature"]}
-    bound = BoundSession(session, ON_CPU, {"quadrature": feeds["quadrature"], "in_phase": others["in_phase"]})
+    bound = BoundSession(session, ON_CPU, {"quadrature": feeds["quadrature"], "in_phase": others["in_phase"]}, "toy")
     for _ in range(2):
         got = bound.run(["p", "phase"], {"in_phase": feeds["in_phase"]})
         for one, other in zip(got, expected, strict=True):
@@ -79,9 +79,9 @@ def test_what_a_gpu_says_is_told_and_a_graph_s_own_failure_is_not_the_gpus() -> 
     session = open_session(toy.decoder_onnx(), "toy", 1)
     in_vain = {"in_phase": np.zeros((3, 3), np.uint8)}
     with pytest.raises(ProviderError, match=r"^provider cuda:1"):
-        BoundSession(session, Provider("cuda", 1), in_vain).run(["p"], {})
+        BoundSession(session, Provider("cuda", 1), in_vain, "toy").run(["p"], {})
     with pytest.raises(RuntimeError):
-        BoundSession(session, ON_CPU, in_vain).run(["p"], {})
+        BoundSession(session, ON_CPU, in_vain, "toy").run(["p"], {})
 
 
 def test_models_behind_the_first_are_computed_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -48,7 +48,7 @@ def bundle_with(path: Path, graph: bytes) -> Bundle:
 
 
 def test_rays_and_pixels_come_back_to_the_last_digit_of_float64(tmp_path: Path) -> None:
-    twin = OnnxTwin(bundle_with(tmp_path / "b.zip", twin_graph()), threads=1)
+    twin = OnnxTwin(bundle_with(tmp_path / "b.zip", twin_graph()))
     parameters = np.zeros(len(NAMES))
     parameters[0] = 1e-9
     points = np.array([[1e-3, 2e-3], [5e-4, -1e-3]])
@@ -60,7 +60,7 @@ def test_rays_and_pixels_come_back_to_the_last_digit_of_float64(tmp_path: Path) 
 
 
 def test_many_devices_at_once_are_each_device_by_itself(tmp_path: Path) -> None:
-    twin = OnnxTwin(bundle_with(tmp_path / "b.zip", twin_graph()), threads=1)
+    twin = OnnxTwin(bundle_with(tmp_path / "b.zip", twin_graph()))
     devices = np.random.default_rng(0).normal(size=(3, len(NAMES)))
     points = np.random.default_rng(1).normal(size=(5, 2))
     together = twin.trace(devices, points)
@@ -81,4 +81,4 @@ def test_many_devices_at_once_are_each_device_by_itself(tmp_path: Path) -> None:
 )
 def test_a_foreign_graph_is_refused(tmp_path: Path, graph: bytes, complaint: str) -> None:
     with pytest.raises(BundleError, match=complaint):
-        OnnxTwin(bundle_with(tmp_path / "b.zip", graph), threads=1)
+        OnnxTwin(bundle_with(tmp_path / "b.zip", graph))
