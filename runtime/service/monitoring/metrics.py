@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from typing import TYPE_CHECKING
 
 from prometheus_client import (
@@ -171,15 +172,15 @@ class ServiceMetrics:
 
     def watch_load(self, decodes: Slots, received: ReceiveBudget) -> None:
         """Show how busy the service is, whenever somebody looks."""
-        self.registry.register(_LoadFigures(decodes, received))
+        self.registry.register(_Figures(partial(_load, decodes, received)))
 
     def watch(self, source: FrameSource) -> None:
         """Show what the source counts, whenever somebody looks."""
-        self.registry.register(_SourceFigures(source))
+        self.registry.register(_Figures(partial(_source, source)))
 
     def watch_store(self, health: StoreHealth, trouble: Callable[[], Trouble | None]) -> None:
         """Show whether the store is well, and else its `trouble`, as far as it is known; whenever somebody looks."""
-        self.registry.register(_StoreFigures(health, trouble))
+        self.registry.register(_Figures(partial(_store, health, trouble)))
 
     def watch_certificates(self, ends_s: Callable[[], float]) -> None:
         """Show when the first certificate ends, whenever somebody looks."""
@@ -198,61 +199,50 @@ class ServiceMetrics:
             self._versions = self._versions[-VERSIONS:]
 
 
-class _LoadFigures(Collector):
+class _Figures(Collector):
+    """What is counted elsewhere, as it is whenever somebody looks."""
+
+    def __init__(self, look: Callable[[], Iterator[Metric]]) -> None:
+        self._look = look
+
+    def collect(self) -> Iterator[Metric]:
+        """The figures as they are now."""
+        return self._look()
+
+
+def _load(decodes: Slots, received: ReceiveBudget) -> Iterator[Metric]:
     """How busy the service is."""
-
-    def __init__(self, decodes: Slots, received: ReceiveBudget) -> None:
-        self._decodes, self._received = decodes, received
-
-    def collect(self) -> Iterator[Metric]:
-        """The figures as they are now."""
-        decodes, received = self._decodes, self._received
-        yield GaugeMetricFamily("lightpage_decodes_waiting", "Pages that wait for a slot.", value=decodes.queued)
-        yield GaugeMetricFamily("lightpage_decodes_busy", "Slots in which a page is decoded.", value=decodes.busy)
-        yield GaugeMetricFamily("lightpage_decodes_slots", "Pages decoded at once, at most.", value=decodes.count)
-        yield CounterMetricFamily("lightpage_received_bytes", "Frames that callers sent.", value=received.taken)
-        yield GaugeMetricFamily("lightpage_receive_buffer_bytes", "Of them not yet decoded.", value=received.used)
-        yield GaugeMetricFamily("lightpage_receive_buffer_limit_bytes", "At most so many.", value=received.size)
+    yield GaugeMetricFamily("lightpage_decodes_waiting", "Pages that wait for a slot.", value=decodes.queued)
+    yield GaugeMetricFamily("lightpage_decodes_busy", "Slots in which a page is decoded.", value=decodes.busy)
+    yield GaugeMetricFamily("lightpage_decodes_slots", "Pages decoded at once, at most.", value=decodes.count)
+    yield CounterMetricFamily("lightpage_received_bytes", "Frames that callers sent.", value=received.taken)
+    yield GaugeMetricFamily("lightpage_receive_buffer_bytes", "Of them not yet decoded.", value=received.used)
+    yield GaugeMetricFamily("lightpage_receive_buffer_limit_bytes", "At most so many.", value=received.size)
 
 
-class _SourceFigures(Collector):
+def _source(source: FrameSource) -> Iterator[Metric]:
     """What a source counts by itself."""
-
-    def __init__(self, source: FrameSource) -> None:
-        self._source = source
-
-    def collect(self) -> Iterator[Metric]:
-        """The figures as they are now."""
-        shots = CounterMetricFamily("lightpage_shots", "Shots of the cameras, by how they ended.", labels=["outcome"])
-        for outcome, count in self._source.shots_by_outcome().items():
-            shots.add_metric([outcome], count)
-        yield shots
-        share = GaugeMetricFamily("lightpage_saturated_share", "Pixels at full scale, last frame.", labels=["camera"])
-        for camera, value in self._source.saturated_shares().items():
-            share.add_metric([camera], value)
-        yield share
-        about = "1 where pages of the source can be read, 0 where a beam may be blocked."
-        yield GaugeMetricFamily("lightpage_source_ok", about, value=float(not self._source.trouble()))
+    shots = CounterMetricFamily("lightpage_shots", "Shots of the cameras, by how they ended.", labels=["outcome"])
+    for outcome, count in source.shots_by_outcome().items():
+        shots.add_metric([outcome], count)
+    yield shots
+    share = GaugeMetricFamily("lightpage_saturated_share", "Pixels at full scale, last frame.", labels=["camera"])
+    for camera, value in source.saturated_shares().items():
+        share.add_metric([camera], value)
+    yield share
+    about = "1 where pages of the source can be read, 0 where a beam may be blocked."
+    yield GaugeMetricFamily("lightpage_source_ok", about, value=float(not source.trouble()))
 
 
-class _StoreFigures(Collector):
-    """How the store is."""
-
-    def __init__(self, health: StoreHealth, trouble: Callable[[], Trouble | None]) -> None:
-        self._health, self._trouble = health, trouble
-
-    def collect(self) -> Iterator[Metric]:
-        """The figures as they are now; a disk that hangs is waited for no longer than `_LOOK_S`."""
-        is_well = self._health.is_well(_LOOK_S)
-        found = None if is_well else self._reason()
-        yield GaugeMetricFamily("lightpage_store_ok", "1 where the model store is well.", value=float(is_well))
-        reasons = GaugeMetricFamily("lightpage_store_trouble", "1 for what is wrong with it.", labels=["reason"])
-        for reason in Reason:
-            reasons.add_metric([reason.value], float(reason is found))
-        yield reasons
-
-    def _reason(self) -> Reason | None:
-        if self._health.hangs:
-            return Reason.HUNG
-        trouble = self._trouble()
-        return None if trouble is None else trouble.reason
+def _store(health: StoreHealth, trouble: Callable[[], Trouble | None]) -> Iterator[Metric]:
+    """How the store is; a disk that hangs is waited for no longer than `_LOOK_S`."""
+    is_well, found = health.is_well(_LOOK_S), None
+    if not is_well and health.hangs:
+        found = Reason.HUNG
+    elif not is_well and (known := trouble()) is not None:
+        found = known.reason
+    yield GaugeMetricFamily("lightpage_store_ok", "1 where the model store is well.", value=float(is_well))
+    reasons = GaugeMetricFamily("lightpage_store_trouble", "1 for what is wrong with it.", labels=["reason"])
+    for reason in Reason:
+        reasons.add_metric([reason.value], float(reason is found))
+    yield reasons
