@@ -106,9 +106,7 @@ DEFAULT_SIZE = f"{Hyperparameters.channels}x{Hyperparameters.blocks}x{Hyperparam
 @click.option(
     "--published-channels", type=click.IntRange(4), multiple=True, default=(32,), show_default=True, help="Network."
 )
-@click.option(
-    "--method", "names", type=click.Choice(METHODS), multiple=True, default=METHODS, show_default=True
-)
+@click.option("--method", "names", type=click.Choice(METHODS), multiple=True, default=METHODS, show_default=True)
 @click.option(
     "--levels",
     type=click.IntRange(2, 255),
@@ -189,8 +187,7 @@ def main(
                     "ideal": ideal,
                     "outcomes": [outcome.as_json() for outcome in outcomes],
                 }
-                # data sets are `lights` there, as in earlier versions
-                write_json(out / "figures.json", {"pages": pages, "seed": seed, "lights": [*measured, data_set]})
+                write_json(out / "figures.json", {"pages": pages, "seed": seed, "data_sets": [*measured, data_set]})
                 draw([*measured, data_set], out)
         measured.append(data_set)
         click.echo(f"\n{title(data_set)}")

@@ -98,5 +98,5 @@ def _maps(part: Any, outcomes: list[dict[str, Any]], out: Path) -> None:
 
 def _name(outcome: dict[str, Any]) -> str:
     """A method, without the number of its refinements if that is one; published ones are marked."""
-    method = str(outcome["arm"]).removesuffix(" 1")
+    method = str(outcome["method"]).removesuffix(" 1")
     return f"{method} (published)" if method in PUBLISHED else method

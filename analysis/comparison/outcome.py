@@ -35,10 +35,6 @@ def gained_at_the_end(curve: Curve, steps: int) -> float:
     return max(late) - max(early) if late and early else float("nan")
 
 
-_KEYS = {"method": "arm", "passes": "looks"}
-"""Attributes of an outcome whose keys in JSON have other names."""
-
-
 @dataclass(frozen=True)
 class Outcome:
     """What one method reached with a network of one size.
@@ -81,11 +77,8 @@ class Outcome:
         return self.gained_in_last_fifth < SETTLED_BITS
 
     def as_json(self) -> dict[str, Any]:
-        """Its entry in `figures.json` and `ablation.json`.
-
-        The files' keys are kept as earlier versions wrote them: `arm` for the method, `looks` for its passes.
-        """
-        return {_KEYS.get(name, name): value for name, value in asdict(self).items()}
+        """Return its entry in `figures.json` and `ablation.json`."""
+        return asdict(self)
 
     def line(self) -> str:
         over = ["" if ratio is None else f"{ratio:.3f}" for ratio in (self.over_oracle, self.over_published)]

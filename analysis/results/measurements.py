@@ -135,15 +135,17 @@ def comparison(figures: Figures) -> Figures:
     curves = {"training_curve", "validation_curve"}
     data_sets = [
         data_set | {"outcomes": [{key: of[key] for key in of if key not in curves} for of in data_set["outcomes"]]}
-        for data_set in figures["lights"]
+        for data_set in figures["data_sets"]
     ]
-    return figures | {"lights": data_sets}
+    return figures | {"data_sets": data_sets}
 
 
 def methods(measurement: Measurement) -> set[str]:
     """Methods of a comparison with the angle that each was measured at; of another measurement none."""
-    data_sets = measurement.figures.get("lights", [])
-    return {f"{of['arm']} at {data_set['angle_deg']:g} degree" for data_set in data_sets for of in data_set["outcomes"]}
+    data_sets = measurement.figures.get("data_sets", [])
+    return {
+        f"{of['method']} at {data_set['angle_deg']:g} degree" for data_set in data_sets for of in data_set["outcomes"]
+    }
 
 
 def evaluation(figures: Figures) -> Figures:

@@ -75,10 +75,10 @@ class Results:
 
     def outcome(self, name: str, angle_deg: float, method: str) -> Figures | None:
         """The outcome of a comparison's method at a pipe angle, with its exposure."""
-        for data_set in (self.figures(name) or {"lights": []})["lights"]:
+        for data_set in (self.figures(name) or {"data_sets": []})["data_sets"]:
             for outcome in data_set["outcomes"]:
                 # the name of a method with several passes ends with their number
-                if data_set["angle_deg"] == angle_deg and outcome["arm"].removesuffix(" 1") == method:
+                if data_set["angle_deg"] == angle_deg and outcome["method"].removesuffix(" 1") == method:
                     return {"exposure": data_set["exposure"], **outcome}
         self._miss(f"{name}, {angle_deg:g} degree, {method}")
         return None

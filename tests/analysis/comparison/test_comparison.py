@@ -59,9 +59,9 @@ def test_the_command_compares_methods_and_says_what_the_device_is(tmp_path: Path
     begun = json.loads((folder / BEGUN).read_text())
     ideal = ideal_device().with_settings(["geometry.pipe_angle_deg=-0.3", "sensor.full_well_e=32"])
     assert Device.model_validate(begun["device"]) == ideal
-    (found,) = json.loads((tmp_path / "figures.json").read_text())["lights"]
+    (found,) = json.loads((tmp_path / "figures.json").read_text())["data_sets"]
     (none,) = found["outcomes"]
-    assert (none["arm"], none["size"], none["steps"]) == ("none", "4/8", 10)
+    assert (none["method"], none["size"], none["steps"]) == ("none", "4/8", 10)
     assert len(none["validation_curve"]) > 0
     data = ~pilot_mask(PROFILE)
     assert none["own_mi_kB"] == pytest.approx(none["own_mi"] * data.sum() / 8000)
@@ -69,7 +69,7 @@ def test_the_command_compares_methods_and_says_what_the_device_is(tmp_path: Path
     shutil.move(folder / "none", tmp_path / "trained" / "none")
     done = CliRunner().invoke(decoders.main, words, catch_exceptions=False)
     assert "trained before" in done.output
-    (found,) = json.loads((tmp_path / "figures.json").read_text())["lights"]
+    (found,) = json.loads((tmp_path / "figures.json").read_text())["data_sets"]
     assert found["outcomes"][0]["air"] == pytest.approx(none["air"], abs=FOURTH_DIGIT)
     both = ["--kept", str(tmp_path / "kept" / "small" / folder.name), "--trained", str(tmp_path / "trained")]
     words = [*both, "--pages", "1", "--out", str(tmp_path / "figures")]

@@ -27,12 +27,12 @@ README = {
 
 def outcome(method: str, air: float, gained: float = 0.001) -> dict[str, Any]:
     curves = {"training_curve": [[1, 0.5]], "validation_curve": [[1, 0.4]]}
-    return {"arm": method, "air": air, "page_kB": air / 2, "steps": 1200, "gained_in_last_fifth": gained, **curves}
+    return {"method": method, "air": air, "page_kB": air / 2, "steps": 1200, "gained_in_last_fifth": gained, **curves}
 
 
 def toy(*outcomes: dict[str, Any], angle_deg: float = -0.6) -> dict[str, Any]:
     data_set = {"angle_deg": angle_deg, "full_well_e": 32.0, "exposure": 0.5, "outcomes": list(outcomes)}
-    return {"pages": 60, "seed": 1, "lights": [data_set]}
+    return {"pages": 60, "seed": 1, "data_sets": [data_set]}
 
 
 def written(path: Path, figures: object) -> Path:
@@ -100,7 +100,7 @@ def test_figures_are_collected_without_their_curves_and_what_lacks_is_left_out(t
     kept = kept_measurements(tmp_path / "kept")
     assert list(kept) == ["sheared"]
     assert (kept["sheared"].source, kept["sheared"].note) == ("measured 2023-11-14 on commit 0123456", "")
-    for one in figures["lights"][0]["outcomes"]:
+    for one in figures["data_sets"][0]["outcomes"]:
         del one["training_curve"], one["validation_curve"]
     assert kept["sheared"].figures == figures
     assert (tmp_path / "images" / "decoders.png").read_bytes() == b"picture"
