@@ -299,8 +299,8 @@ class UnconfirmedPageError(LostPageError):
     """The pilots of a page do not bear out what the decoder claims of it: its symbols would be noise.
 
     Attributes:
-        page: what was decoded, for figures and never for an answer (`unconfirmed_page`); None
-            on the client's side.
+        page: what was decoded, for figures and never for an answer; None on the client's side. The runtime's
+            `tracking.unconfirmed_page` says of which class it is.
     """
 
     page: object = None

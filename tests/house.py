@@ -13,13 +13,15 @@ from pathlib import Path
 import grimp
 
 ROOT = Path(__file__).resolve().parents[1]
+_MADE = {"pb", "build", "dist", "runs", "out", "lightning_logs"}
+"""Folders of what commands make, generated stubs among them."""
 _NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 
 
 def figures() -> dict[str, float]:
     """Return each figure by its name in `limits.toml`."""
-    tops = [path for path in ROOT.iterdir() if path.is_dir() and path.name[0] != "." and path.name != "build"]
-    code = [path for top in tops for path in top.rglob("*.py") if "pb" not in path.parts]  # links are not followed
+    tops = [path for path in ROOT.iterdir() if path.is_dir() and path.name[0] != "." and path.name not in _MADE]
+    code = [path for top in tops for path in top.rglob("*.py") if not _MADE & {*path.parts}]  # links are not followed
     product = [path for path in code if path.relative_to(ROOT).parts[0] != "tests"]
     graph = grimp.build_graph("lightpage", cache_dir=None)
     rooms = graph.find_children("lightpage.runtime")

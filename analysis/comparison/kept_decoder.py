@@ -50,6 +50,7 @@ def kept_decoder(
 
 
 def validation_air(trained: Path, refinements: int) -> float:
+    """Return the AIR that a kept decoder had on its validation pages, bits a symbol."""
     folder = trained / f"refinement-{refinements}" if refinements else trained
     return float(json.loads((folder / FITTED).read_text())["validation_air"])
 

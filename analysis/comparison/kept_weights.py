@@ -35,6 +35,9 @@ LARGE = 1000
 _PROBE = 1 / 16
 """Step by which the effect of a tensor's rounding is found, and of the coarsest one, over its root mean square."""
 _LEAST_MOVED_BITS = 1e-9
+_MOST_STEPS = 127 * 256 + 127
+"""Largest whole number that two signed bytes hold, the low one of which may be negative."""
+_TRIES = 60
 _STEP, _HIGH = ":step", ":high"
 """Behind a tensor's name: its step; and of its whole numbers what one byte cannot hold."""
 _PACKED = [{"id": lzma.FILTER_LZMA2, "preset": 9 | lzma.PRESET_EXTREME, "lc": 0, "lp": 0, "pb": 0}]
@@ -46,9 +49,16 @@ def steps(module: DecoderTraining[Any], pages: Dataset[Page]) -> dict[str, float
 
     A change grows as the square of a step, and the changes by all tensors add up. They are shared out by the numbers
     that each tensor has, which makes the fewest bytes.
+
+    Raises:
+        InvalidInputError: there are no such steps.
     """
     whole = {name: value.clone() for name, value in module.network.state_dict().items()}
-    large = {name: value for name, value in whole.items() if value.is_floating_point() and value.numel() >= LARGE}
+    large = {
+        name: value
+        for name, value in whole.items()
+        if value.is_floating_point() and value.numel() >= LARGE and value.any()
+    }
     before = decode_pages(module, pages)[0]
 
     def moved(by: Mapping[str, float]) -> float:
@@ -59,13 +69,17 @@ def steps(module: DecoderTraining[Any], pages: Dataset[Page]) -> dict[str, float
     shares = {name: large[name].numel() / sum(map(torch.numel, large.values())) for name in large}
     effects = {name: max(moved({name: step}), _LEAST_MOVED_BITS) for name, step in probes.items()}
     allowed, found = MOST_MOVED_BITS, dict[str, float]()
-    while not found or moved(found) > MOST_MOVED_BITS:
-        for name, step in probes.items():
-            finest, coarsest = float(large[name].abs().max()) / np.iinfo(np.int16).max, step / _PROBE
-            found[name] = min(max(step * math.sqrt(allowed * shares[name] / effects[name]), finest), coarsest)
-        allowed *= 0.7
-    module.network.load_state_dict(whole)
-    return found
+    try:
+        for _ in range(_TRIES):
+            for name, step in probes.items():
+                finest, coarsest = float(large[name].abs().max()) / _MOST_STEPS, step / _PROBE
+                found[name] = min(max(step * math.sqrt(allowed * shares[name] / effects[name]), finest), coarsest)
+            if moved(found) <= MOST_MOVED_BITS:
+                return found
+            allowed *= 0.7
+    finally:
+        module.network.load_state_dict(whole)
+    raise InvalidInputError("weights", "numbers that even two bytes each change too much", "a decoder that was trained")
 
 
 def moved_bits(before: NDArray[np.floating], after: NDArray[np.floating]) -> float:
@@ -98,7 +112,7 @@ def write_weights(path: Path, weights: Mapping[str, Tensor], by: Mapping[str, fl
 
 
 def read_weights(path: Path) -> dict[str, Tensor]:
-    """Weights that `write_weights` wrote, float32.
+    """Read weights that `write_weights` wrote: float32 where they were rounded, else of the type that they had.
 
     Raises:
         InvalidInputError: they are missing or damaged.
@@ -106,9 +120,9 @@ def read_weights(path: Path) -> dict[str, Tensor]:
     try:
         with np.load(io.BytesIO(lzma.decompress(path.read_bytes()))) as kept:
             arrays = dict(kept)
-    except (OSError, lzma.LZMAError, EOFError, ValueError, BadZipFile) as error:
+        for name in [name for name in arrays if name + _STEP in arrays]:
+            whole = arrays[name] + 256 * arrays.pop(name + _HIGH).astype(np.float32)
+            arrays[name] = whole * arrays.pop(name + _STEP)
+    except (OSError, lzma.LZMAError, EOFError, ValueError, KeyError, BadZipFile) as error:
         raise InvalidInputError(f"kept weights {path}", error, "those that --keep has written") from None
-    for name in [name for name in arrays if name + _STEP in arrays]:
-        whole = arrays[name] + 256 * arrays.pop(name + _HIGH).astype(np.float32)
-        arrays[name] = whole * arrays.pop(name + _STEP)
     return {name: torch.from_numpy(value) for name, value in arrays.items()}

@@ -84,6 +84,8 @@ class WeightStore:
     def keep(self, run: Path, trained: Fitted[Any], pages: Dataset[Page]) -> None:
         """Keep a trained run, if that was wanted, as small as `pages` allow (`analysis.comparison.kept_weights`).
 
+        A refinement of it is kept by a call of its own.
+
         Raises:
             InvalidInputError: another data set, another calibration, or another training with the same options is kept.
         """

@@ -104,7 +104,7 @@ def end_with_parent(link: socket.socket) -> None:
 
 
 def telling(link: socket.socket) -> Progress:
-    """What tells the parent of each step, in a line of JSON."""
+    """Return what tells the parent of each step, in a line of JSON."""
     return lambda name, fraction: link.sendall(json.dumps([name, fraction]).encode() + b"\n")
 
 

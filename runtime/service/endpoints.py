@@ -21,7 +21,7 @@ from lightpage.runtime.service.shared_memory import SharedMemory
 
 @dataclass(frozen=True)
 class Endpoints:
-    """Where a service is reached.
+    """The addresses of a service.
 
     Attributes:
         target: for calls.

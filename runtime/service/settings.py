@@ -543,7 +543,7 @@ def _fields(table: str) -> Mapping[str, FieldInfo]:
 
 
 def _told(error: ErrorDetails, origins: Mapping[Key, str]) -> tuple[str, str, str]:
-    """Where one wrong setting comes from, what came, and what was wanted."""
+    """Return where one wrong setting comes from, what came, and what was wanted."""
     problem = problem_of(ServiceSettings, error)
     place = problem.place or problem.got.partition(" = ")[0]  # of settings that do not go together
     table, _, name = place.partition(".")

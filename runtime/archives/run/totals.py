@@ -191,7 +191,7 @@ class Reading:
 
     @classmethod
     def of(cls, record: ShardRecord, pages: int) -> Reading:
-        """That of a shard."""
+        """Return the reading of a shard."""
         return cls(record.finished_s, record.seconds, pages, record.worker, record.read_bytes)
 
 
@@ -348,7 +348,10 @@ def _pages(
 ) -> Iterator[tuple[ShardRecord, PageRecord]]:
     """The readings that count of the pages of a range, each with the shard that it is from; rounds are counted."""
     best: dict[int, tuple[ShardRecord, PageRecord]] = {}
-    for number, shard in ledger.readings(index, task.pages[0], there, 1 + len(job.rounds)).items():
+    readings = ledger.readings(index, task.pages[0], there, 1 + len(job.rounds))
+    if 0 not in readings:  # it is read again, and what a later round found of its pages cannot be compared
+        return
+    for number, shard in readings.items():
         record = ShardRecord.read(shard)
         found.readings.append(Reading.of(record, len(record.pages)))
         for part in record.confidence_bins if number == 0 else ():

@@ -10,7 +10,7 @@ LOCAL, RAY = "local", "ray"
 
 
 def engine_of(name: str, address: str | None, workers: int | None, threads: int | None, provider: Provider) -> Engine:
-    """What has the work done.
+    """Return the engine that has the work done.
 
     Args:
         name: `LOCAL` or `RAY`.

@@ -215,7 +215,9 @@ class AravisSetup:
 
     def check(self) -> float:
         """Read everything back; returns the exposure time that the camera keeps, in seconds."""
-        wanted = {**self._trigger, "AcquisitionMode": "Continuous", "PixelFormat": self.settings.pixel_format}
+        # The selector says only which trigger the others are of; a camera may go back to its own.
+        wanted = {feature: value for feature, value in self._trigger.items() if feature != "TriggerSelector"}
+        wanted |= {"AcquisitionMode": "Continuous", "PixelFormat": self.settings.pixel_format}
         for feature, expected in wanted.items():
             with self._setting(feature, expected):
                 got = self._library.text("arv_camera_get_string", self._camera, feature.encode())

@@ -49,7 +49,7 @@ class PixelFormat:
 
 
 def _spread_p(bits: int) -> Callable[[_Words], _Words]:
-    """Of GenICam's packing, which leaves no gaps between pixels."""
+    """Return what spreads the pixels of GenICam's packing, which leaves no gaps between them."""
     pair, first = (1 << 2 * bits) - 1, (1 << bits) - 1
     pairs_low, pairs_high = np.uint64(pair), np.uint64(pair << 2 * bits)
     firsts, seconds = np.uint64(first | first << 32), np.uint64((first | first << 32) << bits)

@@ -35,7 +35,7 @@ SIGN_OF_LIFE_S = 0.05
 
 
 def tolerance(key: str, value: float) -> float:
-    """By how much a number that is read back may differ; a camera exposes for whole lines of its sensor."""
+    """Return how much a number that is read back may differ; a camera exposes for whole lines of its sensor."""
     return {"exposure_us": 0.05 * value, "gain_db": 0.1, "black_level_counts": 0.5}.get(key, 0.0)
 
 

@@ -5,12 +5,13 @@ A caller that gives up takes nothing with it: the answer that may still come bel
 
 from __future__ import annotations
 
+import queue
 import re
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
-from typing import TypeVar
+from concurrent.futures import Future
+from functools import partial
+from typing import Any, TypeVar
 
 from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import LostShotError, Reason
@@ -43,8 +44,10 @@ class ScpiLine:
         self._clock = clock
         self._port = ScpiPort(port, baud, self._times, clock)
         self.name = self._port.name
-        self._owner = ThreadPoolExecutor(1, self.name)
-        """Its only thread is the only one that touches the port."""
+        self._requests: queue.SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = queue.SimpleQueue()
+        self._lock = threading.Lock()
+        """Guards the thread's start and end."""
+        self._thread: threading.Thread | None = None
 
     @property
     def session(self) -> int:
@@ -79,9 +82,13 @@ class ScpiLine:
         return self._wait(self._port.ask_twice, question, answer, session)
 
     def close(self) -> None:
-        """Let go of the line; the next message opens it again."""
-        with suppress(TimeoutError):
-            self._owner.submit(self._port.close).result(_STOP_S)
+        """Let go of the line and end the thread; the next message opens it again."""
+        with self._lock:
+            if self._thread is not None:
+                self._requests.put(None)
+                self._thread.join(_STOP_S)
+                if not self._thread.is_alive():
+                    self._thread = None
 
     def _wait(
         self,
@@ -91,7 +98,13 @@ class ScpiLine:
         session: int | None,
     ) -> T:
         timeout_s = self._times.longest_s
-        result = self._owner.submit(ask, message, answer, session, self._clock.now() + timeout_s)
+        result: Future[T] = Future()
+        with self._lock:
+            if self._thread is None or not self._thread.is_alive():
+                # A port that hangs must not keep the process from ending.
+                self._thread = threading.Thread(target=self._own, name=self.name, daemon=True)
+                self._thread.start()
+            self._requests.put((result, partial(ask, message, answer, session, self._clock.now() + timeout_s)))
         answered = threading.Event()
         result.add_done_callback(lambda _: answered.set())
         if not self._clock.wait(answered, timeout_s + _GRACE_S):
@@ -99,3 +112,14 @@ class ScpiLine:
             told = f"{message} not answered within {timeout_s:g} s"
             raise LostShotError(self.name, told, "an answer", Reason.TRIGGER_GONE)
         return result.result()
+
+    def _own(self) -> None:
+        """Serve callers until told to stop; only this thread touches the port."""
+        while (request := self._requests.get()) is not None:
+            result, ask = request
+            if result.set_running_or_notify_cancel():
+                try:
+                    result.set_result(ask())
+                except BaseException as error:  # whatever it is, it is the caller's
+                    result.set_exception(error)
+        self._port.close()

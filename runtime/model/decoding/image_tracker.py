@@ -174,7 +174,7 @@ class ImageTracker:
         self._decoder, self._model, self._tables, self._search = decoder, model, tables, search
         start = np.diag([SEARCH_ERROR_PX, SEARCH_ERROR_PX, START_TILT, START_TILT]) ** 2
         self._lock = threading.Lock()
-        """Of who replaces the state; never held while anything is computed."""
+        """Held by whoever replaces the state; never held while anything is computed."""
         self.state = ImageState(np.zeros(4), start, decoder, {}, np.zeros(2), WALK**2)
         """What the next page is decoded with."""
         if memory is not None:

@@ -36,7 +36,7 @@ class Port:
 
     @classmethod
     def of(cls, node: onnxruntime.NodeArg) -> Port:
-        """As a session describes it; a name or None stands for a free dimension."""
+        """Return the port that a session describes; a name or None stands for a free dimension."""
         shape = tuple(size if isinstance(size, int) else None for size in node.shape)
         kind = node.type.removeprefix("tensor(").removesuffix(")")
         return cls(_NUMPY_NAMES.get(kind, kind), shape)

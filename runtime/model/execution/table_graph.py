@@ -213,8 +213,10 @@ class TableGraph:
         provider: Provider = ON_CPU,
     ) -> None:
         self._file, self._subject, self._fed_names, self._threads = file, subject, fed, threads
-        self.provider, self.ports = provider, file.table_inputs
-        """What computes pages; and type and shape of every tensor of the table, by name."""
+        self.provider = provider
+        """What computes pages."""
+        self.ports = file.table_inputs
+        """Type and shape of every tensor of the table, by name."""
         self.table: SamplingTable = table or {}
         self.check(self.table)
         parts = file.cut(self.table, fed)

@@ -126,6 +126,7 @@ class _Messages:
         try:
             return self._parse(message)
         except DecodeError as error:
+            await self.aclose()
             raise MalformedError(f"message of {self._name}", str(error), "one that can be parsed") from None
 
     async def aclose(self) -> None:

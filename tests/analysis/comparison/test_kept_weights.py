@@ -79,6 +79,13 @@ def test_what_is_said_moves_by_the_relative_entropy() -> None:
     assert moved_bits(said, said) == 0
 
 
+def test_the_largest_numbers_of_the_finest_step_keep_their_sign(tmp_path: Path) -> None:
+    most = 127 * 256 + 127
+    weights = {"weight": torch.linspace(-1, 1, 2001)}
+    write_weights(tmp_path / "kept", weights, {"weight": 1 / most})
+    torch.testing.assert_close(read_weights(tmp_path / "kept")["weight"], weights["weight"], rtol=0, atol=0.51 / most)
+
+
 def test_damaged_weights_are_refused(tmp_path: Path) -> None:
     write_weights(tmp_path / "kept", {"weight": torch.ones(3)}, {})
     whole = (tmp_path / "kept").read_bytes()

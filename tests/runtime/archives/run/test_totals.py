@@ -64,6 +64,16 @@ def test_a_round_says_what_it_has_brought(tmp_path: Path) -> None:
     assert [reading.pages for reading in found.readings] == [3, 3, 1, 1]
 
 
+def test_a_range_that_is_read_again_is_missing_whatever_a_round_found_of_it(tmp_path: Path) -> None:
+    ledger, asked = Ledger(tmp_path), job(source("a"), rounds=(NEWER,))
+    write(ledger.shard(0, 0), lost(0), lost(1), lost(2))
+    write(ledger.shard(0, 3), page(3))
+    write(ledger.shard(0, 0, 1), page(0, 3.0), lost(1), page(2), model=NEWER)
+    ledger.doubt_losses(asked)
+    found = totals(ledger, asked).to_json()
+    assert (found["pages"], found["pages_read"], found["pages_lost"], found["pages_missing"]) == (PAGES, 1, 0, PAGES - 1)
+
+
 def test_devices_have_a_row_each_that_says_why(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path)
     sources = (source("a1", device="a"), source("a2", device="a"), source("b", device="b"), source("c", device="c"))
