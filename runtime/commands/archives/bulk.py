@@ -206,7 +206,7 @@ def _bulk(
 
 
 def _with_checked_devices(job: Job, ledger: Ledger) -> Job:
-    """Return the job, in which a device of the ledger's that cannot be recalibrated deeply has a problem, unless done."""
+    """Return the job, in which a device of the ledger's that cannot be recalibrated deeply has a problem."""
     sources = list(job.sources)
     for place, own in ledger.part.devices(job):
         if ledger.recalibrated(place) or any(source.problem is not None for source in own):

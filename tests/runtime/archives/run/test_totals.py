@@ -70,8 +70,8 @@ def test_a_range_that_is_read_again_is_missing_whatever_a_round_found_of_it(tmp_
     write(ledger.shard(0, 3), page(3))
     write(ledger.shard(0, 0, 1), page(0, 3.0), lost(1), page(2), model=NEWER)
     ledger.doubt_losses(asked)
-    found = totals(ledger, asked).to_json()
-    assert (found["pages"], found["pages_read"], found["pages_lost"], found["pages_missing"]) == (PAGES, 1, 0, PAGES - 1)
+    told = totals(ledger, asked).to_json()
+    assert (told["pages"], told["pages_read"], told["pages_lost"], told["pages_missing"]) == (PAGES, 1, 0, PAGES - 1)
 
 
 def test_devices_have_a_row_each_that_says_why(tmp_path: Path) -> None:
