@@ -46,7 +46,8 @@ def export(
     with percent_bar() as progress:
         bundle, error = export_run(run, out, name, version, progress, recording, precision)
     if bundle.code is None:
-        note("the bundle has no code for user bytes: export with --recording, or see `lightpage code`")
+        how = "see `lightpage code`" if recording is not None else "export with --recording, or see `lightpage code`"
+        note(f"the bundle has no code for user bytes: {how}")
     size = sum(len(data) for data in bundle.files.values())
     if json_path is not None:
         figures = {"bundle": str(out), "version": bundle.version, "parity_error": error, "unpacked_bytes": size}

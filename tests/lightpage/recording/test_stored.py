@@ -622,3 +622,9 @@ def test_joined_pages_follow_one_another_and_references_are_the_first_ones(tmp_p
     toy.write_toy_recording(tmp_path / "a.h5", toy.ToyDevice(), 8, 2)
     with refused("a.h5: levels", 8, RecordingError):
         join(paths, tmp_path / "joined.h5")
+
+
+@pytest.mark.parametrize("path", [".", "/", ""])
+def test_a_path_without_a_name_is_no_recording(path: str) -> None:
+    with pytest.raises(RecordingError, match="no regular file"):
+        Recording.open(Path(path))
