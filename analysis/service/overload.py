@@ -130,7 +130,7 @@ def overload(
         "asked": len(pending),
         "asked_per_s": len(pending) / seconds,
         "answered": ended["OK"],
-        "answered_per_s": ended["OK"] / took,
+        "answered_per_s": ended["OK"] / took if took else 0.0,
         "ended": dict(ended),
         "decodes": decoded,
     }
