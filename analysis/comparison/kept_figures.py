@@ -39,7 +39,7 @@ FOURTH_DIGIT = 0.0005
 
 
 def outcomes(kept: Path, recording: Recording, out: Path, trained: Path | None = None) -> Iterator[Outcome]:
-    """What each kept method reads, in the order of their names; with the weights of `trained` where that is given.
+    """Yield what each kept method reads, in the order of their names; with the weights of `trained` where given.
 
     Concentrations are calibrated on the same pages for all.
 

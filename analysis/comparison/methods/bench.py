@@ -1,4 +1,4 @@
-"""What all methods of a comparison share: their pages, their calibration and the features of those pages."""
+"""Pages, calibration and features, which all methods of a comparison share."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ def at_levels(
     scale: float,
     prediction: Prediction | None = None,
 ) -> list[LevelFigures]:
-    """What a decoder is worth among fewer levels, on recordings of their own."""
+    """Measure what a decoder is worth among fewer levels, on recordings of their own."""
     found = []
     for levels in bench.levels:
         at = folder / f"levels-{levels}"
