@@ -29,8 +29,7 @@ from lightpage.runtime.service.caller import Actor, Identity, Role
 from lightpage.runtime.service.models.registry import Model, ModelRegistry
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor
-from lightpage.runtime.service.server.certificates import Certificates
-from lightpage.runtime.service.server.roles import identity_of
+from lightpage.runtime.service.server.certificates import Certificates, identity_of
 
 if TYPE_CHECKING:
     from _typeshed.wsgi import StartResponse, WSGIApplication, WSGIEnvironment
