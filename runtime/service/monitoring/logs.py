@@ -20,6 +20,8 @@ from lightpage.runtime.service.table import SettingsTable
 MOST_TEXT = 300
 """Characters of a text of a call in logs and traces: a caller chooses its correlation id."""
 _WINDOW_S = 1.0
+_Shown = tuple[str, int, str]
+"""Logger, level, and text of a kind of lines."""
 _log = logging.getLogger(__name__)
 
 
@@ -58,18 +60,13 @@ class LogFormatter(logging.Formatter):
         fields = {key: value for key, value in cut.items() if value != ""}
         # a library may have logged with `exc_info=False`, or outside of any `except`
         traceback = self.formatException(record.exc_info) if record.exc_info and record.exc_info[0] else ""
-        time = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
+        time, message = datetime.fromtimestamp(record.created, UTC), record.getMessage()
+        head = {"time": time.isoformat(timespec="milliseconds"), "level": record.levelname, "logger": record.name}
         if self._form == "json":
-            line = {
-                "time": time,
-                "level": record.levelname,
-                "logger": record.name,
-                "message": record.getMessage(),
-                **fields,
-            }
-            return json.dumps(line | ({"traceback": traceback} if traceback else {}), default=str)
+            last = {"traceback": traceback} if traceback else {}
+            return json.dumps({**head, "message": message, **fields, **last}, default=str)
         pairs = "".join(f" {key}={_word(str(value))}" for key, value in fields.items())
-        return f"{time} {record.levelname} {record.name}: {_one_line(record.getMessage())}{pairs}\n{traceback}".rstrip()
+        return f"{' '.join(head.values())}: {_one_line(message)}{pairs}" + f"\n{traceback}" * bool(traceback)
 
 
 def _told(record: logging.LogRecord) -> dict[str, Any]:
@@ -99,8 +96,8 @@ class LimitedHandler(logging.StreamHandler[TextIO]):
     def __init__(self, stream: TextIO, lines_per_second: int, clock: Clock = SYSTEM) -> None:
         super().__init__(stream)
         self._most, self._clock, self._ending = lines_per_second, clock, threading.Event()
-        self._begun, self._seen = clock.now(), dict[tuple[str, ...], tuple[logging.LogRecord, int]]()
-        """When this second began; and of each kind its first record, and how many there were."""
+        self._begun, self._seen = clock.now(), dict[tuple[str, str], tuple[_Shown, int]]()
+        """When this second began; and of each kind what is shown of it, and how many lines there were."""
         self._awaited = False
         """Whether a thread tells of what was left out if nothing else is logged."""
 
@@ -108,11 +105,12 @@ class LimitedHandler(logging.StreamHandler[TextIO]):
         """Write a record, or count it; called with the handler's lock held."""
         if self._clock.now() - self._begun >= _WINDOW_S:
             self._tell(self._begun)
-        told = _told(record)
-        call = str(told.get("method", "")), str(told.get("reason") or told.get("code") or "")
-        kind = call if "method" in told else (record.name, str(record.msg))
-        first, count = self._seen.get(kind, (record, 0))
-        self._seen[kind] = first, count + 1
+        told, kind, text = _told(record), (record.name, str(record.msg)), record.getMessage()
+        if "method" in told:
+            kind = str(told["method"]), str(told.get("reason") or told.get("code") or "")
+            text = " ".join(kind).rstrip()
+        shown, count = self._seen.get(kind, ((record.name, record.levelno, text), 0))
+        self._seen[kind] = shown, count + 1
         if count < self._most:
             super().emit(record)
         elif not self._awaited:
@@ -128,11 +126,10 @@ class LimitedHandler(logging.StreamHandler[TextIO]):
         with self.lock:  # type: ignore[union-attr]
             if begun != self._begun:
                 return
-            for kind, (first, count) in self._seen.items():
+            for (name, level, text), count in self._seen.values():
                 if (more := count - self._most) > 0:
-                    shown = " ".join(filter(None, kind)) if "method" in _told(first) else first.getMessage()
-                    text = f"{more} more of these were left out in {max(self._clock.now() - begun, _WINDOW_S):.0f} s"
-                    record = logging.LogRecord(first.name, first.levelno, __file__, 0, f"%s: {text}", (shown,), None)
+                    left = f"{more} more of these were left out in {max(self._clock.now() - begun, _WINDOW_S):.0f} s"
+                    record = logging.LogRecord(name, level, __file__, 0, "%s: %s", (text, left), None)
                     record.told = {"left_out": more}
                     super().emit(record)
             self._begun, self._seen, self._awaited = self._clock.now(), {}, False
