@@ -55,14 +55,13 @@ _OPTIONS: dict[str, Key] = {
 _SHARED = {"--threads": THREADS, "--provider": PROVIDER, "--engine-cache": ENGINE_CACHE}
 
 
-def _option(name: str, key: Key) -> Callable[[_Command], _Command]:
-    """Return an option of the type, the help and the default of its setting, which alone knows them."""
-    setting = TABLES[key[0]].model_json_schema()["properties"][key[1]]
+def _option(name: str, key: str, setting: dict[str, Any]) -> Callable[[_Command], _Command]:
+    """Return an option of the type, the help and the default of its setting, as JSON Schema has it."""
     value, default = setting.get("anyOf", [setting])[0], setting["default"]
     multiple, value = "items" in value, value.get("items", value)
     kind: click.ParamType[Any] | None = None
     if value["type"] == "boolean":
-        name, default = f"{name}/--no-{name[2:]}", default and key[1]
+        name, default = f"{name}/--no-{name[2:]}", default and key
     elif value["type"] == "integer":
         kind = click.IntRange(value["minimum"], value["maximum"])
     elif "format" in value:
@@ -74,8 +73,11 @@ def _option(name: str, key: Key) -> Callable[[_Command], _Command]:
 
 
 def _settings_options(command: _Command) -> _Command:
-    for name, key in reversed(_OPTIONS.items()):
-        command = (_SHARED.get(name) or _option(name, key))(command)
+    settings = {
+        table: TABLES[table].model_json_schema()["properties"] for table in {key[0] for key in _OPTIONS.values()}
+    }
+    for name, (table, key) in reversed(_OPTIONS.items()):
+        command = (_SHARED.get(name) or _option(name, key, settings[table][key]))(command)
     return command
 
 
