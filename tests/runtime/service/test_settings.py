@@ -113,12 +113,13 @@ def test_a_wrong_setting_is_named_with_what_came_and_what_was_wanted(
 def test_all_wrong_settings_are_named_at_once_with_where_they_come_from(tmp_path: Path) -> None:
     option = Given("option --threads", ("service", "threads"), 0)
     error = refused(tmp_path, "[limits]\nstall_s = -1", option, LIGHTPAGE_LOGS__FORMAT="xml")
-    told = str(error.got)
     for one in ("stall_s = -1 (file", "threads = 0 (option --threads)", "format = 'xml' (environment LIGHTPAGE_LOGS"):
-        assert one in told
+        assert one in str(error.got)
     wrong = refused(tmp_path, "", LIGHTPAGE_LIMITS__CONCURENT_DECODES="1")
     assert "LIGHTPAGE_LIMITS__CONCURENT_DECODES" in str(wrong)
     assert "limits.concurrent_decodes" in str(wrong.expected)
+    assert "LIGHTPAGE_LIMTS__STALL_S" in str(refused(tmp_path, "", LIGHTPAGE_LIMTS__STALL_S="1"))
+    assert re.search("receive_s.*age_s", str(refused(tmp_path, "[limits]\nstall_s = 31\nconnection_grace_s = 9").got))
 
 
 def test_a_missing_file_and_missing_paths_are_named(tmp_path: Path) -> None:
