@@ -22,6 +22,7 @@ MOST_TEXT = 300
 _WINDOW_S = 1.0
 _Shown = tuple[str, int, str]
 """Logger, level, and text of a kind of lines."""
+_PLAIN = logging.Formatter()
 _log = logging.getLogger(__name__)
 
 
@@ -47,28 +48,6 @@ class PageLog:
             _log.warning("lost with model %s: %s", observation.model_version, text, extra={"told": fields})
 
 
-class LogFormatter(logging.Formatter):
-    """Writes a record and its `told`, what else is said of it: as one JSON object, or else as text with KEY=VALUE."""
-
-    def __init__(self, form: Literal["text", "json"]) -> None:
-        super().__init__()
-        self._form = form
-
-    def format(self, record: logging.LogRecord) -> str:
-        """Return the line; of text, a traceback follows in lines of its own."""
-        cut = {key: value[:MOST_TEXT] if isinstance(value, str) else value for key, value in _told(record).items()}
-        fields = {key: value for key, value in cut.items() if value != ""}
-        # a library may have logged with `exc_info=False`, or outside of any `except`
-        traceback = self.formatException(record.exc_info) if record.exc_info and record.exc_info[0] else ""
-        time, message = datetime.fromtimestamp(record.created, UTC), record.getMessage()
-        head = {"time": time.isoformat(timespec="milliseconds"), "level": record.levelname, "logger": record.name}
-        if self._form == "json":
-            last = {"traceback": traceback} if traceback else {}
-            return json.dumps({**head, "message": message, **fields, **last}, default=str)
-        pairs = "".join(f" {key}={_word(str(value))}" for key, value in fields.items())
-        return f"{' '.join(head.values())}: {_one_line(message)}{pairs}" + f"\n{traceback}" * bool(traceback)
-
-
 def _told(record: logging.LogRecord) -> dict[str, Any]:
     return getattr(record, "told", {})
 
@@ -82,24 +61,39 @@ def _word(text: str) -> str:
     return text if text.isprintable() and not set(text) & set(' "=') else json.dumps(text)
 
 
-class LimitedHandler(logging.StreamHandler[TextIO]):
-    """Writes at most so many lines of one kind a second, and then one that says how many were left out.
+class LogHandler(logging.StreamHandler[TextIO]):
+    """Writes a record and its `told`, what else is said of it, as a line: at most so many of one kind a second.
 
-    Of one kind are lines of one method and reason, and other lines that differ in their values only.
+    Then a line says how many were left out. Of one kind are lines of one method and reason, and other lines that differ
+    in their values only.
 
     Args:
+        settings: how lines look, and how many are written.
         stream: where they go.
-        lines_per_second: of one kind.
         clock: by which seconds pass.
     """
 
-    def __init__(self, stream: TextIO, lines_per_second: int, clock: Clock = SYSTEM) -> None:
+    def __init__(self, settings: LogSettings, stream: TextIO, clock: Clock = SYSTEM) -> None:
         super().__init__(stream)
-        self._most, self._clock, self._ending = lines_per_second, clock, threading.Event()
+        self._settings, self._clock, self._ending = settings, clock, threading.Event()
         self._begun, self._seen = clock.now(), dict[tuple[str, str], tuple[_Shown, int]]()
         """When this second began; and of each kind what is shown of it, and how many lines there were."""
         self._awaited = False
         """Whether a thread tells of what was left out if nothing else is logged."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line, of text or of JSON; behind one of text, a traceback has lines of its own."""
+        cut = {key: value[:MOST_TEXT] if isinstance(value, str) else value for key, value in _told(record).items()}
+        fields = {key: value for key, value in cut.items() if value != ""}
+        # a library may have logged with `exc_info=False`, or outside of any `except`
+        traceback = _PLAIN.formatException(record.exc_info) if record.exc_info and record.exc_info[0] else ""
+        time, message = datetime.fromtimestamp(record.created, UTC), record.getMessage()
+        head = {"time": time.isoformat(timespec="milliseconds"), "level": record.levelname, "logger": record.name}
+        if self._settings.format == "json":
+            last = {"traceback": traceback} if traceback else {}
+            return json.dumps({**head, "message": message, **fields, **last}, default=str)
+        pairs = "".join(f" {key}={_word(str(value))}" for key, value in fields.items())
+        return f"{' '.join(head.values())}: {_one_line(message)}{pairs}" + f"\n{traceback}" * bool(traceback)
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write a record, or count it; called with the handler's lock held."""
@@ -111,7 +105,7 @@ class LimitedHandler(logging.StreamHandler[TextIO]):
             text = " ".join(kind).rstrip()
         shown, count = self._seen.get(kind, ((record.name, record.levelno, text), 0))
         self._seen[kind] = shown, count + 1
-        if count < self._most:
+        if count < self._settings.lines_per_second:
             super().emit(record)
         elif not self._awaited:
             self._awaited = True
@@ -127,7 +121,7 @@ class LimitedHandler(logging.StreamHandler[TextIO]):
             if begun != self._begun:
                 return
             for (name, level, text), count in self._seen.values():
-                if (more := count - self._most) > 0:
+                if (more := count - self._settings.lines_per_second) > 0:
                     left = f"{more} more of these were left out in {max(self._clock.now() - begun, _WINDOW_S):.0f} s"
                     record = logging.LogRecord(name, level, __file__, 0, "%s: %s", (text, left), None)
                     record.told = {"left_out": more}
@@ -155,9 +149,8 @@ def logging_to_stderr(settings: LogSettings, stream: TextIO | None = None) -> It
         settings: what is written, and how.
         stream: where to, stderr by default.
     """
-    root, hook = logging.getLogger(), threading.excepthook
-    handler, before = LimitedHandler(stream or sys.stderr, settings.lines_per_second), root.level
-    handler.setFormatter(LogFormatter(settings.format))
+    root, hook, handler = logging.getLogger(), threading.excepthook, LogHandler(settings, stream or sys.stderr)
+    before = root.level
     root.addHandler(handler)
     root.setLevel(settings.level.upper())
     logging.captureWarnings(True)

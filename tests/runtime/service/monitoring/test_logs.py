@@ -118,8 +118,7 @@ def test_a_caller_cannot_write_lines_of_its_own() -> None:
 
 def test_of_one_kind_only_so_many_lines_come_in_a_second_and_the_others_are_counted() -> None:
     clock, stream = HandClock(), io.StringIO()
-    handler = logs.LimitedHandler(stream, 3, clock)
-    handler.setFormatter(logs.LogFormatter("text"))
+    handler = logs.LogHandler(logs.LogSettings(lines_per_second=3), stream, clock)
     log = logging.Logger("tests.limited", logging.INFO)
     log.addHandler(handler)
 
