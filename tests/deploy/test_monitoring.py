@@ -28,7 +28,7 @@ from lightpage.runtime.service.models.store import ModelStore
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.pages.reading import read_page
-from lightpage.runtime.service.settings import Option, service_settings
+from lightpage.runtime.service.settings import Given, service_settings
 from lightpage.runtime.service.stages import Stages
 from tests.deploy.manifests import DEPLOY
 from tests.runtime import toy
@@ -178,8 +178,8 @@ def test_the_composition_for_other_machines_has_tls_everywhere() -> None:
     own = services["lightpage"]
     arguments = [argument.removeprefix("--").split("=", 1) for argument in own["command"]]
     keys = {"source": "source", "address": "address"}
-    options = [Option(name, ("service", keys[name]), value) for name, value in arguments if name in keys]
-    options += [Option("", ("metrics", "host"), "0.0.0.0"), Option("", ("metrics", "port"), 9100)]
+    options = [Given(name, ("service", keys[name]), value) for name, value in arguments if name in keys]
+    options += [Given("", ("metrics", "host"), "0.0.0.0"), Given("", ("metrics", "port"), 9100)]
     settings = service_settings(None, own["environment"], options).settings
     assert not settings.service.insecure
     files = settings.tls.files()

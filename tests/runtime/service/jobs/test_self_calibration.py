@@ -295,7 +295,7 @@ def test_figures_of_the_last_page_show_the_device(decoder: Decoder) -> None:
 DRIFTED = (175.0, 110.0)
 """Frames contradict each other or pilots confirm nothing, and a re-fit reads all pages."""
 BUSY_S = 5.0
-OWN = SelfCalibrationSettings((100, 101), busy_s=BUSY_S)
+OWN = SelfCalibrationSettings(pages=(100, 101), busy_s=BUSY_S)
 
 
 class RecordedSource(toy.ToySource):
@@ -490,6 +490,6 @@ def test_reads_go_on_while_it_recalibrates_and_it_stops_in_the_middle(make: Make
 
 def test_pages_that_cannot_serve_are_refused_at_the_start(loop: Loop) -> None:
     loop.source.page_count = lambda: 102  # type: ignore[method-assign]
-    SelfCalibration(loop.plane, loop.monitor, loop.recalibrator, SelfCalibrationSettings((100, 101)))
+    SelfCalibration(loop.plane, loop.monitor, loop.recalibrator, SelfCalibrationSettings(pages=(100, 101)))
     with pytest.raises(InvalidInputError, match="calibration pages"):
-        SelfCalibration(loop.plane, loop.monitor, loop.recalibrator, SelfCalibrationSettings((101, 102)))
+        SelfCalibration(loop.plane, loop.monitor, loop.recalibrator, SelfCalibrationSettings(pages=(101, 102)))
