@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gzip
 import json
 import logging
 import time
@@ -12,10 +13,10 @@ from functools import partial
 from importlib import resources
 from typing import Any
 
-from prometheus_client import CollectorRegistry, make_wsgi_app
+from prometheus_client import CollectorRegistry
+from prometheus_client.exposition import choose_encoder, gzip_accepted
 from tornado.ioloop import IOLoop
 from tornado.web import Finish, HTTPError, RequestHandler, stream_request_body
-from tornado.wsgi import WSGIContainer
 
 from lightpage.errors import InvalidInputError, LightpageError, NotAllowedError
 from lightpage.runtime.client.wire.address import names_machine
@@ -51,7 +52,6 @@ _REFUSALS = {
     413: f"1 to {_ACTION_BYTES} bytes only",
     415: "application/json only",
     421: "this host name is none of this service's: ask by IP address, or name it in metrics.names",
-    500: "see the log",
 }
 _STATUSES = {NotAllowedError: 403, InvalidInputError: 400, LightpageError: 409}
 """Of an error: that of the first kind which it is of."""
@@ -103,7 +103,7 @@ class _Handler(RequestHandler):
         """Say why, whatever a caller has put into it; nothing of the inside."""
         error = told["exc_info"][1] if "exc_info" in told else None
         why = error.get_message() if isinstance(error, HTTPError) else None
-        self.finish(f"{why or _REFUSALS[status_code]}\n".encode("utf-8", "backslashreplace"))
+        self.finish(f"{why or _REFUSALS.get(status_code, 'see the log')}\n".encode("utf-8", "backslashreplace"))
 
 
 class _Page(_Handler):
@@ -128,20 +128,24 @@ class _Action(_Handler):
     """Does what an administrator asks for."""
 
     def initialize(self, state: ConsoleState) -> None:
-        """Take what the route gives."""
+        """Take what the route gives, and begin to wait for the content."""
         self._state, self._content = state, b""
+        self._late = asyncio.get_running_loop().call_later(self.settings["silence_s"], self.send_error, 408)
 
     def prepare(self) -> None:
-        """Wait for the content, for a limited time."""
+        """Refuse what is far too large before it comes."""
         super().prepare()
         with suppress(ValueError):  # Tornado refuses it
             if int(self.request.headers.get("Content-Length", "0")) > MOST_BODY_BYTES:
                 raise HTTPError(413)
-        self._late = asyncio.get_running_loop().call_later(self.settings["silence_s"], self.send_error, 408)
 
     def data_received(self, chunk: bytes) -> None:
         """Take a part of the content."""
         self._content += chunk
+
+    def on_finish(self) -> None:
+        """Wait no longer."""
+        self._late.cancel()
 
     async def post(self) -> None:
         """Do it."""
@@ -164,18 +168,15 @@ class _Action(_Handler):
         self.finish(f"{outcome}\n")
 
 
-def _metrics(registry: CollectorRegistry) -> Content:
-    shown = make_wsgi_app(registry)
-
-    def content(asked: RequestHandler) -> bytes:
-        def begin(_status: str, headers: list[tuple[str, str]]) -> None:
-            for name, value in headers:
-                asked.set_header(name, value)
-
-        environ = WSGIContainer(shown).environ(asked.request)
-        return b"".join(shown(environ | {"REQUEST_METHOD": "GET"}, begin))
-
-    return content
+def _metrics(registry: CollectorRegistry, asked: RequestHandler) -> bytes:
+    headers, names = asked.request.headers, asked.get_query_arguments("name[]")
+    encode, kind = choose_encoder(headers.get("Accept", ""))
+    asked.set_header("Content-Type", kind)
+    content = encode(registry.restricted_registry(names) if names else registry)
+    if not gzip_accepted(headers.get("Accept-Encoding", "")):
+        return content
+    asked.set_header("Content-Encoding", "gzip")
+    return gzip.compress(content)
 
 
 def _page(state: ConsoleState, asked: _Handler) -> bytes:
@@ -195,13 +196,13 @@ def _page(state: ConsoleState, asked: _Handler) -> bytes:
 
 def metrics_routes(registry: CollectorRegistry) -> list[Route]:
     """Make the routes that show metrics, whatever the path."""
-    return [(".*", _Page, {"content": _metrics(registry)})]
+    return [(".*", _Page, {"content": partial(_metrics, registry)})]
 
 
 def console_routes(state: ConsoleState, registry: CollectorRegistry) -> list[Route]:
     """Make the routes of a console, with the metrics beside it."""
     return [
-        ("/metrics", _Page, {"content": _metrics(registry), "clock": state.clock}),
+        ("/metrics", _Page, {"content": partial(_metrics, registry), "clock": state.clock}),
         ("/actions", _Action, {"state": state}),
         (".*", _Page, {"content": partial(_page, state), "clock": state.clock}),
     ]

@@ -384,7 +384,7 @@ def test_an_administrator_recalibrates_with_the_calibration_pages_and_not_the_co
 @pytest.mark.parametrize("roles", [["read"], ["decode", "recalibrate"], []])
 def test_nobody_else_does(roles: list[str], asked: Asked, caplog: pytest.LogCaptureFixture) -> None:
     assert asked.act(roles)[0] == 403
-    assert "operator 7 at 127.0.0.1" in caplog.text
+    assert "127.0.0.1" in caplog.text
     assert asked.version == "toy-2"
     assert asked.ask("/state.json", roles)[0] == (200 if roles else 403)
     assert not roles or asked.state(*roles)["actions"] == []
