@@ -11,13 +11,13 @@ import os
 import socket
 import ssl
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
+from unittest.mock import Mock
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
@@ -53,14 +53,10 @@ from tests.waiting import eventually
 
 
 def fetched(
-    url: str,
-    method: str = "GET",
-    content: bytes | None = None,
-    context: ssl.SSLContext | None = None,
-    headers: Mapping[str, str] = MappingProxyType({}),
+    url: str, method: str = "GET", context: ssl.SSLContext | None = None, content: bytes | None = None, **headers: str
 ) -> tuple[int, bytes, dict[str, str]]:
     try:
-        with urlopen(Request(url, content, dict(headers), method=method), timeout=60, context=context) as reply:
+        with urlopen(Request(url, content, headers, method=method), timeout=60, context=context) as reply:
             return reply.status, reply.read(), dict(reply.headers)
     except HTTPError as error:
         with error:
@@ -106,7 +102,7 @@ def test_metrics_are_beside_it_and_nothing_takes_orders(decoder: Decoder) -> Non
         with pytest.raises(InvalidInputError, match="in use"), serving(running.routes, running.port):
             pass
         for accepted in ("identity", "gzip"):
-            _, content, headers = fetched(f"{running.url}/metrics", headers={"Accept-Encoding": accepted})
+            _, content, headers = fetched(f"{running.url}/metrics", **{"Accept-Encoding": accepted})
             assert headers.get("Content-Encoding", "identity") == accepted
             assert b"lightpage_calls_in_flight" in (gzip.decompress(content) if accepted == "gzip" else content)
         for method in ("POST", "PUT", "DELETE"):
@@ -269,17 +265,12 @@ def test_connections_are_bounded_in_number_and_in_time(decoder: Decoder, monkeyp
 
 
 def test_where_there_is_no_descriptor_callers_wait(decoder: Decoder, monkeypatch: pytest.MonkeyPatch) -> None:
-    failed: list[object] = []
-
-    def fail(*_: object) -> None:
-        failed.append(None)
-        raise OSError(errno.EMFILE, "Too many open files")
-
+    accept = Mock(side_effect=OSError(errno.EMFILE, "Too many open files"))
     with stage(decoder) as running:
         with monkeypatch.context() as patch:
-            patch.setattr("socket.socket.accept", fail)
+            patch.setattr("socket.socket.accept", accept)
             waiting = connected(running)
-            assert eventually(lambda: len(failed) > 1)
+            assert eventually(lambda: accept.call_count > 1)
         with waiting:
             waiting.sendall(b"GET /metrics HTTP/1.0\r\n\r\n")
             assert b" 200 " in waiting.recv(1000)
@@ -288,12 +279,11 @@ def test_where_there_is_no_descriptor_callers_wait(decoder: Decoder, monkeypatch
 def test_new_certificates_count_from_the_next_connection_on(decoder: Decoder, tmp_path: Path) -> None:
     before, after = Authority(tmp_path / "before"), Authority(tmp_path / "after")
     contexts = [each.caller("watcher", ["read"]).client_context() for each in (before, after)]
-    files = before.service()
-    with stage(decoder, files) as running:
+    with stage(decoder, before.service()) as running:
         assert [is_answered(running, context) for context in contexts] == [True, False]
-        newer = after.service()
-        for name in ("ca", "key", "certificate"):
-            os.replace(getattr(newer, name), getattr(files, name))
+        after.service()
+        for name in ("ca.pem", "service.pem", "service.key"):
+            os.replace(after.folder / name, before.folder / name)
         assert [is_answered(running, context) for context in contexts] == [False, True]
 
 
@@ -324,31 +314,23 @@ class Asked:
         actions = Actions(self.plane, self.recalibrator)
         state = ConsoleState(History(), self.plane.registry, Monitor(), "toy", actions, self.clock.now)
         self.routes, authority = console_routes(state, self.plane.metrics.registry), Authority(folder)
-        self.port = stack.enter_context(
-            serving(self.routes, 0, certificates=Certificates(authority.service()), names=["device.example"])
-        )
+        certificates = Certificates(authority.service())
+        self.port = stack.enter_context(serving(self.routes, 0, certificates=certificates, names=["device.example"]))
         self.context = cache(lambda *roles: authority.caller("operator 7", roles).client_context())
 
     @property
     def version(self) -> str:
         return self.plane.registry.current.version
 
-    def ask(
-        self, path: str, roles: Sequence[str] = ("admin",), content: object = None, **headers: str
-    ) -> tuple[int, str]:
-        """Status and text of an answer to a POST; to a GET where there is no content."""
-        told = {"Host": "device.example", "Content-Type": "application/json", **headers}
-        body = content if isinstance(content, bytes | None) else json.dumps(content).encode()
-        method, context = "GET" if content is None else "POST", self.context(*roles)
-        status, answer, _ = fetched(f"https://localhost:{self.port}{path}", method, body, context, told)
-        return status, answer.decode()
+    def shown(self, path: str, *roles: str) -> tuple[int, Any]:
+        """Status and content of a page; of JSON, what it holds."""
+        status, content, headers = fetched(f"https://localhost:{self.port}{path}", context=self.context(*roles))
+        return status, json.loads(content) if headers["Content-Type"] == "application/json" else content
 
-    def act(self, roles: Sequence[str] = ("admin",), content: object = ROLL_BACK, **headers: str) -> tuple[int, str]:
-        return self.ask("/actions", roles, content, **headers)
-
-    def state(self, *roles: str) -> dict[str, Any]:
-        state: dict[str, Any] = json.loads(self.ask("/state.json", roles)[1])
-        return state
+    def act(self, roles: Sequence[str] = ("admin",), content: object = ROLL_BACK, **headers: str) -> tuple[int, bytes]:
+        body = content if isinstance(content, bytes) else json.dumps(content).encode()
+        headers = {"Host": "device.example", "Content-Type": "application/json", **headers}
+        return fetched(f"https://localhost:{self.port}/actions", "POST", self.context(*roles), body, **headers)[:2]
 
 
 @pytest.fixture
@@ -358,12 +340,12 @@ def asked(decoder: Decoder, tmp_path: Path) -> Iterator[Asked]:
 
 
 def test_an_administrator_rolls_back(asked: Asked) -> None:
-    before = asked.state("admin")
+    _, before = asked.shown("/state.json", "admin")
     assert (before["caller"], before["actions"]) == ("operator 7", ["recalibrate", "roll back"])
     status, told = asked.act()
-    assert (status, "toy-1" in told) == (200, True)
+    assert (status, b"toy-1" in told) == (200, True)
     assert asked.version == "toy-1"
-    assert asked.state("admin")["actions"] == ["recalibrate"]
+    assert asked.shown("/state.json", "admin")[1]["actions"] == ["recalibrate"]
     assert asked.act()[0] == 409  # another model is in service than was expected
 
 
@@ -374,7 +356,7 @@ def test_an_administrator_recalibrates_with_the_calibration_pages_and_not_the_co
     content = json.dumps({"action": "recalibrate", "expected": "toy-2"}).encode()
     told = Actions(asked.plane, asked.recalibrator, pages).do(content, Actor("operator"))
     assert asked.recalibrator.jobs.wait_idle(60)
-    job = asked.state("admin")["job"]
+    job = asked.shown("/state.json", "admin")[1]["job"]
     assert job["id"] in told
     assert job["state"] in ("DONE", "REFUSED")
     assert asked.source.asked == list(pages or (0, 1))
@@ -386,20 +368,18 @@ def test_nobody_else_does(roles: list[str], asked: Asked, caplog: pytest.LogCapt
     assert asked.act(roles)[0] == 403
     assert "127.0.0.1" in caplog.text
     assert asked.version == "toy-2"
-    assert asked.ask("/state.json", roles)[0] == (200 if roles else 403)
-    assert not roles or asked.state(*roles)["actions"] == []
+    status, state = asked.shown("/state.json", *roles)
+    assert (status, not roles or state["actions"]) == ((200, []) if roles else (403, True))
 
 
 def test_who_proves_nothing_does_nothing(asked: Asked) -> None:
     with serving(asked.routes, 0) as port:
-        headers = {"Content-Type": "application/json"}
-        assert (
-            fetched(f"http://127.0.0.1:{port}/actions", "POST", json.dumps(ROLL_BACK).encode(), None, headers)[0] == 403
-        )
+        content, headers = json.dumps(ROLL_BACK).encode(), {"Content-Type": "application/json"}
+        assert fetched(f"http://127.0.0.1:{port}/actions", "POST", None, content, **headers)[0] == 403
     assert asked.act()[0] == 200
     asked.clock.advance(100 * 86400.0)  # the certificate has ended since the connection began
     for path in ("/", "/state.json", "/metrics"):
-        assert asked.ask(path)[0] == 403
+        assert asked.shown(path, "admin")[0] == 403
     assert asked.act()[0] == 403
 
 
