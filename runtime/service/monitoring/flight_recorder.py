@@ -253,7 +253,7 @@ def _note(kept: _Kept) -> dict[str, str | float]:
     """Why a page was kept, and what is known of it."""
     seen = kept.observation
     data, page = seen.user_data, seen.page
-    note = {
+    note: dict[str, str | float | None] = {
         "reason": kept.reason,
         "detail": kept.detail,
         "subject": seen.subject,

@@ -61,5 +61,4 @@ def stage(decoder: Decoder, tls: TlsFiles | None = None) -> Iterator[Stage]:
     routes = console_routes(state, metrics.registry)
     with ExitStack() as stack:
         port = stack.enter_context(serving(routes, 0, certificates=None if tls is None else Certificates(tls)))
-        url = f"http{'s' if tls else ''}://localhost:{port}"
-        yield Stage(plane, state, routes, port, url, stack.close)
+        yield Stage(plane, state, routes, port, f"http{'s' if tls else ''}://localhost:{port}", stack.close)

@@ -12,7 +12,7 @@ import socket
 import ssl
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -64,10 +64,9 @@ def fetched(
 
 
 def is_answered(running: Stage, context: ssl.SSLContext | None = None) -> bool:
-    try:
+    with suppress(OSError):
         return fetched(f"{running.url}/metrics", context=context)[0] == 200
-    except OSError:
-        return False
+    return False
 
 
 def connected(running: Stage) -> socket.socket:
@@ -81,8 +80,7 @@ def test_the_state_is_that_of_the_pages(decoder: Decoder) -> None:
         assert fetched(f"{running.url}/frames/in_phase.png")[0] == 404
         running.read(12)
         status, content, headers = fetched(f"{running.url}/state.json")
-        assert status == 200
-        assert headers["Cache-Control"] == "no-store"
+        assert (status, headers["Cache-Control"]) == (200, "no-store")
         assert "default-src 'self'" in headers["Content-Security-Policy"]
         state = json.loads(content)
         assert (state["source"], state["pages"], len(state["recent"])) == ("toy:device", 12, 12)
@@ -97,7 +95,9 @@ def test_the_state_is_that_of_the_pages(decoder: Decoder) -> None:
             assert Image.open(io.BytesIO(picture)).size[0] >= 1
 
 
-def test_metrics_are_beside_it_and_nothing_takes_orders(decoder: Decoder) -> None:
+def test_metrics_are_beside_it_and_nothing_takes_orders_or_tells_of_the_inside(
+    decoder: Decoder, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with stage(decoder) as running:
         with pytest.raises(InvalidInputError, match="in use"), serving(running.routes, running.port):
             pass
@@ -114,10 +114,6 @@ def test_metrics_are_beside_it_and_nothing_takes_orders(decoder: Decoder) -> Non
             found, nothing, told = fetched(running.url + path, "HEAD")
             assert (found, nothing, told["Content-Type"]) == (status, b"", headers["Content-Type"])
             assert int(headers["Content-Length"]) == int(told["Content-Length"]) == len(content)
-
-
-def test_what_nobody_foresaw_tells_nothing_of_the_inside(decoder: Decoder, monkeypatch: pytest.MonkeyPatch) -> None:
-    with stage(decoder) as running:
         monkeypatch.setattr(running.state, "to_json", lambda *_: 1 // 0)
         status, content, headers = fetched(f"{running.url}/state.json")
         assert (status, content, headers["Server"]) == (500, b"see the log\n", "lightpage")
@@ -163,8 +159,7 @@ def test_the_history_is_bounded() -> None:
     history = History(pages=3)
     for number in range(5):
         history.observe(Observation(f"page {number}", number, "toy-1", float(number), 0.1))
-    assert [row.page_index for row in history.rows()] == [2, 3, 4]
-    assert history.pages == 5
+    assert ([row.page_index for row in history.rows()], history.pages) == ([2, 3, 4], 5)
 
 
 def test_pictures_are_thinned_and_show_saturation() -> None:
@@ -392,9 +387,6 @@ def test_who_proves_nothing_does_nothing(asked: Asked) -> None:
         (ROLL_BACK, {"Content-Type": "application/json; charset=utf-8"}, 200),
         ({"action": "roll back", "expected": "x" * 1000}, {}, 413),
         ({"action": "format", "expected": "toy-2"}, {}, 400),
-        ({"action": ["roll back"], "expected": "toy-2"}, {}, 400),
-        ({"action": "roll back", "expected": "\ud800"}, {}, 400),
-        (b"[" * 999, {}, 400),
         (b"", {}, 413),
     ],
 )
