@@ -11,11 +11,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from importlib import resources
-from typing import Any
+from typing import Any, TypeVar
 
 from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import choose_encoder, gzip_accepted
-from tornado.ioloop import IOLoop
 from tornado.web import Finish, HTTPError, RequestHandler, stream_request_body
 
 from lightpage.errors import InvalidInputError, LightpageError, NotAllowedError
@@ -26,6 +25,7 @@ from lightpage.runtime.console.state import ConsoleState
 from lightpage.runtime.service.caller import Actor, Identity, Role
 from lightpage.runtime.service.server.roles import identity_of
 
+T = TypeVar("T")
 _log = logging.getLogger(__name__)
 
 MOST_BODY_BYTES = 1 << 16
@@ -75,8 +75,8 @@ def _refusing() -> Iterator[None]:
 class _Handler(RequestHandler):
     """Answers callers who ask for this machine; says in a line of text why it does not.
 
-    The settings of its application are `names`, which gives the names of this machine by which it may be asked, and
-    `silence_s`, how long content may take to come.
+    The settings of its application are `names`, which gives the names of this machine by which it may be asked,
+    `silence_s`, how long content may take to come, and `threads` for what takes time.
     """
 
     identity: Identity | None = None
@@ -99,6 +99,10 @@ class _Handler(RequestHandler):
             with _refusing():
                 self.identity = identity_of(certificate)
 
+    def in_thread(self, work: Callable[..., T], *arguments: Any) -> asyncio.Future[T]:
+        """Do in a thread what would hold up other callers."""
+        return asyncio.get_running_loop().run_in_executor(self.settings["threads"], work, *arguments)
+
     def write_error(self, status_code: int, **told: Any) -> None:
         """Say why, whatever a caller has put into it; nothing of the inside."""
         error = told["exc_info"][1] if "exc_info" in told else None
@@ -118,7 +122,7 @@ class _Page(_Handler):
         if self.identity is not None:  # whose certificate was checked when the connection began, and not since
             with _refusing():
                 self.identity.check(Role.READ, "a page of the console", self._clock())
-        self.finish(await IOLoop.current().run_in_executor(None, self._content, self))
+        self.finish(await self.in_thread(self._content, self))
 
     head = get
 
@@ -160,8 +164,7 @@ class _Action(_Handler):
         with _refusing():
             try:
                 self.identity.check(ROLE, "an action of the console", self._state.clock())
-                actor = Actor(name, "console")
-                outcome = await IOLoop.current().run_in_executor(None, actions.do, self._content, actor)
+                outcome = await self.in_thread(actions.do, self._content, Actor(name, "console"))
             except NotAllowedError as error:
                 _log.warning("console: an action of %s is refused: %s", name, error)
                 raise

@@ -8,7 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterable, Iterator
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -33,6 +33,8 @@ LONGEST_S = 60.0
 SILENCE_S = 20.0
 """A caller that has not said what it wants after so long is hung up on."""
 _PAUSE_S = 0.1
+_THREADS = 8
+"""They make the answers."""
 
 
 @contextmanager
@@ -61,8 +63,10 @@ def serving(
     except (OSError, UnicodeError) as error:
         expected = "an address of this machine and a free port"
         raise InvalidInputError(f"metrics at {host_and_port(host, port)}", error, expected) from None
+    threads = ThreadPoolExecutor(_THREADS, "lightpage-console")
     application = Application(
         [*routes],
+        threads=threads,
         names=lambda: own if certificates is None else own | certificates.names(),
         silence_s=SILENCE_S,
         cross_origin_protection=True,
@@ -87,6 +91,7 @@ def serving(
     finally:
         ended.set_result(None)
         thread.join()
+        threads.shutdown(wait=False, cancel_futures=True)  # what hangs holds up no stop
 
 
 class _Server(HTTPServer):
