@@ -127,8 +127,8 @@ def test_what_is_no_number_is_none_and_pages_are_bounded_and_thinned(decoder: De
     for number in range(3 * POINTS):
         history.observe(Observation("page", number, "toy-1", float(number), 0.1, page=page))
     state = ConsoleState(history, registry, Monitor(), "toy").to_json()
-    assert state["pages"] == 3 * POINTS
-    assert state["series"]["time_s"] == [*map(float, range(POINTS, 3 * POINTS, 2)), 3 * POINTS - 1]
+    times = [*map(float, range(POINTS, 3 * POINTS, 2)), 3 * POINTS - 1]
+    assert (state["series"]["time_s"], state["pages"]) == (times, 3 * POINTS)
     assert state["series"]["piston_rad"][-1] is state["series"]["share"][-1] is None
     assert [row["page_index"] for row in state["recent"]] == list(range(3 * POINTS))[: -RECENT - 1 : -1]
     json.dumps(state, allow_nan=False)
@@ -310,8 +310,8 @@ class Asked:
         self.plane.models.adopt(Decoder.load(toy.write_toy_bundle(folder / "c.zip", version="toy-2"), 1))
         self.recalibrator = Recalibrator(self.plane, toy.fit_references)
         stack.callback(self.recalibrator.close)
-        actions = Actions(self.plane, self.recalibrator)
-        state = ConsoleState(History(), self.plane.registry, Monitor(), "toy", actions, self.clock.now)
+        monitor, actions = Monitor(), Actions(self.plane, self.recalibrator)
+        state = ConsoleState(History(), self.plane.registry, monitor, "toy", actions, self.clock.now)
         self.routes, authority = console_routes(state, self.plane.metrics.registry), Authority(folder)
         certificates = Certificates(authority.service())
         self.port = stack.enter_context(serving(self.routes, 0, certificates=certificates, names=["device.example"]))
@@ -370,8 +370,7 @@ def test_nobody_else_does(roles: list[str], asked: Asked, caplog: pytest.LogCapt
 
 def test_who_proves_nothing_does_nothing(asked: Asked) -> None:
     with serving(asked.routes, 0) as port:
-        content, headers = json.dumps(ROLL_BACK).encode(), {"Content-Type": "application/json"}
-        assert fetched(f"http://127.0.0.1:{port}/actions", "POST", None, content, **headers)[0] == 403
+        assert fetched(f"http://127.0.0.1:{port}/actions", "POST", None, json.dumps(ROLL_BACK).encode())[0] == 403
     assert asked.act()[0] == 200
     asked.clock.advance(100 * 86400.0)  # the certificate has ended since the connection began
     for path in ("/", "/state.json", "/metrics"):
