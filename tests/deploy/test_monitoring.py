@@ -17,8 +17,10 @@ import yaml
 from click.testing import CliRunner
 
 from lightpage.runtime.commands.service.serve import serve
+from lightpage.runtime.console.application import console_routes
 from lightpage.runtime.console.history import History
-from lightpage.runtime.console.server import Console, ConsoleServer
+from lightpage.runtime.console.server import serving
+from lightpage.runtime.console.state import ConsoleState
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import Caller
@@ -76,8 +78,8 @@ def shown(toy_zip: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
         read_page(plane, None, None, Caller(), stages=stages)
         metrics.timed("ReadPage", stages)
         metrics.call_ended("ReadPage", "OK", "", stages.elapsed_s)
-    console = Console(metrics, history, registry, monitor, "toy:device")
-    with ConsoleServer(console, 0) as server, urlopen(f"http://127.0.0.1:{server.port}/metrics", timeout=20) as reply:
+    routes = console_routes(ConsoleState(history, registry, monitor, "toy:device"), metrics.registry)
+    with serving(routes, 0) as port, urlopen(f"http://127.0.0.1:{port}/metrics", timeout=20) as reply:
         return str(reply.read(), "utf-8")
 
 

@@ -13,7 +13,6 @@ from typing import Any, TypeVar
 import click
 from click.core import ParameterSource
 
-from lightpage.errors import InvalidInputError
 from lightpage.progress import reporting
 from lightpage.runtime.client.wire.address import host_and_port
 from lightpage.runtime.commands.execution import ENGINE_CACHE, THREADS
@@ -21,12 +20,13 @@ from lightpage.runtime.commands.provider_option import PROVIDER
 from lightpage.runtime.commands.service.ending import leave_the_rest, stop_signals
 from lightpage.runtime.console.actions import Actions
 from lightpage.runtime.console.history import History
-from lightpage.runtime.console.server import Console, ConsoleServer
+from lightpage.runtime.console.state import ConsoleState
 from lightpage.runtime.model.execution.memory import share_freed_memory
 from lightpage.runtime.model.execution.session import VERSION as RUNTIME_VERSION
 from lightpage.runtime.service.assembly import assembled
 from lightpage.runtime.service.endpoints import listening
 from lightpage.runtime.service.monitoring.logs import logging_to_stderr
+from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.server.certificates import Certificates
 from lightpage.runtime.service.settings import (
     TABLES,
@@ -126,8 +126,8 @@ def _serve(effective: Effective, wait_for_stop: Callable[[], None]) -> None:
         own = stack.enter_context(assembled(settings, history))
         plane, registry = own.plane, own.plane.registry
         actions = Actions(plane, own.recalibrator, settings.self_calibration.pages)
-        console = Console(plane.metrics, history, registry, own.monitor, own.source_name, actions)
-        stack.enter_context(_shown(console, settings.metrics, certificates))
+        state = ConsoleState(history, registry, own.monitor, own.source_name, actions)
+        stack.enter_context(_shown(state, plane.metrics, settings.metrics, certificates))
         endpoints = stack.enter_context(listening(settings, own, certificates))
         if endpoints.health is not None:
             click.echo(f"health checks at {endpoints.health}")
@@ -148,16 +148,17 @@ def _versions() -> dict[str, str]:
 
 
 @contextmanager
-def _shown(console: Console, settings: MetricsTable, certificates: Certificates | None) -> Iterator[None]:
+def _shown(
+    state: ConsoleState, metrics: ServiceMetrics, settings: MetricsTable, certificates: Certificates | None
+) -> Iterator[None]:
     if settings.port is None:
         yield
         return
-    try:
-        server = ConsoleServer(console, settings.port, settings.host, certificates, settings.names)
-    except OSError as error:
-        got, expected = error.strerror or error, "an address of this machine and a free port"
-        raise InvalidInputError(f"metrics at {host_and_port(settings.host, settings.port)}", got, expected) from None
-    root = f"{'http' if certificates is None else 'https'}://{host_and_port(settings.host, server.port)}"
-    click.echo(f"metrics at {root}/metrics, console at {root}/")
-    with server:
+    from lightpage.runtime.console.application import console_routes  # Tornado is for who asks for it
+    from lightpage.runtime.console.server import serving
+
+    routes = console_routes(state, metrics.registry)
+    with serving(routes, settings.port, settings.host, certificates, settings.names) as port:
+        root = f"{'http' if certificates is None else 'https'}://{host_and_port(settings.host, port)}"
+        click.echo(f"metrics at {root}/metrics, console at {root}/")
         yield

@@ -244,20 +244,19 @@ def _write(kept: _Kept, path: Path) -> None:
 def _note(kept: _Kept) -> dict[str, str | float]:
     """Why a page was kept, and what is known of it."""
     seen = kept.observation
-    note: dict[str, str | float] = {
+    data, page = seen.user_data, seen.page
+    note: dict[str, str | float | None] = {
         "reason": kept.reason,
         "detail": kept.detail,
         "subject": seen.subject,
         "model_version": seen.model_version,
         "time_s": seen.time_s,
+        "page_index": seen.page_index,
+        "margin_bits": None if data is None else data.margin_bits,
+        "pilot_share": None if page is None else page.check.share,
+        "pilot_trust": None if page is None else page.pilot_trust,
     }
-    if seen.page_index is not None:
-        note["page_index"] = seen.page_index
-    if seen.user_data is not None:
-        note["margin_bits"] = seen.user_data.margin_bits
-    if seen.page is not None:
-        note |= {"pilot_share": seen.page.check.share, "pilot_trust": seen.page.pilot_trust}
-    return note
+    return {name: value for name, value in note.items() if value is not None}
 
 
 def _counts(frames: FramePair, bit_depth: int) -> FramePair:
