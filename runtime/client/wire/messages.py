@@ -1,19 +1,17 @@
-"""Parts of messages that both ends write and read.
+"""How large messages are, and chunks of frames.
 
 Chunks of frames are written and read without the copies that protobuf makes of each.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, TypeAlias, TypeVar
+from collections.abc import Iterator, Sequence
+from typing import TypeAlias
 
 import numpy as np
 from google.protobuf.message import Message
 from numpy.typing import NDArray
 
-from lightpage.codec.page_bytes import Loss
-from lightpage.errors import InvalidInputError
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 
 MESSAGE_BYTES = 4 << 20
@@ -28,13 +26,6 @@ REPLY_BYTES = 64 << 20
 PIXEL_TYPES = {pb.PIXEL_TYPE_UINT8: "uint8", pb.PIXEL_TYPE_UINT16: "uint16"}
 PIXEL_CODES = {name: code for code, name in PIXEL_TYPES.items()}
 
-DATA_LOSSES: dict[Loss | None, Any] = {
-    None: pb.DATA_LOSS_UNSPECIFIED,
-    **{loss: pb.DataLoss.Value(f"DATA_LOSS_{loss.name}") for loss in Loss if loss is not Loss.STORAGE},
-}
-FLOAT = np.dtype("<f4")
-"""Of confidences, concentrations and phases."""
-
 FramePart: TypeAlias = pb.DecodeFramesRequest | memoryview
 """A message of frames: a chunk of pixels as a view of bytes, anything else as its message."""
 
@@ -42,29 +33,6 @@ _TAG = bytes([pb.DecodeFramesRequest.CHUNK_FIELD_NUMBER << 3 | 2])
 """How a field of bytes with the number of a chunk begins. Source: protobuf's encoding, wire type LEN."""
 _LONGEST_VARINT = 5
 """Bytes of a number below 2^35: no message is as large."""
-
-M = TypeVar("M", bound=Message)
-
-
-def message_of(kind: Callable[..., M], **fields: object) -> M:
-    """A message with these fields; None stands for one that is not set.
-
-    Raises:
-        InvalidInputError: one that no message can hold, for instance a number out of range.
-    """
-    message = kind()
-    set_fields(message, **fields)
-    return message
-
-
-def set_fields(message: Message, **fields: object) -> None:
-    """Set fields of a message; raises as `message_of`."""
-    for name, value in fields.items():
-        try:
-            message.MergeFrom(type(message)(**{name: value}))
-        except (ValueError, TypeError) as error:
-            expected = f"what the field {name} of {message.DESCRIPTOR.name} can hold ({error})"
-            raise InvalidInputError(name, repr(value)[:100], expected) from None
 
 
 def parsed_part(data: bytes) -> FramePart:
@@ -85,7 +53,7 @@ def parsed_part(data: bytes) -> FramePart:
     return memoryview(message.chunk) if message.WhichOneof("part") == "chunk" else message
 
 
-def serialized_part(part: FramePart) -> bytes:
+def serialized_part(part: Message | memoryview) -> bytes:
     """A message for the wire."""
     if isinstance(part, memoryview):
         return b"".join((_TAG, _varint(part.nbytes), part))

@@ -177,7 +177,7 @@ def _read(client: LightpageClient, count: int, levels: int) -> Iterator[RemotePa
     known = client.describe().source_levels == levels
     for _ in range(count):
         try:
-            page = client.read_page(levels=levels, want_phase=known, want_concentration=known, want_written=known)
+            page = client.pages.read(levels=levels, want_phase=known, want_concentration=known, want_written=known)
         except (InvalidInputError, LostPageError, SourceError, StorageError) as error:
             yield RefusedPage.of(None, error)
         else:
@@ -197,7 +197,7 @@ def _sent(client: LightpageClient, file: Recording, count: int, levels: int) -> 
             symbols = file.symbols(index)
             known = symbols is not None and file.levels == levels
             values = pattern if symbols is None else symbols
-            page = client.decode(
+            page = client.frames.decode(
                 narrow(file.frames(index), file.bit_depth),
                 levels,
                 bit_depth=file.bit_depth,

@@ -18,7 +18,8 @@ from lightpage.progress import Progress, warn
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.evaluation import check_recording
 from lightpage.runtime.client.answers import JobInfo, Recalibrated
-from lightpage.runtime.client.client import RECALIBRATION_S, LightpageClient
+from lightpage.runtime.client.client import LightpageClient
+from lightpage.runtime.client.jobs import RECALIBRATION_S
 from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.commands.client.connection import TARGET, with_tls
 from lightpage.runtime.model.bundle.manifest import check_version
@@ -136,14 +137,14 @@ def _remote(
 ) -> Recalibrated:
     with LightpageClient(target, tls=tls) as client, percent_bar() as progress:
         if not send:
-            return client.recalibrate(count=pages, recording=recording, progress=progress, timeout_s=timeout_s)
+            return client.jobs.recalibrate(count=pages, recording=recording, progress=progress, timeout_s=timeout_s)
         until = time.monotonic() + timeout_s
         job = _start(client, recording, pages, send, timeout_s)
         try:
             return watched(client, job.id, progress, until - time.monotonic())
         except BaseException:
             with suppress(LightpageError):
-                client.cancel_job(job.id)  # one that has ended stays as it is
+                client.jobs.cancel(job.id)  # one that has ended stays as it is
             raise
 
 
@@ -153,7 +154,7 @@ def watched(client: LightpageClient, job_id: str, progress: Progress, timeout_s:
     Raises:
         LightpageError: it is not done, and why.
     """
-    for job in client.watch_job(job_id, timeout_s):
+    for job in client.jobs.watch(job_id, timeout_s):
         progress(job.step, job.fraction)
         if job.error is not None:
             raise job.error
@@ -164,11 +165,11 @@ def watched(client: LightpageClient, job_id: str, progress: Progress, timeout_s:
 
 def _start(client: LightpageClient, recording: str | None, pages: int, send: bool, timeout_s: float) -> JobInfo:
     if not send or recording is None:
-        return client.start_recalibration(count=pages, recording=recording)
+        return client.jobs.start(count=pages, recording=recording)
     with Recording.open(recording) as file:
         known, bit_depth = read_recorded(file, first_lit_pages(file, pages, warn)), file.bit_depth
     assert known.references is not None  # of a recording
-    return client.recalibrate_frames(
+    return client.jobs.start_with_frames(
         known.pairs,
         known.symbols,
         known.references,
@@ -200,5 +201,5 @@ def _offline(bundle: str, recording: str, out: Path, pages: int, version: str | 
 def rollback(target: str, tls: TlsFiles | None, expect: str) -> None:
     """Put a service's previous model back in service; `lightpage models forward` undoes it."""
     with LightpageClient(target, tls=tls) as client:
-        current, before = client.rollback(expect)
+        current, before = client.models.roll_back(expect)
     click.echo(f"{current} is in service again, {before} is not")
