@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from lightpage.codec.page_bytes import FileFacts, Header, Loss, PageBytes
 from lightpage.errors import LightpageError
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.fields import answer_of, array_of, member_of
-from lightpage.runtime.client.wire.messages import PIXEL_TYPES
+from lightpage.runtime.client.wire.messages import PIXEL_TYPES, answer_of, array_of, member_of
 from lightpage.runtime.client.wire.status import error_from
 from lightpage.runtime.model.decoding.image_position import ImagePosition
 
@@ -243,18 +242,18 @@ class Recalibrated:
 
     model_version: str
     previous_version: str
+    angle_deg: float | None
     pages_used: int
     pages_held_back: int
-    air_before: float
-    air_after: float
-    angle_deg: float | None
+    seconds: float
     coherence_before: float | None
     coherence_after: float | None
-    seconds: float
-    pages_lost_before: int
-    image: ImagePosition | None
+    air_before: float
+    air_after: float
     air_limit: float | None
     air_standard_error: float | None
+    pages_lost_before: int
+    image: ImagePosition | None
 
 
 class JobState(StrEnum):

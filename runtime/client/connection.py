@@ -16,8 +16,7 @@ from lightpage.runtime.client.answers import Description, description
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.address import check_address
 from lightpage.runtime.client.wire.channel import TlsFiles, open_channel
-from lightpage.runtime.client.wire.fields import message_of
-from lightpage.runtime.client.wire.messages import serialized_part
+from lightpage.runtime.client.wire.messages import message_of, serialized_part
 from lightpage.runtime.client.wire.status import error_of
 
 DATA_S = 600.0

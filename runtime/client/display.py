@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from lightpage.runtime.client.answers import DisplayOrder, display_order
 from lightpage.runtime.client.connection import Connection
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.fields import message_of
-from lightpage.runtime.client.wire.messages import CHUNK_BYTES
+from lightpage.runtime.client.wire.messages import CHUNK_BYTES, message_of
 
 
 class Display:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, Unpack
+from typing import Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,33 +12,11 @@ from lightpage.errors import LightpageError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.answers import RemotePage, remote_page
 from lightpage.runtime.client.connection import DATA_S, Connection
-from lightpage.runtime.client.outgoing import (
-    KnownPilots,
-    PageOptions,
-    format_of,
-    options_message,
-    pilots_message,
-    sent_frames,
-)
+from lightpage.runtime.client.outgoing import FrameOptions, header_message, sent_frames
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.shared_memory import SharedMemory
-from lightpage.runtime.client.wire.fields import message_of
 from lightpage.runtime.client.wire.messages import FramePart, chunks_of
 from lightpage.runtime.client.wire.status import error_from
-
-
-class FrameOptions(PageOptions, total=False):
-    """What a caller says of frames, beside what it wants to have of their page. All may be left out.
-
-    Attributes:
-        bit_depth: bits of a camera count; by default those of the service's camera.
-        black_level: counts that the cameras add to every pixel.
-        pilots: known symbols, where they differ from the device's pilots.
-    """
-
-    bit_depth: int | None
-    black_level: int
-    pilots: KnownPilots | None
 
 
 class Frames:
@@ -86,7 +64,8 @@ class Frames:
             SlotsTakenError: the service had no free slot until the deadline.
         """
         frames = sent_frames(pair)
-        header = self._header(frames[0], levels, options, frame_id=frame_id, captured_s=captured_s)
+        own = {"frame_id": frame_id, "captured_s": captured_s}
+        header = header_message(self._connection, frames[0], levels, options, **own)
         if memory is None:
             return remote_page(self._connection.ask("DecodeFrames", _parts(header, frames)))
         header.shared.offset, header.shared.region = memory.write(pair), memory.handle
@@ -114,12 +93,15 @@ class Frames:
             LightpageError: the whole call ended.
         """
         failed: list[Exception] = []
+        if options.get("bit_depth") is None:
+            options["bit_depth"] = self._connection.description.bit_depth  # now: the sending thread asks nothing
 
         def parts() -> Iterator[FramePart]:
             try:
                 for number, pair in enumerate(pairs):
                     frames = sent_frames(pair)
-                    yield from _parts(self._header(frames[0], levels, options, frame_id=number), frames)
+                    header = header_message(self._connection, frames[0], levels, options, frame_id=number)
+                    yield from _parts(header, frames)
             except Exception as error:  # gRPC would tell of it on stderr, and end the call with UNKNOWN
                 failed.append(error)
 
@@ -148,25 +130,6 @@ class Frames:
             told = self._connection.description
             size = 2 * int(np.prod(told.frame_shape)) * np.dtype(told.frame_dtype).itemsize
         return SharedMemory(self._connection.target, size)
-
-    def _header(self, frame: NDArray[np.integer], levels: int, options: FrameOptions, **own: object) -> pb.DecodeHeader:
-        """What is sent before a pair."""
-        asked: dict[str, Any] = dict(options)
-        bit_depth, pilots = asked.pop("bit_depth", None), asked.pop("pilots", None)
-        black_level = asked.pop("black_level", 0)
-        page = options_message(levels, asked)
-        if page.tracking != pb.TRACKING_STATELESS:
-            page.session = page.session or self._connection.session
-        return message_of(
-            pb.DecodeHeader,
-            **format_of(frame),
-            bit_depth=self._connection.description.bit_depth if bit_depth is None else bit_depth,
-            black_level=black_level,
-            options=page,
-            pilots=None if pilots is None else pilots_message(pilots),
-            correlation_id=asked.get("correlation_id"),
-            **own,
-        )
 
 
 def _parts(header: pb.DecodeHeader, frames: Sequence[NDArray[np.integer]]) -> Iterator[FramePart]:

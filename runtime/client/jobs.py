@@ -15,8 +15,7 @@ from lightpage.runtime.client.answers import JobInfo, Recalibrated, job_info
 from lightpage.runtime.client.connection import DATA_S, Connection
 from lightpage.runtime.client.outgoing import format_of, sent_frames, sent_symbols
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.fields import answer_of, message_of
-from lightpage.runtime.client.wire.messages import chunks_of
+from lightpage.runtime.client.wire.messages import answer_of, chunks_of, message_of
 from lightpage.runtime.client.wire.status import error_of, is_lost_connection
 
 RECALIBRATION_S = 600.0

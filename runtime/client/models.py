@@ -12,8 +12,7 @@ from lightpage.errors import InvalidInputError
 from lightpage.runtime.client.answers import ModelInfo
 from lightpage.runtime.client.connection import DATA_S, Connection
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.fields import answer_of
-from lightpage.runtime.client.wire.messages import CHUNK_BYTES
+from lightpage.runtime.client.wire.messages import CHUNK_BYTES, answer_of
 from lightpage.runtime.model.bundle.signature_file import read_signature
 
 

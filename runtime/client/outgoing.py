@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from lightpage.errors import FrameError, PageError
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.client.connection import Connection
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.fields import message_of
-from lightpage.runtime.client.wire.messages import PIXEL_CODES
+from lightpage.runtime.client.wire.messages import PIXEL_TYPES, message_of
 
 
 class PageOptions(TypedDict, total=False):
@@ -40,6 +40,29 @@ class PageOptions(TypedDict, total=False):
     correlation_id: str
 
 
+@dataclass(frozen=True)
+class KnownPilots:
+    """Pilots that a caller knows: bool mask [ny, nx], a page of symbols [ny, nx], and their level count."""
+
+    mask: NDArray[np.bool_]
+    symbols: NDArray[np.uint8]
+    levels: int
+
+
+class FrameOptions(PageOptions, total=False):
+    """What a caller says of frames, beside what it wants to have of their page. All may be left out.
+
+    Attributes:
+        bit_depth: bits of a camera count; by default those of the service's camera.
+        black_level: counts that the cameras add to every pixel.
+        pilots: known symbols, where they differ from the device's pilots.
+    """
+
+    bit_depth: int | None
+    black_level: int
+    pilots: KnownPilots | None
+
+
 def options_message(levels: int, options: Mapping[str, Any]) -> pb.DecodeOptions:
     """Return `PageOptions` but for the correlation id, which is no part of it; `levels` 0 stands for the default.
 
@@ -58,29 +81,33 @@ def options_message(levels: int, options: Mapping[str, Any]) -> pb.DecodeOptions
     )
 
 
-@dataclass(frozen=True)
-class KnownPilots:
-    """Pilots that a caller knows: bool mask [ny, nx], a page of symbols [ny, nx], and their level count."""
-
-    mask: NDArray[np.bool_]
-    symbols: NDArray[np.uint8]
-    levels: int
-
-
-def pilots_message(pilots: KnownPilots) -> pb.Pilots:
-    """Return pilots as their message.
-
-    Raises:
-        PageError: mask and page differ in shape.
-    """
-    if pilots.mask.shape != pilots.symbols.shape:
-        raise PageError("pilots", f"mask {pilots.mask.shape}, page {pilots.symbols.shape}", "two equal shapes")
-    return message_of(pb.Pilots, pilots, values=pilots.symbols[pilots.mask])
-
-
 def format_of(frame: NDArray[np.integer]) -> dict[str, Any]:
     """Return what a header says of the size and the type of frames."""
     return {"rows_px": frame.shape[0], "columns_px": frame.shape[1], "pixel_type": frame.dtype.name}
+
+
+def header_message(
+    connection: Connection, frame: NDArray[np.integer], levels: int, options: FrameOptions, **own: object
+) -> pb.DecodeHeader:
+    """Return what is sent before a pair, with what is the caller's `own` of it.
+
+    Raises:
+        PageError: mask and page of the pilots differ in shape.
+        InvalidInputError: see `options_message`.
+    """
+    asked: dict[str, Any] = dict(options)
+    bit_depth, pilots = asked.pop("bit_depth", None), asked.pop("pilots", None)
+    own |= {"black_level": asked.pop("black_level", None), "correlation_id": asked.get("correlation_id")}
+    page = options_message(levels, asked)
+    if page.tracking != pb.TRACKING_STATELESS:
+        page.session = page.session or connection.session
+    if bit_depth is None:
+        bit_depth = connection.description.bit_depth
+    if pilots is not None:
+        if pilots.mask.shape != pilots.symbols.shape:
+            raise PageError("pilots", f"mask {pilots.mask.shape}, page {pilots.symbols.shape}", "two equal shapes")
+        pilots = message_of(pb.Pilots, pilots, values=pilots.symbols[pilots.mask])
+    return message_of(pb.DecodeHeader, **format_of(frame), bit_depth=bit_depth, options=page, pilots=pilots, **own)
 
 
 def sent_frames(pair: FramePair, subject: str = "") -> list[NDArray[np.integer]]:
@@ -93,7 +120,7 @@ def sent_frames(pair: FramePair, subject: str = "") -> list[NDArray[np.integer]]
     first = frames[0]
     for name, frame in zip(("in-phase frame", "quadrature frame"), frames, strict=True):
         alike = (frame.shape, frame.dtype) == (first.shape, first.dtype)
-        if frame.dtype.name not in PIXEL_CODES or frame.ndim != 2 or not alike:
+        if frame.dtype.name not in PIXEL_TYPES.values() or frame.ndim != 2 or not alike:
             got, expected = f"{frame.dtype} {frame.shape}", "uint8 or uint16, rows and columns, as the other"
             raise FrameError(subject + name, got, expected)
     return frames

@@ -31,6 +31,12 @@ from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.commands.client.connection import TARGET, with_tls
 from lightpage.runtime.model.decoding.image_drift import LEAST_COHERENCE
 
+_FIGURES = (
+    *("page", "model_version", "piston_rad", "pilot_coherence", "pilot_trust"),
+    *("claimed_bits", "confirmed_bits", "recalibration_due"),
+)
+"""Of a page, as its report names them too."""
+
 
 @click.command()
 @TARGET
@@ -112,18 +118,11 @@ def page_report(page: RemotePage) -> dict[str, Any]:
     """The figures of one page; AIR and error rate where its symbols are known."""
     figures = _measured(page)
     return {
-        "page": page.page,
-        "model_version": page.model_version,
+        **{name: getattr(page, name) for name in _FIGURES},
         "mean_confidence": float(page.confidence.mean()),
-        "piston_rad": page.piston_rad,
-        "pilot_coherence": page.pilot_coherence,
-        "pilot_trust": page.pilot_trust,
-        "claimed_bits": page.claimed_bits,
-        "confirmed_bits": page.confirmed_bits,
-        "recalibration_due": page.recalibration_due,
-        "image": None if page.image is None else asdict(page.image),
-        "air_bits_per_symbol": figures.air_bits_per_symbol if figures is not None else None,
-        "symbol_error_rate": figures.symbol_error_rate if figures is not None else None,
+        "image": page.image and asdict(page.image),
+        "air_bits_per_symbol": figures and figures.air_bits_per_symbol,
+        "symbol_error_rate": figures and figures.symbol_error_rate,
         **asdict(page.timings),
     }
 

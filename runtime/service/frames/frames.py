@@ -13,8 +13,7 @@ from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import check_levels, symbol_phases
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.fields import message_of
-from lightpage.runtime.client.wire.messages import PIXEL_TYPES
+from lightpage.runtime.client.wire.messages import PIXEL_TYPES, message_of
 from lightpage.runtime.service.admission import Bytes, ReceiveBudget
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import Answer, DataPlane, Seen, levels_for, observed

@@ -16,7 +16,7 @@ from lightpage.errors import FrameError, LimitError, MalformedError, NoSuchModel
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.pb.inference import open_inference_pb2 as oip
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.fields import message_of
+from lightpage.runtime.client.wire.messages import message_of
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.service.admission import ReceiveBudget
 from lightpage.runtime.service.caller import Call

@@ -8,7 +8,7 @@ from functools import partial
 
 from lightpage.errors import MalformedError, StalledError
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.fields import message_of
+from lightpage.runtime.client.wire.messages import message_of
 from lightpage.runtime.service.caller import Call
 from lightpage.runtime.service.models.models import ModelEntry, Models, Upload
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from lightpage.clock import Clock
 from lightpage.errors import CallerLeft, InvalidInputError, LimitError, SlotsTakenError
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.fields import message_of
+from lightpage.runtime.client.wire.messages import message_of
 from lightpage.runtime.client.wire.status import detail_of, reason_told, refusal_of
 from lightpage.runtime.service.caller import Call, Caller
 from lightpage.runtime.service.dataplane import DataPlane

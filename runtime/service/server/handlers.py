@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib.metadata import version as installed_version
 
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.fields import message_of
+from lightpage.runtime.client.wire.messages import message_of
 from lightpage.runtime.client.wire.status import without_folders
 from lightpage.runtime.service.caller import Call
 from lightpage.runtime.service.dataplane import DataPlane
