@@ -22,6 +22,7 @@ from lightpage.runtime.client.wire.status import error_of
 DATA_S = 600.0
 """Deadline of a call that moves many pages, or a model, where none is given."""
 
+_Sent = Iterable[Message | memoryview] | None
 _SERVICE = pb.DESCRIPTOR.services_by_name["Lightpage"]
 
 
@@ -47,9 +48,7 @@ class Connection:
         self._channel = open_channel(target, tls)
         self._description: Description | None = None
 
-    def call(
-        self, name: str, sent: Iterable[Message | memoryview] | None, timeout_s: float | None, **fields: object
-    ) -> Any:
+    def call(self, name: str, sent: _Sent, timeout_s: float | None, **fields: object) -> Any:
         """Begin the call of the contract with this name: with a message of `fields`, or with the messages `sent`."""
         method = _SERVICE.methods_by_name[name]
         way = f"{'unary' if sent is None else 'stream'}_{'stream' if method.server_streaming else 'unary'}"
@@ -58,13 +57,7 @@ class Connection:
         message = message_of(GetMessageClass(method.input_type), **fields) if sent is None else sent
         return begin(message, timeout=timeout_s)
 
-    def ask(
-        self,
-        name: str,
-        sent: Iterable[Message | memoryview] | None = None,
-        timeout_s: float | None = None,
-        **fields: object,
-    ) -> Any:
+    def ask(self, name: str, sent: _Sent = None, timeout_s: float | None = None, **fields: object) -> Any:
         """Return the one reply of a `call`; by default within the client's own deadline.
 
         Raises:
@@ -76,11 +69,7 @@ class Connection:
 
     @contextmanager
     def replies(
-        self,
-        name: str,
-        sent: Iterable[Message | memoryview] | None = None,
-        timeout_s: float | None = DATA_S,
-        **fields: object,
+        self, name: str, sent: _Sent = None, timeout_s: float | None = DATA_S, **fields: object
     ) -> Iterator[Any]:
         """Yield the replies of a `call`, which ends with the `with` statement; raises as `ask`, as they come."""
         call = self.call(name, sent, timeout_s, **fields)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,10 @@ from lightpage.errors import (
     LightpageError,
     LimitError,
     LostShotError,
+    OtherModelError,
     PageError,
     Reason,
+    SourceError,
 )
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.answers import RemotePage
@@ -76,6 +79,23 @@ def test_what_no_message_can_hold_is_named(call: Any, field: str, service: Runni
     with pytest.raises(InvalidInputError) as error:
         call(service.client)
     assert error.value.subject == field
+
+
+@pytest.mark.parametrize(
+    ("call", "place"),
+    [
+        (lambda client: client.decode(a_page()[1], 16), "frames.decode"),
+        (lambda client: client.read_page(3), "pages.read"),
+        (lambda client: client.recalibrate(recording="none.h5"), "jobs.recalibrate"),
+        (lambda client: client.rollback("none"), "models.roll_back"),
+        (lambda client: client.models(), "models.list"),
+    ],
+)
+def test_a_method_of_version_0_1_0_works_and_names_its_new_place(call: Any, place: str, service: Running) -> None:
+    with pytest.warns(DeprecationWarning, match=place), suppress(SourceError, OtherModelError):
+        assert call(service.client)
+    with pytest.raises(AttributeError):
+        _ = service.client.no_such_name  # type: ignore[attr-defined]
 
 
 Serve = Callable[..., tuple[Running, np.ndarray]]

@@ -134,11 +134,8 @@ def test_a_cancelled_job_changes_nothing_and_makes_room(start: Start) -> None:
     done = service.last(service.client.jobs.start(count=2))
     assert done.state is JobState.DONE
     assert service.client.jobs.cancel(done.id) == done
-    for call in (
-        service.client.jobs.get,
-        service.client.jobs.cancel,
-        lambda name: list(service.client.jobs.watch(name, 20)),
-    ):
+    calls = service.client.jobs
+    for call in (calls.get, calls.cancel, lambda name: list(calls.watch(name, 20))):
         with pytest.raises(NoSuchJobError):
             call("no-such-job")
     assert service.version == "toy-1+r1"
