@@ -92,7 +92,7 @@ def answer_of(kind: Callable[..., D], *messages: Message, shape: tuple[int, int]
     for name, hint in _hints(kind).items():
         message = next((each for each in messages if name in each.DESCRIPTOR.fields_by_name), None)
         if name not in given and message is not None:
-            given[name] = _read(message, message.DESCRIPTOR.fields_by_name[name], hint, shape)
+            given[name] = _read(message, name, hint, shape)
     return kind(**given)
 
 
@@ -152,18 +152,19 @@ def _one_written(told: FieldDescriptor, value: Any) -> Any:
     return value
 
 
-def _read(message: Message, told: FieldDescriptor, hint: Any, shape: tuple[int, int] | None) -> Any:
+def _read(message: Message, name: str, hint: Any, shape: tuple[int, int] | None) -> Any:
     """The value of a field as a dataclass has it."""
-    value, kind = getattr(message, told.name), hint
+    told: Any = message.DESCRIPTOR.fields_by_name[name]
+    value, kind = getattr(message, name), hint
     if isinstance(hint, UnionType):
-        if not (message.HasField(told.name) if told.has_presence else value):
+        if not (message.HasField(name) if told.has_presence else value):
             return None
         kind = next(each for each in get_args(hint) if each is not NoneType)
     outer, inner = get_origin(kind), get_args(kind)
     if outer is np.ndarray:
         (scalar,) = get_args(inner[1])
         wire = FLOAT if scalar is np.float32 else np.dtype(np.uint8)
-        array = np.array(value) if shape is None or told.is_repeated else array_of(value, wire, shape, told.name)
+        array = np.array(value) if shape is None or told.is_repeated else array_of(value, wire, shape, name)
         return array.astype(scalar, copy=False)
     if outer is tuple:
         return tuple(_one_read(told, each, inner[0]) for each in value)
