@@ -25,7 +25,7 @@ _RENAMED = {
     "recalibrate": "jobs.recalibrate",
     "rollback": "models.roll_back",
 }
-"""Methods of version 0.1.0, and where they are now. They go with the release after the next."""
+"""Methods of version 0.1.0, and where they are now. They work for one release more."""
 
 
 class LightpageClient:
