@@ -99,3 +99,14 @@ class Connection:
             yield
         except grpc.RpcError as error:
             raise error_of(error, self.target) from None
+
+
+class Part:
+    """What a client has of one kind of calls.
+
+    Args:
+        connection: to the service.
+    """
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection, self._ask, self._replies = connection, connection.ask, connection.replies

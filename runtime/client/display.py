@@ -8,27 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.runtime.client.answers import DisplayOrder, display_order
-from lightpage.runtime.client.connection import Connection
+from lightpage.runtime.client.connection import Part
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import CHUNK_BYTES, message_of
 
 
-class Display:
+class Display(Part):
     """Shows pages and moves shutters for the service, where the caller works them and not the service itself::
 
-        first = client.display.upload_pages(symbols, levels=16)  # a modulator of the service's own shows these too
+    first = client.display.upload_pages(symbols, levels=16)  # a modulator of the service's own shows these too
 
-        for order in client.display.watch():
-            if order.page is not None:
-                modulator.show(order.page)
-                client.display.report_page(order.page)
-
-    Args:
-        connection: to the service.
+    for order in client.display.watch():
+        if order.page is not None:
+            modulator.show(order.page)
+            client.display.report_page(order.page)
     """
-
-    def __init__(self, connection: Connection) -> None:
-        self._connection = connection
 
     def upload_pages(self, symbols: NDArray[np.uint8], levels: int) -> int:
         """Give the source's modulator pages [page, ny, nx] of M levels to show; return the first one's number.
@@ -49,7 +43,7 @@ class Display:
             for start in range(0, len(pages), step):
                 yield pb.UploadPagesRequest(symbols=pages[start : start + step].tobytes())
 
-        reply: pb.UploadPagesReply = self._connection.ask("UploadPages", parts())
+        reply: pb.UploadPagesReply = self._ask("UploadPages", parts())
         return reply.first_page
 
     def watch(self, timeout_s: float | None = None) -> Iterator[DisplayOrder]:
@@ -58,7 +52,7 @@ class Display:
         Raises:
             SourceError: the source's device shows its pages, and moves its shutters, by itself.
         """
-        with self._connection.replies("WatchDisplay", timeout_s=timeout_s) as replies:
+        with self._replies("WatchDisplay", timeout_s=timeout_s) as replies:
             yield from map(display_order, replies)
 
     def report_page(self, page: int | None) -> None:
@@ -68,7 +62,7 @@ class Display:
             SourceError: the source's device shows its pages by itself.
         """
         shown = {"withdrawn": True} if page is None else {"page": page}
-        self._connection.ask("ReportDisplay", **shown)
+        self._ask("ReportDisplay", **shown)
 
     def report_beams(self, *, signal: bool, reference: bool) -> None:
         """Say which beams are let through and have settled.
@@ -76,4 +70,4 @@ class Display:
         Raises:
             SourceError: the source's device moves its shutters by itself.
         """
-        self._connection.ask("ReportDisplay", beams={"signal": signal, "reference": reference})
+        self._ask("ReportDisplay", beams={"signal": signal, "reference": reference})

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lightpage.errors import LightpageError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.answers import RemotePage, remote_page
-from lightpage.runtime.client.connection import DATA_S, Connection
+from lightpage.runtime.client.connection import DATA_S, Part
 from lightpage.runtime.client.outgoing import FrameOptions, header_message, sent_frames
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.shared_memory import SharedMemory
@@ -19,7 +19,7 @@ from lightpage.runtime.client.wire.messages import FramePart, chunks_of
 from lightpage.runtime.client.wire.status import error_from
 
 
-class Frames:
+class Frames(Part):
     """Decodes frame pairs that the caller has, with the model in service::
 
         page = client.frames.decode(FramePair(in_phase, quadrature), levels=16, want_phase=True)
@@ -29,13 +29,7 @@ class Frames:
             print(found if isinstance(found, Exception) else found.frame_id)
 
     A client on the same machine need not send its frames: `share_memory` gives it memory to write them into.
-
-    Args:
-        connection: to the service.
     """
-
-    def __init__(self, connection: Connection) -> None:
-        self._connection = connection
 
     def decode(
         self,
@@ -67,9 +61,9 @@ class Frames:
         own = {"frame_id": frame_id, "captured_s": captured_s}
         header = header_message(self._connection, frames[0], levels, options, **own)
         if memory is None:
-            return remote_page(self._connection.ask("DecodeFrames", _parts(header, frames)))
+            return remote_page(self._ask("DecodeFrames", _parts(header, frames)))
         header.shared.offset, header.shared.region = memory.write(pair), memory.handle
-        return remote_page(self._connection.ask("DecodeFrames", header=header))  # one message needs no sending thread
+        return remote_page(self._ask("DecodeFrames", header=header))  # one message needs no sending thread
 
     def decode_many(
         self,
@@ -106,7 +100,7 @@ class Frames:
                 failed.append(error)
 
         try:
-            with self._connection.replies("DecodePages", parts(), timeout_s) as replies:
+            with self._replies("DecodePages", parts(), timeout_s) as replies:
                 for reply in replies:
                     refused = reply.HasField("refused")
                     yield error_from(reply.refused.detail) if refused else remote_page(reply.decoded)

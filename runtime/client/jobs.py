@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import grpc
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.errors import FrameError, InvalidInputError, LightpageError
+from lightpage.errors import InvalidInputError, LightpageError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.answers import JobInfo, Recalibrated, job_info
-from lightpage.runtime.client.connection import DATA_S, Connection
+from lightpage.runtime.client.connection import DATA_S, Part
 from lightpage.runtime.client.outgoing import format_of, sent_frames, sent_symbols
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import answer_of, chunks_of, message_of
@@ -28,7 +28,23 @@ _AGAIN_S = 0.5
 """From a lost connection to the next try."""
 
 
-class Jobs:
+class RecalibrationOptions(TypedDict, total=False):
+    """Which pages a recalibration has, and which model it replaces. All but the pages may be left out.
+
+    Attributes:
+        count: how many of the source's next pages; or of the recording's first ones, 0 for all of them.
+        pages: which pages of the source.
+        recording: its name in the service's recordings folder.
+        expected_version: that must be in service; empty for any.
+    """
+
+    count: int
+    pages: Sequence[int]
+    recording: str | None
+    expected_version: str
+
+
+class Jobs(Part):
     """Recalibrates, at once or by a job of the service, which goes on when its caller leaves::
 
         result = client.jobs.recalibrate(count=2)
@@ -38,33 +54,21 @@ class Jobs:
             print(job.state, f"{job.fraction:.0%}", job.step)
 
     One runs at a time. What begins one takes the version that must be in service, empty for any.
-
-    Args:
-        connection: to the service.
     """
-
-    def __init__(self, connection: Connection) -> None:
-        self._connection = connection
 
     def recalibrate(
         self,
         *,
-        count: int = 0,
-        pages: Sequence[int] = (),
-        recording: str | None = None,
         progress: Callable[[str, float], None] = lambda step, fraction: None,
         timeout_s: float = RECALIBRATION_S,
-        expected_version: str = "",
+        **options: Unpack[RecalibrationOptions],
     ) -> Recalibrated:
         """Recalibrate and wait for the result; the recalibration is dropped when the call ends early.
 
         Args:
-            count: how many of the source's next pages; or of the recording's first ones, 0 for all of them.
-            pages: which pages of the source.
-            recording: its name in the service's recordings folder.
             progress: told what is being done, and how far all of it is, 0..1.
             timeout_s: for all of it.
-            expected_version: that must be in service; empty for any.
+            options: with which pages, and instead of which model; see `RecalibrationOptions`.
 
         Raises:
             RecalibrationRefusedError: the new model would not be better; the old one stays.
@@ -77,8 +81,8 @@ class Jobs:
             StoppingError: the service is being stopped.
             BundleError: the new model cannot be written or noted; the old one stays.
         """
-        asked, result = _pages(count, pages, recording) | {"expected_version": expected_version}, None
-        with self._connection.replies("Recalibrate", timeout_s=timeout_s, **asked) as replies:
+        result = None
+        with self._replies("Recalibrate", timeout_s=timeout_s, **_fields(options)) as replies:
             for reply in replies:  # to its end: a call that is left early counts as cancelled
                 if reply.HasField("result"):
                     result = answer_of(Recalibrated, reply.result)
@@ -89,20 +93,12 @@ class Jobs:
             raise LightpageError(f"service at {self._connection.target}", got, expected)
         return result
 
-    def start(
-        self,
-        *,
-        count: int = 0,
-        pages: Sequence[int] = (),
-        recording: str | None = None,
-        expected_version: str = "",
-        correlation_id: str = "",
-    ) -> JobInfo:
+    def start(self, *, correlation_id: str = "", **options: Unpack[RecalibrationOptions]) -> JobInfo:
         """Start a recalibration and return its job at once; it goes on by itself, see `watch`.
 
         Args:
-            count, pages, recording, expected_version: as for `recalibrate`.
             correlation_id: a text that the job carries.
+            options: as for `recalibrate`.
 
         Raises:
             BusyError: another recalibration runs; its `job` says which.
@@ -111,8 +107,7 @@ class Jobs:
             InvalidInputError: no such recording.
             SourceError: the service has no source or recordings.
         """
-        asked = _pages(count, pages, recording) | {"expected_version": expected_version}
-        return job_info(self._connection.ask("StartRecalibration", correlation_id=correlation_id, **asked))
+        return job_info(self._ask("StartRecalibration", correlation_id=correlation_id, **_fields(options)))
 
     def start_with_frames(
         self,
@@ -138,7 +133,8 @@ class Jobs:
             bit_depth: bits of a camera count; by default those of the service's camera.
             black_level: counts that the cameras add to every pixel.
             pilot_mask: where the pilots are, [ny, nx]; None for the device's own.
-            expected_version, correlation_id: as for `start`.
+            expected_version: that must be in service; empty for any.
+            correlation_id: as for `start`.
             timeout_s: for sending it all.
 
         Raises:
@@ -165,13 +161,9 @@ class Jobs:
             correlation_id=correlation_id,
         )
         pages = [
-            (sent_frames(pair, f"known page {number}: "), sent_symbols(page, f"known page {number}: symbols"))
+            (sent_frames(pair, f"known page {number}: ", first[0]), sent_symbols(page, f"known page {number}: symbols"))
             for number, (pair, page) in enumerate(zip(pairs, symbols, strict=True))
         ]
-        for number, (frames, _) in enumerate(pages):
-            if (frames[0].shape, frames[0].dtype) != (first[0].shape, first[0].dtype):
-                got, expected = (f"{one.dtype} {one.shape}" for one in (frames[0], first[0]))
-                raise FrameError(f"known page {number}: frames", got, f"{expected}, as the reference frames")
 
         def parts() -> Iterator[pb.RecalibrateFramesRequest]:
             yield pb.RecalibrateFramesRequest(header=header)
@@ -182,7 +174,7 @@ class Jobs:
                 for chunk in map(bytes, chunks_of(frames)):
                     yield pb.RecalibrateFramesRequest(chunk=chunk)
 
-        return job_info(self._connection.ask("RecalibrateFrames", parts(), timeout_s))
+        return job_info(self._ask("RecalibrateFrames", parts(), timeout_s))
 
     def list(self) -> Sequence[JobInfo]:
         """Return the jobs that run, and those that ended lately, the newest first.
@@ -190,7 +182,7 @@ class Jobs:
         Raises:
             LightpageError: no answer.
         """
-        reply: pb.ListJobsReply = self._connection.ask("ListJobs")
+        reply: pb.ListJobsReply = self._ask("ListJobs")
         return [job_info(job) for job in reply.jobs]
 
     def get(self, job_id: str) -> JobInfo:
@@ -199,7 +191,7 @@ class Jobs:
         Raises:
             NoSuchJobError: there is no such job, or it ended long ago.
         """
-        return job_info(self._connection.ask("GetJob", id=job_id))
+        return job_info(self._ask("GetJob", id=job_id))
 
     def watch(self, job_id: str, timeout_s: float = RECALIBRATION_S) -> Iterator[JobInfo]:
         """Yield a job as it is now, and at each change, until it has ended.
@@ -235,11 +227,13 @@ class Jobs:
         Raises:
             NoSuchJobError: there is no such job, or it ended long ago.
         """
-        return job_info(self._connection.ask("CancelJob", id=job_id))
+        return job_info(self._ask("CancelJob", id=job_id))
 
 
-def _pages(count: int, pages: Sequence[int], recording: str | None) -> dict[str, Any]:
-    """Where the pages of a recalibration come from, as fields of its request."""
+def _fields(options: RecalibrationOptions) -> dict[str, Any]:
+    """Options as the fields of a request."""
+    asked: dict[str, Any] = dict(options)
+    count, pages, recording = asked.pop("count", 0), asked.pop("pages", ()), asked.pop("recording", None)
     if recording is not None:
-        return {"recording": recording, "recording_count": count}
-    return {"source": message_of(pb.SourcePages, count=count, pages=pages)}
+        return asked | {"recording": recording, "recording_count": count}
+    return asked | {"source": message_of(pb.SourcePages, count=count, pages=pages)}

@@ -10,13 +10,13 @@ from warnings import warn
 
 from lightpage.errors import InvalidInputError
 from lightpage.runtime.client.answers import ModelInfo
-from lightpage.runtime.client.connection import DATA_S, Connection
+from lightpage.runtime.client.connection import DATA_S, Part
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import CHUNK_BYTES, answer_of
 from lightpage.runtime.model.bundle.signature_file import read_signature
 
 
-class Models:
+class Models(Part):
     """Lists the models of the service, adds to them, and changes which of them decodes::
 
         version = client.models.upload("mine.zip").version
@@ -25,13 +25,7 @@ class Models:
 
     What changes the model in service takes the version that must be in service until then, empty for any, and raises
     `OtherModelError` where another one is.
-
-    Args:
-        connection: to the service.
     """
-
-    def __init__(self, connection: Connection) -> None:
-        self._connection = connection
 
     def list(self, stored: bool = False) -> Sequence[ModelInfo]:
         """Return all models that the service holds loaded, the oldest first; before them those that only its store has.
@@ -42,7 +36,7 @@ class Models:
         Raises:
             LightpageError: no answer.
         """
-        reply: pb.ListModelsReply = self._connection.ask("ListModels", stored=stored)
+        reply: pb.ListModelsReply = self._ask("ListModels", stored=stored)
         return [answer_of(ModelInfo, model) for model in reply.models]
 
     def __call__(self) -> Sequence[ModelInfo]:
@@ -77,7 +71,7 @@ class Models:
                     while chunk := file.read(CHUNK_BYTES):
                         yield pb.UploadModelRequest(chunk=chunk)
 
-                reply: pb.UploadModelReply = self._connection.ask("UploadModel", parts(), timeout_s)
+                reply: pb.UploadModelReply = self._ask("UploadModel", parts(), timeout_s)
         except OSError as error:
             raise InvalidInputError(f"bundle {path}", error, "a zip file that can be read") from None
         return answer_of(ModelInfo, reply.model)
@@ -89,7 +83,7 @@ class Models:
             OtherModelError: another one is in service than was expected.
             BundleError: there is none, it is damaged, or the change cannot be noted; then nothing changes.
         """
-        return _changed(self._connection.ask("ActivateModel", version=version, expected_version=expected_version))
+        return _changed(self._ask("ActivateModel", version=version, expected_version=expected_version))
 
     def roll_back(self, expected_version: str = "") -> tuple[str, str]:
         """Go back to the model before; return the versions (now current, before).
@@ -98,11 +92,11 @@ class Models:
             OtherModelError: another one is in service than was expected.
             BundleError: there is none, or the change cannot be noted in the service's store; then nothing changes.
         """
-        return _changed(self._connection.ask("Rollback", expected_version=expected_version))
+        return _changed(self._ask("Rollback", expected_version=expected_version))
 
     def roll_forward(self, expected_version: str = "") -> tuple[str, str]:
         """Go to the later model again, after a roll-back; else as `roll_back`."""
-        return _changed(self._connection.ask("RollForward", expected_version=expected_version))
+        return _changed(self._ask("RollForward", expected_version=expected_version))
 
     def pin(self, version: str, pinned: bool = True) -> ModelInfo:
         """See that a model is never deleted, nor replaced by the service itself, or let go of it; return it.
@@ -110,7 +104,7 @@ class Models:
         Raises:
             BundleError: there is none, or it cannot be noted.
         """
-        return answer_of(ModelInfo, self._connection.ask("PinModel", version=version, pinned=pinned).model)
+        return answer_of(ModelInfo, self._ask("PinModel", version=version, pinned=pinned).model)
 
 
 def _changed(reply: pb.ActivateModelReply | pb.RollbackReply | pb.RollForwardReply) -> tuple[str, str]:

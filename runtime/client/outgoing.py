@@ -110,18 +110,20 @@ def header_message(
     return message_of(pb.DecodeHeader, **format_of(frame), bit_depth=bit_depth, options=page, pilots=pilots, **own)
 
 
-def sent_frames(pair: FramePair, subject: str = "") -> list[NDArray[np.integer]]:
-    """Return both frames, in-phase first.
+def sent_frames(
+    pair: FramePair, subject: str = "", like: NDArray[np.integer] | None = None
+) -> list[NDArray[np.integer]]:
+    """Return both frames, in-phase first, which are to have the size and type of another one, `like`.
 
     Raises:
         FrameError: they cannot be sent.
     """
     frames = [np.asarray(pair.in_phase), np.asarray(pair.quadrature)]
-    first = frames[0]
+    first = frames[0] if like is None else like
     for name, frame in zip(("in-phase frame", "quadrature frame"), frames, strict=True):
         alike = (frame.shape, frame.dtype) == (first.shape, first.dtype)
         if frame.dtype.name not in PIXEL_TYPES.values() or frame.ndim != 2 or not alike:
-            got, expected = f"{frame.dtype} {frame.shape}", "uint8 or uint16, rows and columns, as the other"
+            got, expected = f"{frame.dtype} {frame.shape}", "uint8 or uint16, rows and columns, as the others"
             raise FrameError(subject + name, got, expected)
     return frames
 

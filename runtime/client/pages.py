@@ -7,28 +7,22 @@ from typing import Unpack
 
 from lightpage.errors import LightpageError
 from lightpage.runtime.client.answers import RemoteData, RemotePage, remote_data, remote_page
-from lightpage.runtime.client.connection import DATA_S, Connection
+from lightpage.runtime.client.connection import DATA_S, Part
 from lightpage.runtime.client.outgoing import PageOptions, options_message
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.status import error_from
 
 
-class Pages:
+class Pages(Part):
     """Has the service read pages from its own source, as symbols or as the bytes that they carry::
 
-        page = client.pages.read(7, request_id="order-7")  # asked again, it takes no second shot
+    page = client.pages.read(7, request_id="order-7")  # asked again, it takes no second shot
 
-        for found in client.pages.read_many([1, 2, 5]):  # a page, or the error that it ended with
-            print(found if isinstance(found, Exception) else found.page)
+    for found in client.pages.read_many([1, 2, 5]):  # a page, or the error that it ended with
+        print(found if isinstance(found, Exception) else found.page)
 
-        content = [found.user_data.data for found in client.pages.read_data(0, 30)]
-
-    Args:
-        connection: to the service.
+    content = [found.user_data.data for found in client.pages.read_data(0, 30)]
     """
-
-    def __init__(self, connection: Connection) -> None:
-        self._connection = connection
 
     def read(
         self,
@@ -56,7 +50,7 @@ class Pages:
             RequestIdError: the request id was given with another request.
             SlotsTakenError: the service had no free slot until the deadline.
         """
-        reply: pb.ReadPageReply = self._connection.ask(
+        reply: pb.ReadPageReply = self._ask(
             "ReadPage",
             page=page,
             options=options_message(levels or 0, options),
@@ -88,7 +82,7 @@ class Pages:
             LimitError: more pages than the service reads in one call.
             LightpageError: the whole call ended.
         """
-        with self._connection.replies(
+        with self._replies(
             "ReadPages",
             timeout_s=timeout_s,
             pages=pages,
@@ -111,5 +105,5 @@ class Pages:
             SourceError: the service has no source, or one that is damaged or dark.
             PageError: no such page.
         """
-        with self._connection.replies("ReadData", timeout_s=timeout_s, first_page=first, pages=pages) as replies:
+        with self._replies("ReadData", timeout_s=timeout_s, first_page=first, pages=pages) as replies:
             yield from map(remote_data, replies)
