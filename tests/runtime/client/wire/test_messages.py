@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,26 +15,10 @@ from lightpage.runtime.client.wire.messages import answer_of, message_of
 from lightpage.runtime.model.decoding.image_position import ImagePosition
 from lightpage.runtime.service.frames.frames import user_data_message
 
-MADE = {  # of each message, and which fields need more than their name
-    answers.RemoteTimings: (pb.Timings, set()),
-    answers.RemoteFrame: (pb.CameraFrame, set()),
-    answers.RemotePage: (pb.DecodeReply, {"page", "written", "pilot_mask", "frames", "replayed"}),
-    answers.ModelInfo: (pb.Model, set()),
-    answers.ServiceLimits: (pb.Limits, set()),
-    answers.Description: (pb.DescribeReply, {"frame_shape", "frame_dtype", "bit_depth", "page_shape"}),
-    answers.Recalibrated: (pb.RecalibrationResult, set()),
-    answers.JobInfo: (pb.Job, {"step", "fraction", "error"}),
-    answers.DisplayOrder: (pb.WatchDisplayReply, set()),
-}
-
-
-@pytest.mark.parametrize("kind", MADE)
-def test_every_field_of_an_answer_has_the_name_of_one_of_its_message(kind: Any) -> None:
-    message, more = MADE[kind]
-    assert {field.name for field in fields(kind)} - set(message.DESCRIPTOR.fields_by_name) == more
-
 
 def test_a_page_goes_there_and_back_by_the_names_of_its_fields() -> None:
+    named = {*pb.DecodeReply.DESCRIPTOR.fields_by_name, *pb.ReadPageReply.DESCRIPTOR.fields_by_name}
+    assert {field.name for field in fields(answers.RemotePage)} <= named  # else one keeps its default for ever
     symbols, mask = np.arange(6, dtype=np.uint8).reshape(2, 3), np.eye(2, 3, dtype=bool)
     timings, image = answers.RemoteTimings(1, 2, 3, 4), ImagePosition(0.5, -1.0, found=True)
     page = answers.RemotePage(
