@@ -106,7 +106,7 @@ def header_message(
     if pilots is not None:
         if pilots.mask.shape != pilots.symbols.shape:
             raise PageError("pilots", f"mask {pilots.mask.shape}, page {pilots.symbols.shape}", "two equal shapes")
-        pilots = message_of(pb.Pilots, pilots, values=pilots.symbols[pilots.mask])
+        pilots = message_of(pb.Pilots, pilots, values=sent_symbols(pilots.symbols[pilots.mask], "pilots"))
     return message_of(pb.DecodeHeader, **format_of(frame), bit_depth=bit_depth, options=page, pilots=pilots, **own)
 
 

@@ -61,14 +61,15 @@ def message_of(kind: Callable[..., M], *sources: object, **given: object) -> M:
     """Make a message of the fields `given`; with sources, any other field is the first source's attribute of its name.
 
     Raises:
-        InvalidInputError: a value that no message can hold, for instance a number out of range.
-        TypeError: no source has a field: each is to be given, if only as None.
+        InvalidInputError: given a value that no message can hold, for instance a number out of range.
+        TypeError: no source has a field: each is to be given, if only as None. Or an array is of another type.
+        ValueError: a source has a value that no message can hold.
     """
     found = _fields(kind.DESCRIPTOR, sources, given)  # type: ignore[attr-defined]  # a class of messages has it
     try:
         return kind(**found)
     except (ValueError, TypeError):
-        for name, value in found.items():
+        for name, value in () if sources else found.items():  # what the objects of a program say is no one's input
             try:
                 kind(**{name: value})
             except (ValueError, TypeError) as error:
@@ -134,11 +135,15 @@ def _written(told: FieldDescriptor | None, value: Any) -> Any:
     """A value as the constructor of a message takes it."""
     if told is None:  # the constructor says that there is no such field
         return value
+    if isinstance(value, np.ndarray) and told.is_repeated:
+        return value.tolist()
     if isinstance(value, np.ndarray):
-        float32 = value.dtype.kind == "f"
-        return (
-            value.tolist() if told.is_repeated else value.astype(FLOAT if float32 else np.uint8, copy=False).tobytes()
+        one = (
+            value.astype(FLOAT, copy=False)
+            if value.dtype.kind == "f"
+            else value.astype(np.uint8, casting="safe", copy=False)
         )
+        return one.tobytes()
     if isinstance(value, Mapping) or not told.is_repeated:
         return _one_written(told, value)
     return [_one_written(told, each) for each in value]

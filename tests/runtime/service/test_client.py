@@ -26,12 +26,15 @@ from lightpage.errors import (
 )
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.answers import RemotePage
+from lightpage.runtime.client.outgoing import KnownPilots
 from lightpage.runtime.device.acquisition.source import Shot
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.pages.reading import read_data
 from tests.runtime import coded, toy
 from tests.runtime.service.stage import Running, Start, a_page
+
+MASK = np.ones(toy.PROFILE.page_shape, bool)
 
 
 def test_pairs_that_fail_on_the_callers_side_end_the_call_with_their_error(service: Running) -> None:
@@ -70,6 +73,7 @@ def test_many_pages_of_the_source_in_one_call(start: Start) -> None:
     [
         (lambda client: client.pages.read(-1), "page"),
         (lambda client: client.frames.decode(a_page()[1], frame_id=2**64), "frame_id"),
+        (lambda client: client.frames.decode(a_page()[1], pilots=KnownPilots(MASK, 256 * MASK, 0)), "pilots"),
         (lambda client: client.models.activate("\ud800"), "version"),
         (lambda client: client.jobs.recalibrate(pages=[-1]), "pages"),
         (lambda client: list(client.pages.read_data(0, 2**40)), "pages"),
