@@ -137,13 +137,10 @@ def _written(told: FieldDescriptor | None, value: Any) -> Any:
         return value
     if isinstance(value, np.ndarray) and told.is_repeated:
         return value.tolist()
+    if isinstance(value, np.ndarray) and value.dtype.kind == "f":
+        return value.astype(FLOAT, copy=False).tobytes()
     if isinstance(value, np.ndarray):
-        one = (
-            value.astype(FLOAT, copy=False)
-            if value.dtype.kind == "f"
-            else value.astype(np.uint8, casting="safe", copy=False)
-        )
-        return one.tobytes()
+        return value.astype(np.uint8, casting="safe", copy=False).tobytes()
     if isinstance(value, Mapping) or not told.is_repeated:
         return _one_written(told, value)
     return [_one_written(told, each) for each in value]
