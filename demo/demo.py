@@ -57,7 +57,7 @@ def run_demo(
         client = stack.enter_context(LightpageClient(server.target))
         frames = source.shot(source.shot_s, 0).pair
         levels = decoder.page_codec.code.levels
-        symbols = client.decode(frames, levels).symbols
+        symbols = client.frames.decode(frames, levels).symbols
 
         def read(name: str, start: float, end: float) -> Phase:
             def told(share: float) -> None:
@@ -68,7 +68,7 @@ def run_demo(
         fresh = read("as calibrated", 0.05, 0.3)
         steps = drift_until_lost(client, drift, lambda: progress("drift", 0.3))
         lost = read("after drift", 0.35, 0.6)
-        recalibrated = client.recalibrate(
+        recalibrated = client.jobs.recalibrate(
             pages=range(RECALIBRATION_PAGES),
             progress=lambda step, share: progress(f"recalibrate: {step}", 0.6 + 0.15 * share),
         )

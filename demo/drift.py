@@ -78,7 +78,7 @@ def drift_until_lost(
         told()
         drift(drifted(Device(), share))
         try:
-            page = client.read_page(0, user_data=True)
+            page = client.pages.read(0, user_data=True)
         except LostPageError as error:
             steps.append(DriftStep(share, None, error.recalibration_due, True))
             break

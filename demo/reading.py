@@ -36,7 +36,7 @@ def read_picture(
         for number in range(volume.pages):
             told(number / volume.pages)
             try:
-                page = client.read_page(
+                page = client.pages.read(
                     number, user_data=True, want_concentration=True, want_phase=True, want_written=True
                 )
             except LostPageError:

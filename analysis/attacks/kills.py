@@ -73,7 +73,7 @@ class Killed:
     def begin(self) -> None:
         """Recalibrate once to the end: without a second model there would be nothing to change between."""
         with self.start() as service, LightpageClient(service.target) as client:
-            client.recalibrate(count=2)
+            client.jobs.recalibrate(count=2)
 
     def check(self, service: RunningService, expected: set[str]) -> str:
         """What the service that came after a kill serves; whatever should not be is noted."""
@@ -81,7 +81,7 @@ class Killed:
             version = client.describe().model.version
             if version not in expected:
                 self.bad.append(f"{version} serves in place of {' or '.join(sorted(expected))}")
-            page = client.read_page(want_written=True)
+            page = client.pages.read(want_written=True)
             assert page.written is not None  # the recording knows
             errors = float(np.mean(page.symbols != page.written))
             if errors > 0.05:
@@ -99,16 +99,16 @@ class Killed:
             asked: list[str] = []
             with LightpageClient(service.target, 60) as client:
                 before = client.describe().model.version
-                versions = [model.version for model in client.models(stored=True)]
+                versions = [model.version for model in client.models.list(stored=True)]
                 recalibrating = chance.random() < 0.5 or len(versions) < 2
 
                 def ask() -> None:
                     try:
                         if recalibrating:
-                            heard.append(client.recalibrate(count=2).model_version)
+                            heard.append(client.jobs.recalibrate(count=2).model_version)
                         while not recalibrating:
                             asked.append(chance.choice(versions))
-                            heard.append(client.activate_model(asked[-1])[0])
+                            heard.append(client.models.activate(asked[-1])[0])
                     except (LightpageError, grpc.RpcError, ValueError):
                         pass  # the service has gone
 
@@ -120,7 +120,7 @@ class Killed:
                 asking.join()
         with self.start() as service:
             with LightpageClient(service.target, 60) as client:
-                now = {model.version for model in client.models(stored=True)}
+                now = {model.version for model in client.models.list(stored=True)}
             last = heard[-1] if heard else before
             possible = {last, *(now - set(versions)), *asked[-1:]}
             self.heard += bool(known)

@@ -151,16 +151,16 @@ def life(folder: Path, options: tuple[str, ...]) -> tuple[Path, dict[str, float]
     with service.start(), LightpageClient(service.target) as client:
 
         def models() -> None:
-            client.models(stored=True)
-            client.rollback()
-            client.roll_forward()
+            client.models.list(stored=True)
+            client.models.roll_back()
+            client.models.roll_forward()
 
         steps: Mapping[str, Callable[[], object]] = {
             "health": lambda: [is_serving(service.health, service=name) for name in ("", "lightpage.store")],
-            "decode": lambda: [client.decode(pages.pair) for _ in range(3)],
-            "read pages": lambda: [client.read_page() for _ in range(3)],
-            "recalibrate": lambda: client.recalibrate(count=2),
-            "jobs": client.jobs,
+            "decode": lambda: [client.frames.decode(pages.pair) for _ in range(3)],
+            "read pages": lambda: [client.pages.read() for _ in range(3)],
+            "recalibrate": lambda: client.jobs.recalibrate(count=2),
+            "jobs": client.jobs.list,
             "models": models,
             "metrics, console": lambda: [fetch(service.page(path)) for path in ("metrics", "")],
         }

@@ -115,7 +115,7 @@ def scenario(service: RunningService, decoder: Decoder, seconds: float, folder: 
         phase("as calibrated", pairs[0], 0.5)
         phase("after a drift", pairs[1], 0.5)
         click.echo("recalibrate")
-        started = client.recalibrate_frames(
+        started = client.jobs.start_with_frames(
             [pair for pair, _ in known],
             [symbols for _, symbols in known],
             moved.references,
@@ -123,7 +123,7 @@ def scenario(service: RunningService, decoder: Decoder, seconds: float, folder: 
         )
         try:
             last = started
-            for job in client.watch_job(started.id):
+            for job in client.jobs.watch(started.id):
                 last = job
             click.echo(f"recalibration: {last.state}")
         except LightpageError as error:

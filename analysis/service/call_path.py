@@ -129,20 +129,24 @@ def served(
 
 def decode(bundle: Bundle, folder: Path) -> Entries:
     """The functions that the service enters to decode a pair of frames that a caller sends."""
-    return served(bundle, folder, (), lambda client: client.decode(bundle.golden.pair))
+    return served(bundle, folder, (), lambda client: client.frames.decode(bundle.golden.pair))
 
 
 def read_page(bundle: Bundle, folder: Path) -> Entries:
     """The functions that the service enters to read a page of a recording, which is its source."""
     source = ("--source", f"recording:{_recorded(bundle, folder)}")
-    return served(bundle, folder, source, lambda client: client.read_page())
+    return served(bundle, folder, source, lambda client: client.pages.read())
 
 
 def recalibration(bundle: Bundle, folder: Path) -> Entries:
     """The functions that the service, and the process it starts, enter until a recalibrated model is in service."""
     options = ("--source", f"recording:{_recorded(bundle, folder, _DRIFTED)}", "--store", str(folder / "store"))
     return served(
-        bundle, folder, options, lambda client: client.recalibrate(count=_KNOWN_PAGES), LightpageClient.rollback
+        bundle,
+        folder,
+        options,
+        lambda client: client.jobs.recalibrate(count=_KNOWN_PAGES),
+        lambda client: client.models.roll_back(),
     )
 
 

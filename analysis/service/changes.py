@@ -77,10 +77,10 @@ def change(client: LightpageClient, versions: list[str], chance: random.Random) 
     way = chance.randrange(4)
     try:
         if way == 0:
-            return client.rollback()[0]
+            return client.models.roll_back()[0]
         if way == 1:
-            return client.roll_forward()[0]
-        return client.activate_model(chance.choice(versions))[0]
+            return client.models.roll_forward()[0]
+        return client.models.activate(chance.choice(versions))[0]
     except BundleError:
         return None
 
@@ -117,7 +117,7 @@ def main(changes: int, seed: int, json_path: Path | None) -> None:
         own = ("--store", f"{folder}/store", "--threads", "1", "--no-tracking")
         with RunningService(*own) as service, LightpageClient(service.target, 120) as client:
             for path in paths:
-                client.upload_model(path)
+                client.models.upload(path)
             changed = [_Changed(0.0, 0.0, base.version)]
             answered: list[list[_Answered]] = [[] for _ in range(_CALLERS)]
             stop = threading.Event()

@@ -58,8 +58,8 @@ def expect(service: RunningService, bundle: Bundle, folder: Path) -> None:
     """Write the golden pair of a bundle, what the service's own client gets for it, and the documentation's example."""
     pair, has_code = bundle.golden.pair, bundle.code is not None
     with LightpageClient(service.target, timeout_s=300) as client:
-        page = client.decode(pair, stateless=True, want_phase=True, want_concentration=True)
-        coded = client.decode(pair, stateless=True, user_data=True) if has_code else None
+        page = client.frames.decode(pair, stateless=True, want_phase=True, want_concentration=True)
+        coded = client.frames.decode(pair, stateless=True, user_data=True) if has_code else None
     found = None if coded is None else coded.user_data
     assert (found is None) == (coded is None)  # asked for
     assert page.image is not None  # the service follows it

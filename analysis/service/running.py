@@ -25,7 +25,7 @@ from lightpage.recording.writer import RecordingWriter
 from lightpage.runtime.client.pb.inference import open_inference_pb2 as oip
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
-from lightpage.runtime.client.wire.messages import PIXEL_CODES
+from lightpage.runtime.client.wire.messages import message_of
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 from lightpage.runtime.service.frames.inference_calls import MODEL
@@ -171,14 +171,8 @@ class PagesToSend:
         """The header of a pair."""
         rows, columns = self._bundle.profile.frame_shape
         manifest = self._bundle.manifest
-        header = pb.DecodeHeader(
-            rows_px=rows,
-            columns_px=columns,
-            pixel_type=PIXEL_CODES[manifest.frame_dtype],
-            bit_depth=manifest.camera_bit_depth,
-        )
-        header.MergeFrom(pb.DecodeHeader(**changes))  # type: ignore[arg-type]
-        return header
+        own = {"rows_px": rows, "columns_px": columns, "bit_depth": manifest.camera_bit_depth}
+        return message_of(pb.DecodeHeader, **own | {"pixel_type": manifest.frame_dtype} | changes)
 
     def requests(self, pair: FramePair | None = None, **changes: object) -> list[pb.DecodeFramesRequest]:
         """Messages of DecodeFrames."""

@@ -90,7 +90,7 @@ def measured(profile_name: str, repeats: int) -> dict[str, Any]:
         local = stack.enter_context(RunningService(*own, *at_socket))
         client = stack.enter_context(LightpageClient(service.target, CALL_S))
         near = stack.enter_context(LightpageClient(local.target, CALL_S))
-        memory = stack.enter_context(near.share_memory())
+        memory = stack.enter_context(near.frames.share_memory())
         inside = memory.frames(profile.frame_shape, "uint8")
         memory.write(pair)
         channel = stack.enter_context(grpc.insecure_channel(stack.enter_context(bare_server())))
@@ -98,9 +98,9 @@ def measured(profile_name: str, repeats: int) -> dict[str, Any]:
         seconds = timed(
             {
                 "bare stream": bare,
-                "chunks": lambda: client.decode(pair),
-                "shared memory, copied into it": lambda: near.decode(pair, memory=memory),
-                "shared memory, in it already": lambda: near.decode(inside, memory=memory),
+                "chunks": lambda: client.frames.decode(pair),
+                "shared memory, copied into it": lambda: near.frames.decode(pair, memory=memory),
+                "shared memory, in it already": lambda: near.frames.decode(inside, memory=memory),
             },
             repeats,
         )

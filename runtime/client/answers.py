@@ -2,34 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, TypeVar
 
 import numpy as np
-from google.protobuf.message import Message
 from numpy.typing import NDArray
 
 from lightpage.codec.page_bytes import FileFacts, Header, Loss, PageBytes
 from lightpage.errors import LightpageError
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.messages import DATA_LOSSES, FLOAT, PIXEL_TYPES
+from lightpage.runtime.client.wire.messages import PIXEL_TYPES, answer_of, array_of, member_of
 from lightpage.runtime.client.wire.status import error_from
 from lightpage.runtime.model.decoding.image_position import ImagePosition
-
-D = TypeVar("D")
-
-
-def _filled(kind: Callable[..., D], message: Message, **given: object) -> D:
-    """A dataclass of the fields of a message, but for those `given`; None stands for one that is not set."""
-    named = message.DESCRIPTOR.fields_by_name
-    found = {
-        name: getattr(message, name) if not named[name].has_presence or message.HasField(name) else None
-        for name in (field.name for field in fields(kind))  # type: ignore[arg-type]
-        if name not in given
-    }
-    return kind(**given, **found)
 
 
 @dataclass(frozen=True)
@@ -114,36 +98,29 @@ class RemotePage:
 
 
 def remote_page(reply: pb.DecodeReply, read: pb.ReadPageReply | None = None) -> RemotePage:
-    """A reply as arrays.
+    """Return a reply as arrays.
 
     Raises:
         LightpageError: arrays whose sizes contradict the reply's own shape.
     """
-    shape, octets = (reply.rows, reply.columns), np.dtype(np.uint8)
+    shape, given = (reply.rows, reply.columns), dict[str, object]()
     if reply.confidence_format == pb.CONFIDENCE_FORMAT_UINT8:
-        confidence = _array(reply.confidence, octets, shape, "confidence") / np.float32(255)
-    else:
-        confidence = _array(reply.confidence, FLOAT, shape, "confidence")
-    of_source = read is not None
-    read = read or pb.ReadPageReply()
-    written = read.written
-    return _filled(
-        RemotePage,
-        reply,
-        symbols=_array(reply.symbols, octets, shape, "symbols"),
-        confidence=confidence.astype(np.float32, copy=False),
-        concentration=_optional(reply.concentration, shape, "concentration"),
-        phase=_optional(reply.phase, shape, "phase"),
-        image=_image(reply),
-        user_data=_user_data(reply.user_data) if reply.HasField("user_data") else None,
-        timings=_filled(RemoteTimings, reply.timings),
-        page=read.page if of_source else None,
-        written=_array(written, octets, shape, "written") if written else None,
-        pilot_mask=_array(read.pilot_mask, octets, shape, "pilot_mask") != 0 if written else None,
-        recalibration_reasons=tuple(map(_reason_name, reply.recalibration_reasons)),
-        frames=tuple(_filled(RemoteFrame, frame) for frame in read.frames),
-        replayed=read.replayed,
-    )
+        octets = array_of(reply.confidence, np.dtype(np.uint8), shape, "confidence")
+        given["confidence"] = octets / np.float32(255)
+    if read is not None:
+        given["page"] = read.page  # 0 is a page like any other
+    user_data = page_bytes(reply.user_data) if reply.HasField("user_data") else None
+    messages = (reply,) if read is None else (reply, read)
+    return answer_of(RemotePage, *messages, shape=shape, user_data=user_data, **given)
+
+
+class ModelOrigin(StrEnum):
+    """Where a model came from."""
+
+    GIVEN = "given"
+    RECALIBRATED = "recalibrated"
+    UPLOADED = "uploaded"
+    UNKNOWN = ""
 
 
 @dataclass(frozen=True)
@@ -155,7 +132,7 @@ class ModelInfo:
         current: whether it decodes now.
         pinned: whether it is never deleted.
         loaded: whether it is loaded.
-        origin: "given", "recalibrated" or "uploaded"; empty where that is not known.
+        origin: where it came from.
     """
 
     name: str
@@ -165,7 +142,7 @@ class ModelInfo:
     metrics: dict[str, float]
     pinned: bool
     loaded: bool
-    origin: str
+    origin: ModelOrigin
 
 
 @dataclass(frozen=True)
@@ -220,19 +197,16 @@ class Description:
 
 
 def description(reply: pb.DescribeReply) -> Description:
-    """What a service is, from its message."""
-    shape = (reply.page.rows, reply.page.columns)
-    return _filled(
+    """Return what a service is."""
+    camera, shape = reply.camera, (reply.page.rows, reply.page.columns)
+    return answer_of(
         Description,
         reply,
-        model=model_info(reply.model),
-        frame_shape=(reply.camera.rows_px, reply.camera.columns_px),
-        frame_dtype=PIXEL_TYPES.get(reply.camera.pixel_type, "unknown"),
-        bit_depth=reply.camera.bit_depth,
+        camera,
+        shape=shape,
+        frame_shape=(camera.rows_px, camera.columns_px),
+        frame_dtype=PIXEL_TYPES.get(camera.pixel_type, "unknown"),
         page_shape=shape,
-        pilot_mask=_array(reply.pilot_mask, np.dtype(np.uint8), shape, "pilot_mask") != 0,
-        pilot_phases=np.array(reply.pilot_phases, np.float32) if reply.pilot_phases else None,
-        limits=_filled(ServiceLimits, reply.limits),
     )
 
 
@@ -252,50 +226,34 @@ class RemoteData:
 
 
 def remote_data(reply: pb.ReadDataReply) -> RemoteData:
-    """A message as a page's bytes."""
+    """Return a page's bytes, or why there are none."""
     told = reply.error
-    error = f"{told.thing}: got {told.got}, wanted {told.wanted}" if reply.HasField("error") else ""
-    return RemoteData(None if reply.restored else reply.page, _user_data(reply.user_data), error)
+    error = str(LightpageError(told.thing, told.got, told.wanted)) if reply.HasField("error") else ""
+    return RemoteData(None if reply.restored else reply.page, page_bytes(reply.user_data), error)
 
 
 @dataclass(frozen=True)
 class Recalibrated:
-    """The result of a recalibration: AIR in bits per symbol on held-back pages; None where the fit does not say.
+    """The result of a recalibration: AIR in bits per symbol on held-back pages; None where the fit, or an earlier
+    service, does not say.
 
     `air_limit` is the least `air_after` that would have been accepted, `air_standard_error` that of the difference.
     """
 
     model_version: str
     previous_version: str
+    angle_deg: float | None
     pages_used: int
     pages_held_back: int
-    air_before: float
-    air_after: float
-    angle_deg: float | None
+    seconds: float
     coherence_before: float | None
     coherence_after: float | None
-    seconds: float
+    air_before: float
+    air_after: float
+    air_limit: float | None
+    air_standard_error: float | None
     pages_lost_before: int
     image: ImagePosition | None
-    air_limit: float
-    air_standard_error: float
-
-
-_ORIGINS = {
-    pb.MODEL_ORIGIN_GIVEN: "given",
-    pb.MODEL_ORIGIN_RECALIBRATED: "recalibrated",
-    pb.MODEL_ORIGIN_UPLOADED: "uploaded",
-}
-
-
-def model_info(model: pb.Model) -> ModelInfo:
-    """A model from its message."""
-    return _filled(ModelInfo, model, metrics=dict(model.metrics), origin=_ORIGINS.get(model.origin, ""))
-
-
-def recalibrated(result: pb.RecalibrationResult) -> Recalibrated:
-    """A recalibration from its message."""
-    return _filled(Recalibrated, result, image=_image(result))
 
 
 class JobState(StrEnum):
@@ -342,18 +300,9 @@ class JobInfo:
 
 
 def job_info(job: pb.Job) -> JobInfo:
-    """A job from its message."""
-    name = pb.JobState.Name(job.state).removeprefix("JOB_STATE_") if job.state in pb.JobState.values() else ""
-    return _filled(
-        JobInfo,
-        job,
-        state=JobState[name] if name in JobState.__members__ else JobState.UNKNOWN,
-        step=job.progress.step,
-        fraction=job.progress.fraction,
-        ended_s=job.ended_s or None,
-        result=recalibrated(job.result) if job.HasField("result") else None,
-        error=error_from(job.refusal.detail) if job.HasField("refusal") else None,
-    )
+    """Return how a job stands."""
+    error = error_from(job.refusal.detail) if job.HasField("refusal") else None
+    return answer_of(JobInfo, job, job.progress, error=error)
 
 
 @dataclass(frozen=True)
@@ -370,45 +319,19 @@ class DisplayOrder:
 
 
 def display_order(reply: pb.WatchDisplayReply) -> DisplayOrder:
-    """An order from its message."""
+    """Return what is to be shown."""
     beams = (reply.beams.signal, reply.beams.reference) if reply.HasField("beams") else None
-    return _filled(DisplayOrder, reply, beams=beams)
+    return answer_of(DisplayOrder, reply, beams=beams)
 
 
-def _image(message: pb.DecodeReply | pb.RecalibrationResult) -> ImagePosition | None:
-    """Where the image of a page lay, as a message says; None where it does not."""
-    return _filled(ImagePosition, message.image) if message.HasField("image") else None
-
-
-def _user_data(message: pb.UserData) -> PageBytes:
-    """A message as what a page gave; a loss that this version does not know counts as one of the body."""
-    told = message.header
-    header = Header(told.code_id, told.volume, told.page, told.volume_bytes) if message.HasField("header") else None
-    loss = next((loss for loss, known in DATA_LOSSES.items() if known == message.loss), Loss.BODY)
-    return PageBytes(
-        header,
-        message.data if loss is None else None,
-        FileFacts(message.data_pages, message.parity_pages, message.file_checksum) if loss is None else None,
-        loss,
-        message.iterations,
-        message.failed_blocks,
-        message.blocks,
-        message.corrected,
-        message.margin_bits,
+def page_bytes(told: pb.UserData) -> PageBytes:
+    """Return what a page gave; a loss that this version does not know counts as one of the body."""
+    loss = member_of(Loss, pb.DataLoss.DESCRIPTOR, told.loss, Loss.BODY) if told.loss else None
+    return answer_of(
+        PageBytes,
+        told,
+        header=answer_of(Header, told.header) if told.HasField("header") else None,
+        data=told.data if loss is None else None,
+        file=FileFacts(told.data_pages, told.parity_pages, told.file_checksum) if loss is None else None,
+        loss=loss,
     )
-
-
-def _reason_name(reason: pb.RecalibrationReason) -> str:
-    """The name of a reason, "OTHER" of one that this version does not know."""
-    known = reason in pb.RecalibrationReason.values()
-    return pb.RecalibrationReason.Name(reason).removeprefix("RECALIBRATION_REASON_") if known else "OTHER"
-
-
-def _optional(data: bytes, shape: tuple[int, int], name: str) -> NDArray[np.float32] | None:
-    return _array(data, FLOAT, shape, name).astype(np.float32, copy=False) if data else None
-
-
-def _array(data: bytes, dtype: np.dtype[Any], shape: tuple[int, int], name: str) -> NDArray[Any]:
-    if len(data) != shape[0] * shape[1] * dtype.itemsize:
-        raise LightpageError(f"reply: {name}", f"{len(data)} bytes", f"{shape[0]}x{shape[1]} of {dtype}")
-    return np.frombuffer(data, dtype).reshape(shape)

@@ -1,8 +1,8 @@
-"""What a caller asks of the service, and how its frames and symbols are sent."""
+"""What a caller asks of a page, and how its frames and symbols are sent."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypedDict
 
@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from lightpage.errors import FrameError, PageError
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.client.connection import Connection
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.messages import PIXEL_CODES, FramePart, chunks_of, message_of
+from lightpage.runtime.client.wire.messages import PIXEL_TYPES, message_of
 
 
 class PageOptions(TypedDict, total=False):
@@ -27,6 +28,7 @@ class PageOptions(TypedDict, total=False):
         session: of the pages that this one is followed with; by default those of the connection, at a Unix socket those
             of the client, or of the device where the service reads the page.
         stateless: decode the page as if it were the first, so that the same frames give the same answer.
+        correlation_id: a text that the page and the log have.
     """
 
     want_concentration: bool
@@ -35,28 +37,7 @@ class PageOptions(TypedDict, total=False):
     user_data: bool
     session: str
     stateless: bool
-
-
-def options_message(levels: int, options: PageOptions) -> pb.DecodeOptions:
-    """The message; `levels` 0 stands for the default.
-
-    Raises:
-        InvalidInputError: values that no message can hold.
-        TypeError: an option that there is not.
-    """
-    if unknown := sorted(options.keys() - PageOptions.__annotations__.keys()):
-        raise TypeError(f"unexpected option {', '.join(unknown)}: there are {', '.join(PageOptions.__annotations__)}")
-    quantised, stateless = options.get("quantised", False), options.get("stateless", False)
-    return message_of(
-        pb.DecodeOptions,
-        levels=levels,
-        confidence_format=pb.CONFIDENCE_FORMAT_UINT8 if quantised else pb.CONFIDENCE_FORMAT_FLOAT32,
-        want_concentration=options.get("want_concentration", False),
-        want_phase=options.get("want_phase", False),
-        want_user_data=options.get("user_data", False),
-        session=options.get("session", ""),
-        tracking=pb.TRACKING_STATELESS if stateless else pb.TRACKING_SESSION,
-    )
+    correlation_id: str
 
 
 @dataclass(frozen=True)
@@ -68,49 +49,87 @@ class KnownPilots:
     levels: int
 
 
-def pilots_message(pilots: KnownPilots) -> pb.Pilots:
-    """Pilots as their message.
+class FrameOptions(PageOptions, total=False):
+    """What a caller says of frames, beside what it wants to have of their page. All may be left out.
+
+    Attributes:
+        bit_depth: bits of a camera count; by default those of the service's camera.
+        black_level: counts that the cameras add to every pixel.
+        pilots: known symbols, where they differ from the device's pilots.
+    """
+
+    bit_depth: int | None
+    black_level: int
+    pilots: KnownPilots | None
+
+
+def options_message(levels: int, options: Mapping[str, Any]) -> pb.DecodeOptions:
+    """Return `PageOptions` but for the correlation id, which is no part of it; `levels` 0 stands for the default.
 
     Raises:
-        PageError: mask and page differ in shape.
+        InvalidInputError: values that no message can hold, or an option that there is not.
     """
-    if pilots.mask.shape != pilots.symbols.shape:
-        raise PageError("pilots", f"mask {pilots.mask.shape}, page {pilots.symbols.shape}", "two equal shapes")
-    values = pilots.symbols[pilots.mask].tobytes()
-    return pb.Pilots(mask=pilots.mask.astype(np.uint8).tobytes(), values=values, levels=pilots.levels)
+    asked = {name: value for name, value in options.items() if name != "correlation_id"}
+    quantised, stateless = asked.pop("quantised", False), asked.pop("stateless", False)
+    return message_of(
+        pb.DecodeOptions,
+        levels=levels,
+        confidence_format="UINT8" if quantised else "FLOAT32",
+        want_user_data=asked.pop("user_data", False),
+        tracking="STATELESS" if stateless else "SESSION",
+        **asked,
+    )
 
 
-def recalibration_pages(count: int, pages: Sequence[int], recording: str | None) -> dict[str, Any]:
-    """Where the pages of a recalibration come from, as fields of its request."""
-    if recording is not None:
-        return {"recording": recording, "recording_count": count}
-    return {"source": message_of(pb.SourcePages, count=count, pages=pages)}
+def format_of(frame: NDArray[np.integer]) -> dict[str, Any]:
+    """Return what a header says of the size and the type of frames."""
+    return {"rows_px": frame.shape[0], "columns_px": frame.shape[1], "pixel_type": frame.dtype.name}
 
 
-def pair_parts(header: pb.DecodeHeader, frames: Sequence[NDArray[np.integer]]) -> Iterator[FramePart]:
-    """The messages that send a pair."""
-    yield pb.DecodeFramesRequest(header=header)
-    yield from chunks_of(frames)
+def header_message(
+    connection: Connection, frame: NDArray[np.integer], levels: int, options: FrameOptions, **own: object
+) -> pb.DecodeHeader:
+    """Return what is sent before a pair, with what is the caller's `own` of it.
+
+    Raises:
+        PageError: mask and page of the pilots differ in shape.
+        InvalidInputError: see `options_message`.
+    """
+    asked: dict[str, Any] = dict(options)
+    bit_depth, pilots = asked.pop("bit_depth", None), asked.pop("pilots", None)
+    own |= {"black_level": asked.pop("black_level", None), "correlation_id": asked.get("correlation_id")}
+    page = options_message(levels, asked)
+    if page.tracking != pb.TRACKING_STATELESS:
+        page.session = page.session or connection.session
+    if bit_depth is None:
+        bit_depth = connection.description.bit_depth
+    if pilots is not None:
+        if pilots.mask.shape != pilots.symbols.shape:
+            raise PageError("pilots", f"mask {pilots.mask.shape}, page {pilots.symbols.shape}", "two equal shapes")
+        pilots = message_of(pb.Pilots, pilots, values=sent_symbols(pilots.symbols[pilots.mask], "pilots"))
+    return message_of(pb.DecodeHeader, **format_of(frame), bit_depth=bit_depth, options=page, pilots=pilots, **own)
 
 
-def sent_frames(pair: FramePair, subject: str = "") -> list[NDArray[np.integer]]:
-    """Both frames, in-phase first.
+def sent_frames(
+    pair: FramePair, subject: str = "", like: NDArray[np.integer] | None = None
+) -> list[NDArray[np.integer]]:
+    """Return both frames, in-phase first, which are to have the size and type of another one, `like`.
 
     Raises:
         FrameError: they cannot be sent.
     """
     frames = [np.asarray(pair.in_phase), np.asarray(pair.quadrature)]
-    first = frames[0]
+    first = frames[0] if like is None else like
     for name, frame in zip(("in-phase frame", "quadrature frame"), frames, strict=True):
         alike = (frame.shape, frame.dtype) == (first.shape, first.dtype)
-        if frame.dtype.name not in PIXEL_CODES or frame.ndim != 2 or not alike:
-            got, expected = f"{frame.dtype} {frame.shape}", "uint8 or uint16, rows and columns, as the other"
+        if frame.dtype.name not in PIXEL_TYPES.values() or frame.ndim != 2 or not alike:
+            got, expected = f"{frame.dtype} {frame.shape}", "uint8 or uint16, rows and columns, as the others"
             raise FrameError(subject + name, got, expected)
     return frames
 
 
 def sent_symbols(page: NDArray[np.uint8], subject: str) -> bytes:
-    """A page of symbols, a byte each.
+    """Return a page of symbols, a byte each.
 
     Raises:
         PageError: they do not fit into bytes.

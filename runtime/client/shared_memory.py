@@ -39,7 +39,7 @@ def memory_path(address: str) -> str:
 class SharedMemory:
     """A region of a service's memory; use it in a `with` statement, or `close` it. Then the service lets go of it.
 
-    A pair is written to it, or straight from a camera into `frames`, and decoded by `LightpageClient.decode`. While a
+    A pair is written to it, or straight from a camera into `frames`, and decoded by `Frames.decode`. While a
     call with it is on its way, its contents must stay.
 
     Args:

@@ -35,7 +35,7 @@ from lightpage.runtime.service.models.registry import ModelRegistry
 plane = DataPlane(ModelRegistry(Decoder(Bundle.open(sys.argv[1]))), open_source("recording:" + sys.argv[2]))
 server = LightpageServer(plane, Recalibrator(plane, None))
 with server, LightpageClient(server.target) as client:
-    page = client.read_page(want_written=True)
+    page = client.pages.read(want_written=True)
     assert (page.symbols == page.written).all()
 loaded = {name.partition(".")[0] for name in sys.modules} | {".".join(name.split(".")[:2]) for name in sys.modules}
 bad = loaded & {"torch", "lightning", "onnx", "onnxscript", "opentelemetry", "ray", "tests"}

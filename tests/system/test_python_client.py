@@ -74,9 +74,9 @@ from lightpage_client.errors import FrameError
 frames, said = np.load(sys.argv[2]), ""
 with LightpageClient(sys.argv[1], timeout_s=60) as client:
     version = client.describe().model.version
-    page = client.decode(FramePair(frames[0], frames[1]), 16)
+    page = client.frames.decode(FramePair(frames[0], frames[1]), 16)
     try:
-        client.decode(FramePair(frames[1], frames[0]), 16)
+        client.frames.decode(FramePair(frames[1], frames[0]), 16)
     except FrameError as error:
         said = type(error).__name__
 np.save(sys.argv[3], page.symbols)

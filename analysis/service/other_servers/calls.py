@@ -138,7 +138,7 @@ def chunk_caller(target: str, graph: Graph) -> Iterator[Call]:
         client.describe()
 
         def call() -> Answer:
-            return _of_page(client.decode(graph.pair))
+            return _of_page(client.frames.decode(graph.pair))
 
         yield call
 
@@ -146,10 +146,10 @@ def chunk_caller(target: str, graph: Graph) -> Iterator[Call]:
 @contextmanager
 def memory_caller(target: str, graph: Graph) -> Iterator[Call]:
     """The same over a Unix socket, with memory that is shared: frames are copied into it."""
-    with LightpageClient(target, CALL_S) as client, client.share_memory() as memory:
+    with LightpageClient(target, CALL_S) as client, client.frames.share_memory() as memory:
 
         def call() -> Answer:
-            return _of_page(client.decode(graph.pair, memory=memory))
+            return _of_page(client.frames.decode(graph.pair, memory=memory))
 
         yield call
 

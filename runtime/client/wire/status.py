@@ -13,6 +13,7 @@ from lightpage import errors
 from lightpage.errors import ERRORS, CallerLeft, InvalidInputError, LightpageError, LostPageError, Reason
 from lightpage.failures import understood
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
+from lightpage.runtime.client.wire.messages import enum_name, member_of, message_of
 
 DETAIL_KEY = "lightpage-error-bin"
 STATUS_KEY = "grpc-status-details-bin"
@@ -61,7 +62,16 @@ _MEANINGS: tuple[tuple[type[BaseException], grpc.StatusCode, pb.ErrorReason], ..
 _RETRY_S: dict[type[LightpageError], float] = {errors.StorageError: 2.0, errors.SurroundingsError: 5.0}
 """When to try again what failed by what passes, seconds: a disk that hiccups, and memory that others give back."""
 
-_REASONS: dict[Reason, Any] = {reason: pb.LossReason.Value(f"LOSS_REASON_{reason}") for reason in Reason}
+_UNSAID = {
+    _Code.RESOURCE_EXHAUSTED: ("{}", "a smaller or a later request"),
+    _Code.UNAVAILABLE: (
+        "no connection ({})",
+        "a running Lightpage service at this address, and certificates where it asks for them",
+    ),
+    _Code.UNIMPLEMENTED: ("no such call ({})", "a Lightpage service, of this version or a later one"),
+    _Code.DEADLINE_EXCEEDED: ("no answer within the call's deadline", "one, or a longer deadline"),
+}
+"""What ended a call that no service of this project did, with what gRPC says of it, and what was wanted."""
 
 _FIELD = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*")
 """The name of a field, as those have that are about one."""
@@ -95,7 +105,7 @@ def reason_of(error: BaseException) -> pb.ErrorReason:
 
 def reason_name(error: BaseException) -> str:
     """The reason's name without its prefix, as callers read it."""
-    return pb.ErrorReason.Name(reason_of(error)).removeprefix("ERROR_REASON_")
+    return enum_name(pb.ErrorReason.DESCRIPTOR, reason_of(error))
 
 
 def _meaning(error: BaseException) -> tuple[grpc.StatusCode, pb.ErrorReason]:
@@ -117,8 +127,7 @@ def detail_of(error: LightpageError) -> pb.ErrorDetail:
     subject, got, expected = (without_folders(text[:_LOOKED_AT])[:_TOLD] for text in parts)
     detail = pb.ErrorDetail(kind=type(error).__name__, thing=subject, got=got, wanted=expected)
     if isinstance(error, LostPageError):
-        detail.reason = _REASONS[error.reason]
-        detail.recalibration_due = error.recalibration_due
+        detail.MergeFrom(message_of(pb.ErrorDetail, reason=error.reason, recalibration_due=error.recalibration_due))
     return detail
 
 
@@ -186,17 +195,9 @@ def error_of(rpc: grpc.RpcError, target: str) -> LightpageError:
             error.job = info.metadata.get("job")
         return error
     code, text = call.code(), call.details() or "no details"
-    subject = f"service at {target}"
-    if code == grpc.StatusCode.RESOURCE_EXHAUSTED:
-        return errors.LimitError(subject, text, "a smaller or a later request")
-    if code == grpc.StatusCode.UNAVAILABLE:
-        expected = "a running Lightpage service at this address, and certificates where it asks for them"
-        return LightpageError(subject, f"no connection ({text})", expected)
-    if code == grpc.StatusCode.UNIMPLEMENTED:
-        return LightpageError(subject, f"no such call ({text})", "a Lightpage service, of this version or a later one")
-    if code == grpc.StatusCode.DEADLINE_EXCEEDED:
-        return LightpageError(subject, "no answer within the call's deadline", "one, or a longer deadline")
-    return LightpageError(subject, f"{code.name}: {text}", "an answer")
+    got, expected = _UNSAID.get(code, (f"{code.name}: {{}}", "an answer"))
+    kind = errors.LimitError if code == _Code.RESOURCE_EXHAUSTED else LightpageError
+    return kind(f"service at {target}", got.format(text), expected)
 
 
 def is_lost_connection(rpc: grpc.RpcError) -> bool:
@@ -212,15 +213,11 @@ def error_from(detail: pb.ErrorDetail, retry_s: float | None = None) -> Lightpag
     kind = ERRORS.get(detail.kind, LightpageError)
     parts = (detail.thing, detail.got, detail.wanted)
     if issubclass(kind, LostPageError):
-        return kind(*parts, _reason(detail.reason), detail.recalibration_due)
+        reason = member_of(Reason, pb.LossReason.DESCRIPTOR, detail.reason, Reason.UNSPECIFIED)
+        return kind(*parts, reason, detail.recalibration_due)
     if issubclass(kind, errors.SlotsTakenError):
         return kind(*parts, retry_s)
     return kind(*parts)
-
-
-def _reason(code: pb.LossReason) -> Reason:
-    """A reason from the wire; one that this version does not know is unspecified."""
-    return next((reason for reason, known in _REASONS.items() if known == code), Reason.UNSPECIFIED)
 
 
 def reason_told(error: BaseException | None) -> str:

@@ -31,6 +31,12 @@ from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.commands.client.connection import TARGET, with_tls
 from lightpage.runtime.model.decoding.image_drift import LEAST_COHERENCE
 
+_FIGURES = (
+    *("page", "model_version", "piston_rad", "pilot_coherence", "pilot_trust"),
+    *("claimed_bits", "confirmed_bits", "recalibration_due"),
+)
+"""Of a page, as its report names them too."""
+
 
 @click.command()
 @TARGET
@@ -112,18 +118,11 @@ def page_report(page: RemotePage) -> dict[str, Any]:
     """The figures of one page; AIR and error rate where its symbols are known."""
     figures = _measured(page)
     return {
-        "page": page.page,
-        "model_version": page.model_version,
+        **{name: getattr(page, name) for name in _FIGURES},
         "mean_confidence": float(page.confidence.mean()),
-        "piston_rad": page.piston_rad,
-        "pilot_coherence": page.pilot_coherence,
-        "pilot_trust": page.pilot_trust,
-        "claimed_bits": page.claimed_bits,
-        "confirmed_bits": page.confirmed_bits,
-        "recalibration_due": page.recalibration_due,
-        "image": None if page.image is None else asdict(page.image),
-        "air_bits_per_symbol": figures.air_bits_per_symbol if figures is not None else None,
-        "symbol_error_rate": figures.symbol_error_rate if figures is not None else None,
+        "image": page.image and asdict(page.image),
+        "air_bits_per_symbol": figures and figures.air_bits_per_symbol,
+        "symbol_error_rate": figures and figures.symbol_error_rate,
         **asdict(page.timings),
     }
 
@@ -177,7 +176,7 @@ def _read(client: LightpageClient, count: int, levels: int) -> Iterator[RemotePa
     known = client.describe().source_levels == levels
     for _ in range(count):
         try:
-            page = client.read_page(levels=levels, want_phase=known, want_concentration=known, want_written=known)
+            page = client.pages.read(levels=levels, want_phase=known, want_concentration=known, want_written=known)
         except (InvalidInputError, LostPageError, SourceError, StorageError) as error:
             yield RefusedPage.of(None, error)
         else:
@@ -197,7 +196,7 @@ def _sent(client: LightpageClient, file: Recording, count: int, levels: int) -> 
             symbols = file.symbols(index)
             known = symbols is not None and file.levels == levels
             values = pattern if symbols is None else symbols
-            page = client.decode(
+            page = client.frames.decode(
                 narrow(file.frames(index), file.bit_depth),
                 levels,
                 bit_depth=file.bit_depth,

@@ -11,7 +11,8 @@ from lightpage.cli.options import FiniteRange
 from lightpage.cli.progress_bar import percent_bar
 from lightpage.errors import InvalidInputError
 from lightpage.runtime.client.answers import JobInfo, JobState
-from lightpage.runtime.client.client import RECALIBRATION_S, LightpageClient
+from lightpage.runtime.client.client import LightpageClient
+from lightpage.runtime.client.jobs import RECALIBRATION_S
 from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.commands.client.connection import TARGET, with_tls
 from lightpage.runtime.commands.client.recalibrate import summary, table, watched
@@ -42,7 +43,7 @@ def jobs(target: str, tls: TlsFiles | None, watch: str | None, cancel: str | Non
                 result = watched(client, watch, progress, timeout_s)
             click.echo(table(summary(result, result.seconds)))
         else:
-            found = client.jobs() if cancel is None else [client.cancel_job(cancel)]
+            found = client.jobs.list() if cancel is None else [client.jobs.cancel(cancel)]
             click.echo("\n".join(map(_line, found)) if found else "no jobs")
 
 

@@ -32,7 +32,7 @@ def models(ctx: click.Context, target: str, tls: TlsFiles | None) -> None:
 @click.pass_obj
 def list_models(client: LightpageClient, stored: bool) -> None:
     """List the models; * is in service."""
-    for model in client.models(stored):
+    for model in client.models.list(stored):
         click.echo(_line(model))
 
 
@@ -41,7 +41,7 @@ def list_models(client: LightpageClient, stored: bool) -> None:
 @click.pass_obj
 def upload(client: LightpageClient, bundle: Path) -> None:
     """Give the service a bundle, a .zip; `activate` puts it in service."""
-    click.echo(f"{client.upload_model(bundle).version} is in the store")
+    click.echo(f"{client.models.upload(bundle).version} is in the store")
 
 
 @models.command()
@@ -50,7 +50,7 @@ def upload(client: LightpageClient, bundle: Path) -> None:
 @click.pass_obj
 def activate(client: LightpageClient, version: str, expect: str) -> None:
     """Put a model in service."""
-    current, before = client.activate_model(version, expect)
+    current, before = client.models.activate(version, expect)
     click.echo(f"{current} is in service, {before} was")
 
 
@@ -59,7 +59,7 @@ def activate(client: LightpageClient, version: str, expect: str) -> None:
 @click.pass_obj
 def forward(client: LightpageClient, expect: str) -> None:
     """Undo a roll-back."""
-    current, before = client.roll_forward(expect)
+    current, before = client.models.roll_forward(expect)
     click.echo(f"{current} is in service, {before} was")
 
 
@@ -68,7 +68,7 @@ def forward(client: LightpageClient, expect: str) -> None:
 @click.pass_obj
 def pin(client: LightpageClient, version: str) -> None:
     """See that a model is never deleted, and not replaced by the service itself."""
-    click.echo(_line(client.pin_model(version)))
+    click.echo(_line(client.models.pin(version)))
 
 
 @models.command()
@@ -76,7 +76,7 @@ def pin(client: LightpageClient, version: str) -> None:
 @click.pass_obj
 def unpin(client: LightpageClient, version: str) -> None:
     """Let go of a pinned model."""
-    click.echo(_line(client.pin_model(version, False)))
+    click.echo(_line(client.models.pin(version, False)))
 
 
 def _line(model: ModelInfo) -> str:

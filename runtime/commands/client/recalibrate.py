@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 
 import click
@@ -18,16 +19,19 @@ from lightpage.progress import Progress, warn
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.evaluation import check_recording
 from lightpage.runtime.client.answers import JobInfo, Recalibrated
-from lightpage.runtime.client.client import RECALIBRATION_S, LightpageClient
+from lightpage.runtime.client.client import LightpageClient
+from lightpage.runtime.client.jobs import RECALIBRATION_S
 from lightpage.runtime.client.wire.channel import TlsFiles
+from lightpage.runtime.client.wire.messages import answer_of
 from lightpage.runtime.commands.client.connection import TARGET, with_tls
 from lightpage.runtime.model.bundle.manifest import check_version
 from lightpage.runtime.model.bundle.shipped import bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.known_pages import read_recorded
-from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome, next_version
+from lightpage.runtime.recalibration.recalibration import next_version
 from lightpage.runtime.recalibration.recalibration import recalibrate as recalibrate_bundle
 from lightpage.runtime.recalibration.refit import refit
+from lightpage.runtime.service.jobs.messages import result_message
 
 DEFAULT_PAGES = 2
 
@@ -88,7 +92,7 @@ def recalibrate(
             write_json(json_path, {"job": job.id})
             click.echo(job.id)
             return
-        result: RecalibrationOutcome | Recalibrated = _remote(target, tls, recording, pages, send, wait_s)
+        result = _remote(target, tls, recording, pages, send, wait_s)
     else:
         if send or detach:
             raise InvalidInputError("--send" if send else "--detach", "without --target", "a service")
@@ -104,26 +108,12 @@ def recalibrate(
     click.echo(table(data))
 
 
-def summary(result: RecalibrationOutcome | Recalibrated, seconds: float) -> dict[str, str | float | None]:
+def summary(result: Recalibrated, seconds: float) -> dict[str, str | float | None]:
     """The result under the names that other programs read."""
-    report = result.report if isinstance(result, RecalibrationOutcome) else result
-    return {
-        "version": result.version if isinstance(result, RecalibrationOutcome) else result.model_version,
-        "previous_version": result.previous_version,
-        "angle_deg": report.angle_deg,
-        "pages_used": result.pages_used,
-        "pages_held_back": result.pages_held_back,
-        "seconds": seconds,
-        "coherence_before": report.coherence_before,
-        "coherence_after": report.coherence_after,
-        "air_before": result.air_before,
-        "air_after": result.air_after,
-        "air_limit": result.air_limit,
-        "air_standard_error": result.air_standard_error,
-        "pages_lost_before": result.pages_lost_before,
-        "image_shift_x_px": None if report.image is None else report.image.shift_x_px,
-        "image_shift_y_px": None if report.image is None else report.image.shift_y_px,
-    }
+    figures = asdict(result)
+    version, image = figures.pop("model_version"), figures.pop("image") or {}
+    shift = {f"image_{name}": image.get(name) for name in ("shift_x_px", "shift_y_px")}
+    return {"version": version, **figures, "seconds": seconds, **shift}
 
 
 def table(data: dict[str, str | float | None]) -> str:
@@ -136,14 +126,14 @@ def _remote(
 ) -> Recalibrated:
     with LightpageClient(target, tls=tls) as client, percent_bar() as progress:
         if not send:
-            return client.recalibrate(count=pages, recording=recording, progress=progress, timeout_s=timeout_s)
+            return client.jobs.recalibrate(count=pages, recording=recording, progress=progress, timeout_s=timeout_s)
         until = time.monotonic() + timeout_s
         job = _start(client, recording, pages, send, timeout_s)
         try:
             return watched(client, job.id, progress, until - time.monotonic())
         except BaseException:
             with suppress(LightpageError):
-                client.cancel_job(job.id)  # one that has ended stays as it is
+                client.jobs.cancel(job.id)  # one that has ended stays as it is
             raise
 
 
@@ -153,7 +143,7 @@ def watched(client: LightpageClient, job_id: str, progress: Progress, timeout_s:
     Raises:
         LightpageError: it is not done, and why.
     """
-    for job in client.watch_job(job_id, timeout_s):
+    for job in client.jobs.watch(job_id, timeout_s):
         progress(job.step, job.fraction)
         if job.error is not None:
             raise job.error
@@ -164,11 +154,11 @@ def watched(client: LightpageClient, job_id: str, progress: Progress, timeout_s:
 
 def _start(client: LightpageClient, recording: str | None, pages: int, send: bool, timeout_s: float) -> JobInfo:
     if not send or recording is None:
-        return client.start_recalibration(count=pages, recording=recording)
+        return client.jobs.start(count=pages, recording=recording)
     with Recording.open(recording) as file:
         known, bit_depth = read_recorded(file, first_lit_pages(file, pages, warn)), file.bit_depth
     assert known.references is not None  # of a recording
-    return client.recalibrate_frames(
+    return client.jobs.start_with_frames(
         known.pairs,
         known.symbols,
         known.references,
@@ -179,7 +169,7 @@ def _start(client: LightpageClient, recording: str | None, pages: int, send: boo
     )
 
 
-def _offline(bundle: str, recording: str, out: Path, pages: int, version: str | None) -> RecalibrationOutcome:
+def _offline(bundle: str, recording: str, out: Path, pages: int, version: str | None) -> Recalibrated:
     if out.exists():
         raise InvalidInputError(f"--out {out}", "something that exists", "a new path: bundles are never overwritten")
     if version is not None:
@@ -190,7 +180,8 @@ def _offline(bundle: str, recording: str, out: Path, pages: int, version: str | 
             check_recording(decoder, file)
             known = read_recorded(file, first_lit_pages(file, pages, warn))
         new = next_version(decoder.version) if version is None else version
-        return recalibrate_bundle(decoder, known, out, new, refit, progress)
+        outcome = recalibrate_bundle(decoder, known, out, new, refit, progress)
+    return answer_of(Recalibrated, result_message(outcome))
 
 
 @click.command()
@@ -200,5 +191,5 @@ def _offline(bundle: str, recording: str, out: Path, pages: int, version: str | 
 def rollback(target: str, tls: TlsFiles | None, expect: str) -> None:
     """Put a service's previous model back in service; `lightpage models forward` undoes it."""
     with LightpageClient(target, tls=tls) as client:
-        current, before = client.rollback(expect)
+        current, before = client.models.roll_back(expect)
     click.echo(f"{current} is in service again, {before} is not")

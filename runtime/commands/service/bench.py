@@ -38,7 +38,7 @@ def bench(load: Load, rounds: int, json_path: Path | None) -> None:
         ways: dict[str, Callable[[], object]] = {
             "inference": lambda: decoder.infer(pair),
             "decode": lambda: decoder.decode(pair, LEVELS),
-            "grpc": lambda: client.decode(pair, LEVELS),
+            "grpc": lambda: client.frames.decode(pair, LEVELS),
         }
         seconds: dict[str, list[float]] = {name: [] for name in ways}
         for iteration in track(range(rounds + WARM_UP), "bench", unit="round"):

@@ -223,10 +223,7 @@ class FrameCalls:
             stages=stages,
             version=version,
         )
-        reply = decode_reply(answer, options)
-        reply.frame_id, reply.captured_s = header.frame_id, header.captured_s
-        reply.correlation_id = header.correlation_id
-        return reply
+        return decode_reply(answer, options, header.correlation_id, header.frame_id, header.captured_s)
 
     def _pilots(self, header: pb.DecodeHeader) -> Pilots | None:
         """The caller's own pilots."""

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import asdict
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lightpage.codec.page_bytes import PageBytes
+from lightpage.codec.page_bytes import FileFacts, PageBytes
 from lightpage.errors import CallerLeft, FrameError, InvalidInputError, LimitError, PageError
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import check_levels, symbol_phases
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.messages import DATA_LOSSES, FLOAT, PIXEL_TYPES
-from lightpage.runtime.model.decoding.image_position import ImagePosition
+from lightpage.runtime.client.wire.messages import PIXEL_TYPES, message_of
 from lightpage.runtime.service.admission import Bytes, ReceiveBudget
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import Answer, DataPlane, levels_for
@@ -76,11 +73,6 @@ def pixel_type(code: pb.PixelType) -> str:
     if code not in PIXEL_TYPES:
         raise InvalidInputError("pixel_type", code, "PIXEL_TYPE_UINT8 or PIXEL_TYPE_UINT16")
     return PIXEL_TYPES[code]
-
-
-def image_message(image: ImagePosition) -> pb.ImagePosition:
-    """An image's position as its message."""
-    return pb.ImagePosition(**asdict(image))
 
 
 class PairReceiver:
@@ -232,35 +224,30 @@ def decode(
     return plane.answer(page, model, stages, found, monitor)
 
 
-def decode_reply(answer: Answer, options: pb.DecodeOptions) -> pb.DecodeReply:
-    """An answer as its message, for `options` that have been checked."""
-    page, found = answer.page, answer.user_data
+def decode_reply(
+    answer: Answer, options: pb.DecodeOptions, correlation_id: str, frame_id: int = 0, captured_s: float = 0.0
+) -> pb.DecodeReply:
+    """Return an answer as its message, for `options` that have been checked, with what is the caller's own."""
+    page, confidence = answer.page, answer.page.confidence
     rows, columns = page.symbols.shape
-    return pb.DecodeReply(
+    coarse = options.confidence_format == pb.CONFIDENCE_FORMAT_UINT8
+    return message_of(
+        pb.DecodeReply,
+        answer,
+        page,
+        page.check,
         rows=rows,
         columns=columns,
-        levels=page.levels,
-        symbols=page.symbols.tobytes(),
-        confidence=_confidence_bytes(page.confidence, options.confidence_format),
+        confidence=np.floor(confidence * 255).astype(np.uint8) if coarse else confidence,
         confidence_format=options.confidence_format or pb.CONFIDENCE_FORMAT_FLOAT32,
-        concentration=page.concentration.astype(FLOAT).tobytes() if options.want_concentration else b"",
-        phase=page.phase.astype(FLOAT).tobytes() if options.want_phase else b"",
-        piston_rad=page.piston_rad,
-        pilot_coherence=page.pilot_coherence,
-        pilot_trust=page.pilot_trust,
-        claimed_bits=page.check.claimed_bits,
-        confirmed_bits=page.check.confirmed_bits,
-        recalibration_due=answer.recalibration_due,
+        concentration=page.concentration if options.want_concentration else None,
+        phase=page.phase if options.want_phase else None,
         recalibration_reasons=_recalibration_reasons(answer),
-        image=None if page.image is None else image_message(page.image),
-        user_data=None if found is None else user_data_message(found),
-        model_version=answer.model_version,
-        timings=pb.Timings(
-            receive_s=answer.receive_s,
-            decode_s=page.timings.total_s,
-            inference_s=page.timings.inference_s,
-            total_s=answer.total_s,
-        ),
+        user_data=None if answer.user_data is None else user_data_message(answer.user_data),
+        timings=message_of(pb.Timings, answer, decode_s=page.timings.total_s, inference_s=page.timings.inference_s),
+        correlation_id=correlation_id,
+        frame_id=frame_id,
+        captured_s=captured_s,
     )
 
 
@@ -282,29 +269,7 @@ def _recalibration_reasons(answer: Answer) -> list[pb.RecalibrationReason]:
     return own + [_SIGNS.get(name, pb.RECALIBRATION_REASON_OTHER) for name in answer.monitor_signs]
 
 
-def _confidence_bytes(confidence: NDArray[np.float32], code: int) -> bytes:
-    if code == pb.CONFIDENCE_FORMAT_UINT8:
-        return np.floor(confidence * 255).astype(np.uint8).tobytes()
-    return confidence.astype(FLOAT).tobytes()
-
-
 def user_data_message(found: PageBytes) -> pb.UserData:
-    """What a page gave as its message."""
-    header = found.header
-    return pb.UserData(
-        data=found.data or b"",
-        loss=DATA_LOSSES[found.loss],
-        header=None
-        if header is None
-        else pb.PageHeader(
-            volume=header.volume, page=header.page, volume_bytes=header.volume_bytes, code_id=header.code_id
-        ),
-        data_pages=0 if found.file is None else found.file.data_pages,
-        parity_pages=0 if found.file is None else found.file.parity_pages,
-        file_checksum=0 if found.file is None else found.file.checksum,
-        margin_bits=found.margin_bits,
-        corrected=found.corrected,
-        blocks=found.blocks,
-        failed_blocks=found.failed_blocks,
-        iterations=found.iterations,
-    )
+    """Return what a page gave as its message."""
+    file = found.file or FileFacts(0, 0, 0)
+    return message_of(pb.UserData, found, file, file_checksum=file.checksum)

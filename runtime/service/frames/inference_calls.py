@@ -16,7 +16,7 @@ from lightpage.errors import FrameError, LimitError, MalformedError, NoSuchModel
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.pb.inference import open_inference_pb2 as oip
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.messages import PIXEL_CODES, message_of
+from lightpage.runtime.client.wire.messages import message_of
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.service.admission import ReceiveBudget
 from lightpage.runtime.service.caller import Call, Role
@@ -217,7 +217,7 @@ class InferenceCalls:
             pb.DecodeOptions,
             levels=asked.get("levels", 0),
             session=asked.get("session", ""),
-            tracking=pb.TRACKING_STATELESS if asked.get("stateless") else pb.TRACKING_SESSION,
+            tracking="STATELESS" if asked.get("stateless") else "SESSION",
             want_concentration="concentration" in names,
             want_phase="phase" in names,
             want_user_data=USER_DATA in names,
@@ -226,7 +226,7 @@ class InferenceCalls:
             pb.DecodeHeader,
             rows_px=rows,
             columns_px=columns,
-            pixel_type=PIXEL_CODES[dtype],
+            pixel_type=dtype,
             bit_depth=depth,
             options=options,
             correlation_id=request.id,
@@ -309,8 +309,7 @@ def _pilots(mask: NDArray[np.bool_] | None, symbols: NDArray[np.uint8] | None, l
     if mask is None or symbols is None:
         given, missing = ("pilot_symbols", "pilot_mask") if mask is None else ("pilot_mask", "pilot_symbols")
         raise PageError(f"inputs.{given}", "this tensor alone", f"{missing} too")
-    values = {"mask": mask.astype(np.uint8).tobytes(), "values": symbols[mask].tobytes()}
-    return message_of(pb.Pilots, **values, levels=levels)
+    return message_of(pb.Pilots, mask=mask, values=symbols[mask], levels=levels)
 
 
 def _response(reply: pb.DecodeReply, names: list[str]) -> oip.ModelInferResponse:

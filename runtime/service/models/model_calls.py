@@ -8,9 +8,9 @@ from functools import partial
 
 from lightpage.errors import MalformedError, StalledError
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
+from lightpage.runtime.client.wire.messages import message_of
 from lightpage.runtime.service.caller import Call, Role
 from lightpage.runtime.service.models.models import ModelEntry, Models, Upload
-from lightpage.runtime.service.models.store import Origin
 from lightpage.runtime.service.rpc import rpc
 
 
@@ -83,23 +83,7 @@ class ModelCalls:
             await call.in_thread(partial(upload.add, message.chunk))
 
 
-_ORIGINS = {
-    Origin.GIVEN: pb.MODEL_ORIGIN_GIVEN,
-    Origin.RECALIBRATED: pb.MODEL_ORIGIN_RECALIBRATED,
-    Origin.UPLOADED: pb.MODEL_ORIGIN_UPLOADED,
-}
-
-
 def model_message(entry: ModelEntry) -> pb.Model:
-    """A model as its message; metrics that are no numbers stay behind."""
-    manifest = entry.manifest
-    return pb.Model(
-        name=manifest.name,
-        version=manifest.version,
-        created=manifest.created,
-        current=entry.current,
-        metrics={k: float(v) for k, v in manifest.metrics.items() if isinstance(v, int | float)},
-        pinned=entry.pinned,
-        loaded=entry.loaded,
-        origin=pb.MODEL_ORIGIN_UNSPECIFIED if entry.origin is None else _ORIGINS[entry.origin],
-    )
+    """Return a model as its message; metrics that are no numbers stay behind."""
+    metrics = {k: float(v) for k, v in entry.manifest.metrics.items() if isinstance(v, int | float)}
+    return message_of(pb.Model, entry, entry.manifest, metrics=metrics)

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import numpy as np
-
 from lightpage.clock import Clock
 from lightpage.errors import CallerLeft, InvalidInputError, LimitError, SlotsTakenError
-from lightpage.recording.layout import FrameInfo
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
+from lightpage.runtime.client.wire.messages import message_of
 from lightpage.runtime.client.wire.status import detail_of, reason_told, refusal_of
 from lightpage.runtime.service.caller import Call, Caller, Role
 from lightpage.runtime.service.dataplane import DataPlane
@@ -130,32 +128,25 @@ def _caller(options: pb.DecodeOptions, call: Call) -> Caller:
 
 
 def data_reply(page: DataPage) -> pb.ReadDataReply:
-    """A page of a range as its message."""
-    found = pb.UserData(loss=pb.DATA_LOSS_OPTICS) if page.found is None else user_data_message(page.found)
-    return pb.ReadDataReply(
-        page=page.source_page or 0,
-        user_data=found,
+    """Return a page of a range as its message."""
+    return message_of(
+        pb.ReadDataReply,
+        page,
+        page=page.source_page,
+        user_data=pb.UserData(loss=pb.DATA_LOSS_OPTICS) if page.found is None else user_data_message(page.found),
         restored=page.source_page is None,
         error=None if page.error is None else detail_of(page.error),
-        model_version=page.model_version,
     )
 
 
 def read_reply(read: ReadAnswer, request: pb.ReadPageRequest) -> pb.ReadPageReply:
-    """A page read from the source as its message."""
+    """Return a page read from the source as its message."""
     written = read.shot.symbols if request.want_written else None
-    decoded = decode_reply(read.answer, request.options)
-    decoded.correlation_id = request.correlation_id
-    return pb.ReadPageReply(
-        decoded=decoded,
+    return message_of(
+        pb.ReadPageReply,
+        decoded=decode_reply(read.answer, request.options, request.correlation_id),
         page=read.shot.page_index,
-        written=b"" if written is None else written.tobytes(),
-        pilot_mask=b"" if written is None else read.pilot_mask.astype(np.uint8).tobytes(),
-        frames=[_camera_frame(info) for info in read.shot.infos or ()],
-    )
-
-
-def _camera_frame(info: FrameInfo) -> pb.CameraFrame:
-    return pb.CameraFrame(
-        serial=info.serial, frame_id=info.frame_id, device_time_s=info.device_time_s, host_time_s=info.host_time_s
+        written=written,
+        pilot_mask=None if written is None else read.pilot_mask,
+        frames=read.shot.infos,
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib.metadata import version as installed_version
 
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.client.wire.messages import PIXEL_CODES
+from lightpage.runtime.client.wire.messages import message_of
 from lightpage.runtime.client.wire.status import without_folders
 from lightpage.runtime.service.caller import Call, Role
 from lightpage.runtime.service.dataplane import DataPlane
@@ -45,27 +45,28 @@ class Describing:
         """What the service is."""
         plane, model = self._plane, self._plane.registry.current
         bundle, limits = model.decoder.bundle, self._plane.limits
-        told = limits.model_dump(include=set(pb.Limits.DESCRIPTOR.fields_by_name))
-        told["shared_bytes"] = 0 if plane.shared is None else plane.shared.most_bytes
+        shared_bytes = 0 if plane.shared is None else plane.shared.most_bytes
         (rows_px, columns_px), (rows, columns) = bundle.profile.frame_shape, bundle.profile.page_shape
-        return pb.DescribeReply(
+        return message_of(
+            pb.DescribeReply,
             service_version=installed_version("lightpage"),
             model=model_message(plane.models.entry(model)),
-            camera=pb.Camera(
+            camera=message_of(
+                pb.Camera,
                 rows_px=rows_px,
                 columns_px=columns_px,
                 bit_depth=bundle.manifest.camera_bit_depth,
-                pixel_type=PIXEL_CODES[bundle.manifest.frame_dtype],
+                pixel_type=bundle.manifest.frame_dtype,
             ),
             page=pb.PageShape(rows=rows, columns=columns),
-            limits=pb.Limits(**told),
+            limits=message_of(pb.Limits, limits, shared_bytes=shared_bytes),
             source=without_folders(plane.source.name) if plane.has_source else "",
             source_levels=plane.source.levels if plane.has_source else 0,
             default_levels=plane.default_levels,
             profile_toml=bundle.manifest.profile,
             calibration_toml=bundle.manifest.calibration,
-            pilot_mask=bundle.pilot_mask.astype("uint8").tobytes(),
-            code_toml=bundle.manifest.code or "",
+            pilot_mask=bundle.pilot_mask,
+            code_toml=bundle.manifest.code,
             user_bytes_per_page=0 if bundle.code is None else model.decoder.page_codec.user_bytes,
-            pilot_phases=() if bundle.pilot_phases is None else bundle.pilot_phases.tolist(),
+            pilot_phases=bundle.pilot_phases,
         )

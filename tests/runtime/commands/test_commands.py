@@ -22,6 +22,7 @@ from lightpage.recording.decoded_file import DecodedWriter
 from lightpage.recording.reader import Recording, RecordingWriter
 from lightpage.runtime.client.answers import RemotePage
 from lightpage.runtime.client.client import LightpageClient
+from lightpage.runtime.client.pages import Pages
 from lightpage.runtime.commands.client import recalibrate as cli_recalibrate
 from lightpage.runtime.device.acquisition.source import open_source
 from lightpage.runtime.model.bundle.bundle import Bundle
@@ -370,14 +371,14 @@ def test_pages_of_the_source_that_came_before_the_end_are_kept(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """It would show other pages the next time."""
-    read, count = LightpageClient.read_page, iter(range(100))
+    read, count = Pages.read, iter(range(100))
 
-    def ending(self: LightpageClient, **options: Any) -> RemotePage:
+    def ending(self: Pages, **options: Any) -> RemotePage:
         if next(count) == 2:
             raise end
         return read(self, **options)
 
-    monkeypatch.setattr(LightpageClient, "read_page", ending)
+    monkeypatch.setattr(Pages, "read", ending)
     out, figures = tmp_path / "decoded.h5", tmp_path / "d.json"
     arguments = ["decode", "--target", service.target, "--source", "--pages", "5", "--out", out, "--json", figures]
     assert run(*arguments) == (130 if end is KeyboardInterrupt else 2)
@@ -438,7 +439,7 @@ def test_a_recording_here_is_sent(service: LightpageServer, tmp_path: Path, caps
     assert run(*sending, "--detach") == 0
     job = capsys.readouterr().out.strip()
     with LightpageClient(service.target) as client:
-        assert (client.jobs()[0].id, {one.pages_of for one in client.jobs()}) == (job, {"frames"})
+        assert (client.jobs.list()[0].id, {one.pages_of for one in client.jobs.list()}) == (job, {"frames"})
 
 
 def test_a_sent_recalibration_ends_with_its_command(
@@ -450,4 +451,4 @@ def test_a_sent_recalibration_ends_with_its_command(
     assert run("recalibrate", *where, "--send", "--timeout", "1.5") == 2
     assert "deadline" in capsys.readouterr().err
     with LightpageClient(server.target) as client:
-        assert eventually(lambda: {job.state for job in client.jobs()} <= {"CANCELLED"})
+        assert eventually(lambda: {job.state for job in client.jobs.list()} <= {"CANCELLED"})

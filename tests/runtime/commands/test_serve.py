@@ -140,9 +140,9 @@ def test_a_service_keeps_to_its_limits_logs_json_and_writes_down_changes_and_los
             assert client.describe().model.version == "toy-1+r1"
             for page in range(3):
                 with pytest.raises(UnconfirmedPageError):
-                    client.read_page(page)
+                    client.pages.read(page)
             symbols = toy.symbols_of(16, 5)[0]
-            assert (client.decode(toy.ToyDevice().page(symbols, 16), 16).symbols == symbols).mean() > 0.9
+            assert (client.frames.decode(toy.ToyDevice().page(symbols, 16), 16).symbols == symbols).mean() > 0.9
         with grpc.insecure_channel(target) as channel:
             stub = pb_grpc.LightpageStub(channel)
             assert stub.Describe(pb.DescribeRequest(), timeout=60).limits.chunk_bytes == 65536

@@ -77,7 +77,7 @@ class Running:
 
     def last(self, job: JobInfo) -> JobInfo:
         """The job once it has ended."""
-        *_, end = self.client.watch_job(job.id, 20)
+        *_, end = self.client.jobs.watch(job.id, 20)
         return end
 
     def reading(self, shot: Callable[[Shot], Shot]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,17 +19,22 @@ from lightpage.errors import (
     LightpageError,
     LimitError,
     LostShotError,
+    OtherModelError,
     PageError,
     Reason,
+    SourceError,
 )
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.answers import RemotePage
+from lightpage.runtime.client.outgoing import KnownPilots
 from lightpage.runtime.device.acquisition.source import Shot
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.pages.reading import read_data
 from tests.runtime import coded, toy
 from tests.runtime.service.stage import Running, Start, a_page
+
+MASK = np.ones(toy.PROFILE.page_shape, bool)
 
 
 def test_pairs_that_fail_on_the_callers_side_end_the_call_with_their_error(service: Running) -> None:
@@ -37,11 +43,11 @@ def test_pairs_that_fail_on_the_callers_side_end_the_call_with_their_error(servi
         raise KeyError("mine")
 
     with pytest.raises(KeyError):
-        list(service.client.decode_pages(pairs()))
+        list(service.client.frames.decode_many(pairs()))
     good = a_page()[1].quadrature
     for bad in (good[1:], good.astype(np.uint16), good[0]):
         with pytest.raises(FrameError):
-            list(service.client.decode_pages([replace(a_page()[1], quadrature=bad)]))
+            list(service.client.frames.decode_many([replace(a_page()[1], quadrature=bad)]))
 
 
 def test_many_pages_of_the_source_in_one_call(start: Start) -> None:
@@ -53,29 +59,47 @@ def test_many_pages_of_the_source_in_one_call(start: Start) -> None:
         return shot
 
     service.reading(lost)
-    first, gone, last = service.client.read_pages([2, 5, 1], want_written=True)
+    first, gone, last = service.client.pages.read_many([2, 5, 1], want_written=True)
     assert isinstance(gone, LostShotError)
     assert gone.reason is Reason.MISSING_FRAME
     for page, number in ((first, 2), (last, 1)):
         assert isinstance(page, RemotePage)
         assert (page.page, page.written is None) == (number, False)
-    assert [one.page for one in service.client.read_pages(count=2) if isinstance(one, RemotePage)] == [0, 1]
+    assert [one.page for one in service.client.pages.read_many(count=2) if isinstance(one, RemotePage)] == [0, 1]
 
 
 @pytest.mark.parametrize(
     ("call", "field"),
     [
-        (lambda client: client.read_page(-1), "page"),
-        (lambda client: client.decode(a_page()[1], frame_id=2**64), "frame_id"),
-        (lambda client: client.activate_model("\ud800"), "version"),
-        (lambda client: client.recalibrate(pages=[-1]), "pages"),
-        (lambda client: list(client.read_data(0, 2**40)), "pages"),
+        (lambda client: client.pages.read(-1), "page"),
+        (lambda client: client.frames.decode(a_page()[1], frame_id=2**64), "frame_id"),
+        (lambda client: client.frames.decode(a_page()[1], pilots=KnownPilots(MASK, 256 * MASK, 0)), "pilots"),
+        (lambda client: client.models.activate("\ud800"), "version"),
+        (lambda client: client.jobs.recalibrate(pages=[-1]), "pages"),
+        (lambda client: list(client.pages.read_data(0, 2**40)), "pages"),
     ],
 )
 def test_what_no_message_can_hold_is_named(call: Any, field: str, service: Running) -> None:
     with pytest.raises(InvalidInputError) as error:
         call(service.client)
     assert error.value.subject == field
+
+
+@pytest.mark.parametrize(
+    ("call", "place"),
+    [
+        (lambda client: client.decode(a_page()[1], 16), "frames.decode"),
+        (lambda client: client.read_page(3), "pages.read"),
+        (lambda client: client.recalibrate(recording="none.h5"), "jobs.recalibrate"),
+        (lambda client: client.rollback("none"), "models.roll_back"),
+        (lambda client: client.models(), "models.list"),
+    ],
+)
+def test_a_method_of_version_0_1_0_works_and_names_its_new_place(call: Any, place: str, service: Running) -> None:
+    with pytest.warns(DeprecationWarning, match=place), suppress(SourceError, OtherModelError):
+        assert call(service.client)
+    with pytest.raises(AttributeError):
+        _ = service.client.no_such_name  # type: ignore[attr-defined]
 
 
 Serve = Callable[..., tuple[Running, np.ndarray]]
@@ -100,7 +124,7 @@ def test_a_page_carries_its_bytes_when_asked(serve: Serve) -> None:
     pair = toy.ToyDevice(noise=8.0).page(pages[1], 32, 0.3)
     size = client.describe().user_bytes_per_page
     assert size == service.plane.registry.current.decoder.page_codec.user_bytes
-    for page in (client.decode(pair, 0, user_data=True), client.read_page(1, user_data=True)):
+    for page in (client.frames.decode(pair, 0, user_data=True), client.pages.read(1, user_data=True)):
         found = page.user_data
         assert found is not None
         assert found.data == coded.CONTENT[size : 2 * size]
@@ -109,9 +133,9 @@ def test_a_page_carries_its_bytes_when_asked(serve: Serve) -> None:
         assert (found.loss, page.levels) == (None, 32)
         assert (found.file.data_pages, found.file.parity_pages) == (3, 2)
         assert found.margin_bits > 0
-    assert client.decode(pair, 32).user_data is None
+    assert client.frames.decode(pair, 32).user_data is None
     assert service.count("lightpage_margin_bits") > 0
-    lost = client.read_page(2, user_data=True).user_data  # it has symbols and no bytes
+    lost = client.pages.read(2, user_data=True).user_data  # it has symbols and no bytes
     assert lost is not None
     assert (lost.data, lost.loss, lost.margin_bits > 0) == (None, Loss.BODY, False)
     assert service.count("lightpage_data_pages_total", loss="body") == 1
@@ -121,11 +145,11 @@ def test_a_page_carries_its_bytes_when_asked(serve: Serve) -> None:
 def test_what_cannot_be_asked_for_is_named(serve: Serve) -> None:
     client = serve()[0].client
     cases: list[tuple[Callable[[], object], type[LightpageError], str]] = [
-        (lambda: client.read_page(0, 16, user_data=True), InvalidInputError, "levels"),
-        (lambda: list(client.read_data(0, 0)), InvalidInputError, "pages"),
-        (lambda: list(client.read_data(0, 4097)), LimitError, "pages"),
-        (lambda: list(client.read_data((1 << 32) - 1, 2)), InvalidInputError, "first_page"),
-        (lambda: list(client.read_data(99, 1)), PageError, "page of toy:pages"),
+        (lambda: client.pages.read(0, 16, user_data=True), InvalidInputError, "levels"),
+        (lambda: list(client.pages.read_data(0, 0)), InvalidInputError, "pages"),
+        (lambda: list(client.pages.read_data(0, 4097)), LimitError, "pages"),
+        (lambda: list(client.pages.read_data((1 << 32) - 1, 2)), InvalidInputError, "first_page"),
+        (lambda: list(client.pages.read_data(99, 1)), PageError, "page of toy:pages"),
     ]
     for call, kind, subject in cases:
         with pytest.raises(kind) as error:
@@ -136,7 +160,7 @@ def test_what_cannot_be_asked_for_is_named(serve: Serve) -> None:
 def test_a_model_without_a_code_says_so(serve: Serve) -> None:
     client = serve(with_code=False)[0].client
     assert (client.describe().code_toml, client.describe().user_bytes_per_page) == ("", 0)
-    for call in (lambda: client.read_page(0, user_data=True), lambda: list(client.read_data(0, 2))):
+    for call in (lambda: client.pages.read(0, user_data=True), lambda: list(client.pages.read_data(0, 2))):
         with pytest.raises(BundleError) as error:
             call()
         assert error.value.subject == "bundle plain.zip: code"
@@ -145,7 +169,7 @@ def test_a_model_without_a_code_says_so(serve: Serve) -> None:
 def test_a_range_is_streamed_and_lost_pages_are_restored(serve: Serve) -> None:
     service, pages = serve({0: coded.dark, 1: coded.half_lost, 6: coded.half_lost, 7: coded.dark, 8: coded.dark})
     size = service.client.describe().user_bytes_per_page
-    found = list(service.client.read_data(0, 1000))  # the range ends with the source
+    found = list(service.client.pages.read_data(0, 1000))  # the range ends with the source
     assert [each.page for each in found if each.page is not None] == list(range(len(pages)))
     assert found[0].user_data.loss == Loss.OPTICS
     assert found[0].error

@@ -127,14 +127,14 @@ def served(servicer: Failing, port: int = 0) -> Iterator[int]:
 def test_a_service_that_is_back_is_found() -> None:
     with served(Failing()) as port:
         client = LightpageClient(f"127.0.0.1:{port}", timeout_s=20)
-        assert client.models() == []
+        assert client.models.list() == []
     with pytest.raises(LightpageError) as error:
-        client.rollback()
+        client.models.roll_back()
     assert error.value.subject == f"service at 127.0.0.1:{port}"
 
     def is_back() -> bool:
         try:
-            return client.rollback() == ("", "")
+            return client.models.roll_back() == ("", "")
         except LightpageError:
             return False
 
@@ -146,11 +146,11 @@ def test_a_service_that_is_back_is_found() -> None:
 def test_calls_that_change_nothing_are_repeated_and_others_are_not() -> None:
     servicer = Failing(2)
     with served(servicer) as port, LightpageClient(f"127.0.0.1:{port}", timeout_s=20) as client:
-        assert client.models() == []
+        assert client.models.list() == []
         assert servicer.asked == 3
         servicer.left = 1
         with pytest.raises(LightpageError):
-            client.rollback()
+            client.models.roll_back()
         assert servicer.asked == 4
     assert set(REPEATABLE) <= {method.name for method in SERVICE.methods}
 
@@ -158,16 +158,16 @@ def test_calls_that_change_nothing_are_repeated_and_others_are_not() -> None:
 def test_a_watch_goes_on_after_a_lost_connection_but_not_beyond_its_time() -> None:
     servicer, clock = Failing(2), HandClock()
     with served(servicer) as port, LightpageClient(f"127.0.0.1:{port}", clock=clock) as client:
-        assert [job.state for job in client.watch_job("a", 10.0)] == [JobState.RUNNING, JobState.DONE]
+        assert [job.state for job in client.jobs.watch("a", 10.0)] == [JobState.RUNNING, JobState.DONE]
         assert (servicer.asked, clock.now()) == (3, 1001.0)
         servicer.left = 1000
         with pytest.raises(LightpageError):
-            list(client.watch_job("a", 10.25))
+            list(client.jobs.watch("a", 10.25))
         assert clock.now() == 1011.25
         assert 3 + 21 <= servicer.asked <= 3 + 22  # the last call may take a quarter of a second, which is real
     with LightpageClient(f"127.0.0.1:{port}", clock=clock) as nobody:
         with pytest.raises(LightpageError):
-            list(nobody.watch_job("a", 20))
+            list(nobody.jobs.watch("a", 20))
         assert clock.now() == 1011.25  # who was never heard is not waited for
 
 
@@ -176,4 +176,4 @@ def test_a_proxy_of_the_environment_is_passed_by(monkeypatch: pytest.MonkeyPatch
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("grpc_proxy", "http://127.0.0.1:1")
     with served(Failing()) as port, LightpageClient(f"localhost:{port}", timeout_s=20) as client:
-        client.models()
+        client.models.list()

@@ -46,20 +46,20 @@ def external(lab: Lab) -> tuple[CameraSource, LabModulator]:
 def test_a_controller_shows_what_it_has_uploaded_and_moves_beams(start: Start) -> None:
     source, stage = external(Lab())
     client = start(source=source).client
-    assert client.upload_pages(PAGES[:1], 16) == 0
-    assert client.upload_pages(PAGES[1], 16) == 1
+    assert client.display.upload_pages(PAGES[:1], 16) == 0
+    assert client.display.upload_pages(PAGES[1], 16) == 1
 
     def control() -> list[int]:
         seen = []
         with LightpageClient(client.target, timeout_s=20) as mine:
-            for order in mine.display_orders(120.0):
+            for order in mine.display.watch(120.0):
                 if order.beams is not None:
                     stage.let_through(signal=order.beams[0], reference=order.beams[1])
-                    mine.beams_set(signal=order.beams[0], reference=order.beams[1])
+                    mine.display.report_beams(signal=order.beams[0], reference=order.beams[1])
                 if order.page is not None:
                     seen.append(order.page)
                     stage.show(PAGES[order.page], 16, order.page, 1.0)
-                    mine.page_shown(order.page)
+                    mine.display.report_page(order.page)
                 if len(seen) == 2:
                     break
         return seen
@@ -68,11 +68,11 @@ def test_a_controller_shows_what_it_has_uploaded_and_moves_beams(start: Start) -
         controlling = pool.submit(control)
         assert (source.references().in_phase == toy.ToyDevice().references().in_phase).all()
         for page in (1, 0):
-            reply = client.read_page(page, want_written=True)
+            reply = client.pages.read(page, want_written=True)
             assert (reply.symbols == PAGES[page]).all()
             assert (reply.written == PAGES[page]).all()
         assert controlling.result(60) == [1, 0]
-    client.page_shown(None)
+    client.display.report_page(None)
 
 
 def test_an_upload_whose_caller_leaves_adds_no_page(start: Start) -> None:
@@ -83,17 +83,17 @@ def test_an_upload_whose_caller_leaves_adds_no_page(start: Start) -> None:
     call.cancel()
     more.set()
     eventually(lambda: service.count("lightpage_calls_in_flight") == 0)
-    assert service.client.upload_pages(PAGES[:1], 16) == 0
+    assert service.client.display.upload_pages(PAGES[:1], 16) == 0
 
 
 def test_what_cannot_be_uploaded_is_named(start: Start) -> None:
     source, _ = external(Lab())
     service = start(source=source)
-    service.client.upload_pages(PAGES, 16)
+    service.client.display.upload_pages(PAGES, 16)
     with pytest.raises(InvalidInputError):  # other levels than those before
-        service.client.upload_pages(PAGES % 4, 4)
+        service.client.display.upload_pages(PAGES % 4, 4)
     with pytest.raises(PageError):
-        service.client.upload_pages(np.full_like(PAGES, 200), 16)
+        service.client.display.upload_pages(np.full_like(PAGES, 200), 16)
     assert len(source.pages) == 2
     levels = pb.UploadPagesRequest(levels=4)
     for messages in ([], [pb.UploadPagesRequest(symbols=b"a")], [levels] * 2, [levels, pb.UploadPagesRequest()]):
@@ -122,10 +122,10 @@ def test_more_than_the_service_holds_is_refused_as_it_comes() -> None:
 
 def test_a_source_that_does_all_by_itself_says_so(service: Running) -> None:
     calls: list[Callable[[], object]] = [
-        lambda: service.client.upload_pages(PAGES, 16),
-        lambda: service.client.page_shown(0),
-        lambda: service.client.beams_set(signal=True, reference=True),
-        lambda: next(service.client.display_orders(20.0)),
+        lambda: service.client.display.upload_pages(PAGES, 16),
+        lambda: service.client.display.report_page(0),
+        lambda: service.client.display.report_beams(signal=True, reference=True),
+        lambda: next(service.client.display.watch(20.0)),
     ]
     for call in calls:
         with pytest.raises(NoSourceError):
@@ -137,10 +137,10 @@ def test_the_shots_of_a_source_are_in_the_metrics(start: Start) -> None:
     source, stage = external(lab)
     source.modulator = stage
     service = start(source=source)
-    service.client.upload_pages(PAGES, 16)
-    service.client.read_page(0)
+    service.client.display.upload_pages(PAGES, 16)
+    service.client.pages.read(0)
     lab.plan = lambda: lab.cameras[0].edge()
-    service.client.read_page(1)
+    service.client.pages.read(1)
     assert service.count("lightpage_shots_total", outcome="TAKEN") == 2
     assert service.count("lightpage_shots_total", outcome="MISSING_FRAME") == 1
     assert service.plane.metrics.registry.get_sample_value("lightpage_saturated_share", {"camera": "I"}) is not None

@@ -86,7 +86,7 @@ def fails(service: Running, request: oip.ModelInferRequest) -> Refused:
 
 @pytest.mark.parametrize("typed", [False, True])
 def test_a_pair_gives_the_same_page_as_by_decode_frames(service: Running, typed: bool) -> None:
-    own = service.client.decode(PAIR, 16, stateless=True, want_phase=True, want_concentration=True)
+    own = service.client.frames.decode(PAIR, 16, stateless=True, want_phase=True, want_concentration=True)
     request = request_of(PAIR, typed, levels=16, stateless=True)
     request.id = "order-7"
     response = infer(service, request)
@@ -208,7 +208,7 @@ def test_sessions_are_those_of_the_own_contract(start: Start) -> None:
     def piston(**parameters: Any) -> float:
         return float(values(infer(service, request_of(levels=16, **parameters)))["piston_rad"])
 
-    assert service.client.decode(PAIR, 16, session="mine").piston_rad == 1
+    assert service.client.frames.decode(PAIR, 16, session="mine").piston_rad == 1
     assert [piston(session="mine"), piston(), piston(), piston(stateless=True)] == [2, 1, 2, 1]
 
 

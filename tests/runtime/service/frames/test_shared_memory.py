@@ -135,14 +135,16 @@ def fails(service: Running, *messages: pb.DecodeFramesRequest) -> Refused:
 
 
 def test_a_pair_in_shared_memory_is_decoded_as_one_that_is_sent(shared: Running) -> None:
-    sent = shared.client.decode(FRAMES, 16)
-    with shared.client.share_memory() as memory:
+    sent = shared.client.frames.decode(FRAMES, 16)
+    with shared.client.frames.share_memory() as memory:
         assert memory.size == PAIR
-        page = shared.client.decode(FRAMES, 16, memory=memory)
-        assert (shared.client.decode(memory.frames(toy.SHAPE, "uint8"), 16, memory=memory).symbols == SYMBOLS).all()
+        page = shared.client.frames.decode(FRAMES, 16, memory=memory)
+        assert (
+            shared.client.frames.decode(memory.frames(toy.SHAPE, "uint8"), 16, memory=memory).symbols == SYMBOLS
+        ).all()
         inside = memory.frames(toy.SHAPE, "uint8")  # lies there the other way round: it is turned
         inside.in_phase[...], inside.quadrature[...] = FRAMES.quadrature, FRAMES.in_phase
-        turned = shared.client.decode(FramePair(inside.quadrature, inside.in_phase), 16, memory=memory)
+        turned = shared.client.frames.decode(FramePair(inside.quadrature, inside.in_phase), 16, memory=memory)
     assert (turned.symbols == SYMBOLS).all()
     np.testing.assert_array_equal(page.confidence, sent.confidence)
     assert shared.plane.received.used == 0
@@ -151,11 +153,11 @@ def test_a_pair_in_shared_memory_is_decoded_as_one_that_is_sent(shared: Running)
 
 def test_pairs_may_lie_anywhere_in_their_region(shared: Running) -> None:
     other, second = a_page(seed=4)
-    with shared.client.share_memory(2 * PAIR + 7) as memory:
+    with shared.client.frames.share_memory(2 * PAIR + 7) as memory:
         for offset, pair in ((7, FRAMES), (7 + PAIR, second)):
             inside = memory.frames(toy.SHAPE, "uint8", offset)
             inside.in_phase[...], inside.quadrature[...] = pair.in_phase, pair.quadrature
-        assert (shared.client.decode(inside, 16, memory=memory).symbols == other).all()
+        assert (shared.client.frames.decode(inside, 16, memory=memory).symbols == other).all()
         messages = [asked(memory.handle, 7), asked(memory.handle, PAIR + 8), asked(memory.handle, 7)]
         replies = list(shared.stub.DecodePages(iter(messages), timeout=20))
         assert [reply.decoded.symbols for reply in replies] == [SYMBOLS.tobytes(), b"", SYMBOLS.tobytes()]
@@ -165,7 +167,7 @@ def test_pairs_may_lie_anywhere_in_their_region(shared: Running) -> None:
 
 
 def test_unknown_foreign_and_dropped_regions_are_refused_alike(shared: Running) -> None:
-    with shared.client.share_memory() as memory:
+    with shared.client.frames.share_memory() as memory:
         memory.write(FRAMES)
         handle = memory.handle
         answer = fails(shared, asked(handle), pb.DecodeFramesRequest(chunk=b"x"))  # pixels behind shared ones
@@ -192,7 +194,7 @@ def test_a_call_that_is_cancelled_while_it_is_copied_gives_its_memory_back(
         add(receiver, chunk)
 
     monkeypatch.setattr(PairReceiver, "add", slow)
-    with shared.client.share_memory() as memory:
+    with shared.client.frames.share_memory() as memory:
         memory.write(FRAMES)
         call = shared.stub.DecodeFrames.future(iter([asked(memory.handle)]), timeout=60)
         assert copying.wait(60)
@@ -200,22 +202,22 @@ def test_a_call_that_is_cancelled_while_it_is_copied_gives_its_memory_back(
         eventually(lambda: not shared.count("lightpage_calls_in_flight"))
         go_on.set()
         monkeypatch.undo()
-        assert (shared.client.decode(FRAMES, 16, memory=memory).symbols == SYMBOLS).all()
+        assert (shared.client.frames.decode(FRAMES, 16, memory=memory).symbols == SYMBOLS).all()
     eventually(lambda: shared.plane.received.used == 0)
 
 
 def test_frames_that_do_not_fit_are_refused_before_they_are_written(shared: Running) -> None:
-    with shared.client.share_memory(PAIR - 1) as memory:
+    with shared.client.frames.share_memory(PAIR - 1) as memory:
         with pytest.raises(InvalidInputError):
-            shared.client.decode(FRAMES, 16, memory=memory)
+            shared.client.frames.decode(FRAMES, 16, memory=memory)
         with pytest.raises(FrameError):
-            shared.client.decode(replace(FRAMES, in_phase=FRAMES.in_phase[0]), 16, memory=memory)
+            shared.client.frames.decode(replace(FRAMES, in_phase=FRAMES.in_phase[0]), 16, memory=memory)
 
 
 def test_a_service_without_shared_memory_says_so(start: Start, service: Running, tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError):
-        service.client.share_memory()
+        service.client.frames.share_memory()
     alone = start(address=f"unix:{tmp_path}/s")
     with pytest.raises(LightpageError):
-        alone.client.share_memory()
+        alone.client.frames.share_memory()
     assert fails(alone, asked(b"x")).subject == "header.shared"

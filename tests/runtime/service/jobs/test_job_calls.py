@@ -58,7 +58,7 @@ def known(count: int = 3, levels: int = 16, offsets: tuple[float, float] = DRIFT
 def send(client: LightpageClient, pages: KnownPages, **options: object) -> JobInfo:
     assert pages.references is not None
     given = {"levels": pages.levels, "pilot_mask": pages.pilot_mask, **options}
-    return client.recalibrate_frames(pages.pairs, pages.symbols, pages.references, **given)  # type: ignore[arg-type]
+    return client.jobs.start_with_frames(pages.pairs, pages.symbols, pages.references, **given)  # type: ignore[arg-type]
 
 
 def header(**changes: object) -> Part:
@@ -84,7 +84,7 @@ def test_a_job_survives_its_caller_and_is_kept_over_a_restart(start: Start, tmp_
     fit = SlowFit()
     service = start(fit=fit, store=tmp_path / "store")
     with LightpageClient(service.server.target) as caller:
-        job = caller.start_recalibration(count=2, correlation_id="night shift")
+        job = caller.jobs.start(count=2, correlation_id="night shift")
     assert fit.entered.wait(60)
     assert (job.state, job.pages_of, job.correlation_id) == (JobState.RUNNING, "source", "night shift")
     fit.go.set()
@@ -97,21 +97,21 @@ def test_a_job_survives_its_caller_and_is_kept_over_a_restart(start: Start, tmp_
     assert service.version == "toy-1+r1"
     service.end()
     again = start(store=tmp_path / "store")
-    assert again.client.jobs() == list(again.client.watch_job(done.id, 20)) == [done]
+    assert again.client.jobs.list() == list(again.client.jobs.watch(done.id, 20)) == [done]
     assert again.version == "toy-1+r1"
 
 
 def test_a_watch_tells_each_change_and_holds_no_thread(start: Start) -> None:
     fit = SlowFit()
     service = start(fit=fit, limits=Limits(concurrent_calls=2))
-    job = service.client.start_recalibration(count=2)
+    job = service.client.jobs.start(count=2)
     assert fit.entered.wait(60)
     told: list[list[JobInfo]] = [[] for _ in range(4)]
     with ThreadPoolExecutor(len(told)) as pool:
         for one in told:
-            pool.submit(lambda one=one: one.extend(service.client.watch_job(job.id, 60)))  # type: ignore[misc]
+            pool.submit(lambda one=one: one.extend(service.client.jobs.watch(job.id, 60)))  # type: ignore[misc]
         eventually(lambda: all(told))
-        assert service.client.job(job.id).state is JobState.RUNNING  # there is room for calls beside them
+        assert service.client.jobs.get(job.id).state is JobState.RUNNING  # there is room for calls beside them
         fit.go.set()
     for one in told:
         assert {job.state for job in one[:-1]} == {JobState.RUNNING}
@@ -123,18 +123,19 @@ def test_a_watch_tells_each_change_and_holds_no_thread(start: Start) -> None:
 def test_a_cancelled_job_changes_nothing_and_makes_room(start: Start) -> None:
     fit = SlowFit()
     service = start(fit=fit)
-    job = service.client.start_recalibration(count=2)
+    job = service.client.jobs.start(count=2)
     assert fit.entered.wait(60)
-    cancelled = service.client.cancel_job(job.id)
+    cancelled = service.client.jobs.cancel(job.id)
     assert cancelled.state is JobState.CANCELLED
     assert isinstance(cancelled.error, JobCancelledError)
     assert service.version == "toy-1"
-    assert service.client.cancel_job(job.id).ended_s == cancelled.ended_s
+    assert service.client.jobs.cancel(job.id).ended_s == cancelled.ended_s
     fit.go.set()
-    done = service.last(service.client.start_recalibration(count=2))
+    done = service.last(service.client.jobs.start(count=2))
     assert done.state is JobState.DONE
-    assert service.client.cancel_job(done.id) == done
-    for call in (service.client.job, service.client.cancel_job, lambda name: list(service.client.watch_job(name, 20))):
+    assert service.client.jobs.cancel(done.id) == done
+    calls = service.client.jobs
+    for call in (calls.get, calls.cancel, lambda name: list(calls.watch(name, 20))):
         with pytest.raises(NoSuchJobError):
             call("no-such-job")
     assert service.version == "toy-1+r1"
@@ -153,7 +154,7 @@ def test_a_job_that_does_not_hear_of_its_end_is_told_as_it_runs() -> None:
 def test_a_job_that_ends_badly_says_why_as_a_call_would(start: Start, tmp_path: Path) -> None:
     service = start()
     toy.write_toy_recording(tmp_path / "short.h5", toy.ToyDevice(), 16, 2)
-    end = service.last(service.client.start_recalibration(recording="short.h5", count=3))
+    end = service.last(service.client.jobs.start(recording="short.h5", count=3))
     assert (end.state, end.pages_of) == (JobState.FAILED, "recording short.h5")
     assert isinstance(end.error, InvalidInputError)
     pages = known(3)
@@ -166,24 +167,24 @@ def test_a_job_that_ends_badly_says_why_as_a_call_would(start: Start, tmp_path: 
     # what is known at once fails the call
     for options, kind in (({"count": 17}, LimitError), ({"recording": "absent.h5"}, InvalidInputError)):
         with pytest.raises(kind):
-            service.client.start_recalibration(**options)
+            service.client.jobs.start(**options)
     answer = refused(lambda: service.stub.StartRecalibration(pb.StartRecalibrationRequest(), timeout=20))
     assert (answer.code, answer.subject) == (grpc.StatusCode.INVALID_ARGUMENT, "pages")
-    assert len(service.client.jobs()) == 2
+    assert len(service.client.jobs.list()) == 2
 
 
 def test_the_model_in_service_must_be_the_one_expected(start: Start) -> None:
     service = start()
     calls: list[Callable[[str], object]] = [
-        lambda version: service.client.start_recalibration(count=2, expected_version=version),
-        lambda version: service.client.recalibrate(count=2, expected_version=version),
+        lambda version: service.client.jobs.start(count=2, expected_version=version),
+        lambda version: service.client.jobs.recalibrate(count=2, expected_version=version),
         lambda version: send(service.client, PAGES, expected_version=version),
     ]
     for call in calls:
         with pytest.raises(OtherModelError) as caught:
             call("toy-0")
         assert caught.value.got == "toy-1"
-    assert service.client.jobs() == []
+    assert service.client.jobs.list() == []
     assert service.last(send(service.client, PAGES, expected_version="toy-1")).state is JobState.DONE
 
 
@@ -193,7 +194,7 @@ def test_the_model_in_service_must_be_the_one_expected(start: Start) -> None:
 def test_frames_that_are_sent_give_what_the_same_pages_of_a_recording_give(start: Start, tmp_path: Path) -> None:
     toy.write_toy_recording(tmp_path / "known.h5", toy.ToyDevice(DRIFTED), 16, 4)
     one, other = start(), start(source=None)
-    recorded = one.last(one.client.start_recalibration(recording="known.h5"))
+    recorded = one.last(one.client.jobs.start(recording="known.h5"))
     with Recording.open(tmp_path / "known.h5") as recording:
         pages = read_recorded(recording, range(4))
     sent = other.last(send(other.client, pages, pilot_mask=pilot_mask(toy.PROFILE), correlation_id="sent"))
@@ -238,7 +239,7 @@ def test_dark_frames_are_left_out_and_too_many_are_the_callers_fault(start: Star
         with pytest.raises(BlackFrameError) as error:
             send(service.client, bad)
         assert named in error.value.subject
-    assert len(service.client.jobs()) == 1
+    assert len(service.client.jobs.list()) == 1
     assert service.plane.received.used == 0
 
 
@@ -287,11 +288,11 @@ def test_bad_input_is_named_and_leaves_nothing_and_good_input_comes_in_any_chunk
     for what, (messages, kind) in WRONG.items():
         answer = refused(lambda parts=messages: service.stub.RecalibrateFrames(iter(parts), timeout=20))  # type: ignore[misc]
         assert type(answer.error) is kind, what
-        assert service.client.jobs() == [], what
+        assert service.client.jobs.list() == [], what
         assert service.plane.received.used == 0, what
     job = service.stub.RecalibrateFrames(iter([piece for part in ALL for piece in halves(part)]), timeout=20)
     assert job.state == pb.JOB_STATE_RUNNING
-    assert [one.state for one in service.client.watch_job(job.id, 20)][-1] is JobState.DONE
+    assert [one.state for one in service.client.jobs.watch(job.id, 20)][-1] is JobState.DONE
 
 
 def test_what_comes_counts_against_the_memory_until_the_job_has_ended(start: Start) -> None:
@@ -328,7 +329,7 @@ def test_a_caller_who_has_not_closed_its_stream_and_leaves_starts_nothing(way: s
     eventually(lambda: call.done() and used.used == 0)
     eventually(lambda: service.count("lightpage_calls_in_flight") == 0)
     more.set()
-    assert service.client.jobs() == []
+    assert service.client.jobs.list() == []
 
 
 def test_the_client_refuses_what_it_cannot_send(service: Running) -> None:

@@ -52,7 +52,9 @@ def recorded(path: Path, pages: int, **changes: Callable[[Any], Any]) -> np.ndar
 
 
 def air_of(service: Running, pages: int = 3) -> float:
-    read = [service.client.read_page(want_phase=True, want_concentration=True, want_written=True) for _ in range(pages)]
+    read = [
+        service.client.pages.read(want_phase=True, want_concentration=True, want_written=True) for _ in range(pages)
+    ]
     data = ~np.stack([page.pilot_mask for page in read])
     stacked = [np.stack([getattr(page, name) for page in read])[data] for name in ("phase", "concentration", "written")]
     return measure(*stacked, 16).air_bits_per_symbol
@@ -64,7 +66,7 @@ def test_it_recovers_what_drift_cost_and_rollback_undoes_it(start: Start) -> Non
     service.device.offsets = DRIFTED
     assert air_of(service) < before - 0.8
     steps: list[tuple[str, float]] = []
-    result = service.client.recalibrate(count=2, progress=lambda name, share: steps.append((name, share)))
+    result = service.client.jobs.recalibrate(count=2, progress=lambda name, share: steps.append((name, share)))
     assert (result.model_version, result.previous_version) == ("toy-1+r1", "toy-1")
     assert (result.pages_used, result.pages_held_back) == (2, 1)
     assert (result.angle_deg, result.coherence_before, result.coherence_after) == (0.5, 0.4, 0.9)
@@ -74,19 +76,19 @@ def test_it_recovers_what_drift_cost_and_rollback_undoes_it(start: Start) -> Non
     assert (shares[0], shares[-1]) == (0, 1)
     assert ("fit", pytest.approx(2 / 25 + 23 / 25 * 11 / 23)) in steps  # half of the fit, two pages read
     assert air_of(service) > 0.98 * before
-    assert [(m.version, m.current) for m in service.client.models()] == [("toy-1", False), ("toy-1+r1", True)]
+    assert [(m.version, m.current) for m in service.client.models.list()] == [("toy-1", False), ("toy-1+r1", True)]
     assert service.client.describe().calibration_toml == "angle_deg = 0.5\n"
-    assert service.client.rollback() == ("toy-1", "toy-1+r1")
+    assert service.client.models.roll_back() == ("toy-1", "toy-1+r1")
     assert air_of(service) < before - 0.8
     with pytest.raises(BundleError):
-        service.client.rollback()
+        service.client.models.roll_back()
 
 
 def test_without_a_store_it_goes_on_after_a_rollback_and_keeps_only_the_models_held(start: Start) -> None:
     service = start()
-    assert service.client.recalibrate(count=2).model_version == "toy-1+r1"
-    assert service.client.rollback() == ("toy-1", "toy-1+r1")
-    versions = [service.client.recalibrate(count=2).model_version for _ in range(KEPT_MODELS + 1)]
+    assert service.client.jobs.recalibrate(count=2).model_version == "toy-1+r1"
+    assert service.client.models.roll_back() == ("toy-1", "toy-1+r1")
+    versions = [service.client.jobs.recalibrate(count=2).model_version for _ in range(KEPT_MODELS + 1)]
     assert versions == [f"toy-1+r{number}" for number in range(2, KEPT_MODELS + 3)]
     kept = [model.decoder.bundle.path for model in service.plane.registry.models]
     assert sorted(kept[0].parent.iterdir()) == sorted(kept)
@@ -103,9 +105,9 @@ def test_a_re_fit_is_not_judged_by_the_page_that_it_was_fitted_on(start: Start, 
     # Of two pages the third one is the first.
     for twice, subject in (({"pages": [1, 1]}, "known page 1"), ({"count": 3}, "known page 2")):
         with pytest.raises(InvalidInputError) as error:
-            client.recalibrate(**twice)
+            client.jobs.recalibrate(**twice)
         assert error.value.subject == subject
-    assert client.recalibrate(pages=[1, 0]).pages_used == 2
+    assert client.jobs.recalibrate(pages=[1, 0]).pages_used == 2
 
 
 def test_pages_without_symbols_are_the_fault_of_who_named_them(start: Start, tmp_path: Path) -> None:
@@ -125,11 +127,11 @@ def test_recordings_on_the_server(start: Start, tmp_path: Path) -> None:
 
     def fails(kind: type[LightpageError], name: str, count: int = 0) -> LightpageError:
         with pytest.raises(kind) as error:
-            service.client.recalibrate(recording=name, count=count)
+            service.client.jobs.recalibrate(recording=name, count=count)
         return error.value
 
     recorded(tmp_path / "known.h5", 4, in_phase=lambda data: data * (np.arange(4) != 1)[:, None, None].astype(np.uint8))
-    assert service.client.recalibrate(recording="known.h5").pages_used == 3  # but for the dark one
+    assert service.client.jobs.recalibrate(recording="known.h5").pages_used == 3  # but for the dark one
     (tmp_path / "link.h5").symlink_to(tmp_path / "known.h5")
     for name in ("absent.h5", "../known.h5", str(tmp_path / "known.h5"), "", "x" * 300, "link.h5"):
         assert fails(InvalidInputError, name).subject == "recording to recalibrate with"
@@ -139,7 +141,7 @@ def test_recordings_on_the_server(start: Start, tmp_path: Path) -> None:
 
     recorded(tmp_path / "long.h5", 18, symbols=wrong_behind_three)
     assert [fails(LimitError, "long.h5", count).got for count in (0, 17)] == ["18", "17"]
-    result = service.client.recalibrate(recording="long.h5", count=3)
+    result = service.client.jobs.recalibrate(recording="long.h5", count=3)
     assert (result.pages_used, result.pages_held_back) == (3, 2)
     assert "4 pages" in fails(RecordingError, "known.h5", 5).got
 
@@ -157,9 +159,9 @@ def test_one_runs_at_a_time_beside_decoding_and_the_end_of_the_service_cuts_it_o
     fit = SlowFit()
     service = start(fit=fit)
     with ThreadPoolExecutor(1) as pool:
-        first = pool.submit(service.client.recalibrate, count=2)
+        first = pool.submit(service.client.jobs.recalibrate, count=2)
         assert fit.entered.wait(60)
-        assert (service.client.decode(a_page()[1], 16).symbols == a_page()[0]).all()
+        assert (service.client.frames.decode(a_page()[1], 16).symbols == a_page()[0]).all()
         service.server.stop(20.0)
         with pytest.raises(StoppingError):
             first.result(60)
@@ -198,20 +200,20 @@ def test_a_caller_who_leaves_ends_it(start: Start) -> None:
     eventually(lambda: service.count("lightpage_recalibrations_total", result="dropped") == 1)
     assert service.version == "toy-1"
     fit.go.set()
-    assert service.client.recalibrate(count=2).model_version == "toy-1+r1"
+    assert service.client.jobs.recalibrate(count=2).model_version == "toy-1+r1"
 
 
 def test_a_model_that_changes_meanwhile_makes_its_result_out_of_date(start: Start) -> None:
     fit = SlowFit()
     service = start(fit=fit)
     fit.go.set()
-    service.client.recalibrate(count=2)
+    service.client.jobs.recalibrate(count=2)
     fit.go.clear()
     fit.entered.clear()
     with ThreadPoolExecutor(1) as pool:
-        again = pool.submit(service.client.recalibrate, count=2)
+        again = pool.submit(service.client.jobs.recalibrate, count=2)
         assert fit.entered.wait(60)
-        assert service.client.rollback()[0] == "toy-1"
+        assert service.client.models.roll_back()[0] == "toy-1"
         fit.go.set()
         with pytest.raises(RecalibrationRefusedError):
             again.result(60)
@@ -219,17 +221,17 @@ def test_a_model_that_changes_meanwhile_makes_its_result_out_of_date(start: Star
 
     def changing(shot: Shot) -> Shot:
         if service.version != "toy-1":
-            service.client.rollback()
+            service.client.models.roll_back()
         return shot
 
-    assert service.client.recalibrate(count=2).model_version == "toy-1+r2"
+    assert service.client.jobs.recalibrate(count=2).model_version == "toy-1+r2"
     service.reading(changing)
     with pytest.raises(OtherModelError):
-        service.client.recalibrate(count=2, expected_version="toy-1+r2")
+        service.client.jobs.recalibrate(count=2, expected_version="toy-1+r2")
     assert service.version == "toy-1"
 
 
 def test_who_asked_for_a_change_is_written_down(start: Start, tmp_path: Path) -> None:
     file = tmp_path / "audit.jsonl"
-    start(audit=AuditLog(file)).client.recalibrate(count=2)
+    start(audit=AuditLog(file)).client.jobs.recalibrate(count=2)
     assert json.loads(file.read_text("utf-8"))["who"].startswith("ipv4:127.0.0.1:")

@@ -67,35 +67,35 @@ def chunk(data: bytes) -> pb.UploadModelRequest:
 def test_an_uploaded_model_is_kept_put_in_service_and_rolled_back(stored: Start, new: Path, toy_zip: Path) -> None:
     service = stored()
     client = service.client
-    model = client.upload_model(new)
+    model = client.models.upload(new)
     assert (model.version, model.origin, model.current, model.loaded) == ("toy-2", "uploaded", False, False)
     assert service.store.path_of("toy-2").read_bytes() == new.read_bytes()
     for bundle in (new, toy_zip):  # a version that is there is not taken again
         with pytest.raises(ModelExistsError):
-            client.upload_model(bundle)
-    assert client.activate_model("toy-2", "toy-1") == ("toy-2", "toy-1")
+            client.models.upload(bundle)
+    assert client.models.activate("toy-2", "toy-1") == ("toy-2", "toy-1")
     changes: list[Callable[[], object]] = [  # a call that is repeated steps once
-        lambda: client.activate_model("toy-2", "toy-1"),
-        lambda: client.rollback("toy-1"),
-        lambda: client.roll_forward("toy-1"),
+        lambda: client.models.activate("toy-2", "toy-1"),
+        lambda: client.models.roll_back("toy-1"),
+        lambda: client.models.roll_forward("toy-1"),
     ]
     for change in changes:
         with pytest.raises(OtherModelError) as error:
             change()
         assert error.value.got == "toy-2"
-    assert client.read_page().model_version == "toy-2"
-    client.recalibrate(count=2)
-    assert client.rollback("toy-2+r1") == ("toy-2", "toy-2+r1")
-    assert client.pin_model("toy-2").pinned
+    assert client.pages.read().model_version == "toy-2"
+    client.jobs.recalibrate(count=2)
+    assert client.models.roll_back("toy-2+r1") == ("toy-2", "toy-2+r1")
+    assert client.models.pin("toy-2").pinned
     service.end()
     again = stored()
     client = again.client
     assert again.version == "toy-2"
-    assert [(model.origin, model.pinned) for model in client.models()] == [("given", False), ("uploaded", True)]
-    assert client.roll_forward("toy-2") == ("toy-2+r1", "toy-2")
-    assert not client.pin_model("toy-2", False).pinned
-    assert [client.rollback()[0] for _ in range(2)] == ["toy-2", "toy-1"]
-    for step in (client.rollback, lambda: client.activate_model("toy-9"), lambda: client.pin_model("../new")):
+    assert [(model.origin, model.pinned) for model in client.models.list()] == [("given", False), ("uploaded", True)]
+    assert client.models.roll_forward("toy-2") == ("toy-2+r1", "toy-2")
+    assert not client.models.pin("toy-2", False).pinned
+    assert [client.models.roll_back()[0] for _ in range(2)] == ["toy-2", "toy-1"]
+    for step in (client.models.roll_back, lambda: client.models.activate("toy-9"), lambda: client.models.pin("../new")):
         with pytest.raises(BundleError):
             step()
     assert again.left_behind == ["jobs.json"]
@@ -103,16 +103,16 @@ def test_an_uploaded_model_is_kept_put_in_service_and_rolled_back(stored: Start,
 
 def test_models_are_listed_with_what_is_known_of_them(stored: Start, new: Path) -> None:
     service = stored()
-    service.client.upload_model(new)
+    service.client.models.upload(new)
     for number in range(1, KEPT_MODELS + 1):
-        assert service.client.recalibrate(count=2).model_version == f"toy-1+r{number}"
+        assert service.client.jobs.recalibrate(count=2).model_version == f"toy-1+r{number}"
     (service.store.folder / "damaged.zip").write_bytes(b"no zip")
-    listed = {model.version: model for model in service.client.models(stored=True)}
+    listed = {model.version: model for model in service.client.models.list(stored=True)}
     assert list(listed) == ["toy-1", "toy-2", *(f"toy-1+r{number}" for number in range(1, KEPT_MODELS + 1))]
     assert [model.origin for model in listed.values()] == ["given", "uploaded"] + ["recalibrated"] * KEPT_MODELS
     assert [model.loaded for model in listed.values()] == [False, False] + [True] * KEPT_MODELS
     assert [version for version, model in listed.items() if model.current] == [f"toy-1+r{KEPT_MODELS}"]
-    assert [model.version for model in service.client.models()] == list(listed)[2:]
+    assert [model.version for model in service.client.models.list()] == list(listed)[2:]
     assert listed["toy-1+r1"].metrics["recalibration_pages"] == 2
 
 
@@ -130,11 +130,11 @@ def test_bundles_that_could_not_serve_are_refused_and_leave_nothing(stored: Star
     foreign = write_bundle(tmp_path / "foreign.zip", toy.manifest(version="toy-4", profile=narrow), toy.files())
     for bundle in (golden, untracked, foreign):
         with pytest.raises(BundleError) as error:
-            service.client.upload_model(bundle)
+            service.client.models.upload(bundle)
         assert ".upload-" not in str(error.value)
         assert service.left_behind == service.store.versions() == []
     with pytest.raises(InvalidInputError):
-        service.client.upload_model(tmp_path / "absent.zip")
+        service.client.models.upload(tmp_path / "absent.zip")
 
 
 def test_an_upload_is_what_was_announced(stored: Start, new: Path) -> None:
@@ -179,11 +179,11 @@ def test_a_caller_who_leaves_leaves_nothing_and_one_upload_is_taken_at_a_time(st
     call = service.stub.UploadModel.future(until_told([header(data), chunk(data[:9])], more), timeout=60)
     eventually(lambda: service.plane.models.uploads.busy == 1 and service.left_behind != [])
     with pytest.raises(SlotsTakenError):
-        service.client.upload_model(new)
+        service.client.models.upload(new)
     call.cancel()
     more.set()
     eventually(lambda: service.left_behind == [] and service.plane.models.uploads.busy == 0)
-    assert service.client.upload_model(new).version == "toy-2"
+    assert service.client.models.upload(new).version == "toy-2"
 
 
 def test_a_caller_who_leaves_while_the_bundle_is_checked_leaves_nothing(
@@ -208,8 +208,8 @@ def test_a_caller_who_leaves_while_the_bundle_is_checked_leaves_nothing(
 def test_without_a_store_there_is_nowhere_to_put_a_model(stored: Start, new: Path) -> None:
     service = stored(store=None)
     with pytest.raises(StoreError):
-        service.client.upload_model(new)
-    assert service.client.pin_model("toy-1").pinned
+        service.client.models.upload(new)
+    assert service.client.models.pin("toy-1").pinned
 
 
 def test_a_disk_that_fails_during_an_upload_leaves_nothing(
@@ -223,9 +223,9 @@ def test_a_disk_that_fails_during_an_upload_leaves_nothing(
     with monkeypatch.context() as patch:
         patch.setattr("os.link", full)
         with pytest.raises(StoreError):
-            service.client.upload_model(new)
+            service.client.models.upload(new)
         eventually(lambda: service.left_behind == service.store.versions() == [])
-    assert service.client.upload_model(new).version == "toy-2"
+    assert service.client.models.upload(new).version == "toy-2"
 
 
 def test_the_command_line_does_all_of_it(stored: Start, new: Path) -> None:

@@ -52,15 +52,15 @@ def test_the_stages_of_a_pages_calls_are_all_of_their_time(start: Start) -> None
     service = start()
     pair = a_page()[1]
     turned = FramePair(pair.quadrature, pair.in_phase)
-    service.client.decode(pair, 16)
+    service.client.frames.decode(pair, 16)
     with pytest.raises(FrameError):
-        service.client.decode(turned, 16)
-    assert len(list(service.client.decode_pages([pair, turned, pair], 16))) == 3
+        service.client.frames.decode(turned, 16)
+    assert len(list(service.client.frames.decode_many([pair, turned, pair], 16))) == 3
     infer(service, request_of(pair))
-    service.client.read_page()
+    service.client.pages.read()
     for _ in range(2):
-        service.client.read_page(3, request_id="once")
-    assert len(list(service.client.read_pages(count=3))) == 3
+        service.client.pages.read(3, request_id="once")
+    assert len(list(service.client.pages.read_many(count=3))) == 3
     expected = [("DecodeFrames", 2, 2), ("DecodePages", 1, 3), (f"{PREFIX}ModelInfer", 1, 1)]
     for method, calls, pages in [*expected, ("ReadPage", 3, 3), ("ReadPages", 1, 3)]:
         assert ended(service, method, calls)
@@ -82,7 +82,7 @@ def test_waiting_for_a_slot_is_told_apart_from_the_work(start: Start) -> None:
     with ThreadPoolExecutor(1) as pool:
         with service.plane.decodes.held(Caller()):
             assert (service.count("lightpage_decodes_busy"), service.count("lightpage_decodes_slots")) == (1, 1)
-            calling = pool.submit(service.client.decode, a_page()[1], 16)
+            calling = pool.submit(service.client.frames.decode, a_page()[1], 16)
             eventually(lambda: service.count("lightpage_decodes_waiting") == 1)
             assert service.count("lightpage_receive_buffer_bytes") == size
         calling.result(60)
@@ -95,8 +95,8 @@ def test_waiting_for_a_slot_is_told_apart_from_the_work(start: Start) -> None:
 def test_user_bytes_have_a_stage_of_their_own(start: Start, tmp_path: Path) -> None:
     bundle = coded.bundle(tmp_path / "toy.zip")
     service = start(bundle, source=coded.ShownPages(coded.pages(bundle, tmp_path)))
-    service.client.read_page(1, user_data=True)
-    assert len(list(service.client.read_data(0, 3))) >= 3
+    service.client.pages.read(1, user_data=True)
+    assert len(list(service.client.pages.read_data(0, 3))) >= 3
     for method, pages in (("ReadPage", 1), ("ReadData", 3)):
         assert ended(service, method, 1)
         assert service.count("lightpage_stage_seconds_count", method=method, stage="code") == pages

@@ -134,8 +134,8 @@ def test_answers_do_not_depend_on_what_others_sent(start: Start) -> None:
     assert pistons(2, tracking=pb.TRACKING_STATELESS) == [1, 1]
     assert pistons(2) == [1, 2]  # the connection's own
     assert pistons(1, pb_grpc.LightpageStub(service.channel())) == [1]
-    assert service.client.read_page().piston_rad == 1  # the device's own
-    assert [service.client.read_page(session="mine").piston_rad, service.client.read_page().piston_rad] == [4, 2]
+    assert service.client.pages.read().piston_rad == 1  # the device's own
+    assert [service.client.pages.read(session="mine").piston_rad, service.client.pages.read().piston_rad] == [4, 2]
 
 
 def test_the_same_request_id_takes_one_shot(start: Start) -> None:
@@ -161,7 +161,7 @@ def test_a_page_whose_caller_gave_up_is_not_lost(start: Start) -> None:
     answers = [service.stub.ReadPage.future(asked, timeout=60) for _ in range(3)]  # the decode still runs
     go.set()
     assert [(answer.result().page, answer.result().replayed) for answer in answers] == [(0, True)] * 3
-    assert service.client.read_page().page == 1
+    assert service.client.pages.read().page == 1
     eventually(lambda: service.count("lightpage_calls_total", method="ReadPage", code="DEADLINE_EXCEEDED") == 1)
 
 
@@ -204,7 +204,7 @@ def test_pairs_are_decoded_in_a_row_and_a_bad_one_ends_nothing(service: Running)
     assert (first.symbols, last.symbols) == (symbols[0].tobytes(), symbols[1].tobytes())
     refusals = [(reply.refused.frame_id, reply.refused.reason) for reply in replies[1:3]]
     assert refusals == [(8, pb.ERROR_REASON_FRAME_BLACK), (9, pb.ERROR_REASON_FRAME_FORMAT)]
-    found = list(service.client.decode_pages([pairs[0], black, pairs[1]], correlation_id="mine"))
+    found = list(service.client.frames.decode_many([pairs[0], black, pairs[1]], correlation_id="mine"))
     assert isinstance(found[1], FrameError)
     assert [(page.frame_id, page.correlation_id) for page in found[::2]] == [(0, "mine"), (2, "mine")]  # type: ignore[union-attr]
     stray = iter([pb.DecodeFramesRequest(chunk=b"1")])
@@ -270,7 +270,7 @@ def test_an_answer_in_flight_survives_the_stop(start: Start) -> None:
     service = start(limits=Limits(concurrent_decodes=1))
     with ThreadPoolExecutor(2) as pool:
         with service.plane.decodes.held(Caller()):
-            page = pool.submit(service.client.decode, a_page()[1], 16)
+            page = pool.submit(service.client.frames.decode, a_page()[1], 16)
             eventually(lambda: service.plane.decodes.queued == 1)
             ending = pool.submit(service.server.stop, 600.0)
             eventually(lambda: not service.server.health()[""])
@@ -302,12 +302,12 @@ def test_clients_at_one_unix_socket_are_followed_apart(start: Start, tmp_path: P
     service, pair = start(tracker=Remembering, address=f"unix:{tmp_path}/s"), a_page()[1]
     one = service.client
     with LightpageClient(service.server.target, timeout_s=20) as two:
-        assert [client.decode(pair).piston_rad for client in (one, one, two)] == [1, 2, 1]
-        assert [one.decode(pair, stateless=True).piston_rad, one.decode(pair).piston_rad] == [1, 3]
-        assert [client.decode(pair, session="both").piston_rad for client in (one, two)] == [1, 2]
-        (page,) = two.decode_pages([pair])
+        assert [client.frames.decode(pair).piston_rad for client in (one, one, two)] == [1, 2, 1]
+        assert [one.frames.decode(pair, stateless=True).piston_rad, one.frames.decode(pair).piston_rad] == [1, 3]
+        assert [client.frames.decode(pair, session="both").piston_rad for client in (one, two)] == [1, 2]
+        (page,) = two.frames.decode_many([pair])
         assert page.piston_rad == 2  # type: ignore[union-attr]
-        assert one.read_page().piston_rad == 1  # the device's own
+        assert one.pages.read().piston_rad == 1  # the device's own
     decode = service.stub.DecodeFrames  # names no session
     assert [decode(parts(pair), timeout=20).piston_rad for _ in range(2)] == [1, 1]
 
@@ -336,7 +336,7 @@ def test_ranges_that_nobody_reads_keep_no_place(start: Start) -> None:
     calls = unread(service, 3)
     eventually(lambda: service.count("lightpage_calls_in_flight") == 3)
     eventually(lambda: service.plane.ranges.busy == 0)
-    assert len(list(service.client.read_pages([1, 2, 3]))) == 3
+    assert len(list(service.client.pages.read_many([1, 2, 3]))) == 3
     for call in calls:
         call.cancel()
 

@@ -107,12 +107,12 @@ def test_a_refusal_says_what_is_lacking_and_the_record_of_changes_who_asked(
 ) -> None:
     with LightpageClient(secured.server.target, tls=authority.caller("reader", ["read"])) as client:
         with pytest.raises(NotAllowedError) as error:
-            client.rollback()
+            client.models.roll_back()
         assert (error.value.subject, error.value.got) == ("call Rollback", "reader with role read")
     assert secured.count("lightpage_calls_total", method="Rollback", code="PERMISSION_DENIED") == 1
     tls = authority.caller("operator 7", ["admin"])
     with LightpageClient(secured.server.target, tls=tls) as client, pytest.raises(BundleError):
-        client.rollback()
+        client.models.roll_back()
     (line,) = (tmp_path / "audit.jsonl").read_text().splitlines()
     assert json.loads(line)["who"].startswith("operator 7 at ipv4:127.0.0.1:")
 
@@ -121,8 +121,8 @@ def test_callers_of_other_names_share_no_session_and_no_request_id(secured: Runn
     answers, pistons, pair = [], [], a_page()[1]
     for name in ("one", "two", "one"):
         with LightpageClient(secured.server.target, tls=authority.caller(name, ["decode"])) as client:
-            pistons.append(client.decode(pair, 16, session="a").piston_rad)
-            answers.append(client.read_page(request_id="shot"))
+            pistons.append(client.frames.decode(pair, 16, session="a").piston_rad)
+            answers.append(client.pages.read(request_id="shot"))
     assert pistons == [1, 1, 2]
     assert [answer.replayed for answer in answers] == [False, False, True]
     assert answers[0].page == answers[2].page != answers[1].page

@@ -65,7 +65,7 @@ def test_the_service_describes_itself(start: Start) -> None:
 def test_a_sent_pair_comes_back_as_the_local_decoder_would_decode_it(service: Running, decoder: Decoder) -> None:
     symbols, pair = a_page()
     here = decoder.decode(pair, 16)
-    there = service.client.decode(pair, 16, want_concentration=True, want_phase=True)
+    there = service.client.frames.decode(pair, 16, want_concentration=True, want_phase=True)
     assert (there.symbols == symbols).all()
     for name in ("symbols", "confidence", "concentration", "phase"):
         np.testing.assert_array_equal(getattr(there, name), getattr(here, name))
@@ -78,7 +78,7 @@ def test_a_sent_pair_comes_back_as_the_local_decoder_would_decode_it(service: Ru
 
 def test_what_is_asked_of_a_pair_is_done_and_no_more_is_sent(service: Running) -> None:
     pair = a_page(64)[1]
-    exact, coarse = service.client.decode(pair, 64), service.client.decode(pair, 64, quantised=True)
+    exact, coarse = service.client.frames.decode(pair, 64), service.client.frames.decode(pair, 64, quantised=True)
     assert (coarse.concentration, coarse.phase) == (None, None)
     assert set(np.unique(coarse.confidence * 255 % 1)) == {0}
     assert (coarse.confidence <= exact.confidence).all()
@@ -86,16 +86,16 @@ def test_what_is_asked_of_a_pair_is_done_and_no_more_is_sent(service: Running) -
 
     assert exact.symbols.max() > 16
     assert service.stub.DecodeFrames(parts(a_page()[1], options=pb.DecodeOptions()), timeout=20).levels == 16
-    assert service.client.read_page(3).levels == 16
+    assert service.client.pages.read(3).levels == 16
 
     symbols = np.random.default_rng(5).integers(16, size=toy.PAGE).astype(np.uint8)
     mask = np.zeros(toy.PAGE, bool)
     mask[::4, ::6] = True
     pair = toy.ToyDevice().page(symbols, 16, 2.0)
-    assert (service.client.decode(pair, 16, pilots=KnownPilots(mask, symbols, 16)).symbols == symbols).all()
+    assert (service.client.frames.decode(pair, 16, pilots=KnownPilots(mask, symbols, 16)).symbols == symbols).all()
 
     symbols, pair = a_page()
-    assert (service.client.decode(raised(pair, 6), 16, black_level=6).symbols == symbols).all()
+    assert (service.client.frames.decode(raised(pair, 6), 16, black_level=6).symbols == symbols).all()
     for level in (255, 256):
         answer = sent(service, beginning(black_level=level))
         assert (answer.code, answer.subject) == (INVALID, "black_level")
@@ -103,7 +103,7 @@ def test_what_is_asked_of_a_pair_is_done_and_no_more_is_sent(service: Running) -
 
 def test_pages_are_read_from_the_source_in_turn_or_by_number(start: Start) -> None:
     client = start().client
-    pages = [client.read_page(want_written=True), client.read_page(want_written=True), client.read_page(9)]
+    pages = [client.pages.read(want_written=True), client.pages.read(want_written=True), client.pages.read(9)]
     assert [page.page for page in pages] == [0, 1, 9]
     for page in pages[:2]:
         assert page.written is not None
@@ -111,7 +111,7 @@ def test_pages_are_read_from_the_source_in_turn_or_by_number(start: Start) -> No
         assert (page.symbols == page.written).all()
         assert (page.pilot_mask == pilot_mask(toy.PROFILE)).all()
     assert pages[2].written is None
-    assert client.read_page(1, 8).levels == 8
+    assert client.pages.read(1, 8).levels == 8
 
 
 # ---- refusals -----------------------------------------------------------------------------------------------------
@@ -138,8 +138,8 @@ def test_bad_options_are_named_before_a_frame_is_sent_or_a_page_is_read(start: S
             assert answer.told["BadRequest"].field_violations[0].field == name
     for pilots in (pb.Pilots(mask=b"abc"), pb.Pilots(mask=b"\2" + bytes(383)), pb.Pilots(mask=bytes(384), values=b"a")):
         assert sent(service, beginning(pilots=pilots)).subject == "pilots"
-    assert service.client.decode(PAIR, 16, session="x" * 1024).levels == 16
-    assert service.client.read_page().page == 0
+    assert service.client.frames.decode(PAIR, 16, session="x" * 1024).levels == 16
+    assert service.client.pages.read().page == 0
 
 
 def test_a_broken_stream_is_the_callers_fault_and_named(service: Running) -> None:
@@ -173,7 +173,7 @@ def test_oversize_requests_are_refused_before_anything_is_allocated(start: Start
     ):
         answer = sent(service, *messages)
         assert (answer.code, got in answer.error.got) == (grpc.StatusCode.RESOURCE_EXHAUSTED, True)
-    assert (service.client.decode(PAIR, 16).symbols == a_page()[0]).all()
+    assert (service.client.frames.decode(PAIR, 16).symbols == a_page()[0]).all()
 
 
 def test_senders_who_stand_still_cost_the_others_nothing_and_leave_nothing_behind(start: Start) -> None:
@@ -181,7 +181,7 @@ def test_senders_who_stand_still_cost_the_others_nothing_and_leave_nothing_behin
     begun = [beginning(), chunk(100)]
     calls = [service.stub.DecodeFrames.future(until_told(begun, over), timeout=60) for _ in range(40)]
     eventually(lambda: service.plane.received.used == 40 * 100)
-    assert (service.client.decode(PAIR, 16).symbols == a_page()[0]).all()
+    assert (service.client.frames.decode(PAIR, 16).symbols == a_page()[0]).all()
     assert service.count("lightpage_calls_in_flight") == 40
     for call in calls:
         call.cancel()
@@ -195,7 +195,7 @@ def test_waiting_for_a_slot_is_not_stalling(start: Start) -> None:
     service = start(limits=Limits(concurrent_decodes=1, receive_s=0.1, stall_s=0.1))
     with ThreadPoolExecutor(1) as pool:
         with service.plane.decodes.held(Caller()):
-            waiting = pool.submit(service.client.decode, PAIR, 16)
+            waiting = pool.submit(service.client.frames.decode, PAIR, 16)
             eventually(lambda: service.plane.decodes.queued == 1)
             threading.Event().wait(0.2)
             assert not waiting.done()
@@ -227,23 +227,23 @@ def test_a_page_whose_pilots_disagree_is_lost_and_not_answered(start: Start) -> 
     service = start()
     strange = toy.ToyDevice().page(np.random.default_rng(5).integers(16, size=toy.PAGE).astype(np.uint8), 16)
     with pytest.raises(UnconfirmedPageError) as caught:
-        service.client.decode(strange, 16)
+        service.client.frames.decode(strange, 16)
     assert caught.value.subject == "frame pair: pilots"
     assert (caught.value.reason, caught.value.recalibration_due) == (Reason.PILOTS_DISAGREE, True)
     assert service.count("lightpage_recalibration_due") == 1
     assert service.count("lightpage_calls_total", method="DecodeFrames", code="DATA_LOSS") == 1
     service.reading(lambda shot: Shot(strange, shot.page_index))
     with pytest.raises(UnconfirmedPageError) as caught:
-        service.client.read_page(7)
+        service.client.pages.read(7)
     assert caught.value.subject == "page 7 of toy:device: pilots"
     # a caller's own pilots may be wrong, and say nothing of the device
-    service.client.decode(PAIR, 16)
+    service.client.frames.decode(PAIR, 16)
     wrong = np.random.default_rng(8).integers(16, size=toy.PAGE).astype(np.uint8)
     with pytest.raises(UnconfirmedPageError) as caught:
-        service.client.decode(PAIR, 16, pilots=KnownPilots(pilot_mask(toy.PROFILE), wrong, 16))
+        service.client.frames.decode(PAIR, 16, pilots=KnownPilots(pilot_mask(toy.PROFILE), wrong, 16))
     assert not caught.value.recalibration_due
     assert service.count("lightpage_recalibration_due") == 0
-    page = service.client.decode(PAIR, 16)
+    page = service.client.frames.decode(PAIR, 16)
     assert page.confirmed_bits == pytest.approx(page.claimed_bits, rel=0.15)
 
 
@@ -259,10 +259,10 @@ def test_a_server_is_found_where_it_is_and_says_what_it_lacks(service: Running, 
     assert service.server.target == f"unix:{tmp_path}/s"
     assert service.client.describe().source == ""
     asked: list[Callable[[], object]] = [
-        service.client.read_page,
-        lambda: service.client.recalibrate(count=2),
-        lambda: service.client.start_recalibration(count=2),
-        lambda: service.client.recalibrate(recording="R.h5"),
+        service.client.pages.read,
+        lambda: service.client.jobs.recalibrate(count=2),
+        lambda: service.client.jobs.start(count=2),
+        lambda: service.client.jobs.recalibrate(recording="R.h5"),
     ]
     for call in asked:
         with pytest.raises(NoSourceError):
@@ -280,5 +280,5 @@ def test_a_recalibration_without_any_folder_is_refused_before_it_begins(
     with pytest.raises(StoreError):
         service.recalibrator.check_start()
     with pytest.raises(StoreError):
-        service.client.start_recalibration(count=2)
-    assert service.client.jobs() == []
+        service.client.jobs.start(count=2)
+    assert service.client.jobs.list() == []
