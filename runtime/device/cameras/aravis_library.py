@@ -56,12 +56,12 @@ _FALLIBLE: Signatures = {
     "arv_camera_new": (c_void_p, (c_char_p,)),
     "arv_camera_get_device_serial_number": (c_char_p, (c_void_p,)),
     "arv_camera_is_feature_available": (c_int, (c_void_p, c_char_p)),
-    "arv_camera_is_enumeration_entry_available": (c_int, (c_void_p, c_char_p, c_char_p)),
     "arv_camera_dup_available_enumerations_as_strings": (POINTER(c_char_p), (c_void_p, c_char_p, POINTER(c_uint32))),
     "arv_camera_get_sensor_size": (None, (c_void_p, POINTER(c_int), POINTER(c_int))),
     "arv_camera_set_string": (None, (c_void_p, c_char_p, c_char_p)),
     "arv_camera_get_string": (c_char_p, (c_void_p, c_char_p)),
     "arv_camera_set_boolean": (None, (c_void_p, c_char_p, c_int)),
+    "arv_camera_get_boolean": (c_int, (c_void_p, c_char_p)),
     "arv_camera_set_region": (None, (c_void_p, c_int, c_int, c_int, c_int)),
     "arv_camera_get_region": (None, (c_void_p, POINTER(c_int), POINTER(c_int), POINTER(c_int), POINTER(c_int))),
     **{f"arv_camera_set_{name}": (None, (c_void_p, c_double)) for name in _NUMBERS},
@@ -101,6 +101,7 @@ _PLAIN: Signatures = {
     "arv_buffer_get_image_pixel_format": (c_uint32, (c_void_p,)),
     "arv_buffer_get_data": (c_void_p, (c_void_p, POINTER(c_size_t))),
     # GLib's functions too: the loader looks for them in what libaravis itself is linked to.
+    "g_free": (None, (c_void_p,)),
     "g_object_unref": (None, (c_void_p,)),
     "g_object_set": (None, (c_void_p, c_char_p)),  # and a value of the property's own type, and None
     "g_signal_connect_data": (c_ulong, (c_void_p, c_char_p, SIGNAL, c_void_p, c_void_p, c_int)),
