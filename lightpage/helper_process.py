@@ -76,7 +76,7 @@ class HelperProcess:
     ) -> None:
         self._subject = subject
         self._progress: Callable[..., None] = lambda *words: None
-        self._answer: tuple[str, Any] | None = None
+        self._answer: tuple[str, Any] | None = _ANSWER, None  # None where a request is under way
         self._socket, other = socket.socketpair()
         self._messages = Connection(os.dup(self._socket.fileno()))
         with other:
@@ -128,6 +128,7 @@ class HelperProcess:
         Raises:
             WorkerError: they are not taken in, or the process has ended; it is of no more use.
         """
+        assert self._answer is not None  # else the last request's answer would pass for this one's
         self._answer = None
         if progress is not None:
             self._progress = progress

@@ -57,7 +57,7 @@ class Region(NamedTuple):
 class CameraSetup(ABC):
     """Gives one open camera its settings, and reads them back: cameras round, clip and ignore what they get.
 
-    A driver reads and writes what goes by the name of a feature, or of a key of `CameraSettings` where that is a number.
+    A driver reads and writes what goes by the name of a feature, or of a key of `CameraSettings` for a number.
     One thread at a time uses it.
 
     Args:

@@ -199,16 +199,16 @@ def test_a_server_that_is_not_as_it_must_be_is_refused(
 
 
 PARENT = """
-import sys, time
+import sys
 import numpy as np
 import lightpage.runtime.device.modulator.screen.screen
 from lightpage.runtime.device.modulator.screen.raster import ScreenSettings
-from lightpage.runtime.device.modulator.screen.window_process import WindowProcess
+from lightpage.runtime.device.modulator.screen.screen_window import opening_window
 settings = ScreenSettings.model_validate_json(sys.argv[1])
-window = WindowProcess(settings)
-until = time.monotonic() + 60
-window.opening(until)
-assert window.ask(until, np.full((settings.rows_px, settings.columns_px), 9, np.uint8)).shows
+window = opening_window(settings)
+assert window.poll(60)
+window.answer()
+assert window.ask("show", np.full((settings.rows_px, settings.columns_px), 9, np.uint8), timeout_s=60)
 print("xcffib" in sys.modules, flush=True)
 sys.stdin.read()
 """
