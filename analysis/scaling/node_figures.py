@@ -10,6 +10,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -24,7 +25,7 @@ from lightpage.runtime.archives.run.ledger import Ledger
 from lightpage.runtime.archives.run.shard import ShardRecord
 from lightpage.runtime.archives.run.task import Choices, NamedBundle, Operation, RecordedFile, Stamp, Task
 from lightpage.runtime.archives.run.totals import totals
-from lightpage.runtime.archives.workers.local import LocalEngine
+from lightpage.runtime.archives.workers.local import LocalEngine, started
 from lightpage.runtime.archives.workers.ray_engine import RayEngine, connected
 from lightpage.runtime.model.bundle.shipped import DEFAULT
 from lightpage.runtime.model.execution.cpus import available_cpus
@@ -143,7 +144,9 @@ def measure(recording: Path, folder: Path, range_pages: int, worker_counts: tupl
         read_bytes=sum(reading.read_bytes for reading in found.readings) / found.tally.pages,
         written_bytes=shards / found.tally.pages,
         record_s=_record_s(like, folder),
-        local=tuple(_driver(LocalEngine(workers, 1, IDLE_WORKER), workers) for workers in worker_counts),
+        local=tuple(
+            _driver(LocalEngine(workers, 1, partial(started, module=IDLE_WORKER)), workers) for workers in worker_counts
+        ),
         ray=ray,
     )
 

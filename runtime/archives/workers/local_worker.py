@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
-import queue
+import select
+import socket
 import sys
 import threading
 
 from lightpage.helper_process import parent_link
-from lightpage.runtime.archives.run.task import Task
+from lightpage.runtime.archives.run.task import Outcome, Step, Task
 from lightpage.runtime.archives.workers.work import Worker
 from lightpage.runtime.model.execution.memory import share_freed_memory
 
@@ -19,21 +20,22 @@ def main(worker: Worker) -> None:
     """Have it do one task after the other until the driver is gone or wants no more, whatever is being done then."""
     share_freed_memory()
     link = parent_link()
-    tasks: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    threading.Thread(target=_end_with_driver, args=(link,), name="lightpage-driver", daemon=True).start()
 
-    def listen() -> None:
-        try:
-            with link.makefile("rb") as lines:
-                for line in lines:
-                    tasks.put(line)
-        finally:
-            os._exit(_DRIVER_GONE)
+    def answer(told: Outcome | Step) -> None:
+        link.sendall(told.model_dump_json().encode() + b"\n")
 
-    threading.Thread(target=listen, name="lightpage-driver", daemon=True).start()
-    worker.tell = lambda step: link.sendall(step.model_dump_json().encode() + b"\n")
-    while True:
-        outcome = worker.work(Task.model_validate_json(tasks.get()))
-        link.sendall(outcome.model_dump_json().encode() + b"\n")
+    worker.tell = answer
+    for line in link.makefile("rb"):
+        answer(worker.work(Task.model_validate_json(line)))
+
+
+def _end_with_driver(link: socket.socket) -> None:
+    """End this process once the other end of its socket is closed."""
+    hung_up = select.poll()
+    hung_up.register(link, 0)
+    hung_up.poll()
+    os._exit(_DRIVER_GONE)
 
 
 if __name__ == "__main__":
