@@ -101,15 +101,15 @@ class HelperProcess:
         """Number of the process."""
         return self._process.pid
 
-    def ask(self, method: str, *arguments: Any, timeout_s: float) -> Any:
-        """Call a method of the helper, and return what it returns.
+    def ask(self, method: str, *arguments: Any, timeout_s: float, progress: Callable[..., None] | None = None) -> Any:
+        """Call a method of the helper, and return what it returns; see `send`.
 
         Raises:
             WorkerError: no answer within `timeout_s`, or the process has ended; it is of no more use.
             LightpageError: what the method raised.
         """
         until = time.monotonic() + timeout_s
-        self.send(method, *arguments, timeout_s=timeout_s)
+        self.send(method, *arguments, progress=progress, timeout_s=timeout_s)
         if not self.poll(until - time.monotonic()):
             raise WorkerError(self._subject, f"no answer within {timeout_s:g} s", "one in time")
         return self.answer()

@@ -32,7 +32,7 @@ from lightpage.runtime.model.execution.cpus import available_cpus
 
 IN_FLIGHT = (2, 64, 512, 2048)
 """Ranges on their way at once, at which the driver of a cluster is measured."""
-IDLE_WORKER = "analysis.scaling.idle_worker"
+IDLE_WORKER = "analysis.scaling.idle_worker:IdleWorker"
 _LIMIT_S = 6 * 3600.0
 _WARM, _COUNTED = 100, 400
 """Outcomes before the driver's time is counted, and while it is."""
@@ -145,7 +145,7 @@ def measure(recording: Path, folder: Path, range_pages: int, worker_counts: tupl
         written_bytes=shards / found.tally.pages,
         record_s=_record_s(like, folder),
         local=tuple(
-            _driver(LocalEngine(workers, 1, partial(started, module=IDLE_WORKER)), workers) for workers in worker_counts
+            _driver(LocalEngine(workers, 1, partial(started, target=IDLE_WORKER)), workers) for workers in worker_counts
         ),
         ray=ray,
     )

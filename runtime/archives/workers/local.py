@@ -2,34 +2,27 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextvars import copy_context
 from dataclasses import dataclass
 
-from pydantic import TypeAdapter
-
 from lightpage.errors import WorkerError
-from lightpage.failures import os_errors
 from lightpage.helper_process import HelperProcess, same_packages
 from lightpage.progress import note
 from lightpage.runtime.archives.run.engine import Attempt, Attempts, longest_s
 from lightpage.runtime.archives.run.task import Outcome, Step, Task
 
-WORKER = "lightpage.runtime.archives.workers.local_worker"
-
-_ANSWER: TypeAdapter[Outcome | Step] = TypeAdapter(Outcome | Step)
+WORKER = "lightpage.runtime.archives.workers.local_worker:LocalWorker"
 
 
-def started(threads: int, module: str = WORKER) -> HelperProcess:
-    """Start a process that runs a module with so many threads.
+def started(threads: int, target: str = WORKER) -> HelperProcess:
+    """Start a `LocalWorker` with so many threads in a process of its own.
 
     Raises:
-        SurroundingsError, StorageError, WorkerError: it cannot be started.
+        WorkerError: it cannot be started.
     """
-    with os_errors("a worker", "a process that can be started", WorkerError):
-        return HelperProcess(module, str(threads), subject="a worker", environment=same_packages(threads))
+    return HelperProcess(target, subject="a worker", environment=same_packages(threads))
 
 
 @dataclass
@@ -42,13 +35,11 @@ class LocalEngine:
         workers: how many.
         threads: of each one's inferences.
         start: starts one with so many threads.
-        clock: by which one is too late.
     """
 
     workers: int
     threads: int
     start: Callable[[int], HelperProcess] = started
-    clock: Callable[[], float] = time.monotonic
     restarts: int = 0
     in_flight: int = 0
     workers_alive: int = 0
@@ -76,11 +67,11 @@ class LocalEngine:
                     try:
                         outcome = answered.result()
                         free.append(worker)
-                    except OSError as error:
+                    except WorkerError as error:
                         worker.end(grace_s=1.0)
                         alive.remove(worker)
                         self.restarts += 1
-                        outcome = attempts.died(attempt, _told(worker, error))
+                        outcome = attempts.died(attempt, error.got)
                     self.in_flight, self.workers_alive = len(busy), len(alive)
                     if outcome is not None:
                         yield outcome
@@ -90,21 +81,14 @@ class LocalEngine:
                 self.in_flight = self.workers_alive = 0
 
     def _answer(self, worker: HelperProcess, task: Task) -> Outcome:
-        """Hand over a task and wait until it is done.
+        """Have a task done.
 
         Raises:
-            OSError: the worker has died, or its time is up.
+            WorkerError: the worker has died, or its time is up.
         """
-        deadline = self.clock() + longest_s(task)
-        worker.send(task.model_dump_json().encode() + b"\n", deadline)
-        while isinstance(answer := _ANSWER.validate_json(worker.line(deadline)), Step):
-            note(f"device {answer.device}: {answer.what}")
-        return answer
+        outcome: Outcome = worker.ask("work", task, self.threads, progress=_note, timeout_s=longest_s(task))
+        return outcome
 
 
-def _told(worker: HelperProcess, error: Exception) -> str:
-    """How a worker has ended, for people."""
-    if isinstance(error, TimeoutError):
-        return "no answer in time"
-    status = worker.status or 0
-    return "the end of its worker " + (f"by signal {-status}" if status < 0 else f"with status {status}")
+def _note(step: Step) -> None:
+    note(f"device {step.device}: {step.what}")
