@@ -12,7 +12,8 @@ from lightpage.device.profile import TomlTable
 from lightpage.errors import InvalidInputError
 from lightpage.files import read_toml
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
-from lightpage.runtime.device.acquisition.camera_source import Exposures, View
+from lightpage.runtime.device.acquisition.camera_image import View
+from lightpage.runtime.device.acquisition.camera_source import Exposures
 from lightpage.runtime.device.acquisition.pairing import PairingSettings
 from lightpage.runtime.device.cameras.settings import CameraSettings
 from lightpage.runtime.device.modulator.screen.raster import ScreenSettings
