@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 from lightpage.errors import SourceError
 from lightpage.runtime.device.cameras.pixel_formats import pixel_format
@@ -69,7 +69,7 @@ class CameraSetup(ABC):
     Every method raises `SourceError` where the camera does not take a setting, and the driver's error where it is gone.
     """
 
-    refusals: ClassVar[tuple[type[Exception], ...]]
+    refusals: tuple[type[Exception], ...]
     """What a driver raises where a camera refuses."""
 
     def __init__(self, settings: CameraSettings, frame_shape: tuple[int, int], name: str, is_gige: bool) -> None:
