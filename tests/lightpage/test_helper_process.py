@@ -95,7 +95,9 @@ def test_one_that_is_killed_is_named_with_its_signal(process: HelperProcess, how
     assert process.ended()
 
 
-def test_one_that_breaks_or_hangs_is_told_apart(process: HelperProcess, capfd: pytest.CaptureFixture[str]) -> None:
+def test_one_that_breaks_hangs_or_cannot_be_started_is_told_apart(
+    process: HelperProcess, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(WorkerError, match=r"no answer within 0\.05 s"):
         process.ask("wait", timeout_s=0.05)
     process.end()
@@ -109,8 +111,9 @@ def test_one_that_breaks_or_hangs_is_told_apart(process: HelperProcess, capfd: p
         broken.ask("break_down", timeout_s=WAIT_S)
     broken.end()
     assert "ZeroDivisionError" in capfd.readouterr().err
+    monkeypatch.setattr(sys, "executable", "/nowhere/python")
     with pytest.raises(WorkerError, match="can be started"):
-        HelperProcess(TARGET, subject="echo", files=[-1])
+        HelperProcess(TARGET, subject="echo")
 
 
 PARENT = """

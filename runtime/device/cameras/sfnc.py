@@ -210,7 +210,7 @@ class CameraSetup(ABC):
             if setting in ("PixelFormat", "TriggerSource", "TriggerActivation"):
                 return f"one of {told}" if (told := ", ".join(self.entries(setting))) else ""
             return self.limits(setting)
-        except (SourceError, *self.refusals):
+        except self.refusals:
             return ""
 
 

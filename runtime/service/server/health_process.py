@@ -41,7 +41,8 @@ class HealthAnswers(Helper):
             InvalidInputError: it cannot be listened on.
         """
         self.idle()
-        return self._run(self._listen(address, tls))
+        port: int = self._run(self._listen(address, tls))
+        return port
 
     def tell(self, states: dict[str, bool]) -> None:
         """Say of each service whether it serves."""
