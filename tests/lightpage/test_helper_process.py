@@ -74,7 +74,7 @@ def process() -> Iterator[HelperProcess]:
 def test_answers_errors_and_progress_come_as_they_were_meant(process: HelperProcess) -> None:
     picture = np.arange(3_000_000, dtype=np.uint16).reshape(1000, -1)
     assert (process.ask("same", picture, timeout_s=WAIT_S) == picture).all()
-    with pytest.raises(LostShotError, match=r"^camera: got nothing, wanted a frame \(CAMERA_GONE\)$") as lost:
+    with pytest.raises(LostShotError, match=r"^camera: .*\(CAMERA_GONE\)$") as lost:
         process.ask("lose", timeout_s=WAIT_S)
     assert (lost.value.reason, lost.value.recalibration_due) == (Reason.CAMERA_GONE, True)
     told: list[tuple[str, int]] = []
@@ -90,7 +90,7 @@ def test_one_that_is_killed_is_named_with_its_signal(process: HelperProcess, how
     os.kill(process.pid, how)
     assert process.poll(WAIT_S)
     for act in (process.answer, lambda: process.ask("same", 1, timeout_s=WAIT_S)):
-        with pytest.raises(WorkerError, match=f"^echo: got the end of its process {got}"):
+        with pytest.raises(WorkerError, match=f"^echo: .*{got}"):
             act()
     assert process.ended()
 
@@ -98,12 +98,12 @@ def test_one_that_is_killed_is_named_with_its_signal(process: HelperProcess, how
 def test_one_that_breaks_hangs_or_cannot_be_started_is_told_apart(
     process: HelperProcess, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(WorkerError, match=r"no answer within 0\.05 s"):
+    with pytest.raises(WorkerError, match=r"no answer .*0\.05"):
         process.ask("wait", timeout_s=0.05)
     process.end()
     stopped = HelperProcess(TARGET, subject="echo")
     os.kill(stopped.pid, signal.SIGSTOP)
-    with pytest.raises(WorkerError, match=r"not taken in within 0\.05 s"):
+    with pytest.raises(WorkerError, match=r"taken in .*0\.05"):
         stopped.ask("same", bytes(1 << 22), timeout_s=0.05)
     stopped.end()
     broken = HelperProcess(TARGET, subject="echo")

@@ -45,7 +45,7 @@ class CameraImage:
     """
 
     def __init__(self, camera: Camera, view: View) -> None:
-        self.camera, self._view = camera, view
+        self.camera, self.view = camera, view
         self.saturated_share: float | None = None
         self._unused = 0
         """Lowest bits that the counts leave unused, as frames have shown."""
@@ -68,7 +68,7 @@ class CameraImage:
         bit_depth = self.camera.bit_depth
         pixels = self._to_full_scale(frame.pixels.astype(frame_type(bit_depth), copy=False))
         self.saturated_share = float(np.count_nonzero(pixels >= 2**bit_depth - 1) / pixels.size)
-        return self._view.upright(pixels)
+        return self.view.upright(pixels)
 
     def _to_full_scale(self, pixels: Counts) -> Counts:
         """The counts of a camera that leaves low bits unused, with its greatest one at full scale; it is told once."""

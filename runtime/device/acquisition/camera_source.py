@@ -105,7 +105,7 @@ class CameraSource(FrameSource):
         self.beams: Beams = beams
         self.pages: PageStore = pages if pages is not None else PageStore(profile)
         self.cameras, self._trigger = cameras, trigger
-        self._images = tuple(map(CameraImage, cameras, views))
+        self.images = tuple(map(CameraImage, cameras, views))
         depths = [camera.bit_depth for camera in cameras]
         if depths[0] != depths[1]:
             raise SourceError(f"{self.name}: cameras", f"{depths[0]} and {depths[1]} bits", "the same for both")
@@ -143,7 +143,7 @@ class CameraSource(FrameSource):
 
     def saturated_shares(self) -> Mapping[str, float]:
         """See `FrameSource.saturated_shares`."""
-        shares = {image.camera.name: image.saturated_share for image in self._images}
+        shares = {image.camera.name: image.saturated_share for image in self.images}
         return {name: share for name, share in shares.items() if share is not None}
 
     def arm(self) -> None:
@@ -203,7 +203,7 @@ class CameraSource(FrameSource):
                 return take()
 
             frames = self._persistent(f"page {index}", index, deadline, attempt, self._exposures.repeats)
-            pair = FramePair(*map(CameraImage.cleaned, self._images, frames))
+            pair = FramePair(*map(CameraImage.cleaned, self.images, frames))
             first, second = frames
             return Shot(pair, index, symbols, None, (first.info, second.info))
 
@@ -248,7 +248,7 @@ class CameraSource(FrameSource):
                     DarkFrame.of(stack, self.bit_depth, f"{camera.name}: dark frames")
                     for stack, camera in zip(stacks, self.cameras, strict=True)
                 )
-            for image, dark in zip(self._images, (first, second), strict=True):
+            for image, dark in zip(self.images, (first, second), strict=True):
                 image.mind(dark)
                 _log.info("%s: black level %d, %d hot pixels", image.camera.name, dark.black_level, len(dark.hot))
             return first, second
@@ -315,5 +315,5 @@ class CameraSource(FrameSource):
             # nothing but the light has to stand still, so there is no reason to give up early
             attempt = partial(self._pairing.shot, deadline)
             shots.append(self._persistent("frames without a page", -1, deadline, attempt, _MOST_REPEATS))
-        each = zip(self._images, zip(*shots, strict=True), strict=True)
+        each = zip(self.images, zip(*shots, strict=True), strict=True)
         return [np.stack([counts_of(image, frame) for frame in frames]) for image, frames in each]
