@@ -19,6 +19,7 @@ from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome, 
 from lightpage.runtime.recalibration.separate_process import recalibrate_apart
 from lightpage.runtime.recalibration.worker import LOWEST, NICENESS, ROOM, yield_more
 from tests.clock import HandClock
+from tests.processes import runs
 from tests.runtime import toy
 from tests.runtime.recalibration.toy_worker import known, quiet
 
@@ -53,13 +54,6 @@ class Apart:
         """The worker's; 0 before it has told of a step."""
         found = [re.search(r"fit in (\d+)", name) for name, _ in self.steps]
         return next((int(each[1]) for each in found if each), 0)
-
-
-def gone(process: int) -> bool:
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    except OSError:
-        return True
 
 
 def test_it_finds_what_this_process_finds_and_leaves_the_bundle_alone(
@@ -110,7 +104,7 @@ def test_a_process_that_comes_to_no_good_end_changes_nothing(
     apart.check = check
     with pytest.raises(error, match=told):
         apart.run(limit_s)
-    assert not apart.process or gone(apart.process)
+    assert not apart.process or not runs(apart.process)
     assert bool(apart.process) == (worker == "Silent")
     assert ["ZeroDivisionError" in record.getMessage() for record in caplog.records] == [True] * (worker == "Broken")
     assert list(tmp_path.iterdir()) == [folder]

@@ -25,6 +25,7 @@ from lightpage.runtime.archives.run.task import Choices, Done, Failed, Operation
 from lightpage.runtime.archives.workers.local import LocalEngine, started
 from lightpage.runtime.archives.workers.work import Worker
 from lightpage.runtime.commands.archives.bulk import bulk
+from tests.processes import runs
 from tests.runtime import toy
 from tests.runtime.archives import jobs
 from tests.runtime.archives.archive import InlineEngine
@@ -169,16 +170,8 @@ def test_no_worker_outlives_a_driver_that_is_killed(job: Job, tmp_path: Path) ->
         worker = int(eventually(begun.read_text))
         driver.send_signal(signal.SIGKILL)
         driver.wait(LIMIT_S)
-        eventually(lambda: not running(worker))
+        eventually(lambda: not runs(worker))
         assert pages(tmp_path / "out") == {}
     finally:
         driver.kill()
         driver.wait()
-
-
-def running(process: int) -> bool:
-    """Whether a process runs; one that nobody waits for does not."""
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
