@@ -12,10 +12,10 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from lightpage.clock import SYSTEM, Clock
-from lightpage.device.profile import Profile, TomlTable
+from lightpage.device.profile import Profile, StrictTable
 from lightpage.errors import LostShotError, Reason, SourceError, raised_as
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.recording.black_level import DarkFrame
@@ -45,7 +45,7 @@ _AGAIN_S = 0.5
 """Between two attempts to reach a device that has gone."""
 
 
-class Exposures(TomlTable):
+class Exposures(StrictTable):
     """How frames are taken.
 
     Attributes:
@@ -53,8 +53,6 @@ class Exposures(TomlTable):
         reference_frames, dark_frames: shots that make the mean of each.
         shot_s: longest wait for one page, repeats included.
     """
-
-    model_config = ConfigDict(strict=True)
 
     repeats: Annotated[int, Field(ge=0, le=100)] = 1
     reference_frames: Annotated[int, Field(ge=1, le=256)] = 8

@@ -97,9 +97,10 @@ class DrivenCamera:
 
     def _absent(self, was_there: bool, got: object, expected: str) -> SourceError | LostShotError:
         """The error of a camera that is not there: it has gone away only if it was there."""
-        if was_there:
-            return LostShotError(self.name, got, expected, Reason.CAMERA_GONE)
-        return SourceError(self.name, got, expected)
+        return self._gone(got, expected) if was_there else SourceError(self.name, got, expected)
+
+    def _gone(self, got: object, expected: str = "a camera that answers") -> LostShotError:
+        return LostShotError(self.name, got, expected, Reason.CAMERA_GONE)
 
     def _unarmed(self, is_open: bool) -> SourceError | LostShotError:
         was_there = self.opened > 0 and not is_open

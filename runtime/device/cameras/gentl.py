@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lightpage.errors import LostShotError, Reason, SourceError, WorkerError
+from lightpage.errors import LostShotError, SourceError, WorkerError
 from lightpage.helper_process import HelperProcess
 from lightpage.recording.layout import FrameInfo
 from lightpage.runtime.device.cameras.camera import BrokenFrame, DrivenCamera, Frame
@@ -109,4 +109,4 @@ class GenTLCamera(DrivenCamera):
             return self._process.ask(what, *arguments, timeout_s=timeout_s + COMMAND_S)
         except (LostShotError, WorkerError) as error:
             self.close()
-            raise LostShotError(self.name, error.got, "a camera that answers", Reason.CAMERA_GONE) from None
+            raise self._gone(error.got) from None

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from lightpage.errors import LostShotError, Reason, SourceError, WorkerError
 from lightpage.helper_process import HelperProcess
-from lightpage.runtime.device.modulator.beam_state import BeamState, OperatorBeams
 from lightpage.runtime.device.modulator.external import ExternalBeams, ExternalModulator
 from lightpage.runtime.device.modulator.lookup_table import linear_table
+from lightpage.runtime.device.modulator.modulator import BeamState, OperatorBeams
 from lightpage.runtime.device.modulator.screen.raster import Raster, ScreenSettings
 from lightpage.runtime.device.modulator.screen.screen import ScreenModulator
 from tests.clock import HandClock
