@@ -2,7 +2,8 @@
 
 Both ends speak one protocol, whatever the object does, over a socket that is the child's standard input. A request is
 the name of a method and its arguments. It is answered by what the method returns, or by the `LightpageError` that it
-raises; words of progress may come before. Messages are pickles: both ends are the same program of the same user.
+raises; words of progress may come before. Messages are pickles: both ends are the same program of the same user. Arrays
+of a request follow it one by one, so that neither end has all of them twice.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ _SEND_S = 60.0
 _END_S = 5.0
 """Time that a process gets to end after its socket has."""
 _PARENT_GONE = 3
-_PICKLE = pickle.HIGHEST_PROTOCOL
-"""Lower protocols copy an array once more."""
+_PICKLE = 5
+"""The first one that leaves arrays to the caller."""
 
 
 class Helper:
@@ -134,9 +135,13 @@ class HelperProcess:
             self._progress = progress
         seconds, rest = divmod(max(timeout_s, 1e-3), 1)  # 0 were no limit
         limit = struct.pack("ll", int(seconds), int(1e6 * rest))
+        arrays: list[pickle.PickleBuffer] = []
+        request = pickle.dumps((method, arguments, progress is not None), _PICKLE, buffer_callback=arrays.append)
         try:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
-            self._messages.send_bytes(pickle.dumps((method, arguments, progress is not None), _PICKLE))
+            self._messages.send((request, len(arrays)))
+            for array in arrays:
+                self._messages.send_bytes(array.raw())
         except BlockingIOError:
             raise WorkerError(self._subject, f"a request not taken in within {timeout_s:g} s", "all of it") from None
         except OSError:
@@ -220,13 +225,14 @@ def serve(target: str) -> None:
     error that nobody foresaw ends the process.
     """
     messages = Connection(os.dup(sys.stdin.fileno()))
-    requests: SimpleQueue[bytes | None] = SimpleQueue()
+    requests: SimpleQueue[tuple[bytes, list[bytearray]] | None] = SimpleQueue()
     made: list[Helper] = []
 
     def listen() -> None:
         with suppress(OSError, EOFError):
             while True:
-                requests.put(messages.recv_bytes())
+                request, count = messages.recv()
+                requests.put((request, [bytearray(messages.recv_bytes()) for _ in range(count)]))
         if made and made[0].farewell_s:
             requests.put(None)
             time.sleep(made[0].farewell_s)
@@ -234,7 +240,7 @@ def serve(target: str) -> None:
 
     def tell(kind: str, value: Any) -> None:
         with suppress(ConnectionError):  # `listen` ends the process
-            messages.send_bytes(pickle.dumps((kind, value), _PICKLE))
+            messages.send((kind, value))
 
     threading.Thread(target=listen, name="lightpage-parent", daemon=True).start()
     module, _, name = target.partition(":")
@@ -248,8 +254,8 @@ def serve(target: str) -> None:
             continue
         if request is None:
             break
-        method, arguments, tells = pickle.loads(request)
-        del request  # it may be large
+        method, arguments, tells = pickle.loads(request[0], buffers=request[1])
+        del request  # what it holds may be large
         options = {"progress": lambda *words: tell(_PROGRESS, words)} if tells else {}
         try:
             tell(_ANSWER, getattr(helper, method)(*arguments, **options))

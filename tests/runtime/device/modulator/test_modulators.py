@@ -40,10 +40,7 @@ class Window:
     pictures: list[NDArray[np.uint8]] = field(default_factory=list)
 
     def poll(self, timeout_s: float) -> bool:
-        if timeout_s < self.opens_s:
-            return False
-        self.opens_s = 0.0
-        return True
+        return timeout_s >= self.opens_s
 
     def answer(self) -> None:
         if self.refusal:
