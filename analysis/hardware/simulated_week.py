@@ -111,7 +111,7 @@ class Week:
             plane = DataPlane(registry, source, store, observers=[recorder], monitor=monitor)
             watched = WatchedRecalibrator(plane)
             stack.callback(watched.close)
-            settings = SelfCalibrationSettings(CALIBRATION_PAGES, busy_s=0.05)
+            settings = SelfCalibrationSettings(pages=CALIBRATION_PAGES, busy_s=0.05)
             stack.enter_context(SelfCalibration(plane, monitor, watched, settings, SimulatedClock(self)))
             begun = len(self.rows)
             numbers = track(range(begun, end), "week", total=end, done=begun)

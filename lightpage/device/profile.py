@@ -234,12 +234,14 @@ def to_toml(table: TomlTable, without: tuple[str, ...] = ()) -> str:
 
 
 def toml_value(value: object) -> str:
-    """A text, a truth value or a number as TOML writes it."""
+    """A text, a truth value, a number or a list of such as TOML writes it."""
     if isinstance(value, str):
         # a JSON string is a TOML one but for this character
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, bool):
         return str(value).lower()
+    if isinstance(value, list):
+        return f"[{', '.join(map(toml_value, value))}]"
     return repr(value)
 
 

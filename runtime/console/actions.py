@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from lightpage.errors import InvalidInputError
 from lightpage.runtime.client.answers import job_info
@@ -16,6 +17,13 @@ from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 
 ROLE = Role.ADMIN
 """Who may do all of it."""
+
+
+class _Asked(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    action: Literal["recalibrate", "roll back"]
+    expected: str = Field(pattern="^[!-~]+$")
 
 
 class Actions:
@@ -30,10 +38,6 @@ class Actions:
 
     def __init__(self, plane: DataPlane, recalibrator: Recalibrator, pages: Sequence[int] = ()) -> None:
         self._plane, self._recalibrator, self._pages = plane, recalibrator, pages or range(MIN_PAGES)
-        self._named: Mapping[str, Callable[[str, Actor], str]] = {
-            "recalibrate": self._recalibrate,
-            "roll back": self._roll_back,
-        }
 
     def available(self) -> list[str]:
         """Those that make sense now."""
@@ -56,25 +60,15 @@ class Actions:
             InvalidInputError: no such object.
             LightpageError: it could not be done; nothing was changed.
         """
-        wanted = 'a JSON object of "action" and "expected", the version of the model in service'
         try:
-            asked: Any = json.loads(content)
-        except (ValueError, RecursionError) as error:
-            raise InvalidInputError("action", error, wanted) from None
-        if not isinstance(asked, dict) or asked.keys() != {"action", "expected"}:
-            raise InvalidInputError("action", repr(asked)[:100], wanted)
-        name, expected = asked["action"], asked["expected"]
-        if not isinstance(expected, str) or not expected.isprintable() or not expected:
-            raise InvalidInputError("expected", repr(expected)[:100], "the version of the model in service")
-        if not isinstance(name, str) or name not in self._named:
-            raise InvalidInputError("action", repr(name)[:100], " or ".join(self._named))
-        return self._named[name](expected, actor)
-
-    def _recalibrate(self, expected: str, actor: Actor) -> str:
+            asked = _Asked.model_validate_json(content)
+        except ValidationError as error:
+            got = "; ".join(": ".join([*map(str, each["loc"]), each["msg"]]) for each in error.errors())
+            expected = 'a JSON object of "action" and "expected", the version of the model in service'
+            raise InvalidInputError("action", got, expected) from None
+        if asked.action == "roll back":
+            current, before = self._plane.models.rollback(asked.expected, actor=actor)
+            return f"{current.version} is in service again, {before.version} is not"
         # By number: whoever reads the source's next pages goes on where it was.
         pages = self._recalibrator.source_pages(0, self._pages)
-        return f"job {self._recalibrator.start(pages, expected, 'console', actor).id} has begun"
-
-    def _roll_back(self, expected: str, actor: Actor) -> str:
-        current, before = self._plane.models.rollback(expected, actor=actor)
-        return f"{current.version} is in service again, {before.version} is not"
+        return f"job {self._recalibrator.start(pages, asked.expected, 'console', actor).id} has begun"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from http.client import BadStatusLine, HTTPException
@@ -63,10 +63,10 @@ def fetch(subject: str, address: str, path: str, tls: TlsFiles | None = None) ->
         got = "an answer that is not HTTP"
     except (HTTPException, ValueError) as error:
         got = error
-    raise LightpageError(subject, got, wanted(tls))
+    raise LightpageError(subject, got, _wanted(tls))
 
 
-def wanted(tls: TlsFiles | None) -> str:
+def _wanted(tls: TlsFiles | None) -> str:
     """What an address is to be of, for people."""
     expected = "a service that runs with --metrics-port: `lightpage serve --metrics-port 9100`"
     return expected if tls else f"{expected}; if it has TLS, --ca, --certificate and --key too"
@@ -93,14 +93,6 @@ class Scrape:
         asked = frozenset(labels.items())
         return {own: value for (known, own), value in self.samples.items() if known == name and asked <= own}
 
-    def by(self, name: str, label: str) -> dict[str, float]:
-        """Sums of a name by one of its labels."""
-        sums: dict[str, float] = {}
-        for own, value in self.values(name).items():
-            key = dict(own).get(label, "")
-            sums[key] = sums.get(key, 0.0) + value
-        return sums
-
 
 def scrape(address: str, tls: TlsFiles | None = None) -> Scrape:
     """The metrics of the service whose `--metrics-port` is at HOST:PORT.
@@ -122,9 +114,9 @@ def scrape(address: str, tls: TlsFiles | None = None) -> Scrape:
             for sample in family.samples
         }
     except ValueError:
-        raise LightpageError(subject, "no metrics", wanted(tls)) from None
+        raise LightpageError(subject, "no metrics", _wanted(tls)) from None
     if (_SERVES, frozenset()) not in samples:
-        raise LightpageError(subject, "metrics of something else", wanted(tls))
+        raise LightpageError(subject, "metrics of something else", _wanted(tls))
     return Scrape(time.monotonic(), samples)
 
 
@@ -170,10 +162,14 @@ class Change:
         """Between them."""
         return self.now.at - self.before.at
 
+    def _risen(self, name: str, **labels: str) -> list[tuple[dict[str, str], float]]:
+        """Labels and rise of each counter that has at least these labels."""
+        found = self.now.values(name, **labels)
+        return [(dict(own), value - self.before.samples.get((name, own), 0.0)) for own, value in found.items()]
+
     def rise(self, name: str, **labels: str) -> float:
         """By how much counters with at least these labels rose, all together."""
-        before = self.before.values(name, **labels)
-        return sum(value - before.get(own, 0.0) for own, value in self.now.values(name, **labels).items())
+        return sum(rise for _, rise in self._risen(name, **labels))
 
     def rate(self, name: str, **labels: str) -> float:
         """The same a second; NaN where no time has passed."""
@@ -181,9 +177,10 @@ class Change:
 
     def rises(self, name: str, label: str) -> dict[str, float]:
         """By how much counters rose, by one of their labels, those left out that did not; the largest first."""
-        before = self.before.by(name, label)
-        risen = {key: value - before.get(key, 0.0) for key, value in self.now.by(name, label).items()}
-        return dict(sorted(((key, value) for key, value in risen.items() if value > 0), key=lambda one: -one[1]))
+        sums = defaultdict[str, float](float)
+        for own, rise in self._risen(name):
+            sums[own.get(label, "")] += rise
+        return dict(sorted(((key, rise) for key, rise in sums.items() if rise > 0), key=lambda one: -one[1]))
 
     def mean(self, name: str, **labels: str) -> float:
         """Mean of what a histogram counted; NaN where that is nothing."""
@@ -193,26 +190,18 @@ class Change:
     def quantile(self, share: float, name: str, **labels: str) -> float:
         """A quantile of what a histogram counted, as Prometheus estimates it: linear within a bucket.
 
-        NaN where nothing was counted; the last finite bound for what lies beyond it.
+        NaN where nothing was counted; the last finite bound for what lies beyond it. `share` is above 0.
         """
-        counts: dict[float, float] = {}
-        for own in self.now.values(f"{name}_bucket", **labels):
-            bound = float(dict(own)["le"])
-            rise = self.now.samples[f"{name}_bucket", own] - self.before.samples.get((f"{name}_bucket", own), 0.0)
-            counts[bound] = counts.get(bound, 0.0) + rise
-        total = counts.get(math.inf, 0.0)
-        if total <= 0:
-            return math.nan
+        counts = defaultdict[float, float](float)
+        for own, rise in self._risen(f"{name}_bucket", **labels):
+            counts[float(own["le"])] += rise
+        rank = share * counts[math.inf]
         low = below = 0.0
         for bound, count in sorted(counts.items()):
-            if count >= share * total:
-                return low if math.isinf(bound) else low + (bound - low) * _part(share * total - below, count - below)
+            if count >= rank > 0:
+                return low if math.isinf(bound) else low + (bound - low) * (rank - below) / (count - below)
             low, below = bound, count
-        return low
-
-
-def _part(wanted: float, held: float) -> float:
-    return wanted / held if held > 0 else 1.0
+        return math.nan
 
 
 def _restarted(before: Scrape, now: Scrape) -> bool:

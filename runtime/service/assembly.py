@@ -79,7 +79,7 @@ def assembled(settings: ServiceSettings, history: Observer) -> Iterator[Assembly
             source = stack.enter_context(checked_source(service.source, service.pages, base))
             take_dark_frames(source)
         if flight.folder is not None:
-            recorder = FlightRecorder(flight.folder, registry, flight.settings(), monitor, metrics)
+            recorder = FlightRecorder(flight.folder, registry, flight, monitor, metrics)
             observers.append(stack.enter_context(recorder))
         plane = DataPlane(
             registry,

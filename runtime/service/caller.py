@@ -219,7 +219,6 @@ class Call:
         begun: when its first byte came, by `time.perf_counter`.
         times: of its pages.
         identity: who calls.
-        is_watch: whether it lasts as long as its caller likes.
     """
 
     method: str
@@ -230,7 +229,6 @@ class Call:
     begun: float = field(default_factory=time.perf_counter)
     times: CallTimes = field(default_factory=CallTimes)
     identity: Identity = LOCAL
-    is_watch: bool = False
 
     @property
     def actor(self) -> Actor:

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import logging
-import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 from lightpage.clock import SYSTEM, Clock
 from lightpage.codec.page_bytes import Header, Loss, PageBytes
 from lightpage.errors import (
     FrameError,
-    FramesDisagreeError,
     InvalidInputError,
     LostPageError,
     NoSourceError,
-    Reason,
-    SourceError,
     UnconfirmedPageError,
 )
 from lightpage.page.levels import MAX_LEVELS
@@ -36,75 +31,13 @@ from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.models.registry import Model, ModelRegistry
 from lightpage.runtime.service.models.store import ModelStore
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
-from lightpage.runtime.service.monitoring.monitor import Monitor, SessionMonitors
-from lightpage.runtime.service.monitoring.observation import Observation, Observer
+from lightpage.runtime.service.monitoring.monitor import Monitor
+from lightpage.runtime.service.monitoring.monitors import Monitors
+from lightpage.runtime.service.monitoring.observation import Observer
 from lightpage.runtime.service.shared_memory import SharedMemory
 from lightpage.runtime.service.stages import Stage, Stages
 
 _log = logging.getLogger(__name__)
-
-
-class Seen:
-    """What becomes known of a page while it is read and decoded.
-
-    Args:
-        subject, page_index, model_version: see `Observation`.
-        clock: seconds since 1970.
-        lap: seconds that never go back, by which the page is timed.
-    """
-
-    def __init__(
-        self,
-        subject: str,
-        page_index: int | None,
-        model_version: str,
-        clock: Callable[[], float] = time.time,
-        lap: Callable[[], float] = time.perf_counter,
-    ) -> None:
-        self._clock, self._lap = clock, lap
-        self.observation = Observation(subject, page_index, model_version, clock(), 0.0)
-        self._begun = lap()
-
-    def note(self, **known: Any) -> None:
-        """Take in fields of `Observation`."""
-        self.observation = replace(self.observation, **known)
-
-    def ended(self, lost: Reason | None, detail: str) -> Observation:
-        """The observation of the page, which was given out or lost now."""
-        seconds = self._lap() - self._begun
-        return replace(self.observation, time_s=self._clock(), seconds=seconds, lost=lost, detail=detail)
-
-
-@contextmanager
-def observed(observers: Sequence[Observer], seen: Seen) -> Iterator[Seen]:
-    """Tell the observers of a page that is read and decoded inside the block, given out or lost.
-
-    A page of the source whose frames contradict each other is told of as lost, with an unspecified reason. Other errors
-    say nothing of a page. What an observer raises is logged: it costs nobody a page.
-    """
-    try:
-        yield seen
-    except LostPageError as error:
-        if isinstance(error, UnconfirmedPageError):
-            seen.note(page=unconfirmed_page(error))
-        _tell(observers, seen, error.reason, str(error))
-        raise
-    except SourceError as error:
-        if isinstance(error.__cause__, FramesDisagreeError):
-            _tell(observers, seen, Reason.UNSPECIFIED, str(error))
-        raise
-    _tell(observers, seen, None, "")
-
-
-def _tell(observers: Sequence[Observer], seen: Seen, lost: Reason | None, detail: str) -> None:
-    if not observers:
-        return
-    observation = seen.ended(lost, detail)
-    for observer in observers:
-        try:
-            observer.observe(observation)
-        except Exception:
-            _log.exception("%s could not take note of %s", type(observer).__name__, observation.subject)
 
 
 @dataclass(frozen=True)
@@ -163,11 +96,8 @@ class DataPlane:
         self.registry, self.store, self.clock = registry, store, clock
         self.limits = limits or Limits()
         self.metrics = metrics or ServiceMetrics()
-        self.monitor = monitor
-        self.observers, self._device_sessions = tuple(observers), frozenset(("", *device_sessions))
-        self._session_monitors = None if monitor is None else SessionMonitors(monitor.settings)
-        if self._session_monitors is not None:
-            self.metrics.sessions_due.set_function(self._session_monitors.due)
+        self.monitors = Monitors(monitor, device_sessions, observers, shows_device=source is not None)
+        self.metrics.sessions_due.set_function(self.monitors.sessions_due)
         self._source = source
         if source is not None:
             _check_source(source, registry.current.decoder)
@@ -209,27 +139,15 @@ class DataPlane:
         """The level count where a caller names none: that of the source's pages, or 256."""
         return MAX_LEVELS if self._source is None else self._source.levels
 
-    def monitor_of(self, caller: Caller) -> Monitor | None:
-        """What follows the frames that a caller sends; None where each is decoded as if it were the first."""
-        if caller.stateless or self._session_monitors is None:
-            return None
-        return self.monitor if caller.session in self._device_sessions else self._session_monitors.of(caller.session)
-
-    def _shows(self, monitor: Monitor | None) -> bool:
-        """Whether the figures of the last page are to show one that `monitor` follows: with a source, the device's."""
-        return monitor is self.monitor or not self.has_source
-
-    def observers_of(self, monitor: Monitor | None) -> Sequence[Observer]:
-        """Who is told of a page, its monitor first."""
-        return self.observers if monitor is None else (monitor, *self.observers)
-
     def answer(
         self, page: DecodedPage, model: Model, stages: Stages, found: PageBytes | None, monitor: Monitor | None
     ) -> Answer:
         """Return what was decoded, with the times so far and the signs of the page's monitor."""
         stages.begin(Stage.RESPOND)
         receive_s = stages.seconds().get(Stage.RECEIVE, 0.0)
-        return Answer(page, model.version, receive_s, stages.elapsed_s, found, _signs(monitor))
+        return Answer(
+            page, model.version, receive_s, stages.elapsed_s, found, () if monitor is None else monitor.raised
+        )
 
     @contextmanager
     def optics(self, user_data: bool) -> Iterator[None]:
@@ -248,7 +166,7 @@ class DataPlane:
         stages.begin(Stage.CODE)
         found = model.decoder.page_codec.decode(page.phase, page.concentration, expected)
         stages.begin(Stage.POST_PROCESSING)
-        self.metrics.user_data(found, shown=self._shows(monitor))
+        self.metrics.user_data(found, shown=self.monitors.shows(monitor))
         return found
 
     def trouble(self) -> str:
@@ -257,10 +175,7 @@ class DataPlane:
 
     def _in_service(self, model: Model) -> None:
         self.metrics.in_service(model.version)
-        if self.monitor is not None:
-            self.monitor.begin(model.version)
-        if self._session_monitors is not None:
-            self._session_monitors.begin(model.version)
+        self.monitors.begin(model.version)
 
     def decode(
         self,
@@ -287,20 +202,12 @@ class DataPlane:
         except LostPageError as error:
             if isinstance(error, UnconfirmedPageError):
                 _inferred(unconfirmed_page(error), stages)
-            self.metrics.lost(error, tells=sure and self._shows(monitor))
+            self.metrics.lost(error, tells=sure and self.monitors.shows(monitor))
             error.recalibration_due = (error.recalibration_due and sure) or (monitor is not None and monitor.due)
             raise error.about(subject) from None
         _inferred(page, stages)
-        self.metrics.page(page, model.version, shown=self._shows(monitor))
+        self.metrics.page(page, model.version, shown=self.monitors.shows(monitor))
         return page
-
-
-def _signs(monitor: Monitor | None) -> tuple[str, ...]:
-    """Signs of a monitor by which a recalibration is due; empty where it is not."""
-    if monitor is None or not monitor.due:
-        return ()
-    raised = tuple(sign.name for sign in monitor.state().signs if sign.raised and sign.decides)
-    return raised or ("other",)
 
 
 def _inferred(page: DecodedPage, stages: Stages) -> None:

@@ -69,7 +69,6 @@ def listening(settings: ServiceSettings, assembly: Assembly, certificates: Certi
         stack.enter_context(server)
         if service.incoming is not None:
             stack.enter_context(Incoming(plane.models, service.incoming))
-        if settings.self_calibrates:
-            own = settings.self_calibration.settings()
+        if (own := settings.self_calibration).is_on:
             stack.enter_context(SelfCalibration(plane, assembly.monitor, recalibrator, own))
         yield Endpoints(server.target, health)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
-from lightpage.device.profile import TomlTable
 from lightpage.runtime.client.wire.messages import CHUNK_BYTES, MESSAGE_BYTES, REPLY_BYTES
 from lightpage.runtime.device.acquisition.page_store import UPLOADED_BYTES
+from lightpage.runtime.service.table import Rule, SettingsTable
 
 JOBS_KEPT = 64
 """Results of jobs that are kept."""
@@ -16,21 +17,23 @@ JOBS_KEPT = 64
 GRACE_S = 10.0
 """Time that calls in flight get when the service is told to stop."""
 
+_HEADER_BYTES = 1 << 10
+"""Of a message beside the chunk in it, at most."""
+
 _Bytes = Annotated[int, Field(ge=1, le=(1 << 31) - 1)]
 """Of a message: gRPC counts them in 32 bits."""
 _MemoryBytes = Annotated[int, Field(ge=1, le=1 << 40)]
-_Seconds = Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)]
+_DAY = Field(gt=0, le=86_400, allow_inf_nan=False)
+_Seconds = Annotated[float, _DAY]
 _Count = Annotated[int, Field(ge=1, le=4096)]
 
 
-class Limits(TomlTable):
+class Limits(SettingsTable):
     """The limits that one service runs under: the table [limits] of its settings.
 
     Each default has its reason below it, or where it is named. A connection has no longest age unless one is set: a
     device's only controller would gain nothing by a new one, and lose its session. Nor are calls ended for it.
     """
-
-    model_config = ConfigDict(strict=True)
 
     message_bytes: _Bytes = MESSAGE_BYTES
     chunk_bytes: _Bytes = CHUNK_BYTES
@@ -87,5 +90,16 @@ class Limits(TomlTable):
     concurrent_watches: _Count = 2
     """Controllers that watch what is to be shown: one, and one whose connection has been lost."""
     grace_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] = GRACE_S
-    connection_age_s: _Seconds | None = None
-    connection_grace_s: _Seconds | None = None
+    connection_age_s: Annotated[float | None, _DAY] = None
+    connection_grace_s: Annotated[float | None, _DAY] = None
+
+    def rules(self) -> Iterator[Rule]:
+        """Yield the rules among limits."""
+        most = self.message_bytes - _HEADER_BYTES
+        wanted = f"at least {_HEADER_BYTES} less than limits.message_bytes, which is {self.message_bytes}"
+        yield self.chunk_bytes <= most, "chunk_bytes", wanted
+        wanted = f"at least limits.pair_bytes, which is {self.pair_bytes}: a larger pair would never be taken"
+        yield self.receive_bytes >= self.pair_bytes, "receive_bytes", wanted
+        yield self.stall_s <= self.receive_s, "stall_s", f"at most limits.receive_s, which is {self.receive_s:g}"
+        alone = self.connection_grace_s is not None and self.connection_age_s is None
+        yield not alone, "connection_grace_s", "limits.connection_age_s too: the age after which it begins"

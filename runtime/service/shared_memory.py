@@ -7,13 +7,13 @@ import logging
 import mmap
 import os
 import secrets
-import selectors
 import socket
+import socketserver
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -98,13 +98,57 @@ def unknown_region() -> InvalidInputError:
     return InvalidInputError("header.shared.region", "an unknown handle", expected)
 
 
-@dataclass
-class _Client:
-    """A connection: what has come of a size, its region once it has one, and when it began."""
+class _Server(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):
+    """Listens for clients, each of which has a thread for as long as it is connected."""
 
-    begun: float
-    received: bytearray = field(default_factory=bytearray)
-    region: Region | None = None
+    daemon_threads, block_on_close = True, False
+    memory: SharedMemory
+
+    def get_request(self) -> tuple[Any, Any]:
+        """See `socketserver.BaseServer`."""
+        try:
+            return super().get_request()
+        except OSError as error:  # the client has gone, or there are too many files
+            _log.warning("shared memory: a client is not taken: %s", error.strerror or error)
+            time.sleep(_PAUSE_S)
+            raise
+
+    def verify_request(self, request: Any, client_address: Any) -> bool:
+        """See `socketserver.BaseServer`."""
+        return self.memory.takes(request)
+
+    def shutdown_request(self, request: Any) -> None:
+        """See `socketserver.BaseServer`."""
+        self.memory.forget(request)
+        super().shutdown_request(request)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """See `socketserver.BaseServer`: one client's trouble is nobody else's."""
+        _log.exception("shared memory: a client could not be served")
+
+
+class _Client(socketserver.BaseRequestHandler):
+    """Gives a client its region, and takes that back when the client leaves."""
+
+    def handle(self) -> None:
+        """See `socketserver.BaseRequestHandler`."""
+        server: Any = self.server
+        memory: SharedMemory = server.memory
+        self.request.settimeout(memory.silence_s)
+        with suppress(OSError), self.request.makefile("rb", buffering=0) as told, ExitStack() as stack:
+            asked = told.read(SIZE.size)
+            while told and asked and len(asked) < SIZE.size and (more := told.read(SIZE.size - len(asked))):
+                asked += more
+            if len(asked) < SIZE.size:
+                return
+            try:
+                region = stack.enter_context(memory.region(*SIZE.unpack(asked)))
+            except LightpageError as error:
+                self.request.send(REFUSED + str(error).encode()[:WHY_BYTES])
+                return
+            socket.send_fds(self.request, [GRANTED + region.handle], [region.descriptor])
+            self.request.settimeout(None)
+            told.read(1)  # nothing until the end
 
 
 class SharedMemory:
@@ -118,14 +162,12 @@ class SharedMemory:
     """
 
     def __init__(self, path: str, most_bytes: int, most_regions: int, silence_s: float) -> None:
-        self._path, self._most_regions, self._silence_s = Path(path), most_regions, silence_s
+        self._path, self._most_regions, self.silence_s = Path(path), most_regions, silence_s
         self.most_bytes = most_bytes
-        self._clients: dict[socket.socket, _Client] = {}
-        self._selector = selectors.DefaultSelector()
+        self._clients: set[socket.socket] = set()
         self._regions: dict[bytes, Region] = {}
         self._lock = threading.Lock()
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="lightpage-shared-memory", daemon=True)
+        """Guards the two above."""
 
     @contextmanager
     def reading(self, handle: bytes, offset: int, size: int) -> Iterator[memoryview]:
@@ -150,95 +192,56 @@ class SharedMemory:
         if not hasattr(os, "memfd_create"):
             raise InvalidInputError("service.shared_memory", "a system without memfd_create", "Linux")
         check_free("socket", f"unix:{self._path}")
-        self._socket = socket.socket(socket.AF_UNIX)
         try:
-            with suppress(FileNotFoundError):
-                self._path.unlink()  # left behind by a process that was killed
-            self._socket.bind(str(self._path))
-            self._socket.listen()
+            self._path.unlink(missing_ok=True)  # left behind by a process that was killed
+            self._server = _Server(str(self._path), _Client)
         except OSError as error:
-            self._socket.close()
             raise InvalidInputError(f"socket {self._path}", error, "a path where a socket can be made") from None
-        self._socket.setblocking(False)
-        self._thread.start()
+        self._server.memory = self
+        run, name = partial(self._server.serve_forever, _LOOK_S), "lightpage-shared-memory"
+        threading.Thread(target=run, name=name, daemon=True).start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stopping.set()
-        self._thread.join()
-        self._socket.close()
+        self._server.shutdown()
+        self._server.server_close()
+        with self._lock:
+            clients, regions = list(self._clients), list(self._regions.values())
+        for client in clients:
+            with suppress(OSError):
+                client.shutdown(socket.SHUT_RDWR)
+        for region in regions:
+            region.drop()
         with suppress(OSError):
             self._path.unlink()
 
-    def _run(self) -> None:
-        with self._selector:
-            self._selector.register(self._socket, selectors.EVENT_READ)
-            while not self._stopping.is_set():
-                for key, _ in self._selector.select(_LOOK_S):
-                    try:
-                        self._serve(key.fileobj)
-                    except Exception:  # one client's trouble is nobody else's
-                        _log.exception("shared memory: a client could not be served")
-                        self._stopping.wait(_PAUSE_S)
-                late, clients = time.monotonic() - self._silence_s, list(self._clients.items())
-                for connection in [one for one, client in clients if not client.region and client.begun < late]:
-                    self._hang_up(connection)
-            for connection in list(self._clients):
-                self._hang_up(connection)
+    def takes(self, client: socket.socket) -> bool:
+        """Note a client; False where there are too many."""
+        with self._lock:
+            if len(self._clients) >= 2 * self._most_regions:
+                return False
+            self._clients.add(client)
+            return True
 
-    def _serve(self, source: Any) -> None:
-        if source is self._socket:
-            self._accept()
-        elif not self._hear(source, self._clients[source]):
-            self._hang_up(source)
+    def forget(self, client: socket.socket) -> None:
+        """Forget a client, which has gone."""
+        with self._lock:
+            self._clients.discard(client)
 
-    def _accept(self) -> None:
+    @contextmanager
+    def region(self, size: int) -> Iterator[Region]:
+        """Yield a new region, which ends with the `with` statement.
+
+        Raises:
+            LimitError, OverloadedError: there is not so much memory, or not now.
+        """
+        region = self._made(size)
         try:
-            connection, _ = self._socket.accept()
-        except OSError as error:  # the client has gone, or there are too many files
-            _log.warning("shared memory: a client is not taken: %s", error.strerror or error)
-            self._stopping.wait(_PAUSE_S)
-            return
-        connection.setblocking(False)
-        if len(self._clients) >= 2 * self._most_regions:
-            connection.close()
-            return
-        self._clients[connection] = _Client(time.monotonic())
-        self._selector.register(connection, selectors.EVENT_READ)
-
-    def _hang_up(self, connection: socket.socket) -> None:
-        region = self._clients.pop(connection).region
-        self._selector.unregister(connection)
-        connection.close()
-        if region is not None:
+            yield region
+        finally:
             with self._lock:
                 del self._regions[region.handle]
             region.drop()
-
-    def _hear(self, connection: socket.socket, client: _Client) -> bool:
-        """Take what a client sends; whether its connection goes on."""
-        try:
-            data = connection.recv(SIZE.size + 1 - len(client.received))
-        except BlockingIOError:
-            return True
-        except OSError:
-            return False
-        client.received += data
-        if not data or len(client.received) > SIZE.size or client.region is not None:
-            return False
-        if len(client.received) < SIZE.size:
-            return True
-        try:
-            client.region = self._made(SIZE.unpack(client.received)[0])
-        except LightpageError as error:
-            with suppress(OSError):
-                connection.send(REFUSED + str(error).encode()[:WHY_BYTES])
-            return False
-        try:
-            socket.send_fds(connection, [GRANTED + client.region.handle], [client.region.descriptor])
-        except OSError:
-            return False
-        return True
 
     def _made(self, size: int) -> Region:
         """A new region."""

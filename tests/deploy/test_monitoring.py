@@ -17,8 +17,10 @@ import yaml
 from click.testing import CliRunner
 
 from lightpage.runtime.commands.service.serve import serve
+from lightpage.runtime.console.application import console_routes
 from lightpage.runtime.console.history import History
-from lightpage.runtime.console.server import Console, ConsoleServer
+from lightpage.runtime.console.server import serving
+from lightpage.runtime.console.state import ConsoleState
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import Caller
@@ -28,7 +30,7 @@ from lightpage.runtime.service.models.store import ModelStore
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.pages.reading import read_page
-from lightpage.runtime.service.settings import Option, service_settings
+from lightpage.runtime.service.settings import Given, service_settings
 from lightpage.runtime.service.stages import Stages
 from tests.deploy.manifests import DEPLOY
 from tests.runtime import toy
@@ -76,8 +78,8 @@ def shown(toy_zip: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
         read_page(plane, None, None, Caller(), stages=stages)
         metrics.timed("ReadPage", stages)
         metrics.call_ended("ReadPage", "OK", "", stages.elapsed_s)
-    console = Console(metrics, history, registry, monitor, "toy:device")
-    with ConsoleServer(console, 0) as server, urlopen(f"http://127.0.0.1:{server.port}/metrics", timeout=20) as reply:
+    routes = console_routes(ConsoleState(history, registry, monitor, "toy:device"), metrics.registry)
+    with serving(routes, 0) as port, urlopen(f"http://127.0.0.1:{port}/metrics", timeout=20) as reply:
         return str(reply.read(), "utf-8")
 
 
@@ -178,8 +180,8 @@ def test_the_composition_for_other_machines_has_tls_everywhere() -> None:
     own = services["lightpage"]
     arguments = [argument.removeprefix("--").split("=", 1) for argument in own["command"]]
     keys = {"source": "source", "address": "address"}
-    options = [Option(name, ("service", keys[name]), value) for name, value in arguments if name in keys]
-    options += [Option("", ("metrics", "host"), "0.0.0.0"), Option("", ("metrics", "port"), 9100)]
+    options = [Given(name, ("service", keys[name]), value) for name, value in arguments if name in keys]
+    options += [Given("", ("metrics", "host"), "0.0.0.0"), Given("", ("metrics", "port"), 9100)]
     settings = service_settings(None, own["environment"], options).settings
     assert not settings.service.insecure
     files = settings.tls.files()

@@ -41,22 +41,17 @@ def watched(ledger: Ledger, operation: Operation, address: str | None, file: Pat
     if address is None and file is None:
         yield Watch()
         return
-    from prometheus_client import make_wsgi_app  # for who asks for metrics
-
-    from lightpage.runtime.archives.run.metrics import BulkMetrics
-    from lightpage.runtime.console.server import ConsoleServer
+    from lightpage.runtime.archives.run.metrics import BulkMetrics  # for who asks for metrics
+    from lightpage.runtime.console.application import metrics_routes
+    from lightpage.runtime.console.server import serving
 
     metrics = BulkMetrics(ledger.folder.name, operation, ledger.part)
     try:
         with ExitStack() as stack:
             if address is not None:
-                host, _, port = address.rpartition(":")
-                try:
-                    server = stack.enter_context(ConsoleServer(make_wsgi_app(metrics.registry), int(port), host))
-                except OSError as error:
-                    expected = "an address of this machine and a free port"
-                    raise InvalidInputError(f"--metrics {address}", error, expected) from None
-                click.echo(f"metrics at http://{host}:{server.port}/metrics", err=True)
+                host, _, asked = address.rpartition(":")
+                port = stack.enter_context(serving(metrics_routes(metrics.registry), int(asked), host))
+                click.echo(f"metrics at http://{host}:{port}/metrics", err=True)
             yield metrics
     finally:
         metrics.end()

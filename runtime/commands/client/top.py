@@ -130,9 +130,9 @@ def _device(change: Change) -> Table:
     raised = [dict(own)["sign"] for own, value in now.values("lightpage_monitor_sign_raised").items() if value == 1]
     for sign in raised:
         table.add_row("sign raised", Text(sign, "red"))
-    for result, count in now.by("lightpage_recalibrations_total", "result").items():
+    for own, count in now.values("lightpage_recalibrations_total").items():
         if count:
-            table.add_row(f"recalibrations {result}", f"{count:.0f}")
+            table.add_row(f"recalibrations {dict(own)['result']}", f"{count:.0f}")
     if now.value("lightpage_source_ok") == 0:
         table.add_row("source", Text("a beam may be blocked", "red"))
     if now.value("lightpage_store_ok") == 0:

@@ -8,12 +8,11 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from importlib.metadata import version as installed_version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import click
 from click.core import ParameterSource
 
-from lightpage.errors import InvalidInputError
 from lightpage.progress import reporting
 from lightpage.runtime.client.wire.address import host_and_port
 from lightpage.runtime.commands.execution import ENGINE_CACHE, THREADS
@@ -21,102 +20,77 @@ from lightpage.runtime.commands.provider_option import PROVIDER
 from lightpage.runtime.commands.service.ending import leave_the_rest, stop_signals
 from lightpage.runtime.console.actions import Actions
 from lightpage.runtime.console.history import History
-from lightpage.runtime.console.server import Console, ConsoleServer
-from lightpage.runtime.model.bundle.shipped import DEFAULT
+from lightpage.runtime.console.state import ConsoleState
 from lightpage.runtime.model.execution.memory import share_freed_memory
 from lightpage.runtime.model.execution.session import VERSION as RUNTIME_VERSION
 from lightpage.runtime.service.assembly import assembled
 from lightpage.runtime.service.endpoints import listening
-from lightpage.runtime.service.monitoring.flight_recorder import PAGES
 from lightpage.runtime.service.monitoring.logs import logging_to_stderr
+from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.server.certificates import Certificates
 from lightpage.runtime.service.settings import (
-    ADDRESS,
-    STORE_VARIABLE,
+    TABLES,
     Effective,
+    Given,
+    Key,
     MetricsTable,
-    Option,
+    ServiceTable,
     service_settings,
 )
 
 _log = logging.getLogger(__name__)
+_Command = TypeVar("_Command", bound=Callable[..., Any])
 
-_KEYS = {
-    "pages_file": ("service", "pages"),
-    "ca": ("tls", "ca"),
-    "certificate": ("tls", "certificate"),
-    "key": ("tls", "key"),
-    "metrics_port": ("metrics", "port"),
-    "metrics_host": ("metrics", "host"),
-    "self_calibrate": ("self_calibration", "enabled"),
-    "calibration_pages": ("self_calibration", "pages"),
-    "flight_recorder": ("flight_recorder", "folder"),
-    "flight_recorder_pages": ("flight_recorder", "pages"),
+_OPTIONS: dict[str, Key] = {
+    **{f"--{key.replace('_', '-')}": ("service", key) for key in ServiceTable.model_fields if key != "insecure"},
+    **{f"--{key}": ("tls", key) for key in ("ca", "certificate", "key")},
+    "--metrics-port": ("metrics", "port"),
+    "--metrics-host": ("metrics", "host"),
+    "--self-calibrate": ("self_calibration", "enabled"),
+    "--calibration-page": ("self_calibration", "pages"),
+    "--flight-recorder": ("flight_recorder", "folder"),
+    "--flight-recorder-pages": ("flight_recorder", "pages"),
 }
-"""Of options the settings that they are above of; all others are above of those of their name in [service]."""
+"""The setting that each option stands above."""
+_SHARED = {"--threads": THREADS, "--provider": PROVIDER, "--engine-cache": ENGINE_CACHE}
 
-_FILE, _FOLDER = click.Path(path_type=Path), click.Path(file_okay=False, path_type=Path)
+
+def _option(name: str, key: str, setting: dict[str, Any]) -> Callable[[_Command], _Command]:
+    """Return an option of the type, the help and the default of its setting, as JSON Schema has it."""
+    value, default = setting.get("anyOf", [setting])[0], setting["default"]
+    multiple, value = "items" in value, value.get("items", value)
+    kind: click.ParamType[Any] | None = None
+    if value["type"] == "boolean":
+        name, default = f"{name}/--no-{name[2:]}", default and key
+    elif value["type"] == "integer":
+        kind = click.IntRange(value["minimum"], value["maximum"])
+    elif "format" in value:
+        kind = click.Path(file_okay=value["format"] == "path", path_type=Path)
+    shown, unset = str(default) if default else None, () if multiple else None
+    return click.option(
+        name, type=kind, multiple=multiple, default=unset, show_default=shown, help=setting["description"]
+    )
+
+
+def _settings_options(command: _Command) -> _Command:
+    settings = {
+        table: TABLES[table].model_json_schema()["properties"] for table in {key[0] for key in _OPTIONS.values()}
+    }
+    for name, (table, key) in reversed(_OPTIONS.items()):
+        command = (_SHARED.get(name) or _option(name, key, settings[table][key]))(command)
+    return command
 
 
 @click.command()
 @click.option(
     "--config",
-    type=_FILE,
+    type=click.Path(path_type=Path),
     envvar="LIGHTPAGE_CONFIG",
     show_envvar=True,
     help="Settings, SERVICE.toml; variables of the environment and options count before them.",
 )
 @click.option("--print-config", is_flag=True, help="Print the settings in effect and where they come from, and end.")
-@click.option("--bundle", show_default=DEFAULT, help="A bundle's path, or the name of a shipped one.")
-@click.option("--bundle-key", type=_FILE, help="Public key, PEM, that bundles must be signed with.")
-@click.option(
-    "--source", help="simulator:PROFILE, recording:FILE, camera:CONFIG.toml; without it only sent frames decode."
-)
-@click.option("--pages", "pages_file", type=_FILE, help="Pages that the source is to show, PAGES.h5.")
-@click.option("--address", show_default=ADDRESS, help="HOST:PORT to listen on; port 0 takes a free one.")
-@click.option(
-    "--health-address",
-    help="HOST:PORT of health checks, answered by a process of their own; by default the next port. off: none.",
-)
-@click.option("--ca", type=_FILE, help="TLS: authorities of the callers' certificates, PEM.")
-@click.option("--certificate", type=_FILE, help="TLS: certificate of the service, PEM.")
-@click.option("--key", type=_FILE, help="TLS: its private key, PEM.")
-@click.option("--metrics-port", type=click.IntRange(0, 65535), help="Show metrics and console on this port.")
-@click.option("--metrics-host", show_default="127.0.0.1", help="Where the figures are shown.")
-@click.option(
-    "--shared-memory/--no-shared-memory", default=None, help="Share memory with clients at the service's Unix socket."
-)
-@click.option(
-    "--store",
-    type=_FOLDER,
-    help=f"Folder of recalibrated and uploaded bundles; it remembers which one serves. {STORE_VARIABLE} too.",
-)
-@click.option("--incoming", type=_FOLDER, help="Folder whose bundles are taken into the store, as uploads are.")
-@click.option(
-    "--recordings",
-    type=click.Path(exists=True, file_okay=False, path_type=Path),
-    help="Folder whose recordings a caller may name to recalibrate with.",
-)
-@THREADS
-@PROVIDER
-@ENGINE_CACHE
-@click.option(
-    "--tracking/--no-tracking", default=None, show_default="tracking", help="Follow the image, and find it again."
-)
-@click.option(
-    "--self-calibrate/--no-self-calibrate",
-    default=None,
-    help="Recalibrate when the monitor says so; by default where calibration pages are named.",
-)
-@click.option(
-    "--calibration-page",
-    "calibration_pages",
-    type=click.IntRange(0, 2**32 - 1),
-    multiple=True,
-    help="Number of a page of the source whose symbols are known; repeat it. Without, the next two pages serve.",
-)
-@click.option("--flight-recorder", type=_FOLDER, help="Folder in which the frames of lost and weak pages are kept.")
-@click.option("--flight-recorder-pages", show_default=str(PAGES), type=click.IntRange(1), help="Kept there at most.")
+@_settings_options
 @click.pass_context
 def serve(context: click.Context, /, config: Path | None, print_config: bool, **_: Any) -> None:
     """Run the service until SIGTERM, Ctrl-C or SIGHUP; calls in flight are finished first."""
@@ -127,21 +101,19 @@ def serve(context: click.Context, /, config: Path | None, print_config: bool, **
     settings = effective.settings
     settings.check_paths()
     share_freed_memory()
-    logs = settings.logs
-    written = logging_to_stderr(logs.format, logs.level, logs.lines_per_second)
-    with stop_signals() as wait_for_stop, written, reporting(None):  # what work tells of itself is logged too
+    logged = reporting(None)  # what work tells of itself goes into the log too
+    with stop_signals() as wait_for_stop, logging_to_stderr(settings.logs), logged:
         _serve(effective, wait_for_stop)
         leave_the_rest()
 
 
-def _given(context: click.Context) -> list[Option]:
-    """The options that somebody gave."""
+def _given(context: click.Context) -> list[Given]:
+    """Return the settings that somebody gave as options."""
     names = {parameter.name: parameter.opts[0] for parameter in context.command.params}
-    given = [name for name in context.params if context.get_parameter_source(name) is ParameterSource.COMMANDLINE]
     return [
-        Option(names[name], _KEYS.get(name, ("service", name)), context.params[name])
-        for name in given
-        if name not in ("config", "print_config")
+        Given(f"option {option}", _OPTIONS[option], context.params[name])
+        for name, option in names.items()
+        if option in _OPTIONS and context.get_parameter_source(name) is ParameterSource.COMMANDLINE
     ]
 
 
@@ -154,8 +126,8 @@ def _serve(effective: Effective, wait_for_stop: Callable[[], None]) -> None:
         own = stack.enter_context(assembled(settings, history))
         plane, registry = own.plane, own.plane.registry
         actions = Actions(plane, own.recalibrator, settings.self_calibration.pages)
-        console = Console(plane.metrics, history, registry, own.monitor, own.source_name, actions)
-        stack.enter_context(_shown(console, settings.metrics, certificates))
+        state = ConsoleState(history, registry, own.monitor, own.source_name, actions)
+        stack.enter_context(_shown(state, plane.metrics, settings.metrics, certificates))
         endpoints = stack.enter_context(listening(settings, own, certificates))
         if endpoints.health is not None:
             click.echo(f"health checks at {endpoints.health}")
@@ -176,16 +148,17 @@ def _versions() -> dict[str, str]:
 
 
 @contextmanager
-def _shown(console: Console, settings: MetricsTable, certificates: Certificates | None) -> Iterator[None]:
+def _shown(
+    state: ConsoleState, metrics: ServiceMetrics, settings: MetricsTable, certificates: Certificates | None
+) -> Iterator[None]:
     if settings.port is None:
         yield
         return
-    try:
-        server = ConsoleServer(console, settings.port, settings.host, certificates, settings.names)
-    except OSError as error:
-        got, expected = error.strerror or error, "an address of this machine and a free port"
-        raise InvalidInputError(f"metrics at {host_and_port(settings.host, settings.port)}", got, expected) from None
-    root = f"{'http' if certificates is None else 'https'}://{host_and_port(settings.host, server.port)}"
-    click.echo(f"metrics at {root}/metrics, console at {root}/")
-    with server:
+    from lightpage.runtime.console.application import console_routes  # Tornado is for who asks for it
+    from lightpage.runtime.console.server import serving
+
+    routes = console_routes(state, metrics.registry)
+    with serving(routes, settings.port, settings.host, certificates, settings.names) as port:
+        root = f"{'http' if certificates is None else 'https'}://{host_and_port(settings.host, port)}"
+        click.echo(f"metrics at {root}/metrics, console at {root}/")
         yield

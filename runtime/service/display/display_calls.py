@@ -13,8 +13,9 @@ from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.device.acquisition.source import FrameSource
 from lightpage.runtime.device.modulator.external import ExternalBeams, ExternalModulator
 from lightpage.runtime.device.modulator.modulator import BeamState
-from lightpage.runtime.service.caller import Call
+from lightpage.runtime.service.caller import Call, Role
 from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.rpc import rpc
 
 _POLL_S = 0.02
 """How often is looked for something new to show."""
@@ -30,6 +31,7 @@ class DisplayCalls:
     def __init__(self, plane: DataPlane) -> None:
         self._plane = plane
 
+    @rpc(Role.DECODE, is_upload=True)
     async def UploadPages(self, requests: AsyncIterator[pb.UploadPagesRequest], call: Call) -> pb.UploadPagesReply:
         """Receive pages to show."""
         limits, shape = self._plane.limits, self._plane.registry.current.decoder.bundle.profile.page_shape
@@ -42,6 +44,7 @@ class DisplayCalls:
         first = await call.in_thread(lambda: self._added(symbols, levels))
         return pb.UploadPagesReply(first_page=first, pages=len(symbols))
 
+    @rpc(Role.DECODE, is_watch=True)
     async def WatchDisplay(self, request: pb.WatchDisplayRequest, call: Call) -> AsyncIterator[pb.WatchDisplayReply]:
         """Tell a controller what to show."""
         with self._plane.watches.held_at_once():
@@ -52,6 +55,7 @@ class DisplayCalls:
                     yield wanted
                 await asyncio.sleep(_POLL_S)
 
+    @rpc(Role.DECODE)
     def ReportDisplay(self, request: pb.ReportDisplayRequest, call: Call) -> pb.ReportDisplayReply:
         """Hear from a controller what is shown."""
         kind, source = request.WhichOneof("what"), self._plane.source

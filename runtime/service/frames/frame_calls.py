@@ -18,7 +18,7 @@ from lightpage.recording.layout import frame_type
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import FramePart
 from lightpage.runtime.client.wire.status import reason_told, refusal_of
-from lightpage.runtime.service.caller import Call, Caller
+from lightpage.runtime.service.caller import Call, Caller, Role
 from lightpage.runtime.service.dataplane import DataPlane, levels_for
 from lightpage.runtime.service.frames.frames import (
     PairReceiver,
@@ -29,6 +29,7 @@ from lightpage.runtime.service.frames.frames import (
     pilots_of,
     pixel_type,
 )
+from lightpage.runtime.service.rpc import rpc
 from lightpage.runtime.service.stages import Stage, Stages
 
 _ON_THEIR_WAY = 2
@@ -60,6 +61,7 @@ class FrameCalls:
     def __init__(self, plane: DataPlane) -> None:
         self._plane = plane
 
+    @rpc(Role.DECODE)
     async def DecodeFrames(self, requests: AsyncIterator[FramePart], call: Call) -> pb.DecodeReply:
         """Receive a frame pair and decode it."""
         stages = call.times.page()
@@ -75,6 +77,7 @@ class FrameCalls:
             raise
         return await call.in_thread(partial(self._decode, receiver, header, call, stages), receiver.close)
 
+    @rpc(Role.DECODE)
     async def DecodePages(self, requests: AsyncIterator[FramePart], call: Call) -> AsyncIterator[pb.DecodePagesReply]:
         """Receive frame pairs, one after another, and decode each while the next one comes."""
         pending: asyncio.Queue[tuple[asyncio.Future[pb.DecodePagesReply], Stages] | None] = asyncio.Queue()

@@ -19,8 +19,9 @@ from lightpage.runtime.client.wire.messages import DATA_LOSSES, FLOAT, PIXEL_TYP
 from lightpage.runtime.model.decoding.image_position import ImagePosition
 from lightpage.runtime.service.admission import Bytes, ReceiveBudget
 from lightpage.runtime.service.caller import Caller
-from lightpage.runtime.service.dataplane import Answer, DataPlane, Seen, levels_for, observed
+from lightpage.runtime.service.dataplane import Answer, DataPlane, levels_for
 from lightpage.runtime.service.monitoring import monitor as signs
+from lightpage.runtime.service.monitoring.observation import Seen, observed
 from lightpage.runtime.service.stages import Stage, Stages
 
 SESSION_CHARACTERS = 1024
@@ -219,10 +220,10 @@ def decode(
         levels = levels_for(model.decoder, levels, plane.default_levels, user_data)
         if user_data:
             pilots = pilots or model.decoder.written_pilots(levels)
-        subject, monitor = "frame pair", plane.monitor_of(caller)
+        subject, monitor = "frame pair", plane.monitors.of(caller)
         seen = Seen(subject, None, model.version)
-        seen.note(tells=sure, pair=pair, of_device=monitor is not None and monitor is plane.monitor)
-        with observed(plane.observers_of(monitor), seen):
+        seen.note(tells=sure, pair=pair, of_device=monitor is not None and monitor is plane.monitors.device)
+        with observed(plane.monitors.told_by(monitor), seen):
             with plane.optics(user_data):
                 page = plane.decode(model, caller, pair, levels, pilots, subject, stages, monitor, sure=sure)
             found = plane.user_data(model, page, stages, monitor) if user_data else None

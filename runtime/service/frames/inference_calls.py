@@ -19,7 +19,7 @@ from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import PIXEL_CODES, message_of
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.service.admission import ReceiveBudget
-from lightpage.runtime.service.caller import Call
+from lightpage.runtime.service.caller import Call, Role
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.frames.frame_calls import FrameCalls
 from lightpage.runtime.service.frames.tensors import (
@@ -31,6 +31,7 @@ from lightpage.runtime.service.frames.tensors import (
     typed_bytes,
 )
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
+from lightpage.runtime.service.rpc import rpc
 from lightpage.runtime.service.stages import Stage, Stages
 
 INFERENCE = oip.DESCRIPTOR.services_by_name["GRPCInferenceService"]
@@ -116,24 +117,29 @@ class InferenceCalls:
         self._plane, self._frames = plane, FrameCalls(plane)
         self._most_beside = _most_beside(plane)
 
+    @rpc(Role.READ)
     async def ServerLive(self, request: oip.ServerLiveRequest, call: Call) -> oip.ServerLiveResponse:
         """Whoever hears this is answered."""
         return oip.ServerLiveResponse(live=True)
 
+    @rpc(Role.READ)
     async def ServerReady(self, request: oip.ServerReadyRequest, call: Call) -> oip.ServerReadyResponse:
         """Whether pages are decoded."""
         return oip.ServerReadyResponse(ready=self._ready)
 
+    @rpc(Role.READ)
     async def ModelReady(self, request: oip.ModelReadyRequest, call: Call) -> oip.ModelReadyResponse:
         """Whether a version is in service."""
         current = self._plane.registry.current.version
         ready = self._ready and request.name == MODEL and request.version in ("", current)
         return oip.ModelReadyResponse(ready=ready)
 
+    @rpc(Role.READ)
     async def ServerMetadata(self, request: oip.ServerMetadataRequest, call: Call) -> oip.ServerMetadataResponse:
         """What the service is."""
         return oip.ServerMetadataResponse(name="lightpage", version=installed_version("lightpage"))
 
+    @rpc(Role.READ)
     def ModelMetadata(self, request: oip.ModelMetadataRequest, call: Call) -> oip.ModelMetadataResponse:
         """The model's tensors and versions."""
         self._check_known(request.name, request.version)
@@ -163,6 +169,7 @@ class InferenceCalls:
             reply.properties["user_bytes_per_page"] = str(decoder.page_codec.user_bytes)
         return reply
 
+    @rpc(Role.DECODE, reads_later=True)
     async def ModelInfer(self, receive: Callable[[], Awaitable[bytes]], call: Call) -> oip.ModelInferResponse:
         """Decode a pair."""
         stages = call.times.page()

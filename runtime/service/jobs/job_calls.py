@@ -9,11 +9,12 @@ from functools import partial
 
 from lightpage.errors import InvalidInputError, MalformedError, OverloadedError
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.service.caller import Call
+from lightpage.runtime.service.caller import Call, Role
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.messages import result_message
 from lightpage.runtime.service.jobs.recalibrator import PagesToUse, Recalibrator, Step
 from lightpage.runtime.service.jobs.sent_pages import SentPages
+from lightpage.runtime.service.rpc import rpc
 
 _POLL_S = 0.1
 """How often is looked whether a job has changed."""
@@ -40,6 +41,7 @@ class JobCalls:
         self._plane, self._recalibrator, self._jobs = plane, recalibrator, recalibrator.jobs
         self._clock, self._watches = clock, 0
 
+    @rpc(Role.RECALIBRATE)
     def Recalibrate(self, request: pb.RecalibrateRequest, call: Call) -> Iterator[pb.RecalibrateReply]:
         """Recalibrate and tell how it goes."""
         pages = self._pages(request)
@@ -49,12 +51,14 @@ class JobCalls:
             else:
                 yield pb.RecalibrateReply(result=result_message(step))
 
+    @rpc(Role.RECALIBRATE)
     def StartRecalibration(self, request: pb.StartRecalibrationRequest, call: Call) -> pb.Job:
         """Start a recalibration that goes on when its caller leaves."""
         return self._recalibrator.start(
             self._pages(request), request.expected_version, request.correlation_id, call.actor
         )
 
+    @rpc(Role.RECALIBRATE, is_upload=True)
     async def RecalibrateFrames(self, requests: AsyncIterator[pb.RecalibrateFramesRequest], call: Call) -> pb.Job:
         """Receive known pages, and start a recalibration with them."""
         first = await anext(requests, None)
@@ -70,14 +74,17 @@ class JobCalls:
         finally:
             sent.close()  # does nothing where the job has taken them
 
+    @rpc(Role.READ)
     def ListJobs(self, request: pb.ListJobsRequest, call: Call) -> pb.ListJobsReply:
         """All jobs that are kept."""
         return pb.ListJobsReply(jobs=self._jobs.all())
 
+    @rpc(Role.READ)
     def GetJob(self, request: pb.GetJobRequest, call: Call) -> pb.Job:
         """A job as it is now."""
         return self._jobs.job(request.id)
 
+    @rpc(Role.READ, is_watch=True)
     async def WatchJob(self, request: pb.WatchJobRequest, call: Call) -> AsyncIterator[pb.Job]:
         """A job at each change."""
         if self._watches >= _WATCHES:
@@ -96,6 +103,7 @@ class JobCalls:
         finally:
             self._watches -= 1
 
+    @rpc(Role.RECALIBRATE)
     async def CancelJob(self, request: pb.CancelJobRequest, call: Call) -> pb.Job:
         """Have a job end at its next step."""
         self._jobs.cancel(request.id)

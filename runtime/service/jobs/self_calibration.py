@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Self
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Self
+
+from pydantic import Field
 
 from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import (
@@ -23,6 +24,7 @@ from lightpage.runtime.service.caller import Actor, Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 from lightpage.runtime.service.monitoring.monitor import Monitor
+from lightpage.runtime.service.table import Rule, Seconds, SettingsTable, Text
 
 _log = logging.getLogger(__name__)
 
@@ -31,23 +33,40 @@ WORTH_BITS = 0.02
 bench device bring 0.03 and more. One that brings less cures nothing that the monitor complains of."""
 
 
-@dataclass(frozen=True)
-class SelfCalibrationSettings:
-    """When and with what a service recalibrates itself.
+class SelfCalibrationSettings(SettingsTable):
+    """When and with what a service recalibrates itself: the table [self_calibration] of its settings."""
 
-    Attributes:
-        pages: fully known pages of the source; where there are none, the next two that it shows.
-        least_s: shortest time between two recalibrations, seconds: a device that drifts faster needs a mechanic.
-        longest_s: to which that time is doubled by one refusal or failure after another, or by recalibrations that
-            bring next to nothing. What was refused once will hardly be better a minute later, and each try costs reads
-            a few pages' time.
-        busy_s: time after which it is looked again whether a recalibration that somebody else runs has ended.
-    """
+    enabled: bool | None = Field(
+        None, description="Recalibrate when the monitor says so; by default where calibration pages are named."
+    )
+    device_sessions: Annotated[tuple[Text, ...], Field(strict=False)] = ()
+    """Sessions whose frames, which callers send, are of the device: the monitor counts them as it does the pages of the
+    source. With TLS each is CALLER/SESSION, CALLER being the name in the caller's certificate."""
+    pages: tuple[Annotated[int, Field(ge=0, le=2**32 - 1)], ...] = Field(
+        (),
+        strict=False,
+        description="Number of a page of the source whose symbols are known; repeat it. Without, the next two pages "
+        "serve.",
+    )
+    least_s: Seconds = 60.0
+    """Shortest time between two recalibrations: a device that drifts faster needs a mechanic."""
+    longest_s: Seconds = 3600.0
+    """To which that time is doubled by one refusal or failure after another, or by recalibrations that bring next to
+    nothing. What was refused once will hardly be better a minute later, and each try costs reads a few pages' time."""
+    busy_s: Seconds = 5.0
+    """Time after which it is looked again whether a recalibration that somebody else runs has ended."""
 
-    pages: tuple[int, ...] = ()
-    least_s: float = 60.0
-    longest_s: float = 3600.0
-    busy_s: float = 5.0
+    @property
+    def is_on(self) -> bool:
+        """Whether the service recalibrates itself."""
+        return bool(self.pages) if self.enabled is None else self.enabled
+
+    def rules(self) -> Iterator[Rule]:
+        """Yield the rules among times, and those of pages."""
+        least = f"at least self_calibration.least_s, which is {self.least_s:g}"
+        yield self.longest_s >= self.least_s, "longest_s", least
+        differ = len(self.pages) >= MIN_PAGES and len({*self.pages}) == len(self.pages)
+        yield not self.pages or differ, "pages", f"at least {MIN_PAGES} that differ: one to fit, one to judge by"
 
 
 class SelfCalibration:

@@ -8,9 +8,10 @@ from functools import partial
 
 from lightpage.errors import MalformedError, StalledError
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
-from lightpage.runtime.service.caller import Call
+from lightpage.runtime.service.caller import Call, Role
 from lightpage.runtime.service.models.models import ModelEntry, Models, Upload
 from lightpage.runtime.service.models.store import Origin
+from lightpage.runtime.service.rpc import rpc
 
 
 class ModelCalls:
@@ -23,29 +24,35 @@ class ModelCalls:
     def __init__(self, models: Models) -> None:
         self._models = models
 
+    @rpc(Role.READ)
     def ListModels(self, request: pb.ListModelsRequest, call: Call) -> pb.ListModelsReply:
         """All models that are loaded, or those of the store too."""
         return pb.ListModelsReply(models=map(model_message, self._models.entries(request.stored)))
 
+    @rpc(Role.ADMIN)
     def Rollback(self, request: pb.RollbackRequest, call: Call) -> pb.RollbackReply:
         """Go back to the model before."""
         current, before = self._models.rollback(request.expected_version, call.actor)
         return pb.RollbackReply(model_version=current.version, previous_version=before.version)
 
+    @rpc(Role.ADMIN)
     def RollForward(self, request: pb.RollForwardRequest, call: Call) -> pb.RollForwardReply:
         """Go to the later model again."""
         current, before = self._models.roll_forward(request.expected_version, call.actor)
         return pb.RollForwardReply(model_version=current.version, previous_version=before.version)
 
+    @rpc(Role.ADMIN)
     def ActivateModel(self, request: pb.ActivateModelRequest, call: Call) -> pb.ActivateModelReply:
         """Put a model in service."""
         current, before = self._models.activate(request.version, request.expected_version, call.actor)
         return pb.ActivateModelReply(model_version=current.version, previous_version=before.version)
 
+    @rpc(Role.ADMIN)
     def PinModel(self, request: pb.PinModelRequest, call: Call) -> pb.PinModelReply:
         """Pin a model, or let go of it."""
         return pb.PinModelReply(model=model_message(self._models.pin(request.version, request.pinned, call.actor)))
 
+    @rpc(Role.ADMIN, is_upload=True)
     async def UploadModel(self, requests: AsyncIterator[pb.UploadModelRequest], call: Call) -> pb.UploadModelReply:
         """Receive a bundle, check it, and keep it."""
         first = await anext(requests, None)

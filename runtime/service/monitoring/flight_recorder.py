@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
+from pydantic import Field
 
 from lightpage.errors import InvalidInputError, LightpageError, LimitError, Reason
 from lightpage.page.levels import MAX_LEVELS
@@ -25,17 +26,12 @@ from lightpage.runtime.service.models.registry import Model, ModelRegistry
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.monitoring.observation import Observation
+from lightpage.runtime.service.table import Folder, SettingsTable
 
 _log = logging.getLogger(__name__)
 
 NOTE = "flight"
 """Group of a kept page's recording whose attributes say why it was kept."""
-
-PAGES = 64
-"""Pages kept: those around a fault, and of some faults before it."""
-
-RING_BYTES = 1 << 30
-"""On disk: 64 pages of a bench device take 160 MB, 25 of a 20-megapixel device all of it."""
 
 _WAITING = 4
 """Pages that wait for the disk; each lies in memory."""
@@ -108,22 +104,18 @@ class FileRing:
             sizes.pop(0)
 
 
-@dataclass(frozen=True)
-class FlightSettings:
-    """What is kept.
+class FlightSettings(SettingsTable):
+    """What is kept, and where: the table [flight_recorder] of the service's settings."""
 
-    Attributes:
-        pages: files at most.
-        ring_bytes: of them all.
-        low_margin_bits: pages with less margin are kept, bits a symbol: one in ten thousand of a quiet bench device.
-        read_every_s: of pages that were read, with a low margin or while a recalibration is due, one is kept in this
-            time, seconds: more would push out the pages that show how it began.
-    """
-
-    pages: int = PAGES
-    ring_bytes: int = RING_BYTES
-    low_margin_bits: float = 0.05
-    read_every_s: float = 60.0
+    folder: Folder | None = Field(None, description="Folder in which the frames of lost and weak pages are kept.")
+    pages: int = Field(64, ge=1, le=1_000_000, description="Kept there at most.")
+    ring_bytes: int = Field(1 << 30, ge=1)
+    """Of them all: 64 pages of a bench device take 160 MB, 25 of a 20-megapixel device all of it."""
+    low_margin_bits: float = Field(0.05, ge=0, le=8, allow_inf_nan=False)
+    """A page with less margin is kept, bits a symbol: one in ten thousand of a quiet bench device."""
+    read_every_s: float = Field(60.0, ge=0, le=31e6, allow_inf_nan=False)
+    """Of pages that were read, with a low margin or while a recalibration is due, one is kept in this time, seconds:
+    more would push out the pages that show how it began."""
 
 
 @dataclass(frozen=True)
@@ -252,20 +244,19 @@ def _write(kept: _Kept, path: Path) -> None:
 def _note(kept: _Kept) -> dict[str, str | float]:
     """Why a page was kept, and what is known of it."""
     seen = kept.observation
-    note: dict[str, str | float] = {
+    data, page = seen.user_data, seen.page
+    note: dict[str, str | float | None] = {
         "reason": kept.reason,
         "detail": kept.detail,
         "subject": seen.subject,
         "model_version": seen.model_version,
         "time_s": seen.time_s,
+        "page_index": seen.page_index,
+        "margin_bits": None if data is None else data.margin_bits,
+        "pilot_share": None if page is None else page.check.share,
+        "pilot_trust": None if page is None else page.pilot_trust,
     }
-    if seen.page_index is not None:
-        note["page_index"] = seen.page_index
-    if seen.user_data is not None:
-        note["margin_bits"] = seen.user_data.margin_bits
-    if seen.page is not None:
-        note |= {"pilot_share": seen.page.check.share, "pilot_trust": seen.page.pilot_trust}
-    return note
+    return {name: value for name, value in note.items() if value is not None}
 
 
 def _counts(frames: FramePair, bit_depth: int) -> FramePair:

@@ -8,22 +8,32 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Literal, TextIO
 
+from pydantic import Field
+
 from lightpage.clock import SYSTEM, Clock
 from lightpage.runtime.service.monitoring.observation import Observation
-
-FIELDS = ("method", "peer", "correlation_id", "code", "reason", "seconds")
-"""What may be said of a call beside the message, in this order."""
+from lightpage.runtime.service.table import SettingsTable
 
 MOST_TEXT = 300
 """Characters of a text of a call in logs and traces: a caller chooses its correlation id."""
 _WINDOW_S = 1.0
-_MOST_KINDS = 1000
-"""Kinds of lines that are counted apart; beyond them those of earlier seconds are forgotten."""
+_Shown = tuple[str, int, str]
+"""Logger, level, and text of a kind of lines."""
+_PLAIN = logging.Formatter()
 _log = logging.getLogger(__name__)
+
+
+class LogSettings(SettingsTable):
+    """What goes to stderr: the table [logs] of the service's settings."""
+
+    format: Literal["text", "json"] = "text"
+    level: Literal["debug", "info", "warning", "error"] = "info"
+    """Lesser lines are left out."""
+    lines_per_second: int = Field(5, ge=1, le=100_000)
+    """Of one kind; the others are counted. Enough to see that it goes on, and too few to fill a disk in a night."""
 
 
 class PageLog:
@@ -38,48 +48,8 @@ class PageLog:
             _log.warning("lost with model %s: %s", observation.model_version, text, extra={"told": fields})
 
 
-class TextFormatter(logging.Formatter):
-    """A line for people: time, level, logger, message, and what else is said as KEY=VALUE."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        """The record as text; only a traceback has more than one line."""
-        pairs = "".join(f" {key}={_word(value)}" for key, value in _fields(record).items())
-        line = f"{_time(record)} {record.levelname} {record.name}: {_one_line(record.getMessage())}{pairs}"
-        return f"{line}\n{self.formatException(record.exc_info)}" if _has_traceback(record) else line  # type: ignore[arg-type]
-
-
-class JsonFormatter(logging.Formatter):
-    """One JSON object a line, with the same in it, and a traceback as `traceback`."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        """The record as JSON."""
-        entry = {
-            "time": _time(record),
-            "level": record.levelname,
-            "logger": record.name,
-            "message": record.getMessage(),
-            **_fields(record),
-        }
-        if _has_traceback(record):
-            entry["traceback"] = self.formatException(record.exc_info)  # type: ignore[arg-type]
-        return json.dumps(entry, default=str)
-
-
-def _time(record: logging.LogRecord) -> str:
-    return datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
-
-
-def _has_traceback(record: logging.LogRecord) -> bool:
-    told = record.exc_info  # False where a library has logged with `exc_info=False`
-    return told is not None and bool(told) and told[0] is not None
-
-
-def _fields(record: logging.LogRecord) -> dict[str, Any]:
-    """What is said beside the message, without what is empty."""
-    said = getattr(record, "told", {})
-    known = [*(key for key in FIELDS if key in said), *(key for key in said if key not in FIELDS)]
-    cut = {key: said[key][:MOST_TEXT] if isinstance(said[key], str) else said[key] for key in known}
-    return {key: value for key, value in cut.items() if value != ""}
+def _told(record: logging.LogRecord) -> dict[str, Any]:
+    return getattr(record, "told", {})
 
 
 def _one_line(text: str) -> str:
@@ -87,112 +57,82 @@ def _one_line(text: str) -> str:
     return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
-def _word(value: Any) -> str:
-    text = str(value)
+def _word(text: str) -> str:
     return text if text.isprintable() and not set(text) & set(' "=') else json.dumps(text)
 
 
-@dataclass
-class _Second:
-    """Lines of one kind in one second."""
+class LogHandler(logging.StreamHandler[TextIO]):
+    """Writes a record and its `told`, what else is said of it, as a line: at most so many of one kind a second.
 
-    begun: float
-    level: int
-    logger: str
-    shown: str
-    lines: int = 0
-    left_out: int = 0
-
-
-class LimitedHandler(logging.StreamHandler[TextIO]):
-    """Writes at most so many lines of one kind a second, and then one that says how many were left out.
-
-    Of one kind are lines of one method and reason, and other lines that differ in their values only.
+    Then a line says how many were left out. Of one kind are lines of one method and reason, and other lines that differ
+    in their values only.
 
     Args:
+        settings: how lines look, and how many are written.
         stream: where they go.
-        lines_per_second: of one kind.
         clock: by which seconds pass.
     """
 
-    def __init__(self, stream: TextIO | None, lines_per_second: int, clock: Clock = SYSTEM) -> None:
+    def __init__(self, settings: LogSettings, stream: TextIO, clock: Clock = SYSTEM) -> None:
         super().__init__(stream)
-        self._most, self._clock = lines_per_second, clock
-        self._seconds: dict[tuple[str, ...], _Second] = {}
-        self._ending = threading.Event()
-        self._waker: threading.Thread | None = None
-        """Tells of what was left out if nothing else is logged."""
+        self._settings, self._clock, self._ending = settings, clock, threading.Event()
+        self._begun, self._seen = clock.now(), dict[tuple[str, str], tuple[_Shown, int]]()
+        """When this second began; and of each kind what is shown of it, and how many lines there were."""
+        self._awaited = False
+        """Whether a thread tells of what was left out if nothing else is logged."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line, of text or of JSON; behind one of text, a traceback has lines of its own."""
+        cut = {key: value[:MOST_TEXT] if isinstance(value, str) else value for key, value in _told(record).items()}
+        fields = {key: value for key, value in cut.items() if value != ""}
+        # a library may have logged with `exc_info=False`, or outside of any `except`
+        traceback = _PLAIN.formatException(record.exc_info) if record.exc_info and record.exc_info[0] else ""
+        time, message = datetime.fromtimestamp(record.created, UTC), record.getMessage()
+        head = {"time": time.isoformat(timespec="milliseconds"), "level": record.levelname, "logger": record.name}
+        if self._settings.format == "json":
+            last = {"traceback": traceback} if traceback else {}
+            return json.dumps({**head, "message": message, **fields, **last}, default=str)
+        pairs = "".join(f" {key}={_word(str(value))}" for key, value in fields.items())
+        return f"{' '.join(head.values())}: {_one_line(message)}{pairs}" + f"\n{traceback}" * bool(traceback)
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write a record, or count it; called with the handler's lock held."""
-        kind, now = _kind(record), self._clock.now()
-        second = self._seconds.get(kind)
-        if second is None or now - second.begun >= _WINDOW_S:
-            self._tell(kind, now)
-            if len(self._seconds) >= _MOST_KINDS:
-                self._forget(now)
-            shown = " ".join(filter(None, kind)) if _is_of_a_call(record) else record.getMessage()
-            second = self._seconds[kind] = _Second(now, record.levelno, record.name, shown)
-        second.lines += 1
-        if second.lines <= self._most:
+        if self._clock.now() - self._begun >= _WINDOW_S:
+            self._tell(self._begun)
+        told, kind, text = _told(record), (record.name, str(record.msg)), record.getMessage()
+        if "method" in told:
+            kind = str(told["method"]), str(told.get("reason") or told.get("code") or "")
+            text = " ".join(kind).rstrip()
+        shown, count = self._seen.get(kind, ((record.name, record.levelno, text), 0))
+        self._seen[kind] = shown, count + 1
+        if count < self._settings.lines_per_second:
             super().emit(record)
-            return
-        second.left_out += 1
-        self._wake_later()
+        elif not self._awaited:
+            self._awaited = True
+            threading.Thread(target=self._wait, args=(self._begun,), name="lightpage-left-out", daemon=True).start()
 
-    def tell_left_out(self, at_once: bool = False) -> None:
-        """Say what was left out in seconds that are over; `at_once`, in those that are not over too."""
-        self.acquire()
-        try:
-            self._waker = None
-            self._forget(self._clock.now(), at_once)
-            if any(each.left_out for each in self._seconds.values()):
-                self._wake_later()
-        finally:
-            self.release()
+    def _wait(self, begun: float) -> None:
+        if not self._clock.wait(self._ending, begun + _WINDOW_S - self._clock.now()):
+            self._tell(begun)
 
-    def _wake_later(self) -> None:
-        """See to it that what was left out is told of, even if nothing else is logged."""
-        if self._waker is None:
-            self._waker = threading.Thread(target=self._wait, name="lightpage-left-out", daemon=True)
-            self._waker.start()
-
-    def _wait(self) -> None:
-        if not self._clock.wait(self._ending, _WINDOW_S):
-            self.tell_left_out()
+    def _tell(self, begun: float) -> None:
+        """Say what was left out in the second that began then, unless another one has begun; and begin a new one."""
+        with self.lock:  # type: ignore[union-attr]
+            if begun != self._begun:
+                return
+            for (name, level, text), count in self._seen.values():
+                if (more := count - self._settings.lines_per_second) > 0:
+                    left = f"{more} more of these were left out in {max(self._clock.now() - begun, _WINDOW_S):.0f} s"
+                    record = logging.LogRecord(name, level, __file__, 0, "%s: %s", (text, left), None)
+                    record.told = {"left_out": more}
+                    super().emit(record)
+            self._begun, self._seen, self._awaited = self._clock.now(), {}, False
 
     def close(self) -> None:
         """Say what was left out, and end."""
         self._ending.set()
-        self.tell_left_out(at_once=True)
+        self._tell(self._begun)
         super().close()
-
-    def _tell(self, kind: tuple[str, ...], now: float) -> None:
-        second = self._seconds.get(kind)
-        if second is None or not second.left_out:
-            return
-        text = f"{second.left_out} more of these were left out in {max(now - second.begun, _WINDOW_S):.0f} s"
-        record = logging.LogRecord(second.logger, second.level, __file__, 0, "%s: %s", (second.shown, text), None)
-        record.told = {"left_out": second.left_out}
-        super().emit(record)
-        second.left_out = 0
-
-    def _forget(self, now: float, at_once: bool = False) -> None:
-        """Say what was left out in seconds that are over, or `at_once` in all, and count anew."""
-        for kind in [kind for kind, each in self._seconds.items() if at_once or now - each.begun >= _WINDOW_S]:
-            self._tell(kind, now)
-            del self._seconds[kind]
-
-
-def _is_of_a_call(record: logging.LogRecord) -> bool:
-    return "method" in getattr(record, "told", {})
-
-
-def _kind(record: logging.LogRecord) -> tuple[str, ...]:
-    said = getattr(record, "told", {})
-    if _is_of_a_call(record):
-        return str(said["method"]), str(said.get("reason") or said.get("code") or "")
-    return record.name, str(record.msg)
 
 
 def _thread_broke(found: threading.ExceptHookArgs) -> None:
@@ -202,27 +142,21 @@ def _thread_broke(found: threading.ExceptHookArgs) -> None:
 
 
 @contextmanager
-def logging_to_stderr(
-    form: Literal["text", "json"], level: str, lines_per_second: int, stream: TextIO | None = None
-) -> Iterator[LimitedHandler]:
+def logging_to_stderr(settings: LogSettings, stream: TextIO | None = None) -> Iterator[None]:
     """Have everything that is logged in the `with` statement written, and what ends threads that nobody waits for.
 
     Args:
-        form: of a line.
-        level: `debug`, `info`, `warning` or `error`; lesser lines are left out.
-        lines_per_second: of one kind.
+        settings: what is written, and how.
         stream: where to, stderr by default.
     """
-    root = logging.getLogger()
-    handler = LimitedHandler(sys.stderr if stream is None else stream, lines_per_second)
-    handler.setFormatter(JsonFormatter() if form == "json" else TextFormatter())
-    before, hook = root.level, threading.excepthook
+    root, hook, handler = logging.getLogger(), threading.excepthook, LogHandler(settings, stream or sys.stderr)
+    before = root.level
     root.addHandler(handler)
-    root.setLevel(level.upper())
+    root.setLevel(settings.level.upper())
     logging.captureWarnings(True)
     threading.excepthook = _thread_broke
     try:
-        yield handler
+        yield
     finally:
         threading.excepthook = hook
         logging.captureWarnings(False)

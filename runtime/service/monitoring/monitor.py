@@ -9,13 +9,11 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 
 import numpy as np
 
 from lightpage.codec.page_bytes import Loss
 from lightpage.errors import Reason
-from lightpage.runtime.service.caller import MOST_SESSIONS, Sessions
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.observation import Observation
 
@@ -308,6 +306,13 @@ class Monitor:
         with self._lock:
             return self._due
 
+    @property
+    def raised(self) -> tuple[str, ...]:
+        """Names of the signs by which a recalibration is due; empty where it is not."""
+        with self._lock:
+            raised = tuple(each.sign.name for each in self._signs if each.raised and each.sign.decides)
+            return (raised or ("other",)) if self._due else ()
+
     def state(self) -> MonitorState:
         """How the device stands, with the reasons."""
         with self._lock:
@@ -357,33 +362,3 @@ class Monitor:
             for sign in state.signs:
                 self._metrics.monitor_signs.labels(sign.name).set(math.nan if sign.value is None else sign.value)
                 self._metrics.monitor_raised.labels(sign.name).set(sign.raised)
-
-
-class SessionMonitors:
-    """A monitor for each session whose frames callers send: what they show says nothing of the service's own device.
-
-    Args:
-        settings: when a recalibration is due.
-        most: see `Sessions`.
-    """
-
-    def __init__(self, settings: MonitorSettings, most: int = MOST_SESSIONS) -> None:
-        self._settings, self._most = settings, most
-        self.begin("")
-
-    def begin(self, version: str) -> None:
-        """Start anew with a model that is put in service."""
-        self._monitors = Sessions(partial(self._begun, version), self._most)
-
-    def of(self, session: str) -> Monitor:
-        """The monitor of a session."""
-        return self._monitors.of(session)
-
-    def due(self) -> int:
-        """Number of sessions whose pages say that a recalibration is due."""
-        return sum(monitor.due for monitor in self._monitors.all())
-
-    def _begun(self, version: str, session: str) -> Monitor:
-        monitor = Monitor(self._settings, whose=f"{session}: ")
-        monitor.begin(version)
-        return monitor

@@ -11,11 +11,12 @@ from lightpage.errors import CallerLeft, InvalidInputError, LimitError, SlotsTak
 from lightpage.recording.layout import FrameInfo
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.status import detail_of, reason_told, refusal_of
-from lightpage.runtime.service.caller import Call, Caller
+from lightpage.runtime.service.caller import Call, Caller, Role
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.frames.frames import check_options, decode_reply, user_data_message
 from lightpage.runtime.service.pages.reading import DataPage, ReadAnswer, read_data, read_page
 from lightpage.runtime.service.pages.replays import Replays
+from lightpage.runtime.service.rpc import rpc
 from lightpage.runtime.service.stages import Stage, Stages
 
 _MOST_PAGES = 1 << 32
@@ -37,6 +38,7 @@ class PageCalls:
         self._plane, self._clock, limits = plane, clock or plane.clock, plane.limits
         self.replays = Replays(limits.replay_s, limits.replay_bytes, self._clock)
 
+    @rpc(Role.DECODE)
     def ReadPage(self, request: pb.ReadPageRequest, call: Call) -> pb.ReadPageReply:
         """Read a page from the source and decode it; with a request id at most once."""
         stages = call.times.page()
@@ -63,6 +65,7 @@ class PageCalls:
         reply.replayed, reply.decoded.correlation_id = replayed, request.correlation_id
         return reply
 
+    @rpc(Role.DECODE, is_range=True)
     def ReadPages(self, request: pb.ReadPagesRequest, call: Call) -> Iterator[pb.ReadPagesReply]:
         """Read several pages; a lost one ends nothing."""
         check_options(request.options)
@@ -89,6 +92,7 @@ class PageCalls:
             yield reply
             call.times.done(stages)
 
+    @rpc(Role.DECODE, is_range=True)
     def ReadData(self, request: pb.ReadDataRequest, call: Call) -> Iterator[pb.ReadDataReply]:
         """Read the bytes of a range of pages."""
         self._check_count("pages", request.pages)

@@ -15,7 +15,8 @@ from lightpage.errors import LightpageError, LostPageError, PageError, SourceErr
 from lightpage.page.pilots import Pilots
 from lightpage.runtime.device.acquisition.source import FrameSource, Shot, own_fault
 from lightpage.runtime.service.caller import Caller
-from lightpage.runtime.service.dataplane import Answer, DataPlane, Seen, levels_for, observed
+from lightpage.runtime.service.dataplane import Answer, DataPlane, levels_for
+from lightpage.runtime.service.monitoring.observation import Seen, observed
 from lightpage.runtime.service.stages import Stage, Stages
 
 GROUPS = 4
@@ -99,13 +100,13 @@ def read_page(
         SourceError: no source, or one that is damaged or dark.
         PageError: no such page, or an impossible level count; else as `decode`.
     """
-    source, stages = plane.source, stages or Stages()
+    source, stages, monitor = plane.source, stages or Stages(), plane.monitors.device
     stages.begin(Stage.QUEUE)
     # The slot first: pages that wait for one shall not be read yet, nor lie in memory.
     with plane.decodes.held(caller):
         model, begun = plane.registry.current, time.perf_counter()
         seen = Seen(f"{'next page' if page is None else f'page {page}'} of {source.name}", page, model.version)
-        with observed(plane.observers_of(plane.monitor), seen):
+        with observed(plane.monitors.told_by(monitor), seen):
             stages.begin(Stage.RECEIVE)
             found = _shot(plane, source, page, caller, user_data)
             subject = f"page {found.page_index} of {source.name}"
@@ -122,11 +123,11 @@ def read_page(
                 own = model.decoder
                 pilots = own.written_pilots(levels) if user_data else own.pilots(source.levels, mask)
             with own_fault(f"{subject}: "), plane.optics(user_data):
-                decoded = plane.decode(model, caller, found.pair, levels, pilots, subject, stages, plane.monitor)
-            data = plane.user_data(model, decoded, stages, plane.monitor, expected) if user_data else None
+                decoded = plane.decode(model, caller, found.pair, levels, pilots, subject, stages, monitor)
+            data = plane.user_data(model, decoded, stages, monitor, expected) if user_data else None
             seen.note(page=decoded, user_data=data)
         plane.decodes.took(time.perf_counter() - begun)
-    return ReadAnswer(plane.answer(decoded, model, stages, data, plane.monitor), found, mask)
+    return ReadAnswer(plane.answer(decoded, model, stages, data, monitor), found, mask)
 
 
 def _shot(plane: DataPlane, source: FrameSource, page: int | None, caller: Caller, user_data: bool) -> Shot:

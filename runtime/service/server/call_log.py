@@ -27,13 +27,14 @@ def log_end(
     foresaw, and with no other.
 
     Args:
-        about: fields of the call; its name in ``method``.
+        about: fields of the call, its name in ``method`` and its time in ``seconds`` among them.
         code: its status.
         error: None where it has ended well.
         is_watch: whether it lasts as long as its caller likes.
     """
     unforeseen = error if code is grpc.StatusCode.INTERNAL else None
     fields = {**about, "code": code.name, "reason": reason_told(error)}
+    fields["seconds"] = fields.pop("seconds")  # behind what people look for first
     text = "done" if error is None else told(error) if isinstance(error, Exception) else "the caller has gone"
     level = _level(code, error, is_watch)
     _log.log(level, "%s: %s", about["method"], text, extra={"told": fields}, exc_info=unforeseen)

@@ -7,20 +7,26 @@ import math
 import os
 import ssl
 import threading
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
+from functools import lru_cache
 from typing import Any
 
 import grpc
 from cryptography import x509
-from cryptography.x509.oid import ExtendedKeyUsageOID
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from lightpage.errors import InvalidInputError
+from lightpage.errors import InvalidInputError, NotAllowedError
 from lightpage.runtime.client.wire.channel import Pem, TlsFiles
+from lightpage.runtime.service.caller import ROLE_URI, Identity, Role
 
 _log = logging.getLogger(__name__)
 
 SOON = timedelta(days=14)
 """A certificate that ends within this time is warned of."""
+
+CERTIFICATES_KEPT = 256
+"""Certificates whose contents are remembered; others are read again."""
 
 _Stamp = tuple[tuple[int, ...], ...]
 """Number, size and times of change of each file: of its contents, and of what the system knows of it, as its owner."""
@@ -171,3 +177,26 @@ def _warn_of(own: x509.Certificate | None) -> None:
 def _configuration(pem: Pem, callers_too: bool) -> grpc.ServerCertificateConfiguration:
     own = [(pem.key, pem.certificate)]
     return grpc.ssl_server_certificate_configuration(own, pem.ca if callers_too else None)
+
+
+@lru_cache(CERTIFICATES_KEPT)
+def identity_of(certificate: bytes) -> Identity:
+    """The owner of a certificate, PEM or DER, that has been verified.
+
+    Raises:
+        NotAllowedError: it cannot be read.
+    """
+    load = x509.load_pem_x509_certificate if certificate.startswith(b"-----") else x509.load_der_x509_certificate
+    uris: list[str] = []
+    try:
+        read = load(certificate)
+        names = read.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+        with suppress(x509.ExtensionNotFound):
+            told = read.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+            uris = told.get_values_for_type(x509.UniformResourceIdentifier)
+    except (ValueError, x509.DuplicateExtension, x509.UnsupportedGeneralNameType) as error:
+        raise NotAllowedError("certificate of the caller", error, "one that can be read") from None
+    name = str(names[0].value) if names else f"certificate {read.serial_number:x}"
+    name = name if name.isprintable() else ascii(name)[1:-1]
+    roles = (Role(role) for uri in uris if (role := uri.removeprefix(ROLE_URI)) != uri and role in list(Role))
+    return Identity(name, frozenset(roles), read.not_valid_after_utc.timestamp())

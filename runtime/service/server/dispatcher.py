@@ -2,8 +2,8 @@
 
 A handler is a method named as the RPC, of one of the classes in this package. It takes the request, or an asynchronous
 iterator of requests, and the `Call`; it returns the reply, or is a generator of replies. A plain `def` runs in a thread
-and may block; an `async def` runs on the server's loop and must not. A handler of a call in `LATER` takes, in place of
-the request, what reads its bytes.
+and may block; an `async def` runs on the server's loop and must not. Its mark says what else there is to know; see
+`lightpage.runtime.service.rpc`.
 """
 
 from __future__ import annotations
@@ -27,24 +27,16 @@ from lightpage.errors import CallerLeft, MalformedError, OverloadedError, Stalle
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import parsed_part
 from lightpage.runtime.client.wire.status import reason_told, status_of, told, trailers
-from lightpage.runtime.service.caller import LOCAL, STRANGER, Call, Caller, Identity, Role
+from lightpage.runtime.service.caller import LOCAL, STRANGER, Call, Caller, Identity
 from lightpage.runtime.service.limits import Limits
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.traces import MOST_PAGES, Traces
+from lightpage.runtime.service.rpc import Rpc, rpc_of
 from lightpage.runtime.service.server.call_log import log_end
-from lightpage.runtime.service.server.roles import NEEDED, identity_of
+from lightpage.runtime.service.server.certificates import identity_of
 from lightpage.runtime.service.stages import CallTimes
 
 SERVICE = pb.DESCRIPTOR.services_by_name["Lightpage"]
-
-ENDLESS = frozenset(["WatchDisplay", "WatchJob"])
-"""Calls that last as long as their callers like: they hold no thread, are no load, and end with the service."""
-
-UPLOADS = frozenset(["UploadPages", "RecalibrateFrames", "UploadModel"])
-"""Calls that change something once their callers have closed their streams."""
-
-LATER = frozenset(["inference/ModelInfer"])
-"""Calls whose one message is so large that it is not read before there is time for what it asks."""
 
 _EARLY_S = 0.05
 """A caller whose call ends so long before its deadline has run out of time too: its clock is its own."""
@@ -80,6 +72,7 @@ class _Method:
         service: full name of its service.
         name: in metrics and logs.
         handler: answers it.
+        served: how.
         many: whether its callers send many messages.
         serialise: a reply.
     """
@@ -87,6 +80,7 @@ class _Method:
     service: str
     name: str
     handler: Callable[..., Any]
+    served: Rpc
     many: bool
     serialise: Callable[[Any], bytes]
 
@@ -120,7 +114,6 @@ class Dispatcher:
         self._told: set[asyncio.Task[Any]] = set()
         """Of both those that were told to end."""
         self._refuses = False
-        self._longest_s = {"ReadData": limits.range_s, "ReadPages": limits.range_s}
 
     def rpc_handlers(self) -> tuple[grpc.GenericRpcHandler[Any, Any], ...]:
         """All RPCs of the services that have a handler, for the server.
@@ -141,11 +134,15 @@ class Dispatcher:
                 False: (grpc.stream_unary_rpc_method_handler, self._unary),
                 True: (grpc.stream_stream_rpc_method_handler, self._stream),
             }[method.server_streaming]
-            name, message = f"{service.prefix}{method.name}", GetMessageClass(method.input_type)
+            name, message, served = (
+                f"{service.prefix}{method.name}",
+                GetMessageClass(method.input_type),
+                rpc_of(handler),
+            )
             parse = parsed_part if message is pb.DecodeFramesRequest else message.FromString
             serialise = GetMessageClass(method.output_type).SerializeToString
-            rpc = _Method(service.descriptor.full_name, name, handler, method.client_streaming, serialise)
-            methods[method.name] = make(partial(serve, rpc), None if name in LATER else parse, None)
+            rpc = _Method(service.descriptor.full_name, name, handler, served, method.client_streaming, serialise)
+            methods[method.name] = make(partial(serve, rpc), None if served.reads_later else parse, None)
         return grpc.method_handlers_generic_handler(service.descriptor.full_name, methods)
 
     def refuse(self) -> None:
@@ -173,20 +170,20 @@ class Dispatcher:
 
     async def _unary(self, rpc: _Method, data: AsyncGenerator[Any, None], context: Any) -> bytes:
         async with self._call(rpc, context) as call:
-            request = self._messages(data, call) if rpc.many else await self._one(data, call)
+            request = self._messages(rpc, data, call) if rpc.many else await self._one(rpc, data, call)
             if inspect.iscoroutinefunction(rpc.handler):
                 return rpc.serialise(await rpc.handler(request, call))
             return rpc.serialise(await asyncio.wrap_future(self._pool.submit(rpc.handler, request, call)))
 
     async def _stream(self, rpc: _Method, data: AsyncGenerator[Any, None], context: Any) -> AsyncIterator[bytes]:
         async with self._call(rpc, context) as call:
-            request = self._messages(data, call) if rpc.many else await self._one(data, call)
+            request = self._messages(rpc, data, call) if rpc.many else await self._one(rpc, data, call)
             if inspect.isasyncgenfunction(rpc.handler):
                 replies: AsyncGenerator[Any, None] = rpc.handler(request, call)
             else:
                 replies = self._stepped(rpc.handler(request, call), call)
-            longest_s, loop = self._longest_s.get(rpc.name), asyncio.get_running_loop()
-            end = None if longest_s is None else loop.time() + longest_s
+            loop = asyncio.get_running_loop()
+            end = loop.time() + self._limits.range_s if rpc.served.is_range else None
             reader = _Reader(replies, partial(self._no_load, asyncio.current_task()))
             try:
                 while True:
@@ -227,7 +224,7 @@ class Dispatcher:
             if step is not None:
                 step.add_done_callback(lambda _: replies.close())  # one that is at work cannot be closed
 
-    async def _one(self, data: AsyncGenerator[Any, None], call: Call) -> Any:
+    async def _one(self, rpc: _Method, data: AsyncGenerator[Any, None], call: Call) -> Any:
         """The one message of a call, or what reads its bytes."""
 
         async def receive() -> Any:
@@ -236,34 +233,34 @@ class Dispatcher:
             await data.aclose()
             return message
 
-        return receive if call.method in LATER else _noted(await receive(), call)
+        return receive if rpc.served.reads_later else _noted(await receive(), call)
 
-    async def _messages(self, data: AsyncIterator[Any], call: Call) -> AsyncIterator[Any]:
+    async def _messages(self, rpc: _Method, data: AsyncIterator[Any], call: Call) -> AsyncIterator[Any]:
         """The messages of a stream."""
         async for message in data:
             yield _noted(message, call)
-        if call.method in UPLOADS:  # the library ends the stream of one who has gone too, and then cancels it
+        if rpc.served.is_upload:  # the library ends the stream of one who has gone too, and then cancels it
             await asyncio.sleep(_GONE_S)
 
     @asynccontextmanager
     async def _call(self, rpc: _Method, context: Any) -> AsyncIterator[Call]:
         """Admit a call, count it, and turn what it raises into its status."""
         name, caller = rpc.name, Caller(partial(_seconds_left, context))
-        call = Call(name, caller, self._pool, context.peer(), is_watch=name in ENDLESS)
+        call = Call(name, caller, self._pool, context.peer())
         call.times = CallTimes(call.begun, partial(self._metrics.timed, name), MOST_PAGES if self._traces else 0)
         headers = dict(context.invocation_metadata() or ()) if self._traces else {}
         ended = partial(self._ended, rpc, call, headers)
         task = asyncio.current_task()
         assert task is not None  # calls run in tasks
-        mine = self._watching if call.is_watch else self._active
+        mine = self._watching if rpc.served.is_watch else self._active
         mine.add(task)
         self._metrics.in_flight.inc()
         try:
             if self._refuses:
                 raise _stopping(name)
             call.identity = self._identity(context)
-            call.identity.check(NEEDED.get(name, Role.ADMIN), f"call {name}", time.time())
-            if not call.is_watch and len(self._active) > self._limits.concurrent_calls:
+            call.identity.check(rpc.served.role, f"call {name}", time.time())
+            if not rpc.served.is_watch and len(self._active) > self._limits.concurrent_calls:
                 got, expected = f"{len(self._active) - 1} at once", f"at most {self._limits.concurrent_calls}"
                 raise OverloadedError("calls", got, f"{expected}; try again later", retry_s=1.0)
             yield call
@@ -305,11 +302,11 @@ class Dispatcher:
         ended, reason = time.perf_counter(), reason_told(error)
         call.times.end(ended)
         self._metrics.in_flight.dec()
-        self._metrics.call_ended(call.method, code.name, reason, None if call.is_watch else ended - call.begun)
+        self._metrics.call_ended(call.method, code.name, reason, None if rpc.served.is_watch else ended - call.begun)
         if self._traces is not None:
             self._traces.ended(call, rpc.service, headers, code, reason, ended)
         fields = {"method": call.method, "peer": call.actor.name, "correlation_id": call.correlation_id}
-        log_end(fields | {"seconds": round(ended - call.begun, 4)}, code, error, is_watch=call.is_watch)
+        log_end(fields | {"seconds": round(ended - call.begun, 4)}, code, error, is_watch=rpc.served.is_watch)
 
 
 class _Reader:

@@ -7,7 +7,7 @@ from importlib.metadata import version as installed_version
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import PIXEL_CODES
 from lightpage.runtime.client.wire.status import without_folders
-from lightpage.runtime.service.caller import Call
+from lightpage.runtime.service.caller import Call, Role
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.display.display_calls import DisplayCalls
 from lightpage.runtime.service.frames.frame_calls import FrameCalls
@@ -15,6 +15,7 @@ from lightpage.runtime.service.jobs.job_calls import JobCalls
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 from lightpage.runtime.service.models.model_calls import ModelCalls, model_message
 from lightpage.runtime.service.pages.page_calls import PageCalls
+from lightpage.runtime.service.rpc import rpc
 
 
 def handlers(plane: DataPlane, recalibrator: Recalibrator) -> tuple[object, ...]:
@@ -39,6 +40,7 @@ class Describing:
     def __init__(self, plane: DataPlane) -> None:
         self._plane = plane
 
+    @rpc(Role.READ)
     def Describe(self, request: pb.DescribeRequest, call: Call) -> pb.DescribeReply:
         """What the service is."""
         plane, model = self._plane, self._plane.registry.current

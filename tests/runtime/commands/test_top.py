@@ -18,7 +18,7 @@ from lightpage.cli import main as cli_main
 from lightpage.cli.main import EXIT_ERROR, lightpage
 from lightpage.runtime.commands.client.top import top
 from lightpage.runtime.console.scrapes import Change, Scrape, Scrapes, scrape
-from lightpage.runtime.console.server import ConsoleServer
+from lightpage.runtime.console.server import serving
 from lightpage.runtime.model.decoding.decoder import Decoder
 from tests.runtime.console.stage import Stage, stage
 from tests.waiting import eventually
@@ -117,7 +117,7 @@ def test_in_a_terminal_it_outlives_the_service_and_ends_with_q(decoder: Decoder)
     screen, own = pty.openpty()
     with stage(decoder) as running:
         running.read(3)
-        port = running.server.port
+        port = running.port
         command = [
             sys.executable,
             "-c",
@@ -130,10 +130,10 @@ def test_in_a_terminal_it_outlives_the_service_and_ends_with_q(decoder: Decoder)
         os.close(own)
         try:
             assert shows("toy-1")
-            running.server.close()
+            running.close()
             assert shows("no answer")
             running.plane.metrics.in_service("toy-2")
-            with ConsoleServer(running.console, port):
+            with serving(running.routes, port):
                 assert shows("toy-2")
                 os.write(screen, b"x")
                 os.write(screen, b"q")

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 
 from lightpage.errors import LostPageError, LostShotError, Reason
 from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.console.actions import Actions
+from lightpage.runtime.console.application import Route, console_routes
 from lightpage.runtime.console.history import History
-from lightpage.runtime.console.server import Console, ConsoleServer
+from lightpage.runtime.console.server import serving
+from lightpage.runtime.console.state import ConsoleState
 from lightpage.runtime.device.acquisition.source import SHOT_S, Shot
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import Caller
@@ -37,9 +39,11 @@ class Losing(toy.ToySource):
 @dataclass
 class Stage:
     plane: DataPlane
-    console: Console
-    server: ConsoleServer
+    state: ConsoleState
+    routes: list[Route]
+    port: int
     url: str
+    close: Callable[[], None]
 
     def read(self, pages: int) -> None:
         for _ in range(pages):
@@ -53,6 +57,8 @@ def stage(decoder: Decoder, tls: TlsFiles | None = None) -> Iterator[Stage]:
     registry = ModelRegistry(decoder)
     plane = DataPlane(registry, Losing(toy.ToyDevice()), metrics=metrics, observers=[history], monitor=monitor)
     recalibrator = Recalibrator(plane, toy.fit_references)
-    console = Console(metrics, history, registry, monitor, "toy:device", Actions(plane, recalibrator))
-    with ConsoleServer(console, 0, certificates=None if tls is None else Certificates(tls)) as server:
-        yield Stage(plane, console, server, f"http{'s' if tls else ''}://localhost:{server.port}")
+    state = ConsoleState(history, registry, monitor, "toy:device", Actions(plane, recalibrator))
+    routes = console_routes(state, metrics.registry)
+    with ExitStack() as stack:
+        port = stack.enter_context(serving(routes, 0, certificates=None if tls is None else Certificates(tls)))
+        yield Stage(plane, state, routes, port, f"http{'s' if tls else ''}://localhost:{port}", stack.close)

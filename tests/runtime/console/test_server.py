@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import errno
+import gzip
 import io
 import json
 import math
+import os
 import socket
 import ssl
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from typing import Any
+from unittest.mock import Mock
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
-from wsgiref.util import setup_testing_defaults
 
 import numpy as np
 import pytest
@@ -21,22 +28,24 @@ from PIL import Image
 
 from lightpage.cli import main as cli_main
 from lightpage.cli.main import EXIT_ERROR, lightpage
-from lightpage.errors import Reason
+from lightpage.errors import InvalidInputError, Reason
 from lightpage.runtime.console.actions import Actions
+from lightpage.runtime.console.application import console_routes
 from lightpage.runtime.console.history import History
 from lightpage.runtime.console.pictures import SIDE_PX, confidence_png, frame_png
 from lightpage.runtime.console.scrapes import fetch
-from lightpage.runtime.console.server import IDENTITY, POINTS, RECENT, Console, ConsoleServer
+from lightpage.runtime.console.server import serving
+from lightpage.runtime.console.state import POINTS, RECENT, ConsoleState
 from lightpage.runtime.device.acquisition.source import Shot
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.service.caller import STRANGER, Actor, Caller, Identity, Role
+from lightpage.runtime.service.caller import Actor, Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 from lightpage.runtime.service.models.registry import ModelRegistry
-from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.monitoring.observation import Observation
 from lightpage.runtime.service.pages.reading import read_page
+from lightpage.runtime.service.server.certificates import Certificates
 from tests.clock import HandClock
 from tests.runtime import toy
 from tests.runtime.console.stage import Stage, stage
@@ -44,9 +53,11 @@ from tests.runtime.service.server.authority import Authority
 from tests.waiting import eventually
 
 
-def fetched(url: str, method: str = "GET") -> tuple[int, bytes, dict[str, str]]:
+def fetched(
+    url: str, method: str = "GET", context: ssl.SSLContext | None = None, content: bytes | None = None, **headers: str
+) -> tuple[int, bytes, dict[str, str]]:
     try:
-        with urlopen(Request(url, method=method), timeout=60) as reply:
+        with urlopen(Request(url, content, headers, method=method), timeout=60, context=context) as reply:
             return reply.status, reply.read(), dict(reply.headers)
     except HTTPError as error:
         with error:
@@ -54,15 +65,13 @@ def fetched(url: str, method: str = "GET") -> tuple[int, bytes, dict[str, str]]:
 
 
 def is_answered(running: Stage, context: ssl.SSLContext | None = None) -> bool:
-    try:
-        with urlopen(f"{running.url}/metrics", timeout=60, context=context) as reply:
-            return bool(reply.status == 200)
-    except OSError:
-        return False
+    with suppress(OSError):
+        return fetched(f"{running.url}/metrics", context=context)[0] == 200
+    return False
 
 
 def connected(running: Stage) -> socket.socket:
-    return socket.create_connection(("localhost", running.server.port), timeout=60)
+    return socket.create_connection(("localhost", running.port), timeout=60)
 
 
 def test_the_state_is_that_of_the_pages(decoder: Decoder) -> None:
@@ -72,8 +81,7 @@ def test_the_state_is_that_of_the_pages(decoder: Decoder) -> None:
         assert fetched(f"{running.url}/frames/in_phase.png")[0] == 404
         running.read(12)
         status, content, headers = fetched(f"{running.url}/state.json")
-        assert status == 200
-        assert headers["Cache-Control"] == "no-store"
+        assert (status, headers["Cache-Control"]) == (200, "no-store")
         assert "default-src 'self'" in headers["Content-Security-Policy"]
         state = json.loads(content)
         assert (state["source"], state["pages"], len(state["recent"])) == ("toy:device", 12, 12)
@@ -88,11 +96,16 @@ def test_the_state_is_that_of_the_pages(decoder: Decoder) -> None:
             assert Image.open(io.BytesIO(picture)).size[0] >= 1
 
 
-def test_metrics_are_beside_it_and_nothing_takes_orders(decoder: Decoder) -> None:
+def test_metrics_are_beside_it_and_nothing_takes_orders_or_tells_of_the_inside(
+    decoder: Decoder, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with stage(decoder) as running:
-        with pytest.raises(OSError, match="in use"):
-            ConsoleServer(running.console, running.server.port)
-        assert b"lightpage_calls_in_flight" in fetched(f"{running.url}/metrics")[1]
+        with pytest.raises(InvalidInputError, match="in use"), serving(running.routes, running.port):
+            pass
+        for accepted in ("identity", "gzip"):
+            _, content, headers = fetched(f"{running.url}/metrics", **{"Accept-Encoding": accepted})
+            assert headers.get("Content-Encoding", "identity") == accepted
+            assert b"lightpage_calls_in_flight" in (gzip.decompress(content) if accepted == "gzip" else content)
         for method in ("POST", "PUT", "DELETE"):
             assert fetched(f"{running.url}/state.json", method)[0] == 405
         for path in ("/static/console.js", "/../server.py", "//etc/passwd", "/frames/other.png"):
@@ -102,23 +115,20 @@ def test_metrics_are_beside_it_and_nothing_takes_orders(decoder: Decoder) -> Non
             found, nothing, told = fetched(running.url + path, "HEAD")
             assert (found, nothing, told["Content-Type"]) == (status, b"", headers["Content-Type"])
             assert int(headers["Content-Length"]) == int(told["Content-Length"]) == len(content)
-
-
-def test_what_nobody_foresaw_tells_nothing_of_the_inside(decoder: Decoder, monkeypatch: pytest.MonkeyPatch) -> None:
-    with stage(decoder) as running:
-        monkeypatch.setattr(running.console, "state", lambda *_: 1 // 0)
+        monkeypatch.setattr(running.state, "to_json", lambda *_: 1 // 0)
         status, content, headers = fetched(f"{running.url}/state.json")
         assert (status, content, headers["Server"]) == (500, b"see the log\n", "lightpage")
 
 
-def test_what_is_no_number_is_none_and_series_are_thinned(decoder: Decoder) -> None:
+def test_what_is_no_number_is_none_and_pages_are_bounded_and_thinned(decoder: Decoder) -> None:
     page = decoder.decode(toy.ToyDevice().page(toy.symbols_of(16, 1)[0], 16, 0.5), 16)
     page = replace(page, piston_rad=math.nan, check=replace(page.check, confirmed_bits=math.inf))
-    history, registry = History(), ModelRegistry(decoder)
+    history, registry = History(pages=2 * POINTS), ModelRegistry(decoder)
     for number in range(3 * POINTS):
         history.observe(Observation("page", number, "toy-1", float(number), 0.1, page=page))
-    state = Console(ServiceMetrics(), history, registry, Monitor(), "toy").state()
-    assert state["series"]["time_s"] == [*map(float, range(0, 3 * POINTS, 3)), 3 * POINTS - 1]
+    state = ConsoleState(history, registry, Monitor(), "toy").to_json()
+    times = [*map(float, range(POINTS, 3 * POINTS, 2)), 3 * POINTS - 1]
+    assert (state["series"]["time_s"], state["pages"]) == (times, 3 * POINTS)
     assert state["series"]["piston_rad"][-1] is state["series"]["share"][-1] is None
     assert [row["page_index"] for row in state["recent"]] == list(range(3 * POINTS))[: -RECENT - 1 : -1]
     json.dumps(state, allow_nan=False)
@@ -126,13 +136,13 @@ def test_what_is_no_number_is_none_and_series_are_thinned(decoder: Decoder) -> N
 
 def test_the_condition_is_that_of_the_last_pages(decoder: Decoder) -> None:
     clock, history, monitor = HandClock(1e9), History(), Monitor()
-    console = Console(ServiceMetrics(), history, ModelRegistry(decoder), monitor, "toy", clock=clock.now)
+    state = ConsoleState(history, ModelRegistry(decoder), monitor, "toy", clock=clock.now)
     told = list[str]()
 
     def seen(*lost: Reason | None) -> None:
         for each in lost:
             history.observe(Observation("page", 1, "toy-1", clock.now(), 0.1, each))
-        told.append(console.state()["condition"])
+        told.append(state.to_json()["condition"])
 
     for lost in ((), (None,), (Reason.MISSING_FRAME, None, None, None, None), (None,)):
         seen(*lost)
@@ -142,17 +152,9 @@ def test_the_condition_is_that_of_the_last_pages(decoder: Decoder) -> None:
     for _ in range(8):
         monitor.follow("toy-1", {"unread": 1.0})
     seen()
-    states = ["no page yet", "reading", "pages are being lost", "reading", "reading", "idle", "recalibration is due"]
-    assert told == states
-    assert console.state()["uptime_s"] == pytest.approx(30.1)
-
-
-def test_the_history_is_bounded() -> None:
-    history = History(pages=3)
-    for number in range(5):
-        history.observe(Observation(f"page {number}", number, "toy-1", float(number), 0.1))
-    assert [row.page_index for row in history.rows()] == [2, 3, 4]
-    assert history.pages == 5
+    expected = ["no page yet", "reading", "pages are being lost", "reading", "reading", "idle", "recalibration is due"]
+    assert told == expected
+    assert state.to_json()["uptime_s"] == pytest.approx(30.1)
 
 
 def test_pictures_are_thinned_and_show_saturation() -> None:
@@ -183,37 +185,34 @@ def test_the_command_finds_a_console_or_says_what_it_lacks(
         assert "--certificate" in found(running)
 
 
-def status_of_host(running: Stage, host: str | None, path: str = "/state.json", method: str = "GET") -> int:
-    with connected(running) as connection:
+def status_of_host(port: int, host: str | None, path: str = "/state.json", method: str = "GET") -> int:
+    with socket.create_connection(("localhost", port), timeout=60) as connection:
         named = "" if host is None else f"Host: {host}\r\n"
-        connection.sendall(f"{method} {path} HTTP/1.1\r\n{named}\r\n".encode())
+        connection.sendall(f"{method} {path} HTTP/1.0\r\n{named}\r\n".encode())
         return int(connection.recv(1000).split()[1])
 
 
 def test_a_name_that_a_stranger_made_resolve_to_this_machine_reads_nothing(decoder: Decoder) -> None:
     with stage(decoder) as running:
-        for host in (f"127.0.0.1:{running.server.port}", "localhost", "[::1]", socket.gethostname(), None):
-            assert status_of_host(running, host) == 200, host
+        for host in (f"127.0.0.1:{running.port}", "localhost", "[::1]", socket.gethostname(), None):
+            assert status_of_host(running.port, host) == 200, host
         for path in ("/", "/metrics", "/frames/in_phase.png", "/console.js"):
-            assert status_of_host(running, "rebound.example", path) == 421
-        assert status_of_host(running, "rebound.example", "/actions", "POST") == 421
-        with ConsoleServer(running.console, 0, names=("Device.example",)) as named:
-            running.server.close()
-            running.server = named
-            assert status_of_host(running, "device.example") == 200
-            assert status_of_host(running, "other.example") == 421
+            assert status_of_host(running.port, "rebound.example", path) == 421
+        assert status_of_host(running.port, "rebound.example", "/actions", "POST") == 421
+        with serving(running.routes, 0, names=("Device.example",)) as port:
+            assert status_of_host(port, "device.example") == 200
+            assert status_of_host(port, "other.example") == 421
 
 
 def test_metrics_are_shown_on_ipv6(decoder: Decoder) -> None:
     if not socket.has_ipv6:
         pytest.skip("no IPv6")
     with stage(decoder) as running:
-        for host, asked in (("::1", ["[::1]"]), ("[::]", ["[::1]", "127.0.0.1"])):  # the latter as gRPC's
-            with ConsoleServer(running.console, 0, host) as server:
-                for name in asked:
-                    assert fetch("metrics", f"{name}:{server.port}", "metrics").startswith(b"# HELP")
-        with pytest.raises(OSError, match="no host"):
-            ConsoleServer(running.console, 0, "a" * 64)
+        for host, asked in (("::1", "[::1]"), ("[::]", "[::1]"), ("[::]", "127.0.0.1")):  # the latter as gRPC's
+            with serving(running.routes, 0, host) as port:
+                assert fetch("metrics", f"{asked}:{port}", "metrics").startswith(b"# HELP")
+        with pytest.raises(InvalidInputError), serving(running.routes, 0, "a" * 64):
+            pass
 
 
 def test_callers_that_say_nothing_or_hang_up_hold_up_nobody(
@@ -226,7 +225,7 @@ def test_callers_that_say_nothing_or_hang_up_hold_up_nobody(
         assert is_answered(running, context)
         assert not any(is_answered(running, other) for other in others)
         with context.wrap_socket(connected(running), server_hostname="localhost") as hung_up:
-            hung_up.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
+            hung_up.sendall(b"GET /metrics HTTP/1.1\r\nHost: localhost\r\n\r\n")
         assert is_answered(running, context)
     assert capfd.readouterr().err == ""
 
@@ -236,7 +235,7 @@ def test_a_body_that_does_not_come_is_refused_and_nothing_else_is_said(
 ) -> None:
     monkeypatch.setattr("lightpage.runtime.console.server.SILENCE_S", 0.1)
     with stage(decoder) as running, connected(running) as connection:
-        connection.sendall(b"POST /actions HTTP/1.1\r\nContent-Length: 100\r\n\r\nx")
+        connection.sendall(b"POST /actions HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100\r\n\r\nx")
         assert b" 408 " in connection.recv(1000)
     assert capfd.readouterr().err == ""
 
@@ -254,23 +253,40 @@ def test_connections_are_bounded_in_number_and_in_time(decoder: Decoder, monkeyp
         assert eventually(lambda: is_answered(running))
 
 
-def test_a_connection_that_cannot_be_answered_gives_its_room_back(
-    decoder: Decoder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: object) -> None:
-        raise OSError(errno.EMFILE, "Too many open files")
+def test_an_answer_that_hangs_holds_up_no_stop(decoder: Decoder, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun, go, ended = threading.Event(), threading.Event(), list[bool]()
+    with stage(decoder) as running, connected(running) as waiting:
+        monkeypatch.setattr(running.state, "to_json", lambda *_: (begun.set(), ended.append(go.wait(20))))
+        waiting.sendall(b"GET /state.json HTTP/1.0\r\n\r\n")
+        assert begun.wait(60)
+        running.close()
+        assert (ended, waiting.recv(1)) == ([], b"")
+    go.set()
 
-    monkeypatch.setattr("lightpage.runtime.console.server.MOST_CONNECTIONS", 1)
+
+def test_where_there_is_no_descriptor_callers_wait(decoder: Decoder, monkeypatch: pytest.MonkeyPatch) -> None:
+    accept = Mock(side_effect=OSError(errno.EMFILE, "Too many open files"))
     with stage(decoder) as running:
-        with monkeypatch.context() as patch:
-            patch.setattr("socket.socket.dup", fail)
-            with connected(running) as connection:
-                assert connection.recv(1) == b""
-        assert eventually(lambda: is_answered(running))
+        monkeypatch.setattr("socket.socket.accept", accept)
+        with connected(running) as waiting:
+            assert eventually(lambda: accept.call_count > 1)
+            monkeypatch.undo()
+            waiting.sendall(b"GET /metrics HTTP/1.0\r\n\r\n")
+            assert b" 200 " in waiting.recv(1000)
+
+
+def test_new_certificates_count_from_the_next_connection_on(decoder: Decoder, tmp_path: Path) -> None:
+    before, after = Authority(tmp_path / "before"), Authority(tmp_path / "after")
+    contexts = [each.caller("watcher", ["read"]).client_context() for each in (before, after)]
+    with stage(decoder, before.service()) as running:
+        assert [is_answered(running, context) for context in contexts] == [True, False]
+        after.service()
+        for name in ("ca.pem", "service.pem", "service.key"):
+            os.replace(after.folder / name, before.folder / name)
+        assert [is_answered(running, context) for context in contexts] == [False, True]
 
 
 ROLL_BACK = {"action": "roll back", "expected": "toy-2"}
-OPERATOR = Identity("operator 7", frozenset([Role.ADMIN]), until=2000.0)
 
 
 class Numbered(toy.ToySource):
@@ -286,57 +302,47 @@ class Numbered(toy.ToySource):
 
 
 class Asked:
-    """A console without its server, of a service that has an earlier model."""
+    """A console with TLS of a service that has an earlier model."""
 
-    def __init__(self, decoder: Decoder, folder: Path) -> None:
-        self.source, self.clock = Numbered(), HandClock()
+    def __init__(self, decoder: Decoder, folder: Path, stack: ExitStack) -> None:
+        self.source, self.clock = Numbered(), HandClock(time.time())
         self.plane = DataPlane(ModelRegistry(decoder), self.source)
         self.plane.models.adopt(Decoder.load(toy.write_toy_bundle(folder / "c.zip", version="toy-2"), 1))
         self.recalibrator = Recalibrator(self.plane, toy.fit_references)
-        actions = Actions(self.plane, self.recalibrator)
-        registry, metrics = self.plane.registry, self.plane.metrics
-        self.console = Console(metrics, History(), registry, Monitor(), "toy", actions, self.clock.now)
+        stack.callback(self.recalibrator.close)
+        monitor, actions = Monitor(), Actions(self.plane, self.recalibrator)
+        state = ConsoleState(History(), self.plane.registry, monitor, "toy", actions, self.clock.now)
+        self.routes, authority = console_routes(state, self.plane.metrics.registry), Authority(folder)
+        certificates = Certificates(authority.service())
+        self.port = stack.enter_context(serving(self.routes, 0, certificates=certificates, names=["device.example"]))
+        self.context = cache(lambda *roles: authority.caller("operator 7", roles).client_context())
 
     @property
     def version(self) -> str:
         return self.plane.registry.current.version
 
-    def ask(self, path: str, caller: Identity | None, content: object = None, **headers: str) -> tuple[int, str]:
-        """Status and text of an answer to a POST; to a GET where there is no content."""
-        body = content if isinstance(content, bytes) else json.dumps(content).encode()
-        environ: dict[str, object] = {
-            "REQUEST_METHOD": "GET" if content is None else "POST",
-            "PATH_INFO": path,
-            "HTTP_HOST": "device.example",
-            "CONTENT_TYPE": "application/json",
-            "CONTENT_LENGTH": str(len(body)),
-            "wsgi.input": io.BytesIO(body),
-            **({} if caller is None else {IDENTITY: caller}),
-            **headers,
-        }
-        setup_testing_defaults(environ)  # type: ignore[arg-type]
-        begun: list[str] = []
-        answer = b"".join(self.console(environ, lambda status, *_: begun.append(status)))  # type: ignore[arg-type]
-        return int(begun[0].split()[0]), answer.decode()
+    def shown(self, path: str, *roles: str) -> tuple[int, Any]:
+        """Status and content of a page; of JSON, what it holds."""
+        status, content, headers = fetched(f"https://localhost:{self.port}{path}", context=self.context(*roles))
+        return status, json.loads(content) if headers["Content-Type"] == "application/json" else content
 
-    def act(self, caller: Identity | None = OPERATOR, content: object = ROLL_BACK, **headers: str) -> tuple[int, str]:
-        return self.ask("/actions", caller, content, **headers)
+    def act(self, roles: Sequence[str] = ("admin",), content: object = ROLL_BACK, **headers: str) -> tuple[int, bytes]:
+        body = content if isinstance(content, bytes) else json.dumps(content).encode()
+        headers = {"Host": "device.example", "Content-Type": "application/json", **headers}
+        return fetched(f"https://localhost:{self.port}/actions", "POST", self.context(*roles), body, **headers)[:2]
 
 
 @pytest.fixture
 def asked(decoder: Decoder, tmp_path: Path) -> Iterator[Asked]:
-    made = Asked(decoder, tmp_path)
-    yield made
-    made.recalibrator.close()
+    with ExitStack() as stack:
+        yield Asked(decoder, tmp_path, stack)
 
 
 def test_an_administrator_rolls_back(asked: Asked) -> None:
-    before = asked.console.state(OPERATOR)
+    _, before = asked.shown("/state.json", "admin")
     assert (before["caller"], before["actions"]) == ("operator 7", ["recalibrate", "roll back"])
-    status, told = asked.act()
-    assert (status, "toy-1" in told) == (200, True)
-    assert asked.version == "toy-1"
-    assert asked.console.state(OPERATOR)["actions"] == ["recalibrate"]
+    assert (asked.act()[0], asked.version) == (200, "toy-1")
+    assert asked.shown("/state.json", "admin")[1]["actions"] == ["recalibrate"]
     assert asked.act()[0] == 409  # another model is in service than was expected
 
 
@@ -347,43 +353,40 @@ def test_an_administrator_recalibrates_with_the_calibration_pages_and_not_the_co
     content = json.dumps({"action": "recalibrate", "expected": "toy-2"}).encode()
     told = Actions(asked.plane, asked.recalibrator, pages).do(content, Actor("operator"))
     assert asked.recalibrator.jobs.wait_idle(60)
-    job = asked.console.state(OPERATOR)["job"]
+    job = asked.shown("/state.json", "admin")[1]["job"]
     assert job["id"] in told
     assert job["state"] in ("DONE", "REFUSED")
     assert asked.source.asked == list(pages or (0, 1))
     assert read_page(asked.plane, None, None, Caller()).shot.page_index == 0
 
 
-@pytest.mark.parametrize("roles", [[Role.READ], [Role.DECODE, Role.RECALIBRATE], []])
-def test_nobody_else_does(roles: list[Role], asked: Asked) -> None:
-    caller = Identity("other", frozenset(roles))
-    assert asked.act(caller)[0] == 403
-    assert asked.version == "toy-2"
-    assert asked.ask("/state.json", caller)[0] == (200 if roles else 403)
-    assert asked.console.state(caller)["actions"] == []
+@pytest.mark.parametrize("roles", [["read"], ["decode", "recalibrate"], []])
+def test_nobody_else_does(roles: list[str], asked: Asked, caplog: pytest.LogCaptureFixture) -> None:
+    assert (asked.act(roles)[0], asked.version) == (403, "toy-2")
+    assert "127.0.0.1" in caplog.text
+    status, state = asked.shown("/state.json", *roles)
+    assert (status, not roles or state["actions"]) == ((200, []) if roles else (403, True))
 
 
 def test_who_proves_nothing_does_nothing(asked: Asked) -> None:
-    assert asked.act(STRANGER)[0] == asked.act(None)[0] == 403
-    asked.clock.advance(1000.0)  # the certificate has ended since its TLS session began
+    with serving(asked.routes, 0) as port:
+        assert fetched(f"http://127.0.0.1:{port}/actions", "POST", None, json.dumps(ROLL_BACK).encode())[0] == 403
+    assert asked.act()[0] == 200
+    asked.clock.advance(100 * 86400.0)  # the certificate has ended since the connection began
     for path in ("/", "/state.json", "/metrics"):
-        assert asked.ask(path, OPERATOR)[0] == 403
+        assert asked.shown(path, "admin")[0] == 403
     assert asked.act()[0] == 403
-    assert asked.version == "toy-2"
 
 
 @pytest.mark.parametrize(
     ("content", "headers", "status"),
     [
-        (ROLL_BACK, {"HTTP_ORIGIN": "https://device.example"}, 200),
-        (ROLL_BACK, {"HTTP_ORIGIN": "https://elsewhere.example"}, 403),
-        (ROLL_BACK, {"CONTENT_TYPE": "text/plain"}, 415),
-        (ROLL_BACK, {"CONTENT_TYPE": "application/json; charset=utf-8"}, 200),
+        (ROLL_BACK, {"Origin": "https://device.example"}, 200),
+        (ROLL_BACK, {"Origin": "https://elsewhere.example"}, 403),
+        (ROLL_BACK, {"Content-Type": "text/plain"}, 415),
+        (ROLL_BACK, {"Content-Type": "application/json; charset=utf-8"}, 200),
         ({"action": "roll back", "expected": "x" * 1000}, {}, 413),
         ({"action": "format", "expected": "toy-2"}, {}, 400),
-        ({"action": ["roll back"], "expected": "toy-2"}, {}, 400),
-        ({"action": "roll back", "expected": "\ud800"}, {}, 400),
-        (b"[" * 999, {}, 400),
         (b"", {}, 413),
     ],
 )

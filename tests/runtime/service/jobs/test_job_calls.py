@@ -296,7 +296,7 @@ def test_bad_input_is_named_and_leaves_nothing_and_good_input_comes_in_any_chunk
 
 def test_what_comes_counts_against_the_memory_until_the_job_has_ended(start: Start) -> None:
     fit = SlowFit()
-    service = start(fit=fit, limits=Limits(receive_bytes=4 * PAIR_BYTES))
+    service = start(fit=fit, limits=Limits(receive_bytes=4 * PAIR_BYTES, pair_bytes=PAIR_BYTES))
     job = send(service.client, PAGES)
     assert fit.entered.wait(60)
     assert service.plane.received.used == ALL_BYTES

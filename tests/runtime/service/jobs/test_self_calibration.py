@@ -28,7 +28,8 @@ from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 from lightpage.runtime.service.jobs.self_calibration import SelfCalibration, SelfCalibrationSettings
 from lightpage.runtime.service.models.registry import ModelRegistry
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
-from lightpage.runtime.service.monitoring.monitor import Monitor, MonitorSettings, PageFigures, SessionMonitors
+from lightpage.runtime.service.monitoring.monitor import Monitor, MonitorSettings, PageFigures
+from lightpage.runtime.service.monitoring.monitors import Monitors
 from lightpage.runtime.service.monitoring.observation import Observation
 from lightpage.runtime.service.pages.reading import read_page
 from lightpage.runtime.service.settings import ServiceSettings
@@ -203,28 +204,28 @@ def due_sessions(plane: DataPlane) -> float | None:
 @pytest.mark.parametrize("session", ["session other", "connection ipv4:127.0.0.1:4000"])
 def test_another_devices_frames_raise_their_own_sessions_flag_alone(session: str, decoder: Decoder) -> None:
     plane, woken = plane_of(decoder), list[bool]()
-    assert plane.monitor is not None
-    plane.monitor.listen(lambda: woken.append(True))
+    assert plane.monitors.device is not None
+    plane.monitors.device.listen(lambda: woken.append(True))
     for seed in range(PAGES):
         send(plane, another_devices(seed), session)
     assert send(plane, own(50), session)
     assert due_sessions(plane) == 1
     assert not send(plane, own(50), "session third")
-    assert not plane.monitor.due
+    assert not plane.monitors.device.due
     assert not woken
     assert not read_page(plane, None, None, Caller()).answer.recalibration_due
-    assert plane.monitor.state().pages == 1
+    assert plane.monitors.device.state().pages == 1
 
 
 def test_pages_of_the_source_feed_the_monitor_and_what_is_decoded_as_if_it_were_the_first_page_none(
     decoder: Decoder,
 ) -> None:
     plane, of_device = plane_of(decoder), list[bool]()
-    assert plane.monitor is not None
-    plane.observers = (SimpleNamespace(observe=lambda each: of_device.append(each.of_device)),)
+    assert plane.monitors.device is not None
+    plane.monitors.observers = (SimpleNamespace(observe=lambda each: of_device.append(each.of_device)),)
     for caller in (Caller(), Caller(session="session a"), Caller(stateless=True)):
         read_page(plane, None, None, caller)
-    assert plane.monitor.state().pages == 3
+    assert plane.monitors.device.state().pages == 3
     send(plane, own(1), "session b")
     assert of_device == [True, True, True, False]
     for seed in range(PAGES):
@@ -235,29 +236,35 @@ def test_pages_of_the_source_feed_the_monitor_and_what_is_decoded_as_if_it_were_
 
 def test_a_session_that_is_named_as_the_device_feeds_the_monitor(decoder: Decoder) -> None:
     plane = plane_of(decoder, "session press-1")
-    assert plane.monitor is not None
+    assert plane.monitors.device is not None
     for seed in range(PAGES):
         send(plane, another_devices(seed), "session press-1")
-    assert plane.monitor.due
+    assert plane.monitors.device.due
     assert due_sessions(plane) == 0
     assert read_page(plane, None, None, Caller()).answer.recalibration_due
     assert not send(plane, own(50), "session press-2")
 
 
 def test_sessions_begin_anew_with_a_model_and_are_bounded() -> None:
-    monitors = SessionMonitors(MonitorSettings(3), most=5)
+    monitors = Monitors(Monitor(MonitorSettings(3)), most=5)
+
+    def of(session: str) -> Monitor:
+        found = monitors.of(Caller(session=session))
+        assert found is not None
+        return found
+
     monitors.begin("m")
-    first = monitors.of("0")
-    for number in range(20):
+    first = of("0")
+    for number in map(str, range(20)):
         for _ in range(PAGES):
-            monitors.of(str(number)).follow("m", {"unread": 1.0})
-    assert monitors.due() == 5
-    assert monitors.of("19") is monitors.of("19")
-    assert monitors.of("0") is not first
+            of(number).follow("m", {"unread": 1.0})
+    assert monitors.sessions_due() == 5
+    assert of("19") is of("19")
+    assert of("0") is not first
     monitors.begin("n")
-    assert monitors.due() == 0
-    monitors.of("19").follow("m", {"unread": 1.0})
-    assert monitors.of("19").state().pages == 0
+    assert monitors.sessions_due() == 0
+    of("19").follow("m", {"unread": 1.0})
+    assert of("19").state().pages == 0
 
 
 def test_the_setting_names_sessions_as_callers_do(tmp_path: Path) -> None:
@@ -288,7 +295,7 @@ def test_figures_of_the_last_page_show_the_device(decoder: Decoder) -> None:
 DRIFTED = (175.0, 110.0)
 """Frames contradict each other or pilots confirm nothing, and a re-fit reads all pages."""
 BUSY_S = 5.0
-OWN = SelfCalibrationSettings((100, 101), busy_s=BUSY_S)
+OWN = SelfCalibrationSettings(pages=(100, 101), busy_s=BUSY_S)
 
 
 class RecordedSource(toy.ToySource):
@@ -483,6 +490,6 @@ def test_reads_go_on_while_it_recalibrates_and_it_stops_in_the_middle(make: Make
 
 def test_pages_that_cannot_serve_are_refused_at_the_start(loop: Loop) -> None:
     loop.source.page_count = lambda: 102  # type: ignore[method-assign]
-    SelfCalibration(loop.plane, loop.monitor, loop.recalibrator, SelfCalibrationSettings((100, 101)))
+    SelfCalibration(loop.plane, loop.monitor, loop.recalibrator, SelfCalibrationSettings(pages=(100, 101)))
     with pytest.raises(InvalidInputError, match="calibration pages"):
-        SelfCalibration(loop.plane, loop.monitor, loop.recalibrator, SelfCalibrationSettings((101, 102)))
+        SelfCalibration(loop.plane, loop.monitor, loop.recalibrator, SelfCalibrationSettings(pages=(101, 102)))

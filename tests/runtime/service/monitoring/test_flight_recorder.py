@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import threading
 from contextlib import suppress
 from dataclasses import replace
@@ -161,11 +160,3 @@ def test_a_folder_that_cannot_be_made_is_refused(registry: ModelRegistry, tmp_pa
     (tmp_path / "file").write_text("")
     with pytest.raises(InvalidInputError, match="folder"):
         FlightRecorder(tmp_path / "file" / "folder", registry)
-
-
-def test_what_a_file_could_not_be_written_for_is_what_is_told(tmp_path: Path) -> None:
-    def write(path: Path) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    with pytest.raises(OSError, match="space"):
-        FileRing(tmp_path, 10, 250).add(0, "A", write)

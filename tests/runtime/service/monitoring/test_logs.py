@@ -25,7 +25,7 @@ from lightpage.runtime.service.jobs.self_calibration import SelfCalibration
 from lightpage.runtime.service.models.audit import AuditLog
 from lightpage.runtime.service.models.registry import ModelRegistry
 from lightpage.runtime.service.models.store import ModelStore
-from lightpage.runtime.service.monitoring.logs import LimitedHandler, PageLog, TextFormatter, logging_to_stderr
+from lightpage.runtime.service.monitoring import logs
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.monitoring.observation import Observation
 from lightpage.runtime.service.server.call_log import log_end
@@ -42,9 +42,9 @@ def call(method: str = "ReadPage", correlation_id: str = "order 7") -> dict[str,
 
 
 @contextmanager
-def json_lines(level: str = "debug", most: int = 100) -> Iterator[list[dict[str, Any]]]:
+def json_lines() -> Iterator[list[dict[str, Any]]]:
     stream, lines = io.StringIO(), list[dict[str, Any]]()
-    with logging_to_stderr("json", level, most, stream):
+    with logs.logging_to_stderr(logs.LogSettings(format="json", level="debug", lines_per_second=100), stream):
         yield lines
     lines += [json.loads(line) for line in stream.getvalue().splitlines()]
 
@@ -106,7 +106,7 @@ def test_a_thread_that_breaks_is_logged() -> None:
 
 def test_a_caller_cannot_write_lines_of_its_own() -> None:
     stream = io.StringIO()
-    with logging_to_stderr("text", "info", 5, stream):
+    with logs.logging_to_stderr(logs.LogSettings(), stream):
         error = InvalidInputError("name\n2026 ERROR root: \x1b[31mforged", "a", "b")
         log_end(call(correlation_id='x\ny="1"' + 1000 * "z"), _Code.INVALID_ARGUMENT, error)
     (line,) = stream.getvalue().splitlines()
@@ -118,8 +118,7 @@ def test_a_caller_cannot_write_lines_of_its_own() -> None:
 
 def test_of_one_kind_only_so_many_lines_come_in_a_second_and_the_others_are_counted() -> None:
     clock, stream = HandClock(), io.StringIO()
-    handler = LimitedHandler(stream, 3, clock)
-    handler.setFormatter(TextFormatter())
+    handler = logs.LogHandler(logs.LogSettings(lines_per_second=3), stream, clock)
     log = logging.Logger("tests.limited", logging.INFO)
     log.addHandler(handler)
 
@@ -146,8 +145,8 @@ def test_of_one_kind_only_so_many_lines_come_in_a_second_and_the_others_are_coun
 def test_lost_pages_are_logged_and_others_are_not() -> None:
     lost = Observation("page 1 of toy", 1, "toy-1", 0.0, 0.25, Reason.MISSING_FRAME, "page 1 of toy: dark")
     with json_lines() as lines:
-        PageLog().observe(lost)
-        PageLog().observe(replace(lost, lost=None))
+        logs.PageLog().observe(lost)
+        logs.PageLog().observe(replace(lost, lost=None))
     (line,) = lines
     assert (line["level"], line["reason"], line["seconds"]) == ("WARNING", "MISSING_FRAME", 0.25)
     assert line["message"].count("page 1 of toy") == 1

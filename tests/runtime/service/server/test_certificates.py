@@ -16,9 +16,8 @@ from lightpage.errors import InvalidInputError, NotAllowedError
 from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.service.caller import LOCAL, Identity, Role
 from lightpage.runtime.service.frames.inference_calls import INFERENCE, PREFIX
-from lightpage.runtime.service.server.certificates import Certificates
+from lightpage.runtime.service.server.certificates import Certificates, identity_of
 from lightpage.runtime.service.server.dispatcher import SERVICE
-from lightpage.runtime.service.server.roles import NEEDED, identity_of
 from tests.runtime.service.server.authority import Authority
 
 
@@ -180,5 +179,4 @@ def test_what_is_no_certificate_is_refused() -> None:
 
 def test_every_call_needs_a_role_and_the_page_for_operators_says_the_same() -> None:
     own, other = ({method.name for method in service.methods} for service in (SERVICE, INFERENCE))
-    assert own | {PREFIX + name for name in other} == NEEDED.keys()
-    assert documented()[1] == NEEDED
+    assert own | {PREFIX + name for name in other} == documented()[1].keys()

@@ -16,6 +16,7 @@ from cryptography import x509
 from google.protobuf.message_factory import GetMessageClass
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
+from analysis.attacks.identity import documented
 from lightpage.errors import BundleError, NotAllowedError
 from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.client.pb.inference import open_inference_pb2_grpc as oip_grpc
@@ -28,7 +29,6 @@ from lightpage.runtime.service.models.audit import AuditLog
 from lightpage.runtime.service.server.certificates import Certificates
 from lightpage.runtime.service.server.dispatcher import SERVICE
 from lightpage.runtime.service.server.health_server import HealthServer
-from lightpage.runtime.service.server.roles import NEEDED
 from lightpage.runtime.service.server.server import LightpageServer
 from tests.runtime.service.server.authority import Authority
 from tests.runtime.service.stage import Remembering, Running, Start, a_page
@@ -73,14 +73,15 @@ def ended(target: str, tls: TlsFiles | None, method: str = "ReadPage") -> grpc.S
         return code_of(channel, method)
 
 
-def test_each_role_may_do_its_calls_and_no_other(secured: Running, authority: Authority) -> None:
+def test_each_role_may_do_the_calls_that_are_documented_and_no_other(secured: Running, authority: Authority) -> None:
+    needed = documented()[1]
     for roles in ((), *((role,) for role in Role), (Role.DECODE, Role.RECALIBRATE)):
         tls = authority.caller("caller", roles)
         with open_channel(secured.server.target, tls) as channel:
-            refused = {name for name in NEEDED if code_of(channel, name) is grpc.StatusCode.PERMISSION_DENIED}
-        allowed = {name for name, role in NEEDED.items() if role in roles or Role.ADMIN in roles}
-        allowed |= {name for name, role in NEEDED.items() if roles and role is Role.READ}
-        assert refused == NEEDED.keys() - allowed, roles
+            refused = {name for name in needed if code_of(channel, name) is grpc.StatusCode.PERMISSION_DENIED}
+        allowed = {name for name, role in needed.items() if role in roles or Role.ADMIN in roles}
+        allowed |= {name for name, role in needed.items() if roles and role is Role.READ}
+        assert refused == needed.keys() - allowed, roles
 
 
 def test_nobody_gets_in_without_a_certificate_of_the_authority(

@@ -1,0 +1,107 @@
+"""What the console says of a service."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from lightpage.runtime.console.actions import ROLE, Actions
+from lightpage.runtime.console.history import History, PageRow
+from lightpage.runtime.console.pictures import confidence_png, frame_png
+from lightpage.runtime.service.caller import Identity
+from lightpage.runtime.service.models.registry import Model, ModelRegistry
+from lightpage.runtime.service.monitoring.monitor import Monitor
+
+POINTS = 600
+"""Most points of a series."""
+RECENT = 50
+"""Pages in the table."""
+_IDLE_S = 30.0
+_SERIES = ("margin_bits", "air_bits", "trust", "share", "shift_x_px", "shift_y_px", "piston_rad", "residual_rad")
+
+
+class ConsoleState:
+    """What the console says.
+
+    Args:
+        history: of the pages.
+        registry: the models.
+        monitor: says whether a recalibration is due.
+        source: of the pages, for people.
+        actions: what callers may do who prove that they may; None for nothing.
+        clock: seconds since 1970.
+    """
+
+    def __init__(
+        self,
+        history: History,
+        registry: ModelRegistry,
+        monitor: Monitor,
+        source: str,
+        actions: Actions | None = None,
+        clock: Callable[[], float] = time.time,
+    ) -> None:
+        self._history, self._registry, self._monitor, self._source = history, registry, monitor, source
+        self.actions, self.clock = actions, clock
+        self._begun = clock()
+
+    def to_json(self, identity: Identity | None = None) -> dict[str, Any]:
+        """All that the page shows to a caller, as JSON has it."""
+        actions = self.actions if identity is not None and identity.may(ROLE) else None
+        rows, now = self._history.rows(), self.clock()
+        thinned = rows[:: max(1, -(-len(rows) // POINTS))]
+        if rows and thinned[-1] is not rows[-1]:
+            thinned.append(rows[-1])
+        told = [row.to_json() for row in thinned]
+        number, pair, confidence = self._history.pictures()
+        monitor = self._monitor.state()
+        return {
+            "time_s": now,
+            "source": self._source,
+            "uptime_s": now - self._begun,
+            "condition": _condition(rows, monitor.due, now),
+            "reasons": list(monitor.reasons),
+            "pages": self._history.pages,
+            "picture": {"number": number, "frames": pair is not None, "confidence": confidence is not None},
+            "series": {name: [row[name] for row in told] for name in ("time_s", *_SERIES)},
+            "losses": [vars(loss) for loss in self._history.losses()],
+            "models": [_model(model, model is self._registry.current) for model in self._registry.models],
+            "caller": "" if identity is None else identity.name,
+            "actions": [] if actions is None else actions.available(),
+            "job": None if actions is None else actions.job(),
+            "recent": [row.to_json() for row in rows[-RECENT:]][::-1],
+        }
+
+    def picture(self, path: str) -> bytes | None:
+        """A picture of the last page, as PNG; None where there is none of this path."""
+        _, pair, confidence = self._history.pictures()
+        if path == "/confidence.png" and confidence is not None:
+            return confidence_png(confidence)
+        if path not in ("/frames/in_phase.png", "/frames/quadrature.png") or pair is None:
+            return None
+        depth = self._registry.current.decoder.bundle.manifest.camera_bit_depth
+        return frame_png(pair.in_phase if "in_phase" in path else pair.quadrature, depth)
+
+
+def _condition(rows: list[PageRow], due: bool, now: float) -> str:
+    """How the service fares, in a word."""
+    if not rows:
+        return "no page yet"
+    if any(row.lost or row.unread for row in rows[-5:]):
+        return "pages are being lost"
+    if due:
+        return "recalibration is due"
+    return "idle" if now - rows[-1].time_s > _IDLE_S else "reading"
+
+
+def _model(model: Model, current: bool) -> dict[str, Any]:
+    manifest = model.decoder.bundle.manifest
+    metrics = manifest.metrics
+    return {
+        "version": manifest.version,
+        "created": manifest.created,
+        "current": current,
+        "air_before": metrics.get("recalibration_air_bits_per_symbol_before"),
+        "air_after": metrics.get("recalibration_air_bits_per_symbol"),
+    }
