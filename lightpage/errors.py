@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copyreg import __newobj__  # type: ignore[attr-defined]  # which typeshed leaves out
 from enum import StrEnum
 from traceback import clear_frames
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 
 class Cause(StrEnum):
@@ -41,6 +42,10 @@ class LightpageError(Exception):
         self.got = (isinstance(got, OSError) and got.strerror) or str(got)
         self.expected = str(expected)
         super().__init__(f"{subject}: got {self.got}, wanted {self.expected}")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Have it cross to another process with its class and all that it says."""
+        return __newobj__, (type(self), *self.args), vars(self)
 
 
 class InvalidInputError(LightpageError):

@@ -1,51 +1,90 @@
-"""A process that does one thing for this one, and answers it in lines over a socket."""
+"""An object in a process of its own, whose methods this process calls; that process ends with this one.
+
+Both ends speak one protocol, whatever the object does, over a socket that is the child's standard input. A request is
+the name of a method and its arguments. It is answered by what the method returns, or by the `LightpageError` that it
+raises; words of progress may come before. Messages are pickles: both ends are the same program of the same user. Arrays
+of a request follow it one by one, so that neither end has all of them twice.
+"""
 
 from __future__ import annotations
 
 import os
+import pickle
 import socket
+import struct
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from importlib import import_module
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import IO
+from queue import Empty, SimpleQueue
+from typing import IO, Any, ClassVar
 
-_RECEIVE_BYTES = 65536
+from lightpage.errors import LightpageError, WorkerError
+from lightpage.failures import short_resource
+
+_PROGRESS, _ANSWER, _ERROR = "progress", "answer", "error"
+_SEND_S = 60.0
+"""Longest time in which a child takes in a request, where its caller says nothing else."""
+_END_S = 5.0
+"""Time that a process gets to end after its socket has."""
+_PARENT_GONE = 3
+_PICKLE = 5
+"""The first one that leaves arrays to the caller."""
+
+
+class Helper:
+    """What a helper process makes: each of its public methods can be asked for."""
+
+    idle_s: ClassVar[float | None] = None
+    """`idle` is called where no request has come for so long; None never calls it."""
+    farewell_s: ClassVar[float] = 0.0
+    """Time for the request at hand and `close` once the parent has gone; 0 ends the process at once."""
+
+    def idle(self) -> None:
+        """Do what is to be done without being asked."""
+
+    def close(self) -> None:
+        """Let go of everything, as the parent wants no more."""
 
 
 class HelperProcess:
-    """``python -m MODULE ARGUMENTS``, with a socket as its standard input; it ends with this process.
+    """A process that makes a `Helper` and does what it is asked for, one request at a time; one thread uses it.
 
     Args:
-        module: what it runs. It is to end once the socket's other end is closed.
-        arguments: of the module.
+        target: the helper, as ``package.module:Class``; it takes no arguments, and only that process imports it.
+        subject: what it does, for errors, e.g. ``recalibration``.
         files: file descriptors that it inherits under the same numbers.
-        subject: for errors, e.g. ``the process of its window``.
         environment: its variables; those of this process if left out.
         log: takes what it prints on its standard error; that of this process if left out.
 
     Raises:
-        OSError: it cannot be started.
+        WorkerError: it cannot be started.
     """
 
     def __init__(
         self,
-        module: str,
-        *arguments: str,
-        files: Sequence[int] = (),
+        target: str,
+        *,
         subject: str,
+        files: Sequence[int] = (),
         environment: Mapping[str, str] | None = None,
         log: IO[bytes] | None = None,
     ) -> None:
         self._subject = subject
-        self._received = b""
-        self._link, other = socket.socketpair()
+        self._progress: Callable[..., None] = lambda *words: None
+        self._answer: tuple[str, Any] | None = _ANSWER, None  # None where a request is under way
+        self._socket, other = socket.socketpair()
+        self._messages = Connection(os.dup(self._socket.fileno()))
         with other:
             try:
                 # In a session of its own: Ctrl-C is for the service, which then ends its helpers.
                 self._process = subprocess.Popen(
-                    [sys.executable, "-P", "-m", module, *arguments],
+                    [sys.executable, "-P", "-m", "lightpage.helper_process", target],
                     stdin=other.fileno(),
                     stdout=subprocess.DEVNULL,
                     stderr=log,
@@ -53,65 +92,118 @@ class HelperProcess:
                     pass_fds=files,
                     env=environment,
                 )
-            except OSError:
-                self._link.close()
-                raise
+            except OSError as error:
+                self._hang_up()
+                short = short_resource(subject, error)
+                raise WorkerError(subject, error, short.expected if short else "one that can be started") from error
 
     @property
     def pid(self) -> int:
         """Number of the process."""
         return self._process.pid
 
-    def send(self, data: bytes, deadline: float) -> None:
-        """Send it until then, a `time.monotonic` moment.
+    def ask(self, method: str, *arguments: Any, timeout_s: float, progress: Callable[..., None] | None = None) -> Any:
+        """Call a method of the helper, and return what it returns; see `send`.
 
         Raises:
-            TimeoutError: not all of it could be sent; the process is of no more use.
-            ConnectionError: it has ended.
+            WorkerError: no answer within `timeout_s`, or the process has ended; it is of no more use.
+            LightpageError: what the method raised.
         """
-        self._link.settimeout(_left(deadline))
-        self._link.sendall(data)
+        until = time.monotonic() + timeout_s
+        self.send(method, *arguments, progress=progress, timeout_s=timeout_s)
+        if not self.poll(until - time.monotonic()):
+            raise WorkerError(self._subject, f"no answer within {timeout_s:g} s", "one in time")
+        return self.answer()
 
-    def line(self, deadline: float) -> bytes:
-        """The next line of its answer, without the line's end.
+    def send(
+        self, method: str, *arguments: Any, progress: Callable[..., None] | None = None, timeout_s: float = _SEND_S
+    ) -> None:
+        """Have it call a method; `poll` says when it has.
+
+        Args:
+            method: of the helper.
+            arguments: of the method.
+            progress: called by `poll` with the words of progress. The method gets what tells them as `progress`.
+            timeout_s: longest time in which they are taken in.
 
         Raises:
-            TimeoutError: it has not come by then, and may yet.
-            ConnectionError: the process has ended.
+            WorkerError: they are not taken in, or the process has ended; it is of no more use.
         """
-        while b"\n" not in self._received:
-            self._link.settimeout(_left(deadline))
-            if not (more := self._link.recv(_RECEIVE_BYTES)):
-                raise ConnectionError(f"{self._subject} has ended")
-            self._received += more
-        line, _, self._received = self._received.partition(b"\n")
-        return line
+        assert self._answer is not None  # else the last request's answer would pass for this one's
+        self._answer = None
+        if progress is not None:
+            self._progress = progress
+        seconds, rest = divmod(max(timeout_s, 1e-3), 1)  # 0 were no limit
+        limit = struct.pack("ll", int(seconds), int(1e6 * rest))
+        arrays: list[pickle.PickleBuffer] = []
+        request = pickle.dumps((method, arguments, progress is not None), _PICKLE, buffer_callback=arrays.append)
+        try:
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
+            self._messages.send((request, len(arrays)))
+            for array in arrays:
+                self._messages.send_bytes(array.raw())
+        except BlockingIOError:
+            raise WorkerError(self._subject, f"a request not taken in within {timeout_s:g} s", "all of it") from None
+        except OSError:
+            raise self._end() from None
 
-    def has_line(self) -> bool:
-        """Whether a line has come already, of which the socket says nothing any more."""
-        return b"\n" in self._received
+    def poll(self, timeout_s: float) -> bool:
+        """Wait so long for the answer, and hand on what comes of progress; return whether `answer` has something."""
+        until = time.monotonic() + timeout_s
+        while self._answer is None:
+            try:
+                if not self._messages.poll(max(0.0, until - time.monotonic())):
+                    return False
+                kind, value = self._messages.recv()
+            except (OSError, EOFError):
+                kind, value = _ERROR, self._end()
+            if kind == _PROGRESS:
+                self._progress(*value)
+            else:
+                self._answer = kind, value
+        return True
+
+    def answer(self) -> Any:
+        """What the method has returned, once `poll` says that it has.
+
+        Raises:
+            WorkerError: the process has ended before.
+            LightpageError: what the method raised.
+        """
+        assert self._answer is not None  # as `poll` says
+        kind, value = self._answer
+        if kind == _ERROR:
+            raise value
+        return value
 
     def fileno(self) -> int:
-        """Of the socket, for `select`: there is something to read of it once the process has answered or ended."""
-        return self._link.fileno()
+        """Of the socket, for `select`: `poll` takes something in once the process has told something or ended."""
+        return self._messages.fileno()
 
     def ended(self) -> bool:
         """Whether it runs no more."""
         return self._process.poll() is not None
 
-    @property
-    def status(self) -> int | None:
-        """Its exit status, negative where a signal has ended it; None while it runs."""
-        return self._process.poll()
-
     def end(self, grace_s: float = 0.0) -> None:
         """End it; it has `grace_s` to do so by itself once the socket is closed."""
-        self._link.close()
+        self._hang_up()
         try:
             self._process.wait(grace_s)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+
+    def _hang_up(self) -> None:
+        self._messages.close()
+        self._socket.close()
+
+    def _end(self) -> WorkerError:
+        """The error of a process whose socket has ended."""
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(_END_S)
+        status = self._process.poll()
+        how = f"by signal {-status}" if status is not None and status < 0 else f"with status {status}"
+        return WorkerError(self._subject, f"the end of its process {how}", "an answer")
 
 
 def same_packages(threads: int) -> dict[str, str]:
@@ -126,17 +218,52 @@ def same_packages(threads: int) -> dict[str, str]:
     return {**os.environ, **limits, "PYTHONPATH": os.pathsep.join(paths)}
 
 
-def parent_link() -> socket.socket:
-    """In such a process: the socket to the one that started it."""
-    return socket.socket(fileno=os.dup(sys.stdin.fileno()))
+def serve(target: str) -> None:
+    """In such a process: make the helper, and do what the parent asks for until it has gone or wants no more.
 
-
-def _left(deadline: float) -> float:
-    """Seconds until then.
-
-    Raises:
-        TimeoutError: it has passed.
+    The kernel's own signal for that (PR_SET_PDEATHSIG) comes when the thread ends that has started the process. An
+    error that nobody foresaw ends the process.
     """
-    if (left := deadline - time.monotonic()) <= 0:
-        raise TimeoutError
-    return left
+    messages = Connection(os.dup(sys.stdin.fileno()))
+    requests: SimpleQueue[tuple[bytes, list[bytearray]] | None] = SimpleQueue()
+    made: list[Helper] = []
+
+    def listen() -> None:
+        with suppress(OSError, EOFError):
+            while True:
+                request, count = messages.recv()
+                requests.put((request, [bytearray(messages.recv_bytes()) for _ in range(count)]))
+        if made and made[0].farewell_s:
+            requests.put(None)
+            time.sleep(made[0].farewell_s)
+        os._exit(_PARENT_GONE)
+
+    def tell(kind: str, value: Any) -> None:
+        with suppress(ConnectionError):  # `listen` ends the process
+            messages.send((kind, value))
+
+    threading.Thread(target=listen, name="lightpage-parent", daemon=True).start()
+    module, _, name = target.partition(":")
+    helper: Helper = getattr(import_module(module), name)()
+    made.append(helper)
+    while True:
+        try:
+            request = requests.get(timeout=helper.idle_s)
+        except Empty:
+            helper.idle()
+            continue
+        if request is None:
+            break
+        method, arguments, tells = pickle.loads(request[0], buffers=request[1])
+        del request  # what it holds may be large
+        options = {"progress": lambda *words: tell(_PROGRESS, words)} if tells else {}
+        try:
+            tell(_ANSWER, getattr(helper, method)(*arguments, **options))
+        except LightpageError as error:
+            tell(_ERROR, error)
+        del arguments
+    helper.close()
+
+
+if __name__ == "__main__":
+    serve(sys.argv[1])

@@ -35,7 +35,7 @@ from lightpage.runtime.device.cameras.aravis import AravisCamera
 from lightpage.runtime.device.cameras.camera import BrokenFrame, Camera, Frame
 from lightpage.runtime.device.cameras.pixel_formats import bit_depth, unpack
 from lightpage.runtime.device.cameras.settings import CameraSettings
-from lightpage.runtime.device.modulator.beam_state import OperatorBeams
+from lightpage.runtime.device.modulator.modulator import OperatorBeams
 from lightpage.runtime.device.trigger.trigger import SoftwareTrigger, Trigger
 from lightpage.virtual_device.fake_camera import FakeCamera
 from lightpage.virtual_device.namespace import ADDRESSES, go_on_inside

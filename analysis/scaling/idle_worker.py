@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lightpage.runtime.archives.run.task import Done, Outcome, Task
-from lightpage.runtime.archives.workers.local_worker import main
+from lightpage.runtime.archives.workers.local_worker import LocalWorker
 from lightpage.runtime.archives.workers.work import Worker
 
 
@@ -13,12 +13,14 @@ def nothing(task: Task, threads: int) -> Outcome:
 
 
 class Idle(Worker):
-    """Does nothing."""
+    """Says that each task is done."""
 
     def work(self, task: Task) -> Outcome:
         """The task is done."""
         return nothing(task, 1)
 
 
-if __name__ == "__main__":
-    main(Idle(1))
+class IdleWorker(LocalWorker):
+    """Does nothing."""
+
+    kind = Idle

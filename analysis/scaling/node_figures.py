@@ -10,6 +10,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -24,14 +25,14 @@ from lightpage.runtime.archives.run.ledger import Ledger
 from lightpage.runtime.archives.run.shard import ShardRecord
 from lightpage.runtime.archives.run.task import Choices, NamedBundle, Operation, RecordedFile, Stamp, Task
 from lightpage.runtime.archives.run.totals import totals
-from lightpage.runtime.archives.workers.local import LocalEngine
+from lightpage.runtime.archives.workers.local import LocalEngine, started
 from lightpage.runtime.archives.workers.ray_engine import RayEngine, connected
 from lightpage.runtime.model.bundle.shipped import DEFAULT
 from lightpage.runtime.model.execution.cpus import available_cpus
 
 IN_FLIGHT = (2, 64, 512, 2048)
 """Ranges on their way at once, at which the driver of a cluster is measured."""
-IDLE_WORKER = "analysis.scaling.idle_worker"
+IDLE_WORKER = "analysis.scaling.idle_worker:IdleWorker"
 _LIMIT_S = 6 * 3600.0
 _WARM, _COUNTED = 100, 400
 """Outcomes before the driver's time is counted, and while it is."""
@@ -143,7 +144,9 @@ def measure(recording: Path, folder: Path, range_pages: int, worker_counts: tupl
         read_bytes=sum(reading.read_bytes for reading in found.readings) / found.tally.pages,
         written_bytes=shards / found.tally.pages,
         record_s=_record_s(like, folder),
-        local=tuple(_driver(LocalEngine(workers, 1, IDLE_WORKER), workers) for workers in worker_counts),
+        local=tuple(
+            _driver(LocalEngine(workers, 1, partial(started, target=IDLE_WORKER)), workers) for workers in worker_counts
+        ),
         ray=ray,
     )
 

@@ -36,6 +36,12 @@ class TomlTable(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
+class StrictTable(TomlTable):
+    """One whose values are of the right type to begin with: no text that stands for a number."""
+
+    model_config = ConfigDict(strict=True)
+
+
 T = TypeVar("T", bound=TomlTable)
 
 

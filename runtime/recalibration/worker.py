@@ -1,11 +1,8 @@
-"""A recalibration's own process, started by `separate_process` with the folder of its work."""
+"""What the process of a recalibration does, which `separate_process` starts."""
 
 from __future__ import annotations
 
-import json
 import os
-import socket
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -13,15 +10,16 @@ from contextlib import suppress
 from pathlib import Path
 
 from lightpage.clock import SYSTEM, Clock
-from lightpage.errors import LightpageError
-from lightpage.helper_process import parent_link
+from lightpage.helper_process import Helper
 from lightpage.progress import Progress
+from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
-from lightpage.runtime.model.decoding.tracking import NoTracker
-from lightpage.runtime.recalibration.recalibration import Refit, recalibrate
+from lightpage.runtime.model.decoding.tracking import NoTracker, TrackerMemory
+from lightpage.runtime.recalibration.known_pages import KnownPages
+from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome, Refit, recalibrate
 from lightpage.runtime.recalibration.refit import refit
-from lightpage.runtime.recalibration.separate_process import THREADS, WorkFolder
+from lightpage.runtime.recalibration.separate_process import THREADS
 
 NICENESS = 10
 """Beside reads without a pause such a process gets a tenth of a core, and ends. With a higher niceness it would starve,
@@ -34,25 +32,6 @@ ROOM = 0.3
 """Share of a core that it has had lately, from which on they do."""
 
 _LOOK_S = 1.0
-
-_PARENT_GONE = 3
-
-
-def work(folder: WorkFolder, progress: Progress, fit: Refit = refit) -> None:
-    """Recalibrate as a folder says, and leave the outcome or the error in the folder.
-
-    Args:
-        folder: filled by the parent.
-        progress: told of every step.
-        fit: how to fit.
-    """
-    try:
-        bundle, pages, job = folder.read_task()
-        decoder = Decoder(bundle, THREADS)
-        tracker = NoTracker(decoder) if job.memory is None else tracker_for(decoder, job.memory)
-        folder.write_result(recalibrate(decoder, pages, job.out, job.version, fit, progress, tracker))
-    except LightpageError as error:
-        folder.write_result(error)
 
 
 def yield_to_reads() -> None:
@@ -89,33 +68,29 @@ def yield_more(clock: Clock = SYSTEM, worked: Callable[[], float] = time.process
     return thread
 
 
-def end_with_parent(link: socket.socket) -> None:
-    """End this process as soon as the other end of `link` is closed, as it is when the parent ends or wants so.
+class RecalibrationWorker(Helper):
+    """Recalibrates at a low priority.
 
-    The kernel's own signal for that (PR_SET_PDEATHSIG) comes when the thread ends that has started the process.
+    Attributes:
+        fit: how to fit.
     """
 
-    def watch() -> None:
-        while link.recv(1):
-            pass
-        os._exit(_PARENT_GONE)
+    fit: Refit = staticmethod(refit)
 
-    threading.Thread(target=watch, name="lightpage-parent", daemon=True).start()
+    def __init__(self) -> None:
+        yield_to_reads()
+        yield_more()
 
-
-def telling(link: socket.socket) -> Progress:
-    """Return what tells the parent of each step, in a line of JSON."""
-    return lambda name, fraction: link.sendall(json.dumps([name, fraction]).encode() + b"\n")
-
-
-def main(folder: str) -> None:
-    """Work at low priority until done, or until the parent is gone."""
-    link = parent_link()
-    end_with_parent(link)
-    yield_to_reads()
-    yield_more()
-    work(WorkFolder(Path(folder)), telling(link))
-
-
-if __name__ == "__main__":
-    main(sys.argv[1])
+    def recalibrate(
+        self,
+        bundle: Bundle,
+        pages: KnownPages,
+        out: Path,
+        version: str,
+        memory: TrackerMemory | None,
+        progress: Progress,
+    ) -> RecalibrationOutcome:
+        """Recalibrate a model whose tracker has learnt so much; see `lightpage.runtime.recalibration.recalibration`."""
+        decoder = Decoder(bundle, THREADS)
+        tracker = NoTracker(decoder) if memory is None else tracker_for(decoder, memory)
+        return recalibrate(decoder, pages, out, version, self.fit, progress, tracker)

@@ -32,7 +32,7 @@ AREAS = {
         "runtime/service/monitoring": "flight_recorder",
         "runtime/service/jobs": "jobs",
     },
-    "pairing": {"runtime/device/acquisition": "pairing camera_source beam_keeper page_store source"},
+    "pairing": {"runtime/device/acquisition": "pairing camera_source camera_image beam_keeper page_store source"},
     "ledger": {
         "runtime/archives/run": "ledger totals shard task job driver volumes",
         "runtime/archives/workers": "work",

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from lightpage.runtime.archives.run.engine import Engine
-from lightpage.runtime.archives.workers.local import LocalEngine, default_workers
+from lightpage.runtime.archives.run.engine import THREADS_OF_WORKER, Engine
+from lightpage.runtime.archives.workers.local import LocalEngine
+from lightpage.runtime.model.execution.cpus import available_cpus
 from lightpage.runtime.model.execution.providers import CPU, Provider
 
 LOCAL, RAY = "local", "ray"
@@ -31,4 +32,5 @@ def engine_of(name: str, address: str | None, workers: int | None, threads: int 
         from lightpage.runtime.model.execution.session import check_provider  # loads onnxruntime, which takes a while
 
         check_provider(provider)
-    return LocalEngine(workers or (1 if on_gpu else default_workers()), threads)
+    count = workers or (1 if on_gpu else max(1, available_cpus() // THREADS_OF_WORKER))
+    return LocalEngine(count, threads or max(1, available_cpus() // count))

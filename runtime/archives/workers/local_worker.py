@@ -1,40 +1,27 @@
-"""A worker's process, started by `local` with its number of threads."""
+"""A worker's process, which `local` starts."""
 
 from __future__ import annotations
 
-import os
-import queue
-import sys
-import threading
+from collections.abc import Callable
+from typing import ClassVar
 
-from lightpage.helper_process import parent_link
-from lightpage.runtime.archives.run.task import Task
+from lightpage.helper_process import Helper
+from lightpage.runtime.archives.run.task import Outcome, Step, Task
 from lightpage.runtime.archives.workers.work import Worker
 from lightpage.runtime.model.execution.memory import share_freed_memory
 
-_DRIVER_GONE = 3
 
+class LocalWorker(Helper):
+    """Does one task after the other."""
 
-def main(worker: Worker) -> None:
-    """Have it do one task after the other until the driver is gone or wants no more, whatever is being done then."""
-    share_freed_memory()
-    link = parent_link()
-    tasks: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    kind: ClassVar[type[Worker]] = Worker
 
-    def listen() -> None:
-        try:
-            with link.makefile("rb") as lines:
-                for line in lines:
-                    tasks.put(line)
-        finally:
-            os._exit(_DRIVER_GONE)
+    def __init__(self) -> None:
+        share_freed_memory()
+        self._worker: Worker | None = None
 
-    threading.Thread(target=listen, name="lightpage-driver", daemon=True).start()
-    worker.tell = lambda step: link.sendall(step.model_dump_json().encode() + b"\n")
-    while True:
-        outcome = worker.work(Task.model_validate_json(tasks.get()))
-        link.sendall(outcome.model_dump_json().encode() + b"\n")
-
-
-if __name__ == "__main__":
-    main(Worker(int(sys.argv[1])))
+    def work(self, task: Task, threads: int, progress: Callable[[Step], None]) -> Outcome:
+        """Do a task with so many threads; see `Worker.work`."""
+        self._worker = self._worker or self.kind(threads)
+        self._worker.tell = progress
+        return self._worker.work(task)

@@ -9,8 +9,7 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 
 from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import LightpageError, LostShotError, Reason
-from lightpage.runtime.device.modulator.beam_state import OperatorBeams
-from lightpage.runtime.device.modulator.modulator import Beams
+from lightpage.runtime.device.modulator.modulator import Beams, OperatorBeams
 
 _log = logging.getLogger(__name__)
 

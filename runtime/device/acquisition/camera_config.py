@@ -5,14 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from lightpage.device.problems import Problem, problems_of
-from lightpage.device.profile import TomlTable
+from lightpage.device.profile import StrictTable, TomlTable
 from lightpage.errors import InvalidInputError
 from lightpage.files import read_toml
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
-from lightpage.runtime.device.acquisition.camera_source import Exposures, View
+from lightpage.runtime.device.acquisition.camera_image import View
+from lightpage.runtime.device.acquisition.camera_source import Exposures
 from lightpage.runtime.device.acquisition.pairing import PairingSettings
 from lightpage.runtime.device.cameras.settings import CameraSettings
 from lightpage.runtime.device.modulator.screen.raster import ScreenSettings
@@ -75,10 +76,8 @@ class ShuttersTable(TomlTable):
     reference: Shutter
 
 
-class ExternalBeamsTable(TomlTable):
+class ExternalBeamsTable(StrictTable):
     """The controller moves the shutters, and says so over gRPC."""
-
-    model_config = ConfigDict(strict=True)
 
     kind: Literal["external"]
     timeout_s: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)] = 10.0
@@ -90,7 +89,7 @@ class OperatorTable(TomlTable):
     kind: Literal["operator"] = "operator"
 
 
-class DeviceTable(TomlTable):
+class DeviceTable(StrictTable):
     """The whole file.
 
     Attributes:
@@ -103,8 +102,6 @@ class DeviceTable(TomlTable):
         beams: what blocks signal and reference.
         pairing, exposures: how frames are taken and told apart.
     """
-
-    model_config = ConfigDict(strict=True)
 
     profile: str
     levels: Annotated[int, Field(ge=MIN_LEVELS, le=MAX_LEVELS)] | None = None

@@ -33,10 +33,9 @@ from lightpage.runtime.device.acquisition.page_store import PageStore
 from lightpage.runtime.device.cameras.aravis import AravisCamera
 from lightpage.runtime.device.cameras.camera import Camera
 from lightpage.runtime.device.cameras.gentl import GenTLCamera
-from lightpage.runtime.device.modulator.beam_state import OperatorBeams
 from lightpage.runtime.device.modulator.external import ExternalBeams, ExternalModulator
 from lightpage.runtime.device.modulator.lookup_table import linear_table, read_table
-from lightpage.runtime.device.modulator.modulator import Beams, Modulator
+from lightpage.runtime.device.modulator.modulator import Beams, Modulator, OperatorBeams
 from lightpage.runtime.device.modulator.screen.screen import ScreenModulator
 from lightpage.runtime.device.modulator.shutters import ShutterBeams
 from lightpage.runtime.device.modulator.simulated import SimulatedModulator

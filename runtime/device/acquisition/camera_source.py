@@ -8,23 +8,21 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from lightpage.clock import SYSTEM, Clock
-from lightpage.device.profile import Profile, TomlTable
+from lightpage.device.profile import Profile, StrictTable
 from lightpage.errors import LostShotError, Reason, SourceError, raised_as
 from lightpage.page.levels import MAX_LEVELS
-from lightpage.progress import warn
-from lightpage.recording.alignment import describe, greatest_count, unused_low_bits
-from lightpage.recording.black_level import DarkFrame, PixelRepair, without_black
+from lightpage.recording.black_level import DarkFrame
 from lightpage.recording.exposure import check_pair_light
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.layout import frame_type
 from lightpage.runtime.device.acquisition.beam_keeper import BeamKeeper
+from lightpage.runtime.device.acquisition.camera_image import CameraImage, Counts, View
 from lightpage.runtime.device.acquisition.page_store import PageStore
 from lightpage.runtime.device.acquisition.pairing import Pairing, PairingSettings
 from lightpage.runtime.device.acquisition.source import SHOT_S, FrameSource, Shot, own_fault
@@ -32,7 +30,6 @@ from lightpage.runtime.device.cameras.camera import Camera, Frame
 from lightpage.runtime.device.modulator.modulator import Beams, Modulator
 from lightpage.runtime.device.trigger.trigger import Trigger
 
-Counts = NDArray[np.unsignedinteger[Any]]
 _Attempt = Callable[[], tuple[Frame, ...]]
 
 _log = logging.getLogger(__name__)
@@ -48,7 +45,7 @@ _AGAIN_S = 0.5
 """Between two attempts to reach a device that has gone."""
 
 
-class Exposures(TomlTable):
+class Exposures(StrictTable):
     """How frames are taken.
 
     Attributes:
@@ -57,28 +54,10 @@ class Exposures(TomlTable):
         shot_s: longest wait for one page, repeats included.
     """
 
-    model_config = ConfigDict(strict=True)
-
     repeats: Annotated[int, Field(ge=0, le=100)] = 1
     reference_frames: Annotated[int, Field(ge=1, le=256)] = 8
     dark_frames: Annotated[int, Field(ge=1, le=256)] = 8
     shot_s: Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)] = SHOT_S
-
-
-class View(TomlTable):
-    """How a camera sees the image: mirrored or not, as behind one more mirror.
-
-    Attributes:
-        flip_x: left and right are the other way round.
-        flip_y: top and bottom are.
-    """
-
-    flip_x: bool = False
-    flip_y: bool = False
-
-    def upright(self, pixels: Counts) -> Counts:
-        """The frame [row, column] as the modulator has it."""
-        return np.ascontiguousarray(pixels[:: -1 if self.flip_y else 1, :: -1 if self.flip_x else 1])
 
 
 class CameraSource(FrameSource):
@@ -123,7 +102,8 @@ class CameraSource(FrameSource):
         self.modulator = modulator
         self.beams: Beams = beams
         self.pages: PageStore = pages if pages is not None else PageStore(profile)
-        self.cameras, self._trigger, self.views = cameras, trigger, views
+        self.cameras, self._trigger = cameras, trigger
+        self.images = tuple(map(CameraImage, cameras, views))
         depths = [camera.bit_depth for camera in cameras]
         if depths[0] != depths[1]:
             raise SourceError(f"{self.name}: cameras", f"{depths[0]} and {depths[1]} bits", "the same for both")
@@ -137,12 +117,7 @@ class CameraSource(FrameSource):
         self._keeper = BeamKeeper(beams, self._lock, name, clock)
         self._armed = self._was_armed = False
         self._next = 0
-        self._dark: tuple[DarkFrame, DarkFrame] | None = None
-        self._repairs: tuple[PixelRepair, ...] = ()
         self._outcomes: Counter[str] = Counter()
-        self._saturated: dict[str, float] = {}
-        self._unused = [0, 0]
-        """Lowest bits that each camera's counts leave unused, as its frames have shown."""
 
     @property
     def levels(self) -> int:  # type: ignore[override]  # uploads may settle it
@@ -166,26 +141,23 @@ class CameraSource(FrameSource):
 
     def saturated_shares(self) -> Mapping[str, float]:
         """See `FrameSource.saturated_shares`."""
-        return dict(self._saturated)
+        shares = {image.camera.name: image.saturated_share for image in self.images}
+        return {name: share for name, share in shares.items() if share is not None}
 
     def arm(self) -> None:
         """See `FrameSource.arm`."""
         with self._lock:
             if self._armed:
                 return
-            if not self._was_armed:
-                self._open_modulator()
+            if not self._was_armed and self.modulator is not None:
+                # Settings that are wrong are not to be found after minutes of other shots.
+                with raised_as(SourceError, LostShotError):
+                    self.modulator.open(SHOT_S, self.pages.levels)
             for camera in self.cameras:
                 self._arm(camera, Reason.CAMERA_GONE)
             self._arm(self._trigger, Reason.TRIGGER_GONE)
             self._pairing.forget()
             self._armed = self._was_armed = True
-
-    def _open_modulator(self) -> None:
-        """Connect what shows the pages: settings that are wrong are not to be found after minutes of other shots."""
-        if self.modulator is not None:
-            with raised_as(SourceError, LostShotError):
-                self.modulator.open(SHOT_S, self.pages.levels)
 
     def _arm(self, device: Camera | Trigger, reason: Reason) -> None:
         """Make one device ready. One that was ready before and cannot be found now has gone, and may come back."""
@@ -229,7 +201,7 @@ class CameraSource(FrameSource):
                 return take()
 
             frames = self._persistent(f"page {index}", index, deadline, attempt, self._exposures.repeats)
-            pair = FramePair(*(self._cleaned(one, frame) for one, frame in enumerate(frames)))
+            pair = FramePair(*map(CameraImage.cleaned, self.images, frames))
             first, second = frames
             return Shot(pair, index, symbols, None, (first.info, second.info))
 
@@ -253,7 +225,7 @@ class CameraSource(FrameSource):
             SourceError: they are dark or saturated, or this device cannot block its signal beam.
         """
         with self._lock, self._keeper.blocked(signal=False, reference=True):
-            stacks = self._stacks(self._exposures.reference_frames, self._cleaned)
+            stacks = self._stacks(self._exposures.reference_frames, CameraImage.cleaned)
             means = [np.rint(stack.mean(axis=0)).astype(stack.dtype) for stack in stacks]
         pair = FramePair(means[0], means[1])
         with own_fault():
@@ -268,17 +240,16 @@ class CameraSource(FrameSource):
             SourceError: there was light, or this device cannot block its beams.
         """
         with self._lock, self._keeper.blocked(signal=False, reference=False):
-            stacks = self._stacks(self._exposures.dark_frames, self._upright)
+            stacks = self._stacks(self._exposures.dark_frames, CameraImage.upright)
             with own_fault():
                 first, second = (
                     DarkFrame.of(stack, self.bit_depth, f"{camera.name}: dark frames")
                     for stack, camera in zip(stacks, self.cameras, strict=True)
                 )
-            self._dark = (first, second)
-            self._repairs = tuple(PixelRepair(self.frame_shape, dark.hot) for dark in self._dark)
-            for camera, dark in zip(self.cameras, self._dark, strict=True):
-                _log.info("%s: black level %d, %d hot pixels", camera.name, dark.black_level, len(dark.hot))
-            return self._dark
+            for image, dark in zip(self.images, (first, second), strict=True):
+                image.mind(dark)
+                _log.info("%s: black level %d, %d hot pixels", image.camera.name, dark.black_level, len(dark.hot))
+            return first, second
 
     def _page(self, page: int | None) -> tuple[int, NDArray[np.uint8] | None]:
         """Number and symbols of page `page`, or of the next one; without pages of its own the number only counts."""
@@ -318,11 +289,13 @@ class CameraSource(FrameSource):
                 self.on_lost(index, error)
                 if error.reason in _DISARMING or self._pairing.distrusted:
                     self._armed = False
+                # No trigger has ever reached a camera, which no repeat mends.
+                never_came = error.reason is Reason.MISSING_FRAME and self._pairing.silent
                 if error.reason in _AWAITED:
                     if self._clock.now() + _AGAIN_S < deadline:
                         self._clock.sleep(_AGAIN_S)
                         continue
-                elif repeats > 0 and self._clock.now() < deadline and not self._never_came(error):
+                elif repeats > 0 and self._clock.now() < deadline and not never_came:
                     repeats -= 1
                     continue
                 raise error.about(f"{subject} of {self.name}") from None
@@ -332,39 +305,7 @@ class CameraSource(FrameSource):
             self._outcomes["TAKEN"] += 1
             return frames
 
-    def _never_came(self, error: LostShotError) -> bool:
-        """Whether a shot is lost as no trigger has ever reached a camera, which no repeat mends."""
-        return error.reason is Reason.MISSING_FRAME and bool(self._pairing.silent)
-
-    def _cleaned(self, one: int, frame: Frame) -> Counts:
-        """The counts of a frame, upright, hot pixels mended, the black level taken off."""
-        pixels = self._upright(one, frame)
-        if self._dark is None:
-            return pixels
-        return without_black(self._repairs[one](pixels), self._dark[one].black_level, self.bit_depth)
-
-    def _upright(self, one: int, frame: Frame) -> Counts:
-        """The counts of a frame, upright, as they are."""
-        pixels = self._to_full_scale(one, frame.pixels.astype(frame_type(self.bit_depth), copy=False))
-        share = float(np.count_nonzero(pixels >= 2**self.bit_depth - 1) / pixels.size)
-        self._saturated[self.cameras[one].name] = share
-        return self.views[one].upright(pixels)
-
-    def _to_full_scale(self, one: int, pixels: Counts) -> Counts:
-        """The counts of a camera that leaves low bits unused, with its greatest one at full scale; it is told once."""
-        found = unused_low_bits(pixels, self.bit_depth)
-        if found and not self._unused[one]:
-            warn(
-                f"{self.cameras[one].name}: {describe(self.bit_depth, found)}. The greatest of them is taken for full "
-                f"scale; better a pixel_format of {self.bit_depth - found} bits, or less digital gain"
-            )
-        self._unused[one] = found or self._unused[one]
-        if found == 0 or not self._unused[one]:
-            return pixels
-        clipped = pixels >= greatest_count(self.bit_depth, self._unused[one])
-        return np.where(clipped, pixels.dtype.type(2**self.bit_depth - 1), pixels) if clipped.any() else pixels
-
-    def _stacks(self, count: int, counts_of: Callable[[int, Frame], Counts]) -> list[Counts]:
+    def _stacks(self, count: int, counts_of: Callable[[CameraImage, Frame], Counts]) -> list[Counts]:
         """Counts of frames of both cameras [exposure, row, column], whatever is on display."""
         shots = []
         for _ in range(count):
@@ -372,4 +313,5 @@ class CameraSource(FrameSource):
             # nothing but the light has to stand still, so there is no reason to give up early
             attempt = partial(self._pairing.shot, deadline)
             shots.append(self._persistent("frames without a page", -1, deadline, attempt, _MOST_REPEATS))
-        return [np.stack([counts_of(one, frames[one]) for frames in shots]) for one in (0, 1)]
+        each = zip(self.images, zip(*shots, strict=True), strict=True)
+        return [np.stack([counts_of(image, frame) for frame in frames]) for image, frames in each]

@@ -27,10 +27,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Self
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from lightpage.clock import SYSTEM, Clock
-from lightpage.device.profile import TomlTable
+from lightpage.device.profile import StrictTable
 from lightpage.errors import LostShotError, Reason
 from lightpage.progress import note
 from lightpage.runtime.device.cameras.camera import BrokenFrame, Camera, Frame
@@ -59,7 +59,7 @@ _FOLLOWING = 0.1
 """Share of an accepted shot's deviation by which the reference follows."""
 
 
-class PairingSettings(TomlTable):
+class PairingSettings(StrictTable):
     """How strictly frames are told apart.
 
     Attributes:
@@ -70,8 +70,6 @@ class PairingSettings(TomlTable):
         spacing_s: least distance of two triggers; at least 2.5 tolerances.
         clock_drift: relative drift of a camera's clock against this machine's that is allowed for.
     """
-
-    model_config = ConfigDict(strict=True)
 
     tolerance_s: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.02
     frame_s: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)] = 0.5

@@ -215,7 +215,7 @@ class AravisCamera(DrivenCamera):
 
     def _lose(self, got: str) -> LostShotError:
         self._release(gone=True)
-        return LostShotError(self.name, got, "a camera that answers", Reason.CAMERA_GONE)
+        return self._gone(got)
 
     def _release(self, gone: bool) -> None:
         """Let go of stream and camera."""

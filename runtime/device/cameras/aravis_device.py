@@ -1,15 +1,9 @@
-"""One camera under Aravis: found, opened and given its settings, until it is let go of or has gone away.
-
-Each setting is read back: cameras round, clip and ignore what they get.
-"""
+"""One camera under Aravis: found, opened and given its settings, until it is let go of or has gone away."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from ctypes import byref, c_double, c_int, c_uint32
-from dataclasses import dataclass
 from typing import Any
 
 from lightpage.errors import SourceError
@@ -23,14 +17,19 @@ from lightpage.runtime.device.cameras.aravis_library import (
     aravis,
 )
 from lightpage.runtime.device.cameras.gige_network import CONTROL_PRIVILEGE, read_register, route_mtu
-from lightpage.runtime.device.cameras.pixel_formats import pixel_format
 from lightpage.runtime.device.cameras.settings import CameraSettings
 
 _DEVICE_ERRORS = "arv-device-error-quark"
 _GONE = {2, 4, 5}
 """Not connected, transfer error, timeout: no answer. Whoever refuses is there."""
-_NUMBERS = {"exposure_us": "exposure_time", "gain_db": "gain", "black_level_counts": "black_level"}
-"""What the library calls the keys of numbers."""
+_NUMBERS = {
+    "exposure_us": "{}_exposure_time",
+    "gain_db": "{}_gain",
+    "black_level_counts": "{}_black_level",
+    "packet_bytes": "gv_{}_packet_size",
+    "PayloadSize": "{}_payload",
+}
+"""How the library gets and sets numbers, by their keys and features."""
 
 
 def says_gone(error: AravisError) -> bool:
@@ -126,188 +125,113 @@ def _found(library: AravisLibrary) -> list[tuple[str, ...]]:
     return [tuple(library.text(name, number) for name in told) for number in range(library("arv_get_n_devices"))]
 
 
-@dataclass
-class AravisSetup:
-    """The settings of one camera that is open. One thread at a time uses it.
+class AravisSetup(sfnc.CameraSetup):
+    """See `CameraSetup`; what says that the camera is gone is an `AravisError`.
 
     Args:
         connection: the camera.
-        settings: what it is to be set to.
-        frame_shape: (rows, columns) of the region that is read.
-        name: of the camera, for errors.
-
-    Every method raises `SourceError` where the camera does not take a setting, and `AravisError` where it is gone.
+        settings, frame_shape, name: see `CameraSetup`.
     """
 
-    connection: AravisConnection
-    settings: CameraSettings
-    frame_shape: tuple[int, int]
-    name: str
+    refusals = (AravisError,)
 
-    def __post_init__(self) -> None:
-        self._library, self._camera = aravis(), self.connection.handle
+    def __init__(
+        self, connection: AravisConnection, settings: CameraSettings, frame_shape: tuple[int, int], name: str
+    ) -> None:
+        super().__init__(settings, frame_shape, name, connection.is_gige)
+        self._library, self._camera, self._address = aravis(), connection.handle, connection.address
         self.packet_bytes = 0
-        self._trigger: dict[str, str] = {}
 
     def stop(self) -> None:
         """Stop the acquisition, whoever started it: cameras lock settings during one."""
-        self._ask("acquisition", "stopped", "stop_acquisition")
+        with self.setting("acquisition", "stopped"):
+            self._do("stop_acquisition")
+
+    def start(self) -> None:
+        """Start the acquisition; from here on a trigger makes a frame."""
+        with self.setting("acquisition", "started"):
+            self._do("start_acquisition")
 
     def set_image(self) -> None:
-        """Set all that a frame depends on but its trigger, which is switched off."""
-        settings = self.settings
+        """See `CameraSetup`."""
         self._do("set_range_check_policy", RANGE_CHECK_ENABLE)
-        for selector in self._selectors():
-            self._set_string("TriggerSelector", selector)
-            self._set_string("TriggerMode", "Off")
-        self._set_string("AcquisitionMode", "Continuous")
-        for feature in sfnc.SWITCHED_OFF:
-            if self._has(feature):
-                self._ask(feature, "off", "set_boolean", feature.encode(), 0)
-        for feature in sfnc.AUTOMATIC:
-            if self._has(feature):
-                self._set_string(feature, "Off")
-        rows, columns = self.frame_shape
-        self._set_string("PixelFormat", settings.pixel_format)
-        offsets = settings.offset_x_px, settings.offset_y_px
-        self._ask("region", self._region(), "set_region", *offsets, columns, rows)
-        for key, value in self._numbers():
-            self._ask(key, value, f"set_{_NUMBERS[key]}", value)
-        if self.connection.is_gige:
+        super().set_image()
+        if self.is_gige:
             self._set_packets()
 
     def _set_packets(self) -> None:
         """The size of packets: as asked for, as large as test packets get through, or as the network card takes."""
-        with self._setting("packet_bytes", self.settings.packet_bytes or "one that gets through"):
-            if self.settings.packet_bytes is not None:
-                self.packet_bytes = self.settings.packet_bytes
-            elif self._has("GevSCPSFireTestPacket"):
-                self.packet_bytes = self._do("gv_auto_packet_size")
-                return
-            else:
-                self.packet_bytes = route_mtu(self.connection.address)
-            self._do("gv_set_packet_size", self.packet_bytes)
+        asked = self.settings.packet_bytes
+        if asked is None and self.has("GevSCPSFireTestPacket"):
+            with self.setting("packet_bytes", "one that gets through"):
+                self.packet_bytes = self._set["packet_bytes"] = self._do("gv_auto_packet_size")
+        else:
+            self.packet_bytes = asked or route_mtu(self._address)
+            self.set("packet_bytes", self.packet_bytes)
 
     def make_stream(self, payload: int) -> int:
         """A stream with empty buffers of `payload` bytes; it ends when it is let go of."""
-        stream: int = self._ask("stream", "one", "create_stream", None, None, None)
-        if self.connection.is_gige:
+        with self.setting("stream", "one"):
+            stream: int = self._do("create_stream", None, None, None)
+        if self.is_gige:
             self._library("g_object_set", stream, b"socket-buffer", c_int(SOCKET_BUFFER_AUTO), None)
         for _ in range(self.settings.buffers):
             self._library("arv_stream_push_buffer", stream, self._library("arv_buffer_new_allocate", payload))
         return stream
 
-    def payload(self) -> int:
-        """Bytes of a frame: its pixels, and whatever the camera adds to them."""
-        rows, columns = self.frame_shape
-        expected = pixel_format(self.settings.pixel_format).nbytes(rows * columns)
-        payload: int = self._ask("PayloadSize", expected, "get_payload")
-        if payload < expected:
-            raise self._refused("PayloadSize", f"{expected} or more", payload, "")
-        return payload
+    def has(self, feature: str) -> bool:
+        """See `CameraSetup`."""
+        return feature in _NUMBERS or bool(self._do("is_feature_available", feature.encode()))
 
-    def set_trigger(self) -> None:
-        """Set the trigger; last of all, for some settings switch it off again."""
-        knows_activation = self._has("TriggerActivation")
-        self._trigger = sfnc.trigger_features(self.settings, self._selectors(), knows_activation)
-        for feature, value in self._trigger.items():
-            self._set_string(feature, value)
+    def entries(self, feature: str) -> list[str]:
+        """See `CameraSetup`."""
+        count = c_uint32()
+        found = self._do("dup_available_enumerations_as_strings", feature.encode(), byref(count))
+        try:
+            return [found[number].decode("utf-8", "replace") for number in range(count.value)]
+        finally:
+            self._library("g_free", found)
 
-    def check(self) -> float:
-        """Read everything back; returns the exposure time that the camera keeps, in seconds."""
-        # The selector says only which trigger the others are of; a camera may go back to its own.
-        wanted = {feature: value for feature, value in self._trigger.items() if feature != "TriggerSelector"}
-        wanted |= {"AcquisitionMode": "Continuous", "PixelFormat": self.settings.pixel_format}
-        for feature, expected in wanted.items():
-            with self._setting(feature, expected):
-                got = self._library.text("arv_camera_get_string", self._camera, feature.encode())
-            self._compare(feature, got, expected)
-        corners = [c_int() for _ in range(4)]
-        self._ask("region", self._region(), "get_region", *map(byref, corners))
-        x, y, columns, rows = (corner.value for corner in corners)
-        self._compare("region", sfnc.describe_region(x, y, columns, rows), self._region())
-        if self.connection.is_gige:
-            kept_bytes = self._ask("packet_bytes", self.packet_bytes, "gv_get_packet_size")
-            self._compare("packet_bytes", kept_bytes, self.packet_bytes)
-        kept = {key: self._check_number(key, value) for key, value in self._numbers()}
-        return 1e-6 * kept["exposure_us"]
+    def write(self, feature: str, value: Any) -> None:
+        """See `CameraSetup`."""
+        if feature in _NUMBERS:
+            self._do(_NUMBERS[feature].format("set"), value)
+        elif feature == "region":
+            self._do("set_region", *value)
+        elif isinstance(value, bool):
+            self._do("set_boolean", feature.encode(), value)
+        else:
+            self._do("set_string", feature.encode(), value.encode())
 
-    def frame_numbers(self) -> int:
-        """See `sfnc.frame_numbers`."""
-        extended = self._has("GevGVSPExtendedIDMode") and self._do("get_string", b"GevGVSPExtendedIDMode") == b"On"
-        return sfnc.frame_numbers(self.connection.is_gige, extended)
+    def read(self, feature: str, kind: type) -> Any:
+        """See `CameraSetup`."""
+        if feature in _NUMBERS:
+            return self._do(_NUMBERS[feature].format("get"))
+        if feature == "region":
+            return sfnc.Region(*self._numbers("get_region", c_int, 4))
+        if kind is bool:
+            return bool(self._do("get_boolean", feature.encode()))
+        return self._library.text("arv_camera_get_string", self._camera, feature.encode())
 
-    def start(self) -> None:
-        """Start the acquisition; from here on a trigger makes a frame."""
-        self._ask("acquisition", "started", "start_acquisition")
+    def limits(self, feature: str) -> str:
+        """See `CameraSetup`."""
+        if feature == "region":
+            columns, rows = self._numbers("get_sensor_size", c_int, 2)
+            return f"a region of its sensor, {columns} x {rows} pixels, in its steps"
+        return sfnc.between(*self._numbers(f"{_NUMBERS[feature]}_bounds".format("get"), c_double, 2))
+
+    def told(self, error: Exception) -> str:
+        """See `CameraSetup`."""
+        assert isinstance(error, AravisError)  # as `refusals` says
+        if says_gone(error):
+            raise error
+        return error.message
 
     def _do(self, what: str, *arguments: Any) -> Any:
         return self._library(f"arv_camera_{what}", self._camera, *arguments)
 
-    def _ask(self, setting: str, expected: object, what: str, *arguments: Any) -> Any:
-        """Do something about a setting, which a refusal names."""
-        with self._setting(setting, expected):
-            return self._do(what, *arguments)
-
-    def _has(self, feature: str) -> bool:
-        return bool(self._do("is_feature_available", feature.encode()))
-
-    def _selectors(self) -> list[str]:
-        """Triggers that it has, those that start a frame last."""
-        if not self._has("TriggerSelector"):
-            return []
-        known = (*sfnc.OTHER_SELECTORS, *sfnc.FRAME_SELECTORS)
-        entry = "is_enumeration_entry_available"
-        return [name for name in known if self._do(entry, b"TriggerSelector", name.encode())]
-
-    def _numbers(self) -> list[tuple[str, float]]:
-        """Keys that are a number and are set, with it."""
-        return [(key, value) for key in _NUMBERS if (value := getattr(self.settings, key)) is not None]
-
-    def _set_string(self, feature: str, value: str) -> None:
-        self._ask(feature, value, "set_string", feature.encode(), value.encode())
-
-    def _check_number(self, key: str, expected: float) -> float:
-        got = float(self._ask(key, expected, f"get_{_NUMBERS[key]}"))
-        if abs(got - expected) > sfnc.tolerance(key, expected):
-            raise self._refused(key, expected, got, "")
-        return got
-
-    def _compare(self, setting: str, got: object, expected: object) -> None:
-        if got != expected:
-            raise self._refused(setting, expected, got, "")
-
-    def _region(self) -> str:
-        rows, columns = self.frame_shape
-        return sfnc.describe_region(self.settings.offset_x_px, self.settings.offset_y_px, columns, rows)
-
-    @contextmanager
-    def _setting(self, setting: str, expected: object) -> Iterator[None]:
-        """Name the setting that the camera refuses."""
-        try:
-            yield
-        except AravisError as error:
-            if says_gone(error):
-                raise
-            raise self._refused(setting, expected, None, error.message) from None
-
-    def _refused(self, setting: str, asked: object, kept: object, told: str) -> SourceError:
-        subject, got, expected = sfnc.refusal(setting, asked, kept, told, lambda: self._offers(setting))
-        return SourceError(f"{self.name}: {subject}", got, expected)
-
-    def _offers(self, setting: str) -> str:
-        """Entries or limits of a setting, empty where the camera tells none."""
-        try:
-            if setting == "region":
-                sides = [c_int(), c_int()]
-                self._do("get_sensor_size", *map(byref, sides))
-                return f"a region of its sensor, {sides[0].value} x {sides[1].value} pixels, in its steps"
-            if setting in _NUMBERS:
-                limits = [c_double(), c_double()]
-                self._do(f"get_{_NUMBERS[setting]}_bounds", *map(byref, limits))
-                return f"{sfnc.between(*(limit.value for limit in limits))}, in its steps"
-            count = c_uint32()
-            entries = self._do("dup_available_enumerations_as_strings", setting.encode(), byref(count))
-            return sfnc.one_of(entries[number].decode("utf-8", "replace") for number in range(count.value))
-        except AravisError:
-            return ""
+    def _numbers(self, what: str, kind: type[c_int] | type[c_double], count: int) -> list[Any]:
+        """Numbers that the library puts in places that it is given."""
+        places = [kind() for _ in range(count)]
+        self._do(what, *map(byref, places))
+        return [place.value for place in places]

@@ -95,12 +95,12 @@ class DrivenCamera:
         self.frame_numbers = 2**64 - 1
         self.opened = 0
 
-    def _absent(self, was_there: bool, got: str, expected: str, setting: str = "") -> SourceError | LostShotError:
+    def _absent(self, was_there: bool, got: object, expected: str) -> SourceError | LostShotError:
         """The error of a camera that is not there: it has gone away only if it was there."""
-        subject = f"{self.name}: {setting}" if setting else self.name
-        if was_there:
-            return LostShotError(subject, got, expected, Reason.CAMERA_GONE)
-        return SourceError(subject, got, expected)
+        return self._gone(got, expected) if was_there else SourceError(self.name, got, expected)
+
+    def _gone(self, got: object, expected: str = "a camera that answers") -> LostShotError:
+        return LostShotError(self.name, got, expected, Reason.CAMERA_GONE)
 
     def _unarmed(self, is_open: bool) -> SourceError | LostShotError:
         was_there = self.opened > 0 and not is_open

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
+from lightpage.device.profile import StrictTable
 from lightpage.errors import InvalidInputError
 from lightpage.runtime.device.cameras.pixel_formats import pixel_format
 
 
-class CameraSettings(BaseModel):
+class CameraSettings(StrictTable):
     """One camera: which, and every setting that a frame depends on.
 
     Attributes:
@@ -31,8 +32,6 @@ class CameraSettings(BaseModel):
             chooses by itself.
         buffers: frames that may wait in this machine.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     driver: Literal["aravis", "gentl"] = "aravis"
     producer: str | None = Field(default=None, min_length=1)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import LostShotError, Reason
-from lightpage.runtime.device.modulator.beam_state import BOTH, BeamState
+from lightpage.runtime.device.modulator.modulator import BOTH, BeamState
 
 T = TypeVar("T")
 

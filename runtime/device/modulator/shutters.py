@@ -6,17 +6,17 @@ import logging
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from lightpage.clock import SYSTEM, Clock
-from lightpage.device.profile import TomlTable
+from lightpage.device.profile import StrictTable
 from lightpage.errors import LightpageError, LostShotError, Reason, SourceError
 from lightpage.runtime.device.trigger.pulse_generator import Channel, PulseGenerator
 
 _log = logging.getLogger(__name__)
 
 
-class Shutter(TomlTable):
+class Shutter(StrictTable):
     """A shutter on a channel of the pulse generator.
 
     Attributes:
@@ -24,8 +24,6 @@ class Shutter(TomlTable):
         open_when: level at which it is open: ``high`` while the channel is on, ``low`` while it is off.
         settle_s: it has moved after this.
     """
-
-    model_config = ConfigDict(strict=True)
 
     channel: Channel
     open_when: Literal["high", "low"] = "high"

@@ -17,9 +17,10 @@ from collections import Counter
 from contextlib import suppress
 from typing import TYPE_CHECKING, Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from lightpage.clock import SYSTEM, Clock
+from lightpage.device.profile import StrictTable
 from lightpage.errors import LostShotError, Reason, SourceError
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ _ROUNDS = 2
 """Identifications in a row, each with silence after, that make a port synchronised."""
 
 
-class LineTimes(BaseModel):
+class LineTimes(StrictTable):
     """How long is waited on a line.
 
     Attributes:
@@ -65,8 +66,6 @@ class LineTimes(BaseModel):
         late_s: for an identification that is due while another has come already; what is later still is taken as lost.
         synchronise_s: for synchronising, all in all.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     answer_s: Annotated[float, Field(ge=0.02, le=10.0)] = 0.5
     quiet_s: Annotated[float, Field(ge=0.005, le=1.0)] = 0.05

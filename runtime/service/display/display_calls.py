@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from lightpage.errors import InvalidInputError, LimitError, MalformedError, NoSourceError, PageError, StalledError
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.device.acquisition.source import FrameSource
-from lightpage.runtime.device.modulator.beam_state import BeamState
 from lightpage.runtime.device.modulator.external import ExternalBeams, ExternalModulator
+from lightpage.runtime.device.modulator.modulator import BeamState
 from lightpage.runtime.service.caller import Call, Role
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.rpc import rpc

@@ -323,9 +323,7 @@ class Recalibrator:
         # Judged against what is in service now: the model with what its tracker has learnt.
         if self._fit is None:
             limit_s = plane.limits.recalibration_s
-            outcome = recalibrate_apart(
-                model.decoder, model.tracker, pages, path, version, progress, check, limit_s, store.folder
-            )
+            outcome = recalibrate_apart(model.decoder, model.tracker, pages, path, version, progress, check, limit_s)
         else:
             outcome = recalibrate(model.decoder, pages, path, version, self._fit, progress, model.tracker)
         try:

@@ -22,7 +22,6 @@ from lightpage.files import new_file, replace_text, synchronise
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import sha256
 from lightpage.runtime.model.bundle.signature_file import signature_path
-from lightpage.runtime.recalibration.separate_process import SCRATCH
 
 _log = logging.getLogger(__name__)
 
@@ -39,7 +38,7 @@ UPLOAD = ".upload-"
 PROBE = ".probe-"
 """How the name of a file begins that tries whether the store can be written."""
 
-_LEFTOVERS = (f"{UPLOAD}*", f"{SCRATCH}*", f"{PROBE}*", f".{CURRENT}-*", ".*.zip-*")
+_LEFTOVERS = (f"{UPLOAD}*", f"{PROBE}*", f".{CURRENT}-*", ".*.zip-*")
 """Names of what a program that was killed leaves here."""
 
 KEPT_BUNDLES = 32

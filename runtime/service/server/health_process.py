@@ -1,70 +1,72 @@
-"""A process that answers health checks, started by `health_server` with HOST:PORT [CA CERTIFICATE KEY].
+"""Answers health checks in a process of its own, for `health_server`.
 
-Its stdin is a socket. The service writes a line of JSON every half second: names of services, and whether each serves.
-Where no line comes any more, nothing serves, whatever the service still holds. The process is idle, so it answers at
-once where the service is busy with decoding. It ends when the socket's other end does.
+The service tells every half second whether each of its services serves. Where it says nothing any more, nothing serves,
+whatever the service still holds. The process is idle, so it answers at once where the service is busy with decoding.
 """
 
 from __future__ import annotations
 
 import asyncio
-import json
-import socket
-import sys
-from pathlib import Path
+import threading
+from collections.abc import Coroutine
+from typing import Any
 
 import grpc
 from grpc_health.v1 import health_pb2_grpc
 
 from lightpage.errors import InvalidInputError
-from lightpage.helper_process import parent_link
+from lightpage.helper_process import Helper
 from lightpage.runtime.client.wire.channel import SERVER_KEEPALIVE, TlsFiles, add_port
 from lightpage.runtime.service.server.certificates import Certificates
 from lightpage.runtime.service.server.health_servicer import HealthServicer
 
-SILENCE_S = 3.0
-"""A service that says nothing for so long has stopped."""
 
+class HealthAnswers(Helper):
+    """Serves the health protocol from a thread."""
 
-async def serve(address: str, link: socket.socket, tls: TlsFiles | None = None, silence_s: float = SILENCE_S) -> None:
-    """Answer health checks at an address until the link is closed; says first at which port, or why not.
+    idle_s = 3.0
+    """A service that says nothing for so long has stopped."""
+    farewell_s = 1.0
 
-    Args:
-        address: HOST:PORT.
-        link: to the service.
-        tls: with which it answers; None for no TLS.
-        silence_s: a service that says nothing for so long has stopped.
-    """
-    reader, writer = await asyncio.open_connection(sock=link)
-    server = grpc.aio.server(options=(("grpc.so_reuseport", 0), *SERVER_KEEPALIVE))
-    servicer = HealthServicer()
-    health_pb2_grpc.add_HealthServicer_to_server(servicer, server)
-    await servicer.tell({"": False})
-    try:
-        credentials = None if tls is None else Certificates(tls).server_credentials(callers_too=False)
-        port = add_port(server, address, credentials)
-        await server.start()
-    except (InvalidInputError, RuntimeError) as error:
-        writer.write(json.dumps({"error": str(error)}).encode() + b"\n")
-        await writer.drain()
-        return
-    writer.write(json.dumps({"port": port}).encode() + b"\n")
-    await writer.drain()
-    names = {""}
-    while True:
+    def __init__(self) -> None:
+        self._loop = asyncio.new_event_loop()
+        threading.Thread(target=self._loop.run_forever, name="lightpage-health", daemon=True).start()
+        self._servicer = HealthServicer()
+        self._names = {""}
+
+    def listen(self, address: str, tls: TlsFiles | None) -> int:
+        """Answer at an address, HOST:PORT, with TLS or without; returns the port.
+
+        Raises:
+            InvalidInputError: it cannot be listened on.
+        """
+        self.idle()
+        port: int = self._run(self._listen(address, tls))
+        return port
+
+    def tell(self, states: dict[str, bool]) -> None:
+        """Say of each service whether it serves."""
+        self._names |= states.keys()
+        self._run(self._servicer.tell(states))
+
+    def idle(self) -> None:
+        """Say that nothing serves."""
+        self.tell(dict.fromkeys(self._names, False))
+
+    def close(self) -> None:
+        """Answer no more."""
+        self._run(self._server.stop(None))
+
+    async def _listen(self, address: str, tls: TlsFiles | None) -> int:
+        server = self._server = grpc.aio.server(options=(("grpc.so_reuseport", 0), *SERVER_KEEPALIVE))
+        health_pb2_grpc.add_HealthServicer_to_server(self._servicer, server)
         try:
-            line = await asyncio.wait_for(reader.readline(), silence_s)
-        except TimeoutError:
-            states = dict.fromkeys(names, False)
-        else:
-            if not line:
-                break
-            states = json.loads(line)
-        names |= states.keys()
-        await servicer.tell(states)
-    await server.stop(None)
+            credentials = None if tls is None else Certificates(tls).server_credentials(callers_too=False)
+            port = add_port(server, address, credentials)
+            await server.start()
+        except (InvalidInputError, RuntimeError) as error:
+            raise InvalidInputError(f"health address {address}", error, "a free HOST:PORT of this machine") from None
+        return port
 
-
-if __name__ == "__main__":
-    files = [Path(path) for path in sys.argv[2:]]
-    asyncio.run(serve(sys.argv[1], parent_link(), TlsFiles(*files) if files else None))
+    def _run(self, work: Coroutine[Any, Any, Any]) -> Any:
+        return asyncio.run_coroutine_threadsafe(work, self._loop).result()

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import threading
-import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Self
 
-from lightpage.errors import InvalidInputError
+from lightpage.errors import InvalidInputError, WorkerError, raised_as
 from lightpage.helper_process import HelperProcess
 from lightpage.runtime.client.wire.address import check_address, check_free, is_local, target_of
 from lightpage.runtime.client.wire.channel import TlsFiles
 
-_PROCESS = "lightpage.runtime.service.server.health_process"
+_PROCESS = "lightpage.runtime.service.server.health_process:HealthAnswers"
 _BEAT_S = 0.5
-_START_S = 20.0
-_SEND_S = 2.0
+_ANSWER_S = 20.0
 _AGAIN_S = 5.0
 """Between two attempts to start the process again."""
 
@@ -49,8 +46,7 @@ class HealthServer:
 
     def __init__(self, address: str, states: Callable[[], Mapping[str, bool]], tls: TlsFiles | None = None) -> None:
         check_address("health address", address, least_port=0)
-        self._address, self._states = address, states
-        self._files = [] if tls is None else [str(path) for path in (tls.ca, tls.certificate, tls.key)]
+        self._address, self._states, self._tls = address, states, tls
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._beat, name="lightpage-heartbeat", daemon=True)
         self._process: HelperProcess | None = None
@@ -81,24 +77,18 @@ class HealthServer:
 
     def _started(self) -> tuple[HelperProcess, int]:
         """A process that answers, and its port."""
-        subject = f"health address {self._address}"
-        process: HelperProcess | None = None
-        try:
-            process = HelperProcess(_PROCESS, self._address, *self._files, subject="the process of health checks")
-            answer = json.loads(process.line(time.monotonic() + _START_S))
-            if "port" in answer:
-                return process, int(answer["port"])
-            got, expected = answer.get("error"), "a free HOST:PORT of this machine"
-        except (OSError, ValueError) as error:
-            got, expected = error, "a process that can be started"
-        if process is not None:
-            process.end()
-        raise InvalidInputError(subject, got, expected)
+        with raised_as(InvalidInputError, WorkerError):
+            process = HelperProcess(_PROCESS, subject="health checks")
+            try:
+                return process, process.ask("listen", self._address, self._tls, timeout_s=_ANSWER_S)
+            except BaseException:
+                process.end()
+                raise
 
     def __exit__(self, *_: object) -> None:
         """Answer no more."""
         self._stop.set()
-        self._thread.join(2 * _SEND_S)
+        self._thread.join(2 * _BEAT_S)
         if self._process is not None:
             self._process.end()
             if self._address.startswith("unix:"):
@@ -108,22 +98,24 @@ class HealthServer:
     def _beat(self) -> None:
         while True:
             try:
-                line = json.dumps(dict(self._states())).encode() + b"\n"
+                states = dict(self._states())
             except Exception:
                 _log.exception("health checks: the service does not say how it fares")
             else:
-                self._tell(line)
+                self._tell(states)
             if self._stop.wait(_BEAT_S):
                 return
 
-    def _tell(self, line: bytes) -> None:
+    def _tell(self, states: dict[str, bool]) -> None:
         """Tell the process how the service fares; one that has ended is started again at the same port."""
         assert self._process is not None  # it was started
         try:
-            self._process.send(line, time.monotonic() + _SEND_S)
+            self._process.ask("tell", states, timeout_s=_ANSWER_S)
             return
-        except OSError as error:
-            _log.error("health checks: %s; their process is started again", error or "nobody listens")
+        except WorkerError as error:
+            if self._stop.is_set():
+                return
+            _log.error("health checks: %s; their process is started again", error)
         self._process.end()
         try:
             self._process, _ = self._started()

@@ -1,21 +1,21 @@
-"""Known pages of a toy device that has drifted, and a worker that fits it: `... toy_worker FOLDER`."""
+"""Known pages of a toy device that has drifted, and workers that fit it, or come to no good end."""
 
 from __future__ import annotations
 
 import os
-import sys
-from pathlib import Path
+import signal
+from typing import Any
 
 import numpy as np
 
-from lightpage.helper_process import parent_link
+from lightpage.errors import RecalibrationRefusedError
+from lightpage.helper_process import Helper
 from lightpage.progress import Progress
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.known_pages import KnownPages
 from lightpage.runtime.recalibration.recalibration import RefitResult
-from lightpage.runtime.recalibration.separate_process import WorkFolder
-from lightpage.runtime.recalibration.worker import end_with_parent, telling, work, yield_to_reads
+from lightpage.runtime.recalibration.worker import RecalibrationWorker, yield_to_reads
 from tests.runtime import toy
 
 DRIFTED = (150.0, 62.0)
@@ -46,8 +46,29 @@ def fit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decoder)
     return toy.fit_references(bundle, pages, progress, decoder)
 
 
-if __name__ == "__main__":
-    link = parent_link()
-    end_with_parent(link)
-    yield_to_reads()
-    work(WorkFolder(Path(sys.argv[1])), telling(link), fit)
+class Sound(RecalibrationWorker):
+    fit = staticmethod(fit)
+
+    def __init__(self) -> None:
+        yield_to_reads()
+
+
+class Refusing(Helper):
+    def recalibrate(self, *task: Any, progress: Progress) -> None:
+        raise RecalibrationRefusedError("fit", "worse", "better")
+
+
+class Killed(Helper):
+    def recalibrate(self, *task: Any, progress: Progress) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Broken(Helper):
+    def recalibrate(self, *task: Any, progress: Progress) -> None:
+        raise ZeroDivisionError
+
+
+class Silent(Helper):
+    def recalibrate(self, *task: Any, progress: Progress) -> None:
+        progress(f"fit in {os.getpid()}", 0.5)
+        signal.pause()

@@ -6,15 +6,15 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
-from lightpage.device.profile import Profile, Side, TomlTable
+from lightpage.device.profile import Profile, Side, StrictTable
 from lightpage.errors import InvalidInputError
 
 Offset = Annotated[int, Field(ge=-30_000, le=30_000)]
 
 
-class ScreenSettings(TomlTable):
+class ScreenSettings(StrictTable):
     """A modulator that is a monitor of an X server, and where a page lies on it.
 
     Pixels are the modulator's; row 0 is its upper edge, column 0 its left one.
@@ -30,8 +30,6 @@ class ScreenSettings(TomlTable):
         monitor: which monitor of that screen, from 0, in the order of ``xrandr --listactivemonitors``.
         settle_s: wait after the display has scanned the page out once, for the liquid crystal, seconds.
     """
-
-    model_config = ConfigDict(strict=True)
 
     rows_px: Side
     columns_px: Side

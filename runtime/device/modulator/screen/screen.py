@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from lightpage.clock import SYSTEM, Clock
 from lightpage.device.profile import Profile
-from lightpage.errors import LostShotError, Reason, SourceError
+from lightpage.errors import LostShotError, Reason, SourceError, WorkerError
+from lightpage.helper_process import HelperProcess
 from lightpage.runtime.device.modulator.screen.raster import Raster, ScreenSettings
-from lightpage.runtime.device.modulator.screen.window_process import WindowProcess
+from lightpage.runtime.device.modulator.screen.screen_window import opening_window
 
 ANSWER_S = 1.0
 """Longest wait for the window's process to say whether the page is still on display."""
@@ -31,7 +32,7 @@ class ScreenModulator:
         settings: which monitor, its resolution, and where the page lies.
         profile: how large page and symbols are.
         table_of: makes a lookup table, the grey value of each level, for a number of levels.
-        window: opens a window, in a process of its own.
+        window: opens a window, in a process of its own, see `opening_window`.
         clock: by which it waits; that of the window.
 
     Raises:
@@ -43,7 +44,7 @@ class ScreenModulator:
         settings: ScreenSettings,
         profile: Profile,
         table_of: Callable[[int], NDArray[np.uint8]],
-        window: Callable[[ScreenSettings], WindowProcess] = WindowProcess,
+        window: Callable[[ScreenSettings], HelperProcess] = opening_window,
         clock: Clock = SYSTEM,
     ) -> None:
         display = settings.x_display or os.environ.get("DISPLAY", "without DISPLAY")
@@ -51,7 +52,7 @@ class ScreenModulator:
         self._settings, self._make_window, self._clock = settings, window, clock
         self._raster = Raster(profile, settings)
         self._table_of = cache(table_of)
-        self._window: WindowProcess | None = None
+        self._window: HelperProcess | None = None
         self._was_open = False
         self._has_page = False
 
@@ -82,14 +83,11 @@ class ScreenModulator:
         self._has_page = False
         window = self._opened(subject, deadline)
         try:
-            answer = window.ask(deadline, image)
-        except TimeoutError:
+            shown = window.ask("show", image, timeout_s=deadline - self._clock.now())
+        except WorkerError as error:
             self.close()
-            raise _lost(subject, f"nothing on display after {timeout_s:g} s") from None
-        except ConnectionError as error:
-            self.close()
-            raise _lost(subject, error) from None
-        if not answer.shows:
+            raise _lost(subject, f"nothing on display: {error.got}") from None
+        if not shown:
             self.close()
             raise _lost(subject, "a window that something covers, or whose monitor has changed")
         if (settle_s := self._settings.settle_s) > deadline - self._clock.now():
@@ -102,8 +100,8 @@ class ScreenModulator:
         if not self._has_page or self._window is None:
             return False
         try:
-            return self._window.ask(self._clock.now() + ANSWER_S).shows
-        except (TimeoutError, ConnectionError):
+            return bool(self._window.ask("shows", timeout_s=ANSWER_S))
+        except WorkerError:
             self._has_page = False
             self._window.end()  # and the next `show` finds it so
             return False
@@ -115,7 +113,7 @@ class ScreenModulator:
             self._window.end()
             self._window = None
 
-    def _opened(self, subject: str, deadline: float) -> WindowProcess:
+    def _opened(self, subject: str, deadline: float) -> HelperProcess:
         """The process, its window open."""
         if self._window is not None and self._window.ended():
             self.close()
@@ -123,17 +121,14 @@ class ScreenModulator:
         try:
             if self._window is None:
                 self._window = self._make_window(self._settings)
-            opening = self._window.opening(deadline)
-        except TimeoutError:
-            raise _lost(subject, "a window that is not open yet") from None
-        except OSError as error:
+            if not self._window.poll(deadline - self._clock.now()):
+                raise _lost(subject, "a window that is not open yet")
+            self._window.answer()
+        except (SourceError, WorkerError) as error:
             self.close()
-            raise _lost(subject, error) from None
-        if opening.got:
-            self.close()
-            if self._was_open:
-                raise _lost(subject, opening.got)
-            raise SourceError(self.name, opening.got, opening.expected)
+            if self._was_open or isinstance(error, WorkerError):
+                raise _lost(subject, error.got) from None
+            raise SourceError(self.name, error.got, error.expected) from None
         self._was_open = True
         return self._window
 

@@ -1,84 +1,86 @@
-"""The process of a modulator's window, started by `window_process` with SETTINGS and a socket on its stdin.
-
-It ends when the socket's other end does, whatever the X server keeps it waiting for.
-"""
+"""The process of a modulator's window: what the X server keeps it waiting for is not to happen where pages are read."""
 
 from __future__ import annotations
 
-import os
-import socket
 import sys
-import threading
-from queue import Empty, SimpleQueue
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
 
 from lightpage.errors import SourceError
-from lightpage.helper_process import parent_link
+from lightpage.helper_process import Helper, HelperProcess
 from lightpage.runtime.device.modulator.screen.raster import ScreenSettings
-from lightpage.runtime.device.modulator.screen.window_process import REQUEST, Answer
 
-LOOK_S = 0.1
-"""How often it looks at the X server's events without being asked."""
-
-Requests = SimpleQueue[tuple[int, bytes | None]]
-"""Number of each request, and the page to show with it."""
+if TYPE_CHECKING:
+    from lightpage.runtime.device.modulator.screen.x_window import XWindow
 
 
-def main(settings_json: str) -> int:
-    """Show what comes over the socket on stdin until its other end is closed."""
-    settings = ScreenSettings.model_validate_json(settings_json)
-    link = parent_link()
-    requests: Requests = SimpleQueue()
-    arguments = (link, settings.rows_px * settings.columns_px, requests)
-    threading.Thread(target=_receive, args=arguments, daemon=True).start()
-    try:
-        return _serve(settings, link, requests)
-    except OSError as error:
-        print(f"window of the modulator: {error}", file=sys.stderr)
-        return 1
+def opening_window(settings: ScreenSettings) -> HelperProcess:
+    """Start a process that opens a window; its first answer is that of `ScreenWindow.open`.
+
+    Raises:
+        WorkerError: it cannot be started.
+    """
+    process = HelperProcess(f"{__name__}:{ScreenWindow.__name__}", subject="window of the modulator")
+    # of a table that wires a device, what else it says is not the window's
+    plain = ScreenSettings.model_validate(settings.model_dump(include=set(ScreenSettings.model_fields)))
+    process.send("open", plain)
+    return process
 
 
-def _receive(link: socket.socket, page_bytes: int, requests: Requests) -> None:
-    """Take in requests; end the process behind the last one."""
-    try:
-        with link.makefile("rb") as stream:
-            while len(head := stream.read(REQUEST.size)) == REQUEST.size:
-                has_page, number = REQUEST.unpack(head)
-                requests.put((number, stream.read(page_bytes) if has_page else None))
-    finally:
-        os._exit(0)
+class ScreenWindow(Helper):
+    """A window over a whole monitor."""
 
+    idle_s = 0.1
+    """How often it looks at the X server's events without being asked."""
 
-def _serve(settings: ScreenSettings, link: socket.socket, requests: Requests) -> int:
-    try:
-        import xcffib
+    def __init__(self) -> None:
+        self._window: XWindow | None = None
 
-        from lightpage.runtime.device.modulator.screen.x_window import XWindow
-    except (ImportError, OSError) as error:
-        expected = "the screen extra (pip install 'lightpage[screen]') and the library libxcb"
-        link.sendall(Answer(number=0, got=str(error), expected=expected).to_line())
-        return 1
-    try:
+    def open(self, settings: ScreenSettings) -> None:
+        """Open the window.
+
+        Raises:
+            SourceError: there is no such X server or monitor, or it is not what a modulator needs.
+        """
         try:
-            window = XWindow(settings)
-        except SourceError as error:
-            link.sendall(Answer(number=0, got=error.got, expected=error.expected).to_line())
-            return 1
-        link.sendall(Answer(number=0).to_line())
-        while True:
-            try:
-                number, page = requests.get(timeout=LOOK_S)
-            except Empty:
-                window.look()
-                continue
-            if page is None:
-                window.look()
-            else:
-                window.draw(page)
-            link.sendall(Answer(number=number, shows=window.shows).to_line())
+            from lightpage.runtime.device.modulator.screen.x_window import XWindow
+        except (ImportError, OSError) as error:
+            expected = "the screen extra (pip install 'lightpage[screen]') and the library libxcb"
+            raise SourceError("screen", error, expected) from None
+        with _server():
+            self._window = XWindow(settings)
+
+    def show(self, image: NDArray[np.uint8]) -> bool:
+        """Show a picture [row, column]; returns whether all of it is on display, as far as the X server knows."""
+        assert self._window is not None  # it was opened
+        with _server():
+            self._window.draw(image)
+            return self._window.shows
+
+    def shows(self) -> bool:
+        """Whether the whole last picture is still on display."""
+        assert self._window is not None  # it was opened
+        self.idle()
+        with _server():
+            return self._window.shows
+
+    def idle(self) -> None:
+        """Take note of what the server has said meanwhile."""
+        if self._window is not None:
+            with _server():
+                self._window.look()
+
+
+@contextmanager
+def _server() -> Iterator[None]:
+    """End the process where the X server has gone."""
+    import xcffib
+
+    try:
+        yield
     except xcffib.XcffibException as error:
-        print(f"window of the modulator: {error!r}", file=sys.stderr)
-        return 1
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1]))
+        sys.exit(f"window of the modulator: {error!r}")

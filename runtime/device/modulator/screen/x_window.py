@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xcffib
+from numpy.typing import NDArray
 from xcffib import present, randr, screensaver, xproto
 
 from lightpage.errors import SourceError
@@ -89,16 +90,16 @@ class XWindow:
         """Whether nothing covers the window, and its monitor is where and what it was."""
         return self._visible and self._find_monitor() == self._monitor
 
-    def draw(self, image: bytes) -> None:
+    def draw(self, image: NDArray[np.uint8]) -> None:
         """Show a picture, and return once the display has scanned it out once.
 
         The server copies the picture to the window at a refresh and says so. What covers the window is put below it.
 
         Args:
-            image: grey values, row by row.
+            image: grey values [row, column].
         """
         columns = self._monitor.columns
-        pixels = np.frombuffer(image, np.uint8).repeat(4).tobytes()
+        pixels = image.repeat(4).tobytes()
         strip = _ROWS_AT_ONCE * columns * 4
         for start in range(0, len(pixels), strip):
             self._put_rows(start // (4 * columns), pixels[start : start + strip])

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 import threading
 
 from lightpage.runtime.archives.run.task import Outcome, Task
-from lightpage.runtime.archives.workers.local_worker import main
+from lightpage.runtime.archives.workers.local_worker import LocalWorker
 from lightpage.runtime.archives.workers.work import Worker
 
 KILLS, BEGUN = ".kills", ".begun"
@@ -27,5 +26,5 @@ class Deadly(Worker):
         return super().work(task)
 
 
-if __name__ == "__main__":
-    main(Deadly(int(sys.argv[1])))
+class DeadlyWorker(LocalWorker):
+    kind = Deadly

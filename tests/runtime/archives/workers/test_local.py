@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import signal
-import socket
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from lightpage.cli.main import run as run_command
+from lightpage.errors import WorkerError
 from lightpage.progress import reporting
 from lightpage.runtime.archives.run.driver import run
 from lightpage.runtime.archives.run.engine import ATTEMPTS, longest_s
@@ -21,10 +22,10 @@ from lightpage.runtime.archives.run.metrics import BulkMetrics
 from lightpage.runtime.archives.run.question import of_recordings
 from lightpage.runtime.archives.run.shard import PageRecord, ShardRecord
 from lightpage.runtime.archives.run.task import Choices, Done, Failed, Operation, Outcome, Step, Task
-from lightpage.runtime.archives.workers.local import LocalEngine
+from lightpage.runtime.archives.workers.local import LocalEngine, started
 from lightpage.runtime.archives.workers.work import Worker
 from lightpage.runtime.commands.archives.bulk import bulk
-from tests.clock import HandClock
+from tests.processes import runs
 from tests.runtime import toy
 from tests.runtime.archives import jobs
 from tests.runtime.archives.archive import InlineEngine
@@ -33,7 +34,7 @@ from tests.told import Told
 from tests.waiting import eventually
 
 ROOT = Path(__file__).resolve().parents[4]
-WORKER = "tests.runtime.archives.workers.deadly_worker"
+WORKER = "tests.runtime.archives.workers.deadly_worker:DeadlyWorker"
 PAGES, RANGE = 12, 3
 LIMIT_S = 60
 
@@ -42,64 +43,40 @@ class Workers:
     """Workers that are no processes: at first pages of ranges, so many `hang`, or `die` by signal 9."""
 
     def __init__(self, hang: dict[int, int] | None = None, die: dict[int, int] | None = None) -> None:
-        self.clock = HandClock()
         self.hang, self.die = hang or {}, die or {}
-        self.started: list[tuple[str, int]] = []
+        self.started: list[int] = []
         self.ended: list[float] = []
         self.tries: list[int] = []
 
-    def start(self, module: str, threads: int) -> Link:
-        self.started.append((module, threads))
+    def start(self, threads: int) -> Link:
+        self.started.append(threads)
         return Link(self)
 
 
 class Link:
-    """A socket at whose other end a worker answers at once, or never."""
+    """A worker that answers at once, or never."""
 
     def __init__(self, workers: Workers) -> None:
-        self._workers, (self._own, self._other) = workers, socket.socketpair()
-        self._lines = b""
-        self.status: int | None = None
+        self._workers = workers
 
-    def send(self, data: bytes, deadline: float) -> None:
-        task, all_of = Task.model_validate_json(data), self._workers
-        first = task.pages[0]
+    def ask(self, method: str, task: Task, threads: int, timeout_s: float, progress: Callable[[Step], None]) -> Outcome:
+        all_of, first = self._workers, task.pages[0]
         all_of.tries.append(first)
-        if all_of.die.get(first, 0) > 0:
-            all_of.die[first] -= 1
-            self.status = -9
-            self._other.close()
-        elif all_of.hang.get(first, 0) > 0:
-            all_of.hang[first] -= 1
-            all_of.clock.advance(deadline - all_of.clock.now() + longest_s(task))
-        else:
-            answers = [*(Step(device="a", what=f"{first}, {n}") for n in range(2)), Done(task=task, lost={}, seconds=1)]
-            self._other.sendall("".join(answer.model_dump_json() + "\n" for answer in answers).encode())
-
-    def line(self, deadline: float) -> bytes:
-        if not self.has_line():
-            if self._workers.clock.now() >= deadline:
-                raise TimeoutError
-            if not (came := self._own.recv(65536)):
-                raise ConnectionError
-            self._lines += came
-        line, _, self._lines = self._lines.partition(b"\n")
-        return line
-
-    def has_line(self) -> bool:
-        return b"\n" in self._lines
-
-    def fileno(self) -> int:
-        return self._own.fileno()
+        assert (method, threads, timeout_s) == ("work", all_of.started[-1], longest_s(task))
+        for counts, got in ((all_of.die, "its end"), (all_of.hang, "no answer")):
+            if counts.get(first, 0) > 0:
+                counts[first] -= 1
+                raise WorkerError("a worker", got, "an answer")
+        for step in range(2):
+            progress(Step(device="a", what=f"{first}, {step}"))
+        return Done(task=task, lost={}, seconds=1)
 
     def end(self, grace_s: float = 0.0) -> None:
         self._workers.ended.append(grace_s)
-        self._own.close()
-        self._other.close()
 
 
 def outcomes(workers: Workers, tasks: Iterable[Task]) -> tuple[LocalEngine, list[Outcome], Told]:
-    engine = LocalEngine(1, 2, "module", workers.start, workers.clock.now)
+    engine = LocalEngine(1, 2, workers.start)
     told = Told()
     with reporting(told):
         return engine, list(engine.run(tasks)), told
@@ -115,11 +92,11 @@ def test_workers_do_each_range_once_and_tell_of_it_in_lines_that_may_come_togeth
     engine, found, told = outcomes(workers, ranges)
     assert [outcome.task.pages for outcome in found] == [(0, 1, 2), (3, 4, 5), (6,)]
     assert told.notes == [f"device a: {first}, {number}" for first in (0, 3, 6) for number in range(2)]
-    assert (workers.started, workers.ended) == ([("module", 2)], [0.0])
+    assert (workers.started, workers.ended) == ([2], [0.0])
     assert (engine.restarts, engine.in_flight, engine.workers_alive) == (0, 0, 0)
-    engine = LocalEngine(2, 1, "module", (workers := Workers()).start, workers.clock.now)
+    engine = LocalEngine(2, 1, (workers := Workers()).start)
     seen = [(engine.in_flight, engine.workers_alive) for _ in engine.run(ranges)]
-    assert (seen, len(workers.started)) == ([(1, 2), (0, 2), (0, 2)], 2)
+    assert (seen, len(workers.started)) == ([(1, 2), (1, 2), (0, 2)], 2)
 
 
 @pytest.mark.parametrize("kind", ["hang", "die"])
@@ -131,7 +108,7 @@ def test_a_range_goes_to_another_worker_and_is_given_up_when_three_have_died_at_
     assert sorted(workers.tries) == [0] * 2 + [3] * ATTEMPTS + [6]
     (lost,) = [outcome for outcome in found if isinstance(outcome, Failed)]
     assert (lost.task.pages, lost.problem.subject) == ((3, 4, 5), "recording /a.h5: pages 3-5")
-    assert lost.problem.got == {"hang": "no answer in time", "die": "the end of its worker by signal 9"}[kind]
+    assert lost.problem.got == {"hang": "no answer", "die": "its end"}[kind]
     assert (engine.restarts, len(found), len(workers.started)) == (1 + ATTEMPTS, 3, len(workers.ended))
 
 
@@ -152,7 +129,7 @@ def test_a_killed_worker_costs_a_restart_and_nothing_comes_out_differently(job: 
     with Ledger(tmp_path / "single") as ledger:
         run(ledger, job, lambda: InlineEngine(Worker(1)))
     (tmp_path / f"a.6{KILLS}").write_text("1")
-    engine, metrics = LocalEngine(2, 1, WORKER), BulkMetrics("killed", Operation.DECODE)
+    engine, metrics = LocalEngine(2, 1, partial(started, target=WORKER)), BulkMetrics("killed", Operation.DECODE)
     with Ledger(tmp_path / "killed") as ledger:
         made = run(ledger, job, lambda: engine, metrics)
     shown, labels = metrics.registry.get_sample_value, {"run": "killed", "part": "0/1"}
@@ -171,13 +148,14 @@ def test_the_command_works_with_the_usual_workers(job: Job, tmp_path: Path) -> N
 
 DRIVER = """
 import sys
+from functools import partial
 from pathlib import Path
 from lightpage.runtime.archives.run.driver import run
 from lightpage.runtime.archives.run.job import Job
 from lightpage.runtime.archives.run.ledger import Ledger
-from lightpage.runtime.archives.workers.local import LocalEngine
+from lightpage.runtime.archives.workers.local import LocalEngine, started
 with Ledger(Path(sys.argv[1])) as ledger:
-    run(ledger, Job.read(ledger.folder), lambda: LocalEngine(1, 1, sys.argv[2]))
+    run(ledger, Job.read(ledger.folder), lambda: LocalEngine(1, 1, partial(started, target=sys.argv[2])))
 """
 
 
@@ -192,16 +170,8 @@ def test_no_worker_outlives_a_driver_that_is_killed(job: Job, tmp_path: Path) ->
         worker = int(eventually(begun.read_text))
         driver.send_signal(signal.SIGKILL)
         driver.wait(LIMIT_S)
-        eventually(lambda: not running(worker))
+        eventually(lambda: not runs(worker))
         assert pages(tmp_path / "out") == {}
     finally:
         driver.kill()
         driver.wait()
-
-
-def running(process: int) -> bool:
-    """Whether a process runs; one that nobody waits for does not."""
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
-    except (FileNotFoundError, ProcessLookupError):
-        return False

@@ -12,7 +12,8 @@ import pytest
 from lightpage.errors import LostShotError, Reason
 from lightpage.recording.layout import FrameInfo
 from lightpage.recording.pages import Pages, PagesWriter
-from lightpage.runtime.device.acquisition.camera_source import CameraSource, Exposures, View
+from lightpage.runtime.device.acquisition.camera_image import View
+from lightpage.runtime.device.acquisition.camera_source import CameraSource, Exposures
 from lightpage.runtime.device.acquisition.page_store import PageStore
 from lightpage.runtime.device.acquisition.pairing import PairingSettings
 from lightpage.runtime.device.cameras.camera import BrokenFrame, Frame

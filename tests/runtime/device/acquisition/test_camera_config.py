@@ -46,14 +46,14 @@ def test_the_example_of_the_documents_is_a_whole_device() -> None:
     assert source.frame_shape == (3648, 5472)
     assert isinstance(source.modulator, ScreenModulator)
     assert isinstance(source.beams, ShutterBeams)
-    assert [view.flip_x for view in source.views] == [False, True]
+    assert [image.view.flip_x for image in source.images] == [False, True]
     source.pages.close()
 
 
 def test_what_is_left_out_is_done_by_hand(tmp_path: Path) -> None:
     source = opened(tmp_path, PLAIN)
     assert source.name == f"camera:{tmp_path / 'device.toml'}"
-    assert [(view.flip_x, view.flip_y) for view in source.views] == [(False, False), (False, True)]
+    assert [(image.view.flip_x, image.view.flip_y) for image in source.images] == [(False, False), (False, True)]
     assert [camera.name for camera in source.cameras] == ["in-phase camera (1)", "quadrature camera (2)"]
     assert (source.levels, source.bit_depth) == (16, 8)
     assert source.modulator is None

@@ -13,9 +13,10 @@ import pytest
 from lightpage.errors import LostShotError, PageError, Reason, SourceError
 from lightpage.progress import reporting
 from lightpage.runtime.device.acquisition.beam_keeper import BeamKeeper
-from lightpage.runtime.device.acquisition.camera_source import CameraSource, View
+from lightpage.runtime.device.acquisition.camera_image import View
+from lightpage.runtime.device.acquisition.camera_source import CameraSource
 from lightpage.runtime.device.acquisition.page_store import PageStore
-from lightpage.runtime.device.modulator.beam_state import OperatorBeams
+from lightpage.runtime.device.modulator.modulator import OperatorBeams
 from lightpage.runtime.service.assembly import take_dark_frames
 from tests.clock import HandClock
 from tests.runtime import toy

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lightpage.errors import LostShotError, Reason, SourceError
-from lightpage.runtime.device.modulator.beam_state import BeamState, OperatorBeams
+from lightpage.errors import LostShotError, Reason, SourceError, WorkerError
+from lightpage.helper_process import HelperProcess
 from lightpage.runtime.device.modulator.external import ExternalBeams, ExternalModulator
 from lightpage.runtime.device.modulator.lookup_table import linear_table
+from lightpage.runtime.device.modulator.modulator import BeamState, OperatorBeams
 from lightpage.runtime.device.modulator.screen.raster import Raster, ScreenSettings
 from lightpage.runtime.device.modulator.screen.screen import ScreenModulator
-from lightpage.runtime.device.modulator.screen.window_process import Answer, WindowProcess
 from tests.clock import HandClock
 from tests.lightpage.small import small_profile
 from tests.runtime.device.acquisition.lab import reason_of
@@ -34,23 +34,23 @@ class Window:
     clock: HandClock
     opens_s: float = 0.0
     refusal: str = ""
-    fault: Callable[[], Answer] | None = None
+    fault: Callable[[], bool] | None = None
     dead: bool = False
     closed: bool = False
     pictures: list[NDArray[np.uint8]] = field(default_factory=list)
 
-    def opening(self, deadline: float) -> Answer:
-        if deadline - self.clock.now() < self.opens_s:
-            raise TimeoutError
-        self.opens_s = 0.0
-        return Answer(number=0, got=self.refusal, expected="another")
+    def poll(self, timeout_s: float) -> bool:
+        return timeout_s >= self.opens_s
 
-    def ask(self, deadline: float, image: NDArray[np.uint8] | None = None) -> Answer:
+    def answer(self) -> None:
+        if self.refusal:
+            raise SourceError("screen", self.refusal, "another")
+
+    def ask(self, method: str, *image: NDArray[np.uint8], timeout_s: float) -> bool:
         if self.fault is not None:
             return self.fault()
-        if image is not None:
-            self.pictures.append(image)
-        return Answer(number=1, shows=True)
+        self.pictures.extend(image)
+        return True
 
     def ended(self) -> bool:
         return self.dead
@@ -67,10 +67,10 @@ class Lab:
         self.settings = ScreenSettings(rows_px=800, columns_px=1280, settle_s=0.5, x_display=":5")
         self.screen = ScreenModulator(self.settings, PROFILE, linear_table, self._open, self.clock)
 
-    def _open(self, settings: ScreenSettings) -> WindowProcess:
+    def _open(self, settings: ScreenSettings) -> HelperProcess:
         assert settings is self.settings
         if self.next.dead:
-            raise OSError("no process")
+            raise WorkerError("window", "no process", "one")
         self.windows.append(self.next)
         self.next = Window(self.clock)
         return self.windows[-1]  # type: ignore[return-value]
@@ -88,11 +88,8 @@ def lab() -> Lab:
     return Lab()
 
 
-def raising(error: BaseException) -> Callable[[], Answer]:
-    def fault() -> Answer:
-        raise error
-
-    return fault
+def broken() -> bool:
+    raise WorkerError("window", "nothing", "an answer")
 
 
 def test_a_page_counts_as_shown_when_the_liquid_crystal_has_settled(lab: Lab) -> None:
@@ -108,12 +105,10 @@ def test_a_page_counts_as_shown_when_the_liquid_crystal_has_settled(lab: Lab) ->
     assert len(lab.windows) == 1
 
 
-@pytest.mark.parametrize(
-    "fault", [raising(TimeoutError()), raising(ConnectionError("gone")), lambda: Answer(number=1, shows=False)]
-)
+@pytest.mark.parametrize("fault", [broken, lambda: False])
 @pytest.mark.parametrize("behind", [True, False])
 def test_a_window_that_fails_loses_a_page_and_is_opened_again(
-    lab: Lab, fault: Callable[[], Answer], behind: bool
+    lab: Lab, fault: Callable[[], bool], behind: bool
 ) -> None:
     lab.show()
     lab.windows[0].fault = fault
@@ -123,7 +118,7 @@ def test_a_window_that_fails_loses_a_page_and_is_opened_again(
     assert lab.windows[0].closed
     lab.show()
     assert (len(lab.windows), len(lab.windows[1].pictures)) == (2, 1)
-    lab.windows[1].fault = lambda: Answer(number=1, shows=False)
+    lab.windows[1].fault = lambda: False
     assert not lab.screen.shows()
     lab.windows[1].fault = None  # what covered it has gone
     assert lab.screen.shows()

@@ -22,13 +22,14 @@ from lightpage.runtime.device.modulator.lookup_table import linear_table
 from lightpage.runtime.device.modulator.screen.raster import ScreenSettings
 from lightpage.runtime.device.modulator.screen.screen import ScreenModulator
 from tests.lightpage.small import small_profile
-from tests.processes import children, runs
+from tests.processes import children
 from tests.waiting import eventually
 
 xcffib = pytest.importorskip("xcffib")
 from xcffib import randr, xproto  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[4]
+SCREEN = "lightpage.runtime.device.modulator.screen"
 PROFILE = small_profile()
 LEVELS = 16
 WAIT_S = 60.0
@@ -112,7 +113,7 @@ def shown(screen: ScreenModulator, seed: int = 1, offset_x_px: int = OFFSET_PX) 
 
 
 def windows_of(parent: int) -> list[int]:
-    return children(parent, "lightpage.runtime.device.modulator.screen.screen_window")
+    return children(parent, f"{SCREEN}.screen_window")
 
 
 def test_each_pixel_shows_the_grey_of_its_symbol_and_no_mouse_pointer(server: XServer, screen: ScreenModulator) -> None:
@@ -128,6 +129,7 @@ def test_each_pixel_shows_the_grey_of_its_symbol_and_no_mouse_pointer(server: XS
         np.testing.assert_array_equal(shown(screen, page), server.greys())
         assert screen.shows()
     assert len(windows_of(os.getpid())) == 1
+    assert f"{SCREEN}.x_window" not in sys.modules  # its process alone talks to the server
     connection.core.ChangeWindowAttributesChecked(root, xproto.CW.Cursor, [0]).check()
     connection.disconnect()
 
@@ -196,39 +198,6 @@ def test_a_server_that_is_not_as_it_must_be_is_refused(
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{ROOT}")
     refused(server.display, "screen extra")
     assert windows_of(os.getpid()) == []
-
-
-PARENT = """
-import sys, time
-import numpy as np
-import lightpage.runtime.device.modulator.screen.screen
-from lightpage.runtime.device.modulator.screen.raster import ScreenSettings
-from lightpage.runtime.device.modulator.screen.window_process import WindowProcess
-settings = ScreenSettings.model_validate_json(sys.argv[1])
-window = WindowProcess(settings)
-until = time.monotonic() + 60
-window.opening(until)
-assert window.ask(until, np.full((settings.rows_px, settings.columns_px), 9, np.uint8)).shows
-print("xcffib" in sys.modules, flush=True)
-sys.stdin.read()
-"""
-
-
-def test_the_window_ends_with_the_process_that_opened_it(server: XServer) -> None:
-    settings = ScreenSettings(rows_px=ROWS, columns_px=COLUMNS, x_display=server.display)
-    arguments = [sys.executable, "-c", PARENT, settings.model_dump_json()]
-    with subprocess.Popen(
-        arguments, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    ) as parent:
-        try:
-            assert parent.stdout is not None
-            assert parent.stdout.readline() == "False\n"  # its own process alone talks to the server
-            (window,) = windows_of(parent.pid)
-            assert server.greys().any()
-        finally:
-            parent.kill()
-    eventually(lambda: not runs(window))
-    eventually(lambda: not server.picture().any())
 
 
 def test_a_configured_screen_shows_the_greys_of_its_table_or_of_the_levels_that_are_shown(
