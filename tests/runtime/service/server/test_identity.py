@@ -80,7 +80,7 @@ def test_each_role_may_do_the_calls_that_are_documented_and_no_other(secured: Ru
         with open_channel(secured.server.target, tls) as channel:
             refused = {name for name in needed if code_of(channel, name) is grpc.StatusCode.PERMISSION_DENIED}
         allowed = {name for name, role in needed.items() if role in roles or Role.ADMIN in roles}
-        allowed |= {name for name, role in needed.items() if roles and role is Role.READ}
+        allowed |= {name for name, role in needed.items() if roles and role == Role.READ}
         assert refused == needed.keys() - allowed, roles
 
 
