@@ -16,8 +16,8 @@ from lightpage.metrics.reliability import ConcentrationBin, ConfidenceBin
 from lightpage.page.pilots import Pilots, estimate_piston
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.layout import narrow
-from lightpage.recording.reader import Recording, page_hashes
+from lightpage.recording.layout import narrow, page_hashes
+from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.read_ahead import read_ahead
 from lightpage.runtime.archives.recordings.refused import RefusedPage, refusal, refused_json
 from lightpage.runtime.model.bundle.manifest import GOLDEN
@@ -113,7 +113,7 @@ def check_recording(decoder: Decoder, recording: Recording) -> None:
     Raises:
         RecordingError: other shapes or another bit depth.
     """
-    recording.check_against(decoder.bundle.profile)
+    recording.header.check_against(decoder.bundle.profile)
     depth = decoder.bundle.manifest.camera_bit_depth
     if recording.bit_depth != depth:
         raise RecordingError(f"recording {recording.path}", f"{recording.bit_depth} bits", f"{depth}, as the bundle")

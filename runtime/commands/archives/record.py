@@ -21,7 +21,8 @@ from lightpage.recording.exposure import check_pair_light
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import LostShot
 from lightpage.recording.pages import Pages
-from lightpage.recording.writer import RecordingWriter, pages_there, partial_path
+from lightpage.recording.unfinished import Identity, pages_there, partial_path
+from lightpage.recording.writer import RecordingWriter
 from lightpage.runtime.device.acquisition.page_store import PageStore
 from lightpage.runtime.device.acquisition.source import FrameSource, Shot, open_source
 from lightpage.words import counted
@@ -71,7 +72,8 @@ def record(
         if symbols is not None:
             source.show_pages(PageStore(profile, Pages.open(symbols)))
         count = _count(source, pages, symbols)
-        there = pages_there(out, profile, source.levels, source.bit_depth, overwrite=force, **_shown(source))
+        identity = Identity(profile, source.levels, source.bit_depth, **_shown(source))
+        there = pages_there(out, identity, overwrite=force)
         _check_room(count, there)
         _tell_where(out, there)
         source.on_lost = _tell_loss
@@ -144,12 +146,13 @@ def _record(
     losses: list[LostShot] = []
     repeated = 0
     begun = time.perf_counter()
-    with RecordingWriter.resume(
+    with RecordingWriter(
         out,
         profile,
         source.levels,
         source.bit_depth,
         references,
+        resume=True,
         keep_references=True,
         overwrite=force,
         **_shown(source),
