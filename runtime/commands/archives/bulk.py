@@ -50,6 +50,12 @@ def bulk() -> None:
     """
 
 
+def _tuning(name: str, kind: click.ParamType[Any], what: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """An option of `FineTuning`."""
+    told = f"With --deep: {what}; {getattr(FineTuning(), name):g} by default."
+    return click.option(f"--{name.replace('_', '-')}", type=kind, help=told)
+
+
 def _options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Options of all operations."""
     for option in (
@@ -120,20 +126,10 @@ def evaluate(**asked: Any) -> None:
 @_options
 @click.option("--pages", type=click.IntRange(2), help=f"Known pages to use; {KNOWN_PAGES} by default, all with --deep.")
 @click.option("--deep", is_flag=True, help="Train the network on, too, from the run that the fleet names; needs torch.")
-@click.option(
-    "--steps", type=click.IntRange(10), help=f"With --deep: of the optimiser; {FineTuning().steps} by default."
-)
-@click.option(
-    "--learning-rate",
-    type=FiniteRange(0, min_open=True),
-    help=f"With --deep: at its peak; {FineTuning().learning_rate:g} by default.",
-)
-@click.option(
-    "--synthetic-pages",
-    type=click.IntRange(0),
-    help=f"With --deep: of the drifted device, trained on too; {FineTuning().synthetic_pages} by default.",
-)
-@click.option("--seed", type=click.IntRange(0), help=f"With --deep: of the training; {FineTuning().seed} by default.")
+@_tuning("steps", click.IntRange(10), "of the optimiser")
+@_tuning("learning_rate", FiniteRange(0, min_open=True), "at its peak")
+@_tuning("synthetic_pages", click.IntRange(0), "of the drifted device, trained on too")
+@_tuning("seed", click.IntRange(0), "of the training")
 def recalibrate(pages: int | None, deep: bool, fleet: Path | None, **asked: Any) -> None:
     """Recalibrate devices, each from recordings of its own; the new bundles are in OUT."""
     given = {name: value for name in FineTuning.model_fields if (value := asked.pop(name)) is not None}
