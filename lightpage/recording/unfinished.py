@@ -43,7 +43,7 @@ class Identity:
     code: str | None = None
     symbols: Symbols | None = None
 
-    def attributes(self) -> dict[str, int | str]:
+    def attributes(self) -> dict[str, object]:
         """The root attributes that say so."""
         told = {"format": FORMAT, "version": VERSION, "camera_bit_depth": self.bit_depth, "levels": self.levels}
         return told | {"profile": self.profile.to_toml()} | ({} if self.code is None else {"code": self.code})

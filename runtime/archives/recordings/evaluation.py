@@ -176,12 +176,13 @@ def unseen_pages(
         refused: takes the pages that could not be decoded, or were not confirmed.
         more: errors that it takes pages for, too.
     """
+    losses: tuple[type[LightpageError], ...] = (InvalidInputError, LostPageError, *more)
     mask, shown = pilots_of(decoder, recording), read_ahead(recording.shown, range(recording.pages))
     for index, read in track(shown, what, total=recording.pages):
         try:
             frames, symbols = read.result()
             page = decode_unseen(decoder, recording, tracker, mask, frames, symbols)
-        except (InvalidInputError, LostPageError, *more) as error:
+        except losses as error:
             refused.append(RefusedPage.of(index, error))
             continue
         if page is not None and symbols is not None:

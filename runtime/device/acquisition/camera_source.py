@@ -19,9 +19,8 @@ from lightpage.device.profile import Profile, TomlTable
 from lightpage.errors import LostShotError, Reason, SourceError, raised_as
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.progress import warn
-from lightpage.recording.alignment import describe, greatest_count, unused_low_bits
 from lightpage.recording.black_level import DarkFrame, PixelRepair, without_black
-from lightpage.recording.exposure import check_pair_light
+from lightpage.recording.exposure import check_pair_light, describe, greatest_count, unused_low_bits
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import frame_type
 from lightpage.runtime.device.acquisition.beam_keeper import BeamKeeper
