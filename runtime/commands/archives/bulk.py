@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,7 @@ from lightpage.runtime.model.execution.providers import Provider
 CLOCK = SYSTEM
 """Of the pauses before what may pass is tried again."""
 _FILE = click.Path(path_type=Path)
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
 @click.group(cls=Group)
@@ -50,47 +51,43 @@ def bulk() -> None:
     """
 
 
-def _tuning(name: str, kind: click.ParamType[Any], what: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def _tuning(name: str, kind: click.ParamType[Any], what: str) -> Decorator:
     """An option of `FineTuning`."""
     told = f"With --deep: {what}; {getattr(FineTuning(), name):g} by default."
     return click.option(f"--{name.replace('_', '-')}", type=kind, help=told)
 
 
-def _options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Options of all operations."""
-    for option in (
-        click.option("--metrics-file", type=OutputFile(), help="Write metrics at the end, for node_exporter: *.prom."),
-        click.option("--metrics-insecure", is_flag=True, help="Let other machines read the metrics, without TLS."),
-        click.option("--metrics", "metrics_address", metavar="HOST:PORT", help="Show metrics there while it runs."),
-        click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file."),
-        click.option(
-            "--part", metavar="K/N", help="Do every Nth recording or device from the Kth, K from 0; others do the rest."
-        ),
-        click.option("--threads", type=click.IntRange(1), help="Threads of a worker; by default its share of cores."),
-        PROVIDER,
-        click.option("--workers", type=click.IntRange(1), help="How many; by default one for every two cores."),
-        click.option("--address", help="With --engine ray: of the cluster, `auto` for the one that runs here."),
-        click.option("--engine", type=click.Choice([LOCAL, RAY]), default=LOCAL, show_default=True, help="Who works."),
-        click.option("--bundle", help=f"A bundle's path, or the name of a shipped one; {DEFAULT} by default."),
-        click.option("--fleet", type=_FILE, help="TOML file of devices: name, bundle, recordings."),
-        click.option("--recordings", multiple=True, metavar="GLOB", help="HDF5 recordings; may be given repeatedly."),
-        click.argument("out", type=OutputFolder()),
-    ):
-        command = option(command)
-    return command
+def _together(*options: Decorator) -> Decorator:
+    return lambda command: reduce(lambda made, option: option(made), options, command)
 
 
-def _pages_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Options of operations on page ranges."""
-    for option in (
-        click.option("--give-up", is_flag=True, help="Take pages that storage does not give in the end for lost."),
-        click.option("--retry-lost", is_flag=True, help="Read ranges with lost pages once more, whatever the cause."),
-        click.option("--again-with", metavar="BUNDLE", help="Read pages again that were not read well."),
-        click.option("--tracking/--no-tracking", default=None, help="Follow the image within a range; the default."),
-        click.option("--range-pages", type=click.IntRange(1), help=f"Pages of a range; {RANGE_PAGES} by default."),
-    ):
-        command = option(command)
-    return command
+_options = _together(
+    click.option("--metrics-file", type=OutputFile(), help="Write metrics at the end, for node_exporter: *.prom."),
+    click.option("--metrics-insecure", is_flag=True, help="Let other machines read the metrics, without TLS."),
+    click.option("--metrics", "metrics_address", metavar="HOST:PORT", help="Show metrics there while it runs."),
+    click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file."),
+    click.option(
+        "--part", metavar="K/N", help="Do every Nth recording or device from the Kth, K from 0; others do the rest."
+    ),
+    click.option("--threads", type=click.IntRange(1), help="Threads of a worker; by default its share of cores."),
+    PROVIDER,
+    click.option("--workers", type=click.IntRange(1), help="How many; by default one for every two cores."),
+    click.option("--address", help="With --engine ray: of the cluster, `auto` for the one that runs here."),
+    click.option("--engine", type=click.Choice([LOCAL, RAY]), default=LOCAL, show_default=True, help="Who works."),
+    click.option("--bundle", help=f"A bundle's path, or the name of a shipped one; {DEFAULT} by default."),
+    click.option("--fleet", type=_FILE, help="TOML file of devices: name, bundle, recordings."),
+    click.option("--recordings", multiple=True, metavar="GLOB", help="HDF5 recordings; may be given repeatedly."),
+    click.argument("out", type=OutputFolder()),
+)
+"""Options of all operations."""
+_pages_options = _together(
+    click.option("--give-up", is_flag=True, help="Take pages that storage does not give in the end for lost."),
+    click.option("--retry-lost", is_flag=True, help="Read ranges with lost pages once more, whatever the cause."),
+    click.option("--again-with", metavar="BUNDLE", help="Read pages again that were not read well."),
+    click.option("--tracking/--no-tracking", default=None, help="Follow the image within a range; the default."),
+    click.option("--range-pages", type=click.IntRange(1), help=f"Pages of a range; {RANGE_PAGES} by default."),
+)
+"""Options of operations on page ranges."""
 
 
 @bulk.command()

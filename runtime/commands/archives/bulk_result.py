@@ -44,12 +44,8 @@ class Result:
             "part": None if self.part == WHOLE else str(self.part),
             "bundles": [bundle.model_dump(mode="json") for bundle in job.bundles],
             "this_run": {
-                "pages": made.pages,
-                "ranges": made.ranges,
-                "failed": made.failed,
-                "given_up": made.given_up,
+                **{name: getattr(made, name) for name in ("pages", "ranges", "failed", "given_up", "seconds")},
                 "problems": [str(problem) for problem in made.problems],
-                "seconds": made.seconds,
                 "pages_per_s": made.pages_per_s,
                 "worker_restarts": made.restarts,
             },
