@@ -46,7 +46,7 @@ def simulated(path: Path) -> Path:
     simulator = Simulator(profile, device, _LEVELS, 1)
     symbols = random_symbols(profile, _LEVELS, _PAGES, np.random.default_rng(1))
     bits = device.sensor.bit_depth
-    with RecordingWriter.resume(path, profile, _LEVELS, bits, simulator.references()) as writer:
+    with RecordingWriter(path, profile, _LEVELS, bits, simulator.references(), resume=True) as writer:
         for number in track(range(writer.pages, _PAGES), "simulate", total=_PAGES):
             writer.append(symbols[number], simulator.page(symbols[number]))
     return path
