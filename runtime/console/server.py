@@ -26,7 +26,8 @@ from lightpage.runtime.console.actions import ROLE, Actions
 from lightpage.runtime.console.history import History, PageRow
 from lightpage.runtime.console.pictures import confidence_png, frame_png
 from lightpage.runtime.service.caller import Actor, Identity, Role
-from lightpage.runtime.service.models.registry import Model, ModelRegistry
+from lightpage.runtime.service.models.loader import Model
+from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.server.certificates import Certificates
@@ -77,7 +78,7 @@ class Console:
     Args:
         metrics: shown at ``/metrics``.
         history: of the pages.
-        registry: the models.
+        models: the models.
         monitor: says whether a recalibration is due.
         source: of the pages, for people.
         actions: what callers may do who prove that they may; None for nothing.
@@ -88,7 +89,7 @@ class Console:
         self,
         metrics: ServiceMetrics,
         history: History,
-        registry: ModelRegistry,
+        models: Models,
         monitor: Monitor,
         source: str,
         actions: Actions | None = None,
@@ -96,7 +97,7 @@ class Console:
     ) -> None:
         self._actions, self._clock = actions, clock
         self._metrics = make_wsgi_app(metrics.registry)
-        self._history, self._registry, self._monitor, self._source = history, registry, monitor, source
+        self._history, self._models, self._monitor, self._source = history, models, monitor, source
         self._begun = clock()
 
     def __call__(self, environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
@@ -165,7 +166,7 @@ class Console:
         if path == "/state.json":
             return json.dumps(self.state(identity), allow_nan=False).encode(), "application/json"
         _, pair, confidence = self._history.pictures()
-        depth = self._registry.current.decoder.bundle.manifest.camera_bit_depth
+        depth = self._models.current.decoder.bundle.manifest.camera_bit_depth
         pictures: dict[str, Callable[[], bytes] | None] = {
             "/frames/in_phase.png": None if pair is None else lambda: frame_png(pair.in_phase, depth),
             "/frames/quadrature.png": None if pair is None else lambda: frame_png(pair.quadrature, depth),
@@ -194,7 +195,7 @@ class Console:
             "picture": {"number": number, "frames": pair is not None, "confidence": confidence is not None},
             "series": {name: [row[name] for row in told] for name in ("time_s", *_SERIES)},
             "losses": [vars(loss) for loss in self._history.losses()],
-            "models": [_model(model, model is self._registry.current) for model in self._registry.models],
+            "models": [_model(model, model is self._models.current) for model in self._models.loaded],
             "caller": "" if identity is None else identity.name,
             "actions": [] if acts is None else acts.available(),
             "job": None if acts is None else acts.job(),

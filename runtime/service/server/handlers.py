@@ -24,7 +24,7 @@ def handlers(plane: DataPlane, recalibrator: Recalibrator) -> tuple[object, ...]
         FrameCalls(plane),
         PageCalls(plane),
         DisplayCalls(plane),
-        ModelCalls(plane.models),
+        ModelCalls(plane.models, plane.uploads),
         JobCalls(plane, recalibrator),
     )
 
@@ -41,14 +41,14 @@ class Describing:
 
     def Describe(self, request: pb.DescribeRequest, call: Call) -> pb.DescribeReply:
         """What the service is."""
-        plane, model = self._plane, self._plane.registry.current
+        plane, model = self._plane, self._plane.models.current
         bundle, limits = model.decoder.bundle, self._plane.limits
         told = limits.model_dump(include=set(pb.Limits.DESCRIPTOR.fields_by_name))
         told["shared_bytes"] = 0 if plane.shared is None else plane.shared.most_bytes
         (rows_px, columns_px), (rows, columns) = bundle.profile.frame_shape, bundle.profile.page_shape
         return pb.DescribeReply(
             service_version=installed_version("lightpage"),
-            model=model_message(plane.models.entry(model)),
+            model=model_message(plane.models.entry(model.decoder.bundle.manifest)),
             camera=pb.Camera(
                 rows_px=rows_px,
                 columns_px=columns_px,

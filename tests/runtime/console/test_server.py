@@ -294,12 +294,12 @@ class Asked:
         self.plane.models.adopt(Decoder.load(toy.write_toy_bundle(folder / "c.zip", version="toy-2"), 1))
         self.recalibrator = Recalibrator(self.plane, toy.fit_references)
         actions = Actions(self.plane, self.recalibrator)
-        registry, metrics = self.plane.registry, self.plane.metrics
+        registry, metrics = self.plane.models, self.plane.metrics
         self.console = Console(metrics, History(), registry, Monitor(), "toy", actions, self.clock.now)
 
     @property
     def version(self) -> str:
-        return self.plane.registry.current.version
+        return self.plane.models.current.version
 
     def ask(self, path: str, caller: Identity | None, content: object = None, **headers: str) -> tuple[int, str]:
         """Status and text of an answer to a POST; to a GET where there is no content."""

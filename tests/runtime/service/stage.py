@@ -49,7 +49,7 @@ class Running:
 
     @property
     def version(self) -> str:
-        return self.plane.registry.current.version
+        return self.plane.models.current.version
 
     @property
     def store(self) -> ModelStore:

@@ -343,7 +343,7 @@ class Loop:
 
     @property
     def version(self) -> str:
-        return self.plane.registry.current.version
+        return self.plane.models.current.version
 
     def count(self, result: str) -> float:
         value = self.plane.metrics.registry.get_sample_value

@@ -190,14 +190,14 @@ def test_a_caller_who_leaves_while_the_bundle_is_checked_leaves_nothing(
     stored: Start, new: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     service, data = stored(), new.read_bytes()
-    as_it_was, checking = service.plane.registry.tracked, threading.Event()
+    as_it_was, checking = service.plane.models.tracked, threading.Event()
 
     def slow_check(decoder: Decoder) -> Model:
         checking.set()
         eventually(lambda: service.plane.models.uploads.busy == 0)
         return as_it_was(decoder)
 
-    monkeypatch.setattr(service.plane.registry, "tracked", slow_check)
+    monkeypatch.setattr(service.plane.models, "tracked", slow_check)
     call = service.stub.UploadModel.future(iter([header(data), chunk(data)]), timeout=60)
     assert checking.wait(60)
     call.cancel()

@@ -121,7 +121,7 @@ def test_a_damaged_bundle_is_said_and_the_newest_before_it_that_is_there_serves(
     store.path_of("toy-1+r3").write_bytes(b"damaged")
     store.path_of("toy-1+r1").unlink()
     plane = a_plane(decoder, store)
-    assert plane.registry.current.version == "toy-1+r2"
+    assert plane.models.current.version == "toy-1+r2"
     assert "toy-1+r3.zip" in trouble(plane)
     assert figure(plane, "lightpage_store_ok") == 0
     assert figure(plane, "lightpage_store_trouble", reason="bundle") == 1
@@ -155,7 +155,7 @@ def test_a_note_that_is_damaged_or_gone_is_said(content: str | None, decoder: De
     if content is not None:
         note.write_text(content)
     plane = a_plane(decoder, store)
-    assert plane.registry.current.version == "toy-1"
+    assert plane.models.current.version == "toy-1"
     assert CURRENT in trouble(plane)
     assert figure(plane, "lightpage_store_trouble", reason="note") == 1
     assert note.exists() == (content is not None)  # the next start says it again
@@ -201,9 +201,9 @@ def test_pinned_loaded_and_foreign_bundles_are_never_pruned_and_pruned_ones_leav
     plane.models.pin(names[1], True)
     assert plane.store is not None
     plane.models.prune(plane.store)
-    assert [model.version for model in plane.registry.models] == names[2:6]
+    assert [model.version for model in plane.models.loaded] == names[2:6]
     assert set(plane.store.versions()) == {"bench", *names[1:6], *names[-KEPT_BUNDLES:]}
-    assert [place.version for place in plane.registry.history.places] == ["toy-1", *names[1:6]]
+    assert [place.version for place in plane.models.history.places] == ["toy-1", *names[1:6]]
     assert ModelStore(store.folder, decoder.bundle).read().history == (None, *(f"{name}.zip" for name in names[1:6]))
 
 

@@ -55,7 +55,7 @@ def test_a_bundle_is_moved_to_the_store_once_it_is_whole(plane: DataPlane, folde
     incoming.look()
     assert versions(plane) == ["toy-2", "toy-1"]
     assert [file.name for file in folder.iterdir()] == [whole.name]
-    assert plane.registry.current.version == "toy-1"
+    assert plane.models.current.version == "toy-1"
 
 
 def test_what_is_refused_is_said_once_and_stays(
@@ -208,7 +208,7 @@ def test_a_stored_bundle_without_its_own_signature_is_refused(service: Signed) -
 def recalibrated(plane: DataPlane, folder: Path, version: str) -> Path:
     """The bundle of a recalibration that the service has made and put in service."""
     path = toy.write_toy_bundle(folder / "store" / f"{version}.zip", version=version)
-    plane.models.adopt(plane.registry.current.decoder.of_another(Bundle.open(path)))
+    plane.models.adopt(plane.models.current.decoder.of_another(Bundle.open(path)))
     return path
 
 
@@ -217,7 +217,7 @@ def test_a_recalibration_under_no_key_or_another_one_needs_a_signature(tmp_path:
     signer, before = Signer(tmp_path), Signer(tmp_path, "before")
     own = recalibrated(begin(tmp_path, before if earlier == "another" else None), tmp_path, "toy-1+r1")
     plane = begin(tmp_path, signer)
-    assert plane.registry.current.version == "toy-1"
+    assert plane.models.current.version == "toy-1"
     found = plane.models.trouble()
     assert found is not None
     assert f"under {earlier} bundle" in found.text
@@ -244,7 +244,7 @@ def test_without_a_key_no_signature_is_kept(tmp_path: Path) -> None:
 
 
 def test_pruning_takes_signatures_along(service: Signed) -> None:
-    store = ModelStore(service.store, service.plane.registry.current.decoder.bundle, kept=1)
+    store = ModelStore(service.store, service.plane.models.current.decoder.bundle, kept=1)
     for version in ("toy-2", "toy-3"):
         service.take_in(version)
     store.note = service.plane.store.note  # type: ignore[union-attr]

@@ -1,0 +1,218 @@
+"""Bundles that come from elsewhere: received into the store in pieces, checked, and given their names."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+from lightpage.clock import SYSTEM, Clock
+from lightpage.errors import BundleError, CallerLeft, InvalidInputError, LimitError, ModelExistsError, StoreError
+from lightpage.files import move_to_new_name, new_file, synchronise
+from lightpage.runtime.model.bundle.signature_file import MOST_BYTES, signature_path
+from lightpage.runtime.service.admission import Slots
+from lightpage.runtime.service.caller import NOBODY, Actor, Caller
+from lightpage.runtime.service.limits import Limits
+from lightpage.runtime.service.models.audit import Entry
+from lightpage.runtime.service.models.folder import UPLOAD
+from lightpage.runtime.service.models.history import Origin
+from lightpage.runtime.service.models.models import ModelEntry, Models
+
+_log = logging.getLogger(__name__)
+
+
+class Uploads:
+    """Takes bundles into the store. Every method may be called from many threads.
+
+    Args:
+        models: that are added to.
+        limits: of uploads.
+        clock: by which callers wait.
+
+    Attributes:
+        limits: of uploads.
+        slots: the one slot for them.
+    """
+
+    def __init__(self, models: Models, limits: Limits, clock: Clock = SYSTEM) -> None:
+        self._models, self.limits = models, limits
+        self.slots = Slots(1, "uploads of models", limits.deadline_s, clock)
+
+    def upload(self, size: int, digest: bytes, caller: Caller, signature: bytes = b"") -> Upload:
+        """Return a bundle that is about to come.
+
+        Args:
+            size: bytes of its zip.
+            digest: SHA-256 of it, empty where that is not known.
+            caller: who sends it.
+            signature: of the zip; empty for none.
+
+        Raises:
+            StoreError: there is no store.
+            LimitError: it is too large.
+            InvalidInputError: an impossible size, hash or signature.
+        """
+        if not self._models.store.folder.is_kept:
+            raise StoreError("model store", "none", "a service started with --store")
+        if size == 0:
+            raise InvalidInputError("header.bytes", 0, "the size of the zip")
+        if size > self.limits.model_bytes:
+            raise LimitError("uploaded model", f"{size} bytes", f"at most {self.limits.model_bytes}")
+        if len(digest) not in (0, 32):
+            raise InvalidInputError("header.sha256", f"{len(digest)} bytes", "32, or none")
+        if len(signature) > MOST_BYTES:
+            raise InvalidInputError("header.signature", f"{len(signature)} bytes", f"at most {MOST_BYTES}")
+        return Upload(self._models, size, digest, caller, signature)
+
+
+def take_in(
+    models: Models, path: Path, actor: Actor = NOBODY, here: Callable[[], None] = lambda: None, signature: bytes = b""
+) -> ModelEntry:
+    """Check a bundle that lies in the store under another name, and give it its own.
+
+    Args:
+        models: that it is added to.
+        path: of the zip.
+        actor: who brings it, for the record.
+        here: called before it gets its name; what it raises leaves it as it is.
+        signature: of the zip, which is kept beside it where it was asked for; empty for none.
+
+    Raises:
+        StoreError: the store cannot be written.
+        ModelExistsError: there is a model of its version.
+        BundleError: it is damaged, for another device, or lacks the signature that it needs.
+    """
+    loader, store = models.loader, models.store
+    with models.recorded("upload", actor):
+        current = models.current.decoder
+        try:
+            decoder = loader.opened(path, current, signature)
+            loader.tracked(decoder, current)  # as if it were put in service
+        except BundleError as error:
+            subject = error.subject.replace(f"bundle {path}", "new bundle")
+            raise type(error)(subject, error.got, error.expected) from None
+        version, taken = decoder.version, False
+        final = store.folder.bundle(version)
+        with store.changing:
+            try:
+                if version in models.versions():
+                    raise FileExistsError
+                here()
+                if loader.wants_signatures:
+                    with signature_path(final).open("wb") as file:
+                        file.write(signature)
+                        file.flush()
+                        synchronise(file.fileno())
+                move_to_new_name(path, final)  # unlike a renaming, it replaces nothing that came in the meantime
+                taken = True
+                state = models.now.state.among(models.versions()).noting(version, origin=Origin.UPLOADED)
+                models.commit(Entry("upload", actor, models.current.version, version), state)
+            except FileExistsError:
+                expected = "one that the service does not have"
+                raise ModelExistsError("new bundle: version", version, expected) from None
+            except BaseException:
+                if taken:
+                    store.folder.delete(version)
+                raise
+    models.prune(version)
+    return models.entry(decoder.bundle.manifest)
+
+
+class Upload:
+    """A bundle that comes in pieces into a hidden file of the store. It is dropped unless `finish` returns.
+
+    Args:
+        models: that it is added to.
+        size: bytes that are to come.
+        digest: SHA-256 of them, or empty.
+        caller: who sends them.
+        signature: of them, or empty.
+    """
+
+    def __init__(self, models: Models, size: int, digest: bytes, caller: Caller, signature: bytes) -> None:
+        self._models, self._size, self._digest, self._caller = models, size, digest, caller
+        self._signature, self._hash, self._come = signature, hashlib.sha256(), 0
+        self._file: IO[bytes] | None = None
+        self._path = Path()
+        self._lock = threading.Lock()
+        self._dropped = False
+
+    def begin(self) -> None:
+        """Open the file.
+
+        Raises:
+            StoreError: the store cannot be written, or has no room.
+        """
+        with self._at_work():
+            self._models.store.check(self._size)
+            descriptor, self._path = new_file(self._models.store.folder.path, UPLOAD.strip(".-"))
+            self._file = os.fdopen(descriptor, "wb")
+
+    def add(self, data: bytes) -> None:
+        """Take the next piece.
+
+        Raises:
+            InvalidInputError: more than was announced.
+            StoreError: it cannot be written.
+        """
+        with self._at_work():
+            assert self._file is not None  # `begin` comes first
+            self._come += len(data)
+            if self._come > self._size:
+                raise InvalidInputError("uploaded model", f"at least {self._come} bytes", f"{self._size}, as announced")
+            self._hash.update(data)
+            self._file.write(data)
+
+    def finish(self) -> ModelEntry:
+        """Check the bundle and take it in.
+
+        Raises:
+            InvalidInputError: less than was announced.
+            BundleError: it is damaged, foreign, or there already; see `take_in`.
+            CallerLeft: the caller has gone.
+        """
+        with self._at_work():
+            assert self._file is not None  # `begin` comes first
+            if self._come != self._size:
+                raise InvalidInputError("uploaded model", f"{self._come} bytes", f"{self._size}, as announced")
+            if self._digest and self._hash.digest() != self._digest:
+                found = self._hash.hexdigest()
+                raise BundleError("uploaded model: SHA-256", found, f"{self._digest.hex()}, as announced")
+            self._file.flush()
+            return take_in(self._models, self._path, self._caller.actor, self._check_here, self._signature)
+
+    def drop(self) -> None:
+        """Remove what has come, at once or when the piece at work is done; the bundle stays if it was taken in."""
+        self._dropped = True
+        if self._lock.acquire(blocking=False):
+            try:
+                if self._file is not None:
+                    self._path.unlink(missing_ok=True)
+                    self._file.close()
+            except OSError as error:
+                _log.warning("%s: an upload was dropped: %s", self._models.store.folder.subject, error)
+            finally:
+                self._lock.release()
+
+    def _check_here(self) -> None:
+        self._caller.check()
+        if self._dropped:
+            raise CallerLeft
+
+    @contextmanager
+    def _at_work(self) -> Iterator[None]:
+        """Work on the file; nobody removes it meanwhile."""
+        try:
+            with self._lock:
+                self._check_here()
+                yield
+        except OSError as error:
+            raise self._models.store.failed(error) from None
+        finally:
+            if self._dropped:  # while this was at work
+                self.drop()
