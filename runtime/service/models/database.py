@@ -1,4 +1,4 @@
-"""The SQLite file of what a service remembers across restarts: history, pins and origins of models, jobs, the record."""
+"""The SQLite file of what a service remembers across restarts: its models' history, its jobs, the record of changes."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Contents:
         """See whether it makes sense.
 
         Raises:
-            ValueError: it contradicts itself, or names what is no version.
+            ValueError, BundleError: it contradicts itself, or names what is no version.
         """
         history = self.state.history
         if not 0 <= history.cursor < len(history.versions):
@@ -105,7 +105,7 @@ class Database:
 
                 identity = (*values("PRAGMA application_id"), *values("PRAGMA user_version"))
                 if identity != _IDENTITY or (told := values("PRAGMA quick_check(1)")) != ["ok"]:
-                    raise BundleError(subject, told[0] if identity == _IDENTITY else identity, expected)
+                    raise ValueError(told[0] if identity == _IDENTITY else f"application and version {identity}")
                 ((base, cursor),) = database.execute("SELECT base, cursor FROM service")
                 history = History(tuple(values("SELECT version FROM history ORDER BY place")), cursor)
                 bundles = {
@@ -115,7 +115,7 @@ class Database:
                 jobs = dict(database.execute("SELECT id, message FROM jobs ORDER BY number"))
                 contents = Contents(base, State(history, bundles), jobs, values("SELECT line FROM audit"))
                 contents.check()
-        except (sqlite3.Error, ValueError, TypeError) as error:
+        except (sqlite3.Error, ValueError, TypeError, BundleError) as error:
             if getattr(error, "sqlite_errorcode", 0) == sqlite3.SQLITE_BUSY:
                 raise
             raise BundleError(subject, error, expected) from None

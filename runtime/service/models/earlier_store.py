@@ -14,7 +14,7 @@ from lightpage.runtime.service.models.database import Contents
 from lightpage.runtime.service.models.history import History, Known, Origin, State
 
 EARLIER = CURRENT, JOBS = "current.json", "jobs.json"
-_DAMAGED = (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError, json_format.Error)
+_DAMAGED = (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError, json_format.Error, BundleError)
 
 _log = logging.getLogger(__name__)
 

@@ -1,4 +1,4 @@
-"""The folder of a service's bundles: locked, swept of what killed programs have left, tried whether it can be written."""
+"""The folder of a service's bundles: it is locked, swept of what killed programs have left, and tried now and then."""
 
 from __future__ import annotations
 

@@ -6,17 +6,24 @@ import errno
 import logging
 import sqlite3
 import threading
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Self
 
-from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import BundleError, LightpageError, StoreError
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import sha256
-from lightpage.runtime.service.models.database import Contents, Database, Statement, bundles_written, history_written
+from lightpage.runtime.service.models.database import (
+    DATABASE,
+    Contents,
+    Database,
+    Statement,
+    bundles_written,
+    history_written,
+)
 from lightpage.runtime.service.models.earlier_store import EARLIER, read_earlier
 from lightpage.runtime.service.models.folder import BundleFolder
 from lightpage.runtime.service.models.history import History, State
@@ -53,9 +60,11 @@ class Store:
         StoreError: the folder cannot be made, or another program uses it.
     """
 
-    def __init__(self, folder: Path | None, base: Bundle, kept: int = KEPT_BUNDLES, clock: Clock = SYSTEM) -> None:
+    def __init__(
+        self, folder: Path | None, base: Bundle, kept: int = KEPT_BUNDLES, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self.changing, self.kept, self._clock = threading.RLock(), 0 if folder is None else kept, clock
-        self.room_bytes, self.health = 0, StoreHealth(self.trouble, clock=clock)
+        self.room_bytes, self.health = 0, StoreHealth(self.trouble)
         self._base = sha256(base.manifest.to_json())
         self._is_lost = self._is_closed = False
         """Whether there is no database that can be written: what is next to be remembered of models begins one."""
@@ -150,8 +159,8 @@ class Store:
             return read_earlier(self.folder.path, self.contents.state.history.current)
         except FileNotFoundError:
             if made := [version for version in self.folder.versions() if "+r" in version]:
-                expected = f"the database of {', '.join(made)}"
-                raise BundleError(self.folder.subject, "no database", expected) from None
+                subject, expected = f"{self.folder.subject}: {DATABASE}", f"a database: there is {', '.join(made)}"
+                raise BundleError(subject, "no such file", expected) from None
             return self.contents
 
     # ---- how it is -------------------------------------------------------------------------------------------------
@@ -173,7 +182,7 @@ class Store:
         """
         if self._database is None:
             return
-        self._probed = self._clock.now()
+        self._probed = self._clock()
         try:
             self.folder.probe(max(self.room_bytes, needed_bytes))
         except OSError as error:
@@ -200,7 +209,7 @@ class Store:
 
     def trouble(self) -> Trouble | None:
         """What is wrong with the store, None where nothing is; it is tried again where that was long ago."""
-        if self._clock.now() - self._probed >= PROBE_S:
+        if self._clock() - self._probed >= PROBE_S:
             with suppress(StoreError):
                 self.check()
         return self.known_trouble()

@@ -32,7 +32,7 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import STRANGER, Actor, Caller, Identity, Role
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
-from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.monitoring.observation import Observation
@@ -114,7 +114,7 @@ def test_what_nobody_foresaw_tells_nothing_of_the_inside(decoder: Decoder, monke
 def test_what_is_no_number_is_none_and_series_are_thinned(decoder: Decoder) -> None:
     page = decoder.decode(toy.ToyDevice().page(toy.symbols_of(16, 1)[0], 16, 0.5), 16)
     page = replace(page, piston_rad=math.nan, check=replace(page.check, confirmed_bits=math.inf))
-    history, registry = History(), ModelRegistry(decoder)
+    history, registry = History(), Models(decoder)
     for number in range(3 * POINTS):
         history.observe(Observation("page", number, "toy-1", float(number), 0.1, page=page))
     state = Console(ServiceMetrics(), history, registry, Monitor(), "toy").state()
@@ -126,7 +126,7 @@ def test_what_is_no_number_is_none_and_series_are_thinned(decoder: Decoder) -> N
 
 def test_the_condition_is_that_of_the_last_pages(decoder: Decoder) -> None:
     clock, history, monitor = HandClock(1e9), History(), Monitor()
-    console = Console(ServiceMetrics(), history, ModelRegistry(decoder), monitor, "toy", clock=clock.now)
+    console = Console(ServiceMetrics(), history, Models(decoder), monitor, "toy", clock=clock.now)
     told = list[str]()
 
     def seen(*lost: Reason | None) -> None:
@@ -290,7 +290,7 @@ class Asked:
 
     def __init__(self, decoder: Decoder, folder: Path) -> None:
         self.source, self.clock = Numbered(), HandClock()
-        self.plane = DataPlane(ModelRegistry(decoder), self.source)
+        self.plane = DataPlane(Models(decoder), self.source)
         self.plane.models.adopt(Decoder.load(toy.write_toy_bundle(folder / "c.zip", version="toy-2"), 1))
         self.recalibrator = Recalibrator(self.plane, toy.fit_references)
         actions = Actions(self.plane, self.recalibrator)

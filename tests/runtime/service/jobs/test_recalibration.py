@@ -30,7 +30,7 @@ from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.device.acquisition.source import Shot, open_source
 from lightpage.runtime.recalibration.recalibration import RefitResult
 from lightpage.runtime.service.models.audit import AuditLog
-from lightpage.runtime.service.models.registry import KEPT_MODELS
+from lightpage.runtime.service.models.models import KEPT_MODELS
 from tests.runtime import toy
 from tests.runtime.service.stage import Running, Start, a_page, refused
 from tests.runtime.slow_fit import SlowFit
