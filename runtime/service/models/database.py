@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import sqlite3
 from collections.abc import Mapping, Sequence
@@ -12,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from lightpage.errors import BundleError
-from lightpage.files import new_file
 from lightpage.runtime.model.bundle.manifest import check_version
 from lightpage.runtime.service.models.history import History, Known, Origin, State
 
@@ -81,8 +79,7 @@ class Database:
     """
 
     def __init__(self, folder: Path, has_locks: bool) -> None:
-        self.path = folder / DATABASE
-        self._options = "" if has_locks and _has_record_locks(folder) else "&nolock=1"
+        self.path, self._options = folder / DATABASE, "" if has_locks else "&nolock=1"
 
     @property
     def exists(self) -> bool:
@@ -152,21 +149,6 @@ class Database:
         for end in ("-journal", ""):
             with suppress(FileNotFoundError):
                 os.replace(f"{self.path}{end}", self.path.with_name(DAMAGED + end))
-
-
-def _has_record_locks(folder: Path) -> bool:
-    """Whether the file system of a folder has the locks that SQLite takes, as far as can be tried."""
-    try:
-        descriptor, path = new_file(folder, "probe")
-    except OSError:
-        return True
-    with os.fdopen(descriptor, "wb") as file:
-        path.unlink()
-        try:
-            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            return False
-    return True
 
 
 def history_written(history: History, base: str) -> list[Statement]:

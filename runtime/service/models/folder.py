@@ -11,11 +11,11 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from lightpage.errors import StoreError
-from lightpage.failures import os_failure
+from lightpage.errors import StoreError, SurroundingsError, raised_as
 from lightpage.files import lock, new_file, synchronise
 from lightpage.runtime.model.bundle.signature_file import signature_path
 from lightpage.runtime.recalibration.separate_process import SCRATCH
+from lightpage.temporary import temporary_folder
 
 _log = logging.getLogger(__name__)
 
@@ -27,7 +27,7 @@ PROBE = ".probe-"
 _LEFTOVERS = (f"{UPLOAD}*", f"{SCRATCH}*", f"{PROBE}*", ".*.json-*", ".*.zip-*")
 """Names of what a program that was killed leaves here."""
 
-_ROOM = "a service started with --store FOLDER, or a temporary folder that can be written: TMPDIR, or --tmpfs /tmp"
+_PREFIX = "lightpage-models-"
 
 
 class BundleFolder:
@@ -72,18 +72,11 @@ class BundleFolder:
 
         Raises:
             StoreError: there is no temporary folder that can be written.
-            StorageError, SurroundingsError: the disk fails, or has no room.
         """
-        with self._making:
+        with self._making, raised_as(StoreError, SurroundingsError):
             if self._path is None:
-                subject = "temporary folder of recalibrated models"
-                try:
-                    made = tempfile.TemporaryDirectory(prefix="lightpage-models-", ignore_cleanup_errors=True)
-                except FileNotFoundError as error:
-                    raise StoreError(subject, error, _ROOM) from None
-                except OSError as error:
-                    raise os_failure(subject, error, _ROOM, StoreError) from None
-                self._temporary, self._path = made, Path(made.name)
+                self._temporary = temporary_folder("recalibrated models of a service without --store", _PREFIX)
+                self._path = Path(self._temporary.name)
             return self._path
 
     def close(self) -> None:

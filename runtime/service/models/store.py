@@ -8,10 +8,9 @@ import sqlite3
 import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Self
 
 from lightpage.errors import BundleError, LightpageError, StoreError
 from lightpage.runtime.model.bundle.bundle import Bundle
@@ -37,7 +36,7 @@ PROBE_S = 30.0
 """Time after which it is tried again whether the store can be written, when somebody asks."""
 
 
-class Store:
+class Store(AbstractContextManager["Store"]):
     """Bundles descended from one base bundle, and what is remembered of them; to be closed at the end.
 
     Without a folder nothing outlives the service. Methods may be called from many threads.
@@ -79,9 +78,6 @@ class Store:
         except BaseException:
             self.close()
             raise
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

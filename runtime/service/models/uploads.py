@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import logging
 import os
-import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
 
 from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import BundleError, CallerLeft, InvalidInputError, LimitError, ModelExistsError, StoreError
@@ -22,8 +19,6 @@ from lightpage.runtime.service.models.audit import Entry
 from lightpage.runtime.service.models.folder import UPLOAD
 from lightpage.runtime.service.models.history import Origin
 from lightpage.runtime.service.models.models import ModelEntry, Models
-
-_log = logging.getLogger(__name__)
 
 
 class Uploads:
@@ -137,13 +132,11 @@ class Upload:
     def __init__(self, models: Models, size: int, digest: bytes, caller: Caller, signature: bytes) -> None:
         self._models, self._size, self._digest, self._caller = models, size, digest, caller
         self._signature, self._hash, self._come = signature, hashlib.sha256(), 0
-        self._file: IO[bytes] | None = None
         self._path = Path()
-        self._lock = threading.Lock()
         self._dropped = False
 
     def begin(self) -> None:
-        """Open the file.
+        """Make the file.
 
         Raises:
             StoreError: the store cannot be written, or has no room.
@@ -151,7 +144,7 @@ class Upload:
         with self._at_work():
             self._models.store.check(self._size)
             descriptor, self._path = new_file(self._models.store.folder.path, UPLOAD.strip(".-"))
-            self._file = os.fdopen(descriptor, "wb")
+            os.close(descriptor)
 
     def add(self, data: bytes) -> None:
         """Take the next piece.
@@ -161,12 +154,13 @@ class Upload:
             StoreError: it cannot be written.
         """
         with self._at_work():
-            assert self._file is not None  # `begin` comes first
-            self._come += len(data)
-            if self._come > self._size:
-                raise InvalidInputError("uploaded model", f"at least {self._come} bytes", f"{self._size}, as announced")
+            if self._come + len(data) > self._size:
+                come = f"at least {self._come + len(data)} bytes"
+                raise InvalidInputError("uploaded model", come, f"{self._size}, as announced")
             self._hash.update(data)
-            self._file.write(data)
+            with self._path.open("r+b") as file:  # it is not made again where somebody drops it
+                file.seek(self._come)
+                self._come += file.write(data)
 
     def finish(self) -> ModelEntry:
         """Check the bundle and take it in.
@@ -177,27 +171,19 @@ class Upload:
             CallerLeft: the caller has gone.
         """
         with self._at_work():
-            assert self._file is not None  # `begin` comes first
             if self._come != self._size:
                 raise InvalidInputError("uploaded model", f"{self._come} bytes", f"{self._size}, as announced")
             if self._digest and self._hash.digest() != self._digest:
                 found = self._hash.hexdigest()
                 raise BundleError("uploaded model: SHA-256", found, f"{self._digest.hex()}, as announced")
-            self._file.flush()
             return take_in(self._models, self._path, self._caller.actor, self._check_here, self._signature)
 
     def drop(self) -> None:
-        """Remove what has come, at once or when the piece at work is done; the bundle stays if it was taken in."""
+        """Remove what has come, also while a piece of it is at work; the bundle stays if it was taken in."""
         self._dropped = True
-        if self._lock.acquire(blocking=False):
-            try:
-                if self._file is not None:
-                    self._path.unlink(missing_ok=True)
-                    self._file.close()
-            except OSError as error:
-                _log.warning("%s: an upload was dropped: %s", self._models.store.folder.subject, error)
-            finally:
-                self._lock.release()
+        with suppress(OSError):  # the next start sweeps it
+            if self._path.name:
+                self._path.unlink()
 
     def _check_here(self) -> None:
         self._caller.check()
@@ -206,13 +192,12 @@ class Upload:
 
     @contextmanager
     def _at_work(self) -> Iterator[None]:
-        """Work on the file; nobody removes it meanwhile."""
         try:
-            with self._lock:
-                self._check_here()
-                yield
+            self._check_here()
+            yield
         except OSError as error:
+            self._check_here()
             raise self._models.store.failed(error) from None
         finally:
-            if self._dropped:  # while this was at work
+            if self._dropped:  # perhaps before there was a file
                 self.drop()

@@ -90,7 +90,7 @@ def test_without_a_store_it_goes_on_after_a_rollback_and_keeps_only_the_models_h
     assert versions == [f"toy-1+r{number}" for number in range(2, KEPT_MODELS + 3)]
     kept = [model.decoder.bundle.path for model in service.plane.models.loaded]
     assert sorted(kept[0].parent.iterdir()) == sorted(kept)
-    service.recalibrator.close()
+    service.end()
     assert not kept[0].parent.exists()
 
 
