@@ -33,7 +33,6 @@ from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.limits import Limits
 from lightpage.runtime.service.models.loader import Model
 from lightpage.runtime.service.models.models import Models
-from lightpage.runtime.service.models.uploads import Uploads
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor, SessionMonitors
 from lightpage.runtime.service.monitoring.observation import Observation, Observer
@@ -173,7 +172,7 @@ class DataPlane:
         self.decodes = Slots(self.limits.concurrent_decodes, "decodes", self.limits.deadline_s, clock)
         self.ranges = Slots(self.limits.concurrent_ranges, "ranges of pages", self.limits.deadline_s, clock)
         self.watches = Slots(self.limits.concurrent_watches, "watches of the display", self.limits.deadline_s, clock)
-        self.uploads = Uploads(models, self.limits, clock)
+        self.uploads = Slots(1, "uploads of models", self.limits.deadline_s, clock)
         models.in_service = self._in_service
         self._in_service(models.current)
         self.metrics.watch_load(self.decodes, self.received)

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from functools import cached_property
 from io import TextIOWrapper
 from logging.handlers import RotatingFileHandler
 from pathlib import Path
@@ -26,8 +25,8 @@ AUDIT_KEPT = 10
 """Earlier records that stay."""
 _WAITING = 10_000
 """Lines that wait at most while the file cannot be written."""
-_LINE_BYTES = 1 << 16
-"""More than a line has."""
+_LAST_BYTES = 1 << 20
+"""Of the file, in which a line is looked for that may have been appended."""
 
 _log = logging.getLogger(__name__)
 
@@ -52,21 +51,24 @@ class Entry:
     failure: Exception | None = None
     time: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="milliseconds"))
 
-    @cached_property
+    @property
     def line(self) -> str:
         """Itself in JSON."""
         who = {"who": self.actor.name, "correlation_id": self.actor.correlation_id}
         entry = {"time": self.time, "what": self.what, **who, "from": self.before, "to": self.after}
-        entry["outcome"] = "failed" if self.failure else "done"
-        return json.dumps(entry | ({"detail": str(self.failure) or repr(self.failure)} if self.failure else {}))
+        how = {"outcome": "failed", "detail": self._detail} if self.failure else {"outcome": "done"}
+        return json.dumps(entry | how)
 
     def log(self) -> None:
         """Log it."""
         told = {"peer": self.actor.name, "correlation_id": self.actor.correlation_id, "method": self.what}
         change = f"from {self.before} to {self.after}" if self.after else f"of {self.before}"
-        how = f"failed: {str(self.failure) or repr(self.failure)}" if self.failure else "done"
-        level = logging.WARNING if self.failure else logging.INFO
+        level, how = (logging.WARNING, f"failed: {self._detail}") if self.failure else (logging.INFO, "done")
         _log.log(level, "model change %s: %s, %s", self.what, change, how, extra={"told": told})
+
+    @property
+    def _detail(self) -> str:
+        return str(self.failure) or repr(self.failure)
 
 
 class AuditLog:
@@ -96,8 +98,8 @@ class AuditLog:
 
     def resume(self, lines: Sequence[str]) -> None:
         """Append those of the lines that the service before was to write and has not."""
-        last = "" if self._path is None else _last_line(self._path)
-        self._waiting.extend(lines[lines.index(last) + 1 :] if last in lines else lines)
+        written = set() if self._path is None else _last_lines(self._path)
+        self._waiting.extend(line for line in lines if line not in written)
         self._write()
 
     def pending(self, entry: Entry) -> list[str]:
@@ -142,8 +144,8 @@ class AuditLog:
                 sync_folder(path.parent)
 
 
-def _last_line(path: Path) -> str:
+def _last_lines(path: Path) -> set[str]:
     with suppress(OSError), path.open("rb") as file:
-        file.seek(max(0, os.fstat(file.fileno()).st_size - _LINE_BYTES))
-        return (file.read().splitlines() or [b""])[-1].decode(errors="replace")
-    return ""
+        file.seek(max(0, os.fstat(file.fileno()).st_size - _LAST_BYTES))
+        return {*file.read().decode(errors="replace").splitlines()}
+    return set()

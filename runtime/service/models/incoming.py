@@ -12,9 +12,11 @@ from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import BusyError, CallerLeft, LightpageError, StoreError
 from lightpage.runtime.client.wire.messages import CHUNK_BYTES
 from lightpage.runtime.model.bundle.signature_file import read_signature, signature_path
+from lightpage.runtime.service.admission import Slots
 from lightpage.runtime.service.caller import Actor, Caller
 from lightpage.runtime.service.limits import GRACE_S
-from lightpage.runtime.service.models.uploads import Uploads
+from lightpage.runtime.service.models.models import Models
+from lightpage.runtime.service.models.uploads import Upload
 
 _log = logging.getLogger(__name__)
 
@@ -32,14 +34,25 @@ class Incoming:
     it, it is.
 
     Args:
-        uploads: of a service that has a store.
+        models: of a service that has a store.
+        most_bytes: of a bundle.
+        uploads: the slot for one.
         folder: is looked at for files that end in .zip.
         look_s: how often.
         clock: by which it waits between two looks.
     """
 
-    def __init__(self, uploads: Uploads, folder: Path, look_s: float = LOOK_S, clock: Clock = SYSTEM) -> None:
-        self._uploads, self._folder, self._look_s, self._clock = uploads, folder, look_s, clock
+    def __init__(
+        self,
+        models: Models,
+        most_bytes: int,
+        uploads: Slots,
+        folder: Path,
+        look_s: float = LOOK_S,
+        clock: Clock = SYSTEM,
+    ) -> None:
+        self._models, self._most_bytes, self._uploads = models, most_bytes, uploads
+        self._folder, self._look_s, self._clock = folder, look_s, clock
         self._seen: dict[Path, _Stamp] = {}
         self._refused: dict[Path, _Stamp] = {}
         self._put_off: dict[Path, _Stamp] = {}
@@ -90,9 +103,9 @@ class Incoming:
 
     def _take_in(self, path: Path) -> str:
         """Move a bundle to the store; returns its version."""
-        with path.open("rb") as file, self._uploads.slots.held_at_once():
+        with path.open("rb") as file, self._uploads.held_at_once():
             size, signature = os.fstat(file.fileno()).st_size, read_signature(path)
-            upload = self._uploads.upload(size, b"", self._caller, signature)
+            upload = Upload(self._models, self._most_bytes, self._caller, size, signature=signature)
             try:
                 upload.begin()
                 while chunk := file.read(CHUNK_BYTES):

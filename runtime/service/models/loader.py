@@ -58,14 +58,6 @@ class Loader:
         self._make_tracker, self._key = make_tracker, key
         self.wants_signatures, self.fingerprint = key is not None, "" if key is None else key.fingerprint
 
-    def first(self, decoder: Decoder) -> Model:
-        """Return the model that a service begins with.
-
-        Raises:
-            CalibrationError: the tracker needs a calibration that the bundle does not hold.
-        """
-        return Model(decoder, self._make_tracker(decoder))
-
     def opened(self, path: Path, current: Decoder, signature: bytes = b"") -> Decoder:
         """Return the decoder of a bundle that comes from elsewhere, to run as the `current` one does.
 
@@ -120,6 +112,6 @@ class Loader:
         if depth != present:
             raise BundleError(f"{decoder.bundle.subject}: camera", f"{depth} bits", f"{present} bits, as in service")
         try:
-            return self.first(decoder)
+            return Model(decoder, self._make_tracker(decoder))
         except CalibrationError as error:
             raise BundleError(error.subject, error.got, error.expected) from None

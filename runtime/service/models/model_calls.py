@@ -8,10 +8,12 @@ from functools import partial
 
 from lightpage.errors import MalformedError, StalledError
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
+from lightpage.runtime.service.admission import Slots
 from lightpage.runtime.service.caller import Call
+from lightpage.runtime.service.limits import Limits
 from lightpage.runtime.service.models.history import Origin
 from lightpage.runtime.service.models.models import ModelEntry, Models
-from lightpage.runtime.service.models.uploads import Upload, Uploads
+from lightpage.runtime.service.models.uploads import Upload
 
 
 class ModelCalls:
@@ -19,11 +21,12 @@ class ModelCalls:
 
     Args:
         models: of the service.
-        uploads: add to them.
+        limits: of uploads.
+        uploads: the slot for one.
     """
 
-    def __init__(self, models: Models, uploads: Uploads) -> None:
-        self._models, self._uploads = models, uploads
+    def __init__(self, models: Models, limits: Limits, uploads: Slots) -> None:
+        self._models, self._limits, self._uploads = models, limits, uploads
 
     def ListModels(self, request: pb.ListModelsRequest, call: Call) -> pb.ListModelsReply:
         """All models that are loaded, or those of the store too."""
@@ -53,11 +56,12 @@ class ModelCalls:
         first = await anext(requests, None)
         if first is None or first.WhichOneof("part") != "header":
             raise MalformedError("first message of UploadModel", "no header", "a header, then chunks")
-        header, limit_s = first.header, self._uploads.limits.model_s
+        header, limit_s = first.header, self._limits.model_s
         call.correlation_id = header.correlation_id or call.correlation_id
         call.caller.actor = call.actor
-        with self._uploads.slots.held_at_once():
-            upload = self._uploads.upload(header.bytes, header.sha256, call.caller, header.signature)
+        with self._uploads.held_at_once():
+            given = (header.bytes, header.sha256, header.signature)
+            upload = Upload(self._models, self._limits.model_bytes, call.caller, *given)
             try:
                 async with asyncio.timeout(limit_s):
                     await self._receive(upload, requests, call)

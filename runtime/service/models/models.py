@@ -113,7 +113,7 @@ class Models:
         found = self.store.contents
         begun = State(History((first.version,)), found.state.bundles)
         self.now = Snapshot(begun, {})
-        self._serve(begun, self.loader.first(first))
+        self._serve(begun, self.loader.tracked(first, first))
         self._resume(found.state)
         self._audit.resume(found.audit)
 

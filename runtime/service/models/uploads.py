@@ -8,61 +8,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import BundleError, CallerLeft, InvalidInputError, LimitError, ModelExistsError, StoreError
 from lightpage.files import move_to_new_name, new_file, synchronise
 from lightpage.runtime.model.bundle.signature_file import MOST_BYTES, signature_path
-from lightpage.runtime.service.admission import Slots
 from lightpage.runtime.service.caller import NOBODY, Actor, Caller
-from lightpage.runtime.service.limits import Limits
 from lightpage.runtime.service.models.audit import Entry
 from lightpage.runtime.service.models.folder import UPLOAD
 from lightpage.runtime.service.models.history import Origin
 from lightpage.runtime.service.models.models import ModelEntry, Models
-
-
-class Uploads:
-    """Takes bundles into the store. Every method may be called from many threads.
-
-    Args:
-        models: that are added to.
-        limits: of uploads.
-        clock: by which callers wait.
-
-    Attributes:
-        limits: of uploads.
-        slots: the one slot for them.
-    """
-
-    def __init__(self, models: Models, limits: Limits, clock: Clock = SYSTEM) -> None:
-        self._models, self.limits = models, limits
-        self.slots = Slots(1, "uploads of models", limits.deadline_s, clock)
-
-    def upload(self, size: int, digest: bytes, caller: Caller, signature: bytes = b"") -> Upload:
-        """Return a bundle that is about to come.
-
-        Args:
-            size: bytes of its zip.
-            digest: SHA-256 of it, empty where that is not known.
-            caller: who sends it.
-            signature: of the zip; empty for none.
-
-        Raises:
-            StoreError: there is no store.
-            LimitError: it is too large.
-            InvalidInputError: an impossible size, hash or signature.
-        """
-        if not self._models.store.folder.is_kept:
-            raise StoreError("model store", "none", "a service started with --store")
-        if size == 0:
-            raise InvalidInputError("header.bytes", 0, "the size of the zip")
-        if size > self.limits.model_bytes:
-            raise LimitError("uploaded model", f"{size} bytes", f"at most {self.limits.model_bytes}")
-        if len(digest) not in (0, 32):
-            raise InvalidInputError("header.sha256", f"{len(digest)} bytes", "32, or none")
-        if len(signature) > MOST_BYTES:
-            raise InvalidInputError("header.signature", f"{len(signature)} bytes", f"at most {MOST_BYTES}")
-        return Upload(self._models, size, digest, caller, signature)
 
 
 def take_in(
@@ -123,17 +76,34 @@ class Upload:
 
     Args:
         models: that it is added to.
-        size: bytes that are to come.
-        digest: SHA-256 of them, or empty.
-        caller: who sends them.
-        signature: of them, or empty.
+        most_bytes: of its zip.
+        caller: who sends it.
+        size: bytes of its zip.
+        digest: SHA-256 of them, empty where that is not known.
+        signature: of them; empty for none.
+
+    Raises:
+        StoreError: there is no store.
+        LimitError: it is too large.
+        InvalidInputError: an impossible size, hash or signature.
     """
 
-    def __init__(self, models: Models, size: int, digest: bytes, caller: Caller, signature: bytes) -> None:
-        self._models, self._size, self._digest, self._caller = models, size, digest, caller
-        self._signature, self._hash, self._come = signature, hashlib.sha256(), 0
-        self._path = Path()
-        self._dropped = False
+    def __init__(
+        self, models: Models, most_bytes: int, caller: Caller, size: int, digest: bytes = b"", signature: bytes = b""
+    ) -> None:
+        if not models.store.folder.is_kept:
+            raise StoreError("model store", "none", "a service started with --store")
+        if size == 0:
+            raise InvalidInputError("header.bytes", 0, "the size of the zip")
+        if size > most_bytes:
+            raise LimitError("uploaded model", f"{size} bytes", f"at most {most_bytes}")
+        if len(digest) not in (0, 32):
+            raise InvalidInputError("header.sha256", f"{len(digest)} bytes", "32, or none")
+        if len(signature) > MOST_BYTES:
+            raise InvalidInputError("header.signature", f"{len(signature)} bytes", f"at most {MOST_BYTES}")
+        self._models, self._caller, self._size, self._digest, self._signature = models, caller, size, digest, signature
+        self._hash, self._come = hashlib.sha256(), 0
+        self._path, self._dropped = Path(), False
 
     def begin(self) -> None:
         """Make the file.

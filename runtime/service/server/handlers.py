@@ -24,7 +24,7 @@ def handlers(plane: DataPlane, recalibrator: Recalibrator) -> tuple[object, ...]
         FrameCalls(plane),
         PageCalls(plane),
         DisplayCalls(plane),
-        ModelCalls(plane.models, plane.uploads),
+        ModelCalls(plane.models, plane.limits, plane.uploads),
         JobCalls(plane, recalibrator),
     )
 

@@ -178,12 +178,12 @@ def test_a_caller_who_is_slow_leaves_nothing(stored: Start, new: Path) -> None:
 def test_a_caller_who_leaves_leaves_nothing_and_one_upload_is_taken_at_a_time(stored: Start, new: Path) -> None:
     service, data, more = stored(), new.read_bytes(), threading.Event()
     call = service.stub.UploadModel.future(until_told([header(data), chunk(data[:9])], more), timeout=60)
-    eventually(lambda: service.plane.uploads.slots.busy == 1 and service.left_behind != [])
+    eventually(lambda: service.plane.uploads.busy == 1 and service.left_behind != [])
     with pytest.raises(SlotsTakenError):
         service.client.upload_model(new)
     call.cancel()
     more.set()
-    eventually(lambda: service.left_behind == [] and service.plane.uploads.slots.busy == 0)
+    eventually(lambda: service.left_behind == [] and service.plane.uploads.busy == 0)
     assert service.client.upload_model(new).version == "toy-2"
 
 
@@ -196,7 +196,7 @@ def test_a_caller_who_leaves_while_the_bundle_is_checked_leaves_nothing(
 
     def slow_check(decoder: Decoder, current: Decoder) -> Model:
         checking.set()
-        eventually(lambda: service.plane.uploads.slots.busy == 0)
+        eventually(lambda: service.plane.uploads.busy == 0)
         return as_it_was(decoder, current)
 
     monkeypatch.setattr(loader, "tracked", slow_check)

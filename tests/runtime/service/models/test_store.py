@@ -8,9 +8,12 @@ import itertools
 import json
 import os
 import shutil
+import signal
 import sqlite3
 import threading
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,7 +26,7 @@ from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.model.bundle.manifest import sha256
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.dataplane import DataPlane
-from lightpage.runtime.service.models.database import DAMAGED, DATABASE
+from lightpage.runtime.service.models.database import DAMAGED, DATABASE, audit_written, job_written
 from lightpage.runtime.service.models.folder import LOCK
 from lightpage.runtime.service.models.history import History, Known, Origin
 from lightpage.runtime.service.models.models import Models
@@ -234,6 +237,45 @@ def test_a_database_that_another_program_holds_is_no_damaged_one(
         start()
     other.close()
     assert start().models.current.version == "toy-1+r3"
+
+
+class Dying(sqlite3.Connection):
+    """A connection of a process that is killed at one of its statements."""
+
+    left = 0
+
+    def execute(self, *given: object) -> sqlite3.Cursor:
+        Dying.left -= 1
+        if Dying.left < 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().execute(*given)  # type: ignore[arg-type]
+
+    def executemany(self, *given: object) -> sqlite3.Cursor:
+        Dying.left -= 1
+        if Dying.left < 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().executemany(*given)  # type: ignore[arg-type]
+
+
+def test_a_kill_at_any_statement_leaves_all_of_a_change_or_nothing(
+    worn: DataPlane, start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, state = worn.models.store, worn.models.now.state.noting("toy-1", pinned=True)
+    later, found = replace(state, history=state.history.stepped(-1)), set()
+    monkeypatch.setattr(sqlite3, "connect", partial(sqlite3.connect, factory=Dying))
+    for Dying.left in range(20):
+        if not (child := os.fork()):
+            store.save(later, audit_written(["line"]), job_written("job", b"message", 1), settles=True)
+            os._exit(0)
+        _, status = os.waitpid(child, 0)
+        Dying.left = 999
+        store = start().models.store
+        kept = store.contents
+        found.add((status, kept.state == later, *kept.audit, *kept.jobs))
+        assert kept.state in (later, worn.models.now.state)
+        if status == 0:
+            break
+    assert found == {(signal.SIGKILL, False), (0, True, "line", "job")}
 
 
 @pytest.mark.parametrize("note", ["history", "bundle"])

@@ -6,6 +6,7 @@ import logging
 import os
 import sqlite3
 from pathlib import Path
+from typing import Any
 
 import pytest
 from cryptography.hazmat.primitives import hashes, serialization
@@ -41,12 +42,16 @@ def folder(tmp_path: Path) -> Path:
     return made
 
 
+def incoming_of(plane: DataPlane, folder: Path, *options: Any) -> Incoming:
+    return Incoming(plane.models, plane.limits.model_bytes, plane.uploads, folder, *options)
+
+
 def versions(plane: DataPlane) -> list[str]:
     return [entry.manifest.version for entry in plane.models.entries(stored=True)]
 
 
 def test_a_bundle_is_moved_to_the_store_once_it_is_whole(plane: DataPlane, folder: Path) -> None:
-    incoming, path = Incoming(plane.uploads, folder), folder / "new.zip"
+    incoming, path = incoming_of(plane, folder), folder / "new.zip"
     whole = toy.write_toy_bundle(folder / "new.part", version="toy-2")
     data = toy.write_toy_bundle(folder.parent / "toy-2.zip", version="toy-2").read_bytes()
     path.write_bytes(data[:100])
@@ -63,7 +68,7 @@ def test_a_bundle_is_moved_to_the_store_once_it_is_whole(plane: DataPlane, folde
 def test_what_is_refused_is_said_once_and_stays(
     plane: DataPlane, folder: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    incoming, path = Incoming(plane.uploads, folder), folder / "bad.zip"
+    incoming, path = incoming_of(plane, folder), folder / "bad.zip"
     path.write_bytes(b"no zip")
     (folder / "link.zip").symlink_to(toy.write_toy_bundle(folder.parent / "elsewhere.zip", version="toy-3"))
     for _ in range(4):
@@ -80,7 +85,7 @@ def test_what_is_refused_is_said_once_and_stays(
 def test_what_the_store_cannot_take_is_tried_again(
     plane: DataPlane, folder: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    incoming = Incoming(plane.uploads, folder)
+    incoming = incoming_of(plane, folder)
     toy.write_toy_bundle(folder / "new.zip", version="toy-2")
     incoming.look()
     with full_disk(10):
@@ -97,7 +102,7 @@ def test_the_folder_is_looked_at_while_the_service_runs(
     caplog.set_level(logging.INFO)
     clock = HandClock()
     toy.write_toy_bundle(folder / "new.zip", version="toy-2")
-    with Incoming(plane.uploads, folder, 5.0, clock):
+    with incoming_of(plane, folder, 5.0, clock):
         clock.until_somebody_waits()
         assert versions(plane) == ["toy-1"]
         eventually(lambda: clock.advance(5.0) or "as toy-2" in caplog.text)
@@ -155,7 +160,7 @@ class Signed:
         take_in(self.models, path, signature=signature)
 
     def looked(self) -> set[str]:
-        taking = Incoming(self.plane.uploads, self.incoming)
+        taking = incoming_of(self.plane, self.incoming)
         taking.look()
         taking.look()
         return set(self.models.versions())
