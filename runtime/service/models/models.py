@@ -6,7 +6,6 @@ import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from lightpage.errors import (
     BundleError,
@@ -326,16 +325,13 @@ class Models:
             self.store.damaged(Reason.BUNDLE, lost)
             _log.warning("serving %s%s: %s", current, " as it was given" if current == base else "", lost)
 
-    def _bundle(self, version: str) -> Path:
-        return self._base_path if version == self.base.version else self.store.folder.bundle(version)
-
     def _model(self, version: str) -> Model:
         """A model of the history, loaded if it is not."""
         now = self.now
-        made_under = now.state.known(version).key
-        return now.loaded.get(version) or self.loader.load(
-            version, self._bundle(version), now.current.decoder, made_under
-        )
+        if version in now.loaded:
+            return now.loaded[version]
+        path = self._base_path if version == self.base.version else self.store.folder.bundle(version)
+        return self.loader.load(version, path, now.current.decoder, now.state.known(version).key)
 
     def _manifest(self, version: str) -> Manifest:
         """The manifest of a model that is loaded, was in service, or is in the store."""
@@ -345,7 +341,7 @@ class Models:
             return now.loaded[version].decoder.bundle.manifest
         if version == self.base.version:
             return self.base
-        path = self._bundle(version)
+        path = self.store.folder.bundle(version)
         if version not in now.state.history.versions and not path.is_file():
             raise BundleError("model", f"no {version}", "the version of a model that the service has")
         manifest = read_manifest(path)

@@ -83,10 +83,9 @@ class Store(AbstractContextManager["Store"]):
         self.close()
 
     def close(self) -> None:
-        """Let go of the folder; whoever changes something later hears that it is closed."""
-        with self.changing:
-            self._is_closed = True
-            self.folder.close()
+        """Let go of the folder, and wait for no disk; whoever changes something later hears that it is closed."""
+        self._is_closed = True
+        self.folder.close()
 
     def save(self, state: State, *more: Sequence[Statement], settles: bool = False) -> None:
         """Write the state of the models, and more with it, in one transaction.

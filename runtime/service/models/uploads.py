@@ -51,14 +51,14 @@ def take_in(
                 if version in models.versions():
                     raise FileExistsError
                 here()
+                taken = True
                 if loader.wants_signatures:
                     with signature_path(final).open("wb") as file:
                         file.write(signature)
                         file.flush()
                         synchronise(file.fileno())
                 move_to_new_name(path, final)  # unlike a renaming, it replaces nothing that came in the meantime
-                taken = True
-                state = models.now.state.among(models.versions()).noting(version, origin=Origin.UPLOADED)
+                state = models.now.state.among(models.versions()).noting(version, origin=Origin.UPLOADED, key=None)
                 models.commit(Entry("upload", actor, models.current.version, version), state)
             except FileExistsError:
                 expected = "one that the service does not have"
