@@ -105,16 +105,9 @@ class Jobs:
             self.check_free()
             self._running = running = RunningJob(secrets.token_hex(6), caller)
             self._idle.clear()
-            self._keep(
-                pb.Job(
-                    id=running.id,
-                    state=pb.JOB_STATE_RUNNING,
-                    progress=pb.Progress(step="begin"),
-                    created_s=self._clock(),
-                    correlation_id=correlation_id,
-                    pages_of=pages_of,
-                )
-            )
+            job = pb.Job(id=running.id, state=pb.JOB_STATE_RUNNING, created_s=self._clock(), pages_of=pages_of)
+            job.correlation_id, job.progress.step = correlation_id, "begin"
+            self._keep(job)
         return running
 
     def check_free(self) -> None:

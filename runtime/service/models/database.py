@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -154,17 +154,15 @@ class Database:
 def history_written(history: History, base: str) -> list[Statement]:
     """Return what writes a history that begins with the base bundle of this digest."""
     return [
-        ("DELETE FROM service", [()]),
-        ("INSERT INTO service VALUES (?, ?)", [(base, history.cursor)]),
-        ("DELETE FROM history", [()]),
-        ("INSERT INTO history VALUES (?, ?)", list(enumerate(history.versions))),
+        *_table("service", "?, ?", [(base, history.cursor)]),
+        *_table("history", "?, ?", enumerate(history.versions)),
     ]
 
 
 def bundles_written(state: State) -> list[Statement]:
     """Return what writes all that is known of bundles."""
     rows = [(version, known.origin, known.key, known.pinned) for version, known in state.bundles.items()]
-    return [("DELETE FROM bundles", [()]), ("INSERT INTO bundles VALUES (?, ?, ?, ?)", rows)]
+    return _table("bundles", "?, ?, ?, ?", rows)
 
 
 def job_written(id_: str, message: bytes, kept: int) -> list[Statement]:
@@ -176,4 +174,8 @@ def job_written(id_: str, message: bytes, kept: int) -> list[Statement]:
 
 def audit_written(lines: Sequence[str]) -> list[Statement]:
     """Return what writes the lines that are not in the record of model changes yet, in place of those before."""
-    return [("DELETE FROM audit", [()]), ("INSERT INTO audit VALUES (?)", [(line,) for line in lines])]
+    return _table("audit", "?", [(line,) for line in lines])
+
+
+def _table(name: str, values: str, rows: Iterable[tuple[Any, ...]]) -> list[Statement]:
+    return [(f"DELETE FROM {name}", [()]), (f"INSERT INTO {name} VALUES ({values})", list(rows))]

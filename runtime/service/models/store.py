@@ -130,19 +130,17 @@ class Store(AbstractContextManager["Store"]):
         """Read the database, or make one of what a store without one remembers."""
         if self._database is None:
             return
-        fresh, is_new, folder = self.contents, not self._database.exists, self.folder.path
         try:
-            found = self._without_database() if is_new else self._database.read()
-            history = found.state.history if found.base == self._base else fresh.state.history
+            self._is_lost = not self._database.exists
+            found = self._without_database() if self._is_lost else self._database.read()
+            history = found.state.history if found.base == self._base else self.contents.state.history
             self.contents = replace(found, state=replace(found.state, history=history))
-            if is_new:
-                self._is_lost = True
-                with suppress(StoreError):  # logged, and its trouble
+            with suppress(StoreError, OSError):  # what cannot be written is logged, and the store's trouble
+                if self._is_lost:
                     self.save(self.contents.state, found.jobs_written())
-            for path in (folder / name for name in EARLIER):
-                with suppress(OSError):
+                for path in (self.folder.path / name for name in EARLIER):
                     path.rename(f"{path}.imported")
-        except sqlite3.Error as error:
+        except (sqlite3.Error, OSError) as error:
             raise StoreError(self.folder.subject, error, "one that no other program uses") from None
         except BundleError as error:
             self._is_lost = True

@@ -286,6 +286,8 @@ def test_what_a_store_without_a_database_remembers_is_taken_over_once(
     jobs = [pb.Job(id="a", state=pb.JOB_STATE_DONE), pb.Job(id="b", state=pb.JOB_STATE_RUNNING, result=result)]
     (folder / "current.json").write_text(json.dumps(content | {"base": sha256(decoder.bundle.manifest.to_json())}))
     (folder / "jobs.json").write_text(json.dumps({"jobs": [json_format.MessageToDict(job) for job in jobs]}))
+    with full_disk(10):
+        assert start().models.current.version == "toy-1+r1"
     for _ in range(2):
         plane = start()
         assert plane.models.current.version == "toy-1+r1"
