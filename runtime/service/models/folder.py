@@ -97,38 +97,22 @@ class BundleFolder:
         return sorted(path.name.removesuffix(".zip") for path in found)
 
     def newest_first(self, own: Callable[[str], bool]) -> list[str]:
-        """Versions of bundles that are the service's `own`, the newest first.
-
-        Raises:
-            OSError: the disk fails.
-        """
+        """Return the versions of bundles that are the service's `own`, the newest first; `OSError` where that fails."""
         written_ns = {version: self.bundle(version).stat().st_mtime_ns for version in self.versions() if own(version)}
         return sorted(written_ns, key=written_ns.__getitem__, reverse=True)
 
     def delete(self, version: str) -> None:
-        """Delete a bundle with its signature.
-
-        Raises:
-            OSError: it stays.
-        """
+        """Delete a bundle with its signature; `OSError` where it stays."""
         for path in (self.bundle(version), signature_path(self.bundle(version))):
             path.unlink(missing_ok=True)
 
     def check(self) -> None:
-        """Check that it is the one that was locked: under a disk that is gone there may be an empty one.
-
-        Raises:
-            OSError: it is gone, or another one.
-        """
+        """Raise `OSError` unless it is the one that was locked: under a disk that is gone there may be an empty one."""
         if self._lock is not None and not os.path.samestat(os.stat(self.path / LOCK), os.fstat(self._lock)):
             raise FileNotFoundError(errno.ENOENT, "another folder than at the start")
 
     def probe(self, needed_bytes: int = 0) -> None:
-        """Try whether it can be written and has room.
-
-        Raises:
-            OSError: it cannot, or has not.
-        """
+        """Raise `OSError` where it cannot be written, or has no room."""
         self.check()
         descriptor, name = new_file(self.path, PROBE.strip(".-"))
         try:

@@ -61,10 +61,7 @@ class Loader:
     def opened(self, path: Path, current: Decoder, signature: bytes = b"") -> Decoder:
         """Return the decoder of a bundle that comes from elsewhere, to run as the `current` one does.
 
-        Args:
-            path: of the bundle.
-            current: the decoder in service.
-            signature: of the bundle; empty for that in the file beside it.
+        Without a signature, that in the file beside it counts.
 
         Raises:
             BundleError: it is damaged, or lacks the signature that it needs.
