@@ -185,7 +185,7 @@ class Models:
             RecalibrationRefusedError: `expected` is no longer in service.
         """
         version = decoder.version
-        with self.recorded("recalibrate", actor, version), self.store.changing:
+        with self.store.changing, self.recorded("recalibrate", actor, version):
             current, state = self.current, self.now.state
             if expected is not None and current is not expected:
                 wanted = f"{expected.version}, which was recalibrated"
@@ -232,7 +232,7 @@ class Models:
             BundleError: there is none, or it cannot be remembered.
         """
         manifest, what = self._manifest(version), "pin" if pinned else "unpin"
-        with self.recorded(what, actor, version), self.store.changing:
+        with self.store.changing, self.recorded(what, actor, version):
             entry = Entry(what, actor, self.current.version, version)
             self.commit(entry, self.now.state.noting(version, pinned=pinned))
         return self.entry(manifest)
@@ -290,7 +290,7 @@ class Models:
     def _change(
         self, what: str, change: Callable[[History], History], expected: str, actor: Actor, version: str = ""
     ) -> tuple[Model, Model]:
-        with self.recorded(what, actor, version), self.store.changing:
+        with self.store.changing, self.recorded(what, actor, version):
             before, state = self.expect(expected), self.now.state
             history = change(state.history)
             model = None if history is state.history else self._model(history.current)
