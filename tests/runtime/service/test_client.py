@@ -146,6 +146,7 @@ def test_what_cannot_be_asked_for_is_named(serve: Serve) -> None:
     client = serve()[0].client
     cases: list[tuple[Callable[[], object], type[LightpageError], str]] = [
         (lambda: client.pages.read(0, 16, user_data=True), InvalidInputError, "levels"),
+        (lambda: client.pages.read(0, 16, want_fase=True), InvalidInputError, "option of a page"),
         (lambda: list(client.pages.read_data(0, 0)), InvalidInputError, "pages"),
         (lambda: list(client.pages.read_data(0, 4097)), LimitError, "pages"),
         (lambda: list(client.pages.read_data((1 << 32) - 1, 2)), InvalidInputError, "first_page"),
