@@ -24,9 +24,9 @@ def opening_window(settings: ScreenSettings) -> HelperProcess:
     Raises:
         WorkerError: it cannot be started.
     """
-    process = HelperProcess(f"{__name__}:{ScreenWindow.__name__}", subject="window of the modulator")
     # of a table that wires a device, what else it says is not the window's
     plain = ScreenSettings.model_validate(settings.model_dump(include=set(ScreenSettings.model_fields)))
+    process = HelperProcess(f"{__name__}:{ScreenWindow.__name__}", subject="window of the modulator")
     process.send("open", plain)
     return process
 
