@@ -230,13 +230,21 @@ def test_callers_that_say_nothing_or_hang_up_hold_up_nobody(
     assert capfd.readouterr().err == ""
 
 
-def test_a_body_that_does_not_come_is_refused_and_nothing_else_is_said(
-    decoder: Decoder, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("request_line", ["POST /actions", "POST /", "GET /metrics", "HEAD /"])
+@pytest.mark.parametrize(("length", "status"), [(100, b" 408 "), (100_000, b" 413 ")])
+def test_a_body_that_does_not_come_or_is_too_large_is_refused_and_nothing_else_is_said(
+    request_line: str,
+    length: int,
+    status: bytes,
+    decoder: Decoder,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr("lightpage.runtime.console.server.SILENCE_S", 0.1)
     with stage(decoder) as running, connected(running) as connection:
-        connection.sendall(b"POST /actions HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100\r\n\r\nx")
-        assert b" 408 " in connection.recv(1000)
+        connection.settimeout(20.0)  # an end of `LONGEST_S` comes later
+        connection.sendall(f"{request_line} HTTP/1.1\r\nHost: localhost\r\nContent-Length: {length}\r\n\r\nx".encode())
+        assert status in connection.recv(1000)
     assert capfd.readouterr().err == ""
 
 
@@ -264,13 +272,17 @@ def test_an_answer_that_hangs_holds_up_no_stop(decoder: Decoder, monkeypatch: py
     go.set()
 
 
-def test_where_there_is_no_descriptor_callers_wait(decoder: Decoder, monkeypatch: pytest.MonkeyPatch) -> None:
-    accept = Mock(side_effect=OSError(errno.EMFILE, "Too many open files"))
+@pytest.mark.parametrize(("number", "pause_s"), [(errno.EMFILE, 0.1), (errno.EPERM, 200.0)])
+def test_where_there_is_no_descriptor_callers_wait_and_whatever_else_fails_holds_up_nobody(
+    number: int, pause_s: float, decoder: Decoder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    accepting, accept = socket.socket.accept, Mock(side_effect=OSError(number, os.strerror(number)))
+    monkeypatch.setattr("lightpage.runtime.console.server.PAUSE_S", pause_s)
     with stage(decoder) as running:
         monkeypatch.setattr("socket.socket.accept", accept)
         with connected(running) as waiting:
             assert eventually(lambda: accept.call_count > 1)
-            monkeypatch.undo()
+            monkeypatch.setattr("socket.socket.accept", accepting)
             waiting.sendall(b"GET /metrics HTTP/1.0\r\n\r\n")
             assert b" 200 " in waiting.recv(1000)
 
