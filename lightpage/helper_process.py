@@ -192,11 +192,11 @@ class HelperProcess:
             with Connection(os.dup(self._socket.fileno())) as messages, suppress(OSError, EOFError):
                 while True:
                     _send_all(messages, self._requests.get())
-                    kind = _PROGRESS
-                    while kind == _PROGRESS:
-                        kind, value = messages.recv()
-                        self._told.put((kind, value))
-                    del value
+                    message: tuple[str, Any] = _PROGRESS, None
+                    while message[0] == _PROGRESS:
+                        message = messages.recv()
+                        self._told.put(message)
+                    del message  # the answer may be large
         finally:
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(_END_S)

@@ -84,8 +84,8 @@ class _Handler(RequestHandler):
     """Of the caller; None without TLS."""
     _content = b""
 
-    def initialize(self, **_given: Any) -> None:
-        """Begin to wait for the content."""
+    def __init__(self, *arguments: Any, **given: Any) -> None:
+        super().__init__(*arguments, **given)
         self._late = asyncio.get_running_loop().call_later(self.settings["silence_s"], self.send_error, 408)
 
     def set_default_headers(self) -> None:
@@ -132,7 +132,6 @@ class _Page(_Handler):
 
     def initialize(self, content: Content, clock: Callable[[], float] = time.time) -> None:
         """Take what the route gives."""
-        super().initialize()
         self._page, self._clock = content, clock
 
     async def get(self) -> None:
@@ -151,7 +150,6 @@ class _Action(_Handler):
 
     def initialize(self, state: ConsoleState) -> None:
         """Take what the route gives."""
-        super().initialize()
         self._state = state
 
     async def post(self) -> None:

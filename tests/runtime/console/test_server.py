@@ -31,7 +31,7 @@ from lightpage.cli.main import EXIT_ERROR, lightpage
 from lightpage.errors import InvalidInputError, Reason
 from lightpage.runtime.console.actions import Actions
 from lightpage.runtime.console.application import console_routes
-from lightpage.runtime.console.history import History
+from lightpage.runtime.console.last_pages import LastPages
 from lightpage.runtime.console.pictures import SIDE_PX, confidence_png, frame_png
 from lightpage.runtime.console.scrapes import fetch
 from lightpage.runtime.console.server import serving
@@ -123,10 +123,10 @@ def test_metrics_are_beside_it_and_nothing_takes_orders_or_tells_of_the_inside(
 def test_what_is_no_number_is_none_and_pages_are_bounded_and_thinned(decoder: Decoder) -> None:
     page = decoder.decode(toy.ToyDevice().page(toy.symbols_of(16, 1)[0], 16, 0.5), 16)
     page = replace(page, piston_rad=math.nan, check=replace(page.check, confirmed_bits=math.inf))
-    history, registry = History(pages=2 * POINTS), Models(decoder)
+    last_pages, registry = LastPages(pages=2 * POINTS), Models(decoder)
     for number in range(3 * POINTS):
-        history.observe(Observation("page", number, "toy-1", float(number), 0.1, page=page))
-    state = ConsoleState(history, registry, Monitor(), "toy").to_json()
+        last_pages.observe(Observation("page", number, "toy-1", float(number), 0.1, page=page))
+    state = ConsoleState(last_pages, registry, Monitor(), "toy").to_json()
     times = [*map(float, range(POINTS, 3 * POINTS, 2)), 3 * POINTS - 1]
     assert (state["series"]["time_s"], state["pages"]) == (times, 3 * POINTS)
     assert state["series"]["piston_rad"][-1] is state["series"]["share"][-1] is None
@@ -135,13 +135,13 @@ def test_what_is_no_number_is_none_and_pages_are_bounded_and_thinned(decoder: De
 
 
 def test_the_condition_is_that_of_the_last_pages(decoder: Decoder) -> None:
-    clock, history, monitor = HandClock(1e9), History(), Monitor()
-    state = ConsoleState(history, Models(decoder), monitor, "toy", clock=clock.now)
+    clock, last_pages, monitor = HandClock(1e9), LastPages(), Monitor()
+    state = ConsoleState(last_pages, Models(decoder), monitor, "toy", clock=clock.now)
     told = list[str]()
 
     def seen(*lost: Reason | None) -> None:
         for each in lost:
-            history.observe(Observation("page", 1, "toy-1", clock.now(), 0.1, each))
+            last_pages.observe(Observation("page", 1, "toy-1", clock.now(), 0.1, each))
         told.append(state.to_json()["condition"])
 
     for lost in ((), (None,), (Reason.MISSING_FRAME, None, None, None, None), (None,)):
@@ -323,7 +323,7 @@ class Asked:
         self.recalibrator = Recalibrator(self.plane, toy.fit_references)
         stack.callback(self.recalibrator.close)
         monitor, actions = Monitor(), Actions(self.plane, self.recalibrator)
-        state = ConsoleState(History(), self.plane.models, monitor, "toy", actions, self.clock.now)
+        state = ConsoleState(LastPages(), self.plane.models, monitor, "toy", actions, self.clock.now)
         self.routes, authority = console_routes(state, self.plane.metrics.registry), Authority(folder)
         certificates = Certificates(authority.service())
         self.port = stack.enter_context(serving(self.routes, 0, certificates=certificates, names=["device.example"]))

@@ -70,7 +70,7 @@ class Losses:
     time_s: float
 
 
-class History:
+class LastPages:
     """Takes note of pages, an `Observer`. Its methods may be called from many threads."""
 
     def __init__(self, pages: int = PAGES) -> None:
