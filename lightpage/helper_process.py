@@ -36,7 +36,7 @@ _PICKLE = 5
 
 
 class Helper:
-    """What a helper process makes: each of its public methods can be asked for."""
+    """Does the work of a helper process: each of its public methods can be asked for."""
 
     idle_s: ClassVar[float | None] = None
     """`idle` is called where no request has come for so long; None never calls it."""

@@ -135,7 +135,7 @@ class _Page(_Handler):
         self._page, self._clock = content, clock
 
     async def get(self) -> None:
-        """Show it."""
+        """Show what `content` makes of the request."""
         self._late.cancel()
         if self.identity is not None:  # whose certificate was checked when the connection began, and not since
             with _refusing():
@@ -153,7 +153,7 @@ class _Action(_Handler):
         self._state = state
 
     async def post(self) -> None:
-        """Do it."""
+        """Do what the content asks for, and say what came of it."""
         self._late.cancel()
         if self.identity is None or (actions := self._state.actions) is None:
             raise HTTPError(403, "actions need TLS, and a certificate with role admin")

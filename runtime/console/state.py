@@ -48,7 +48,7 @@ class ConsoleState:
         self._begun = clock()
 
     def to_json(self, identity: Identity | None = None) -> dict[str, Any]:
-        """All that the page shows to a caller, as JSON has it."""
+        """Return all that the page shows to a caller, as JSON has it."""
         actions = self.actions if identity is not None and identity.may(ROLE) else None
         rows, now = self._last_pages.rows(), self.clock()
         thinned = rows[:: max(1, -(-len(rows) // POINTS))]
@@ -75,7 +75,7 @@ class ConsoleState:
         }
 
     def picture(self, path: str) -> bytes | None:
-        """A picture of the last page, as PNG; None where there is none of this path."""
+        """Return a picture of the last page, as PNG; None where there is none of this path."""
         _, pair, confidence = self._last_pages.pictures()
         if path == "/confidence.png" and confidence is not None:
             return confidence_png(confidence)

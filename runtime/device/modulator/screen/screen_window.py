@@ -62,7 +62,7 @@ class ScreenWindow(Helper):
             return self._window.shows
 
     def shows(self) -> bool:
-        """Whether the whole last picture is still on display."""
+        """Return whether the whole last picture is still on display."""
         assert self._window is not None  # it was opened
         self.idle()
         with _server():
