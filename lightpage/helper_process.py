@@ -15,7 +15,6 @@ import subprocess
 import sys
 import threading
 import time
-import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from importlib import import_module
@@ -135,7 +134,8 @@ class HelperProcess:
         arrays: list[pickle.PickleBuffer] = []
         request = pickle.dumps((method, arguments, progress is not None), _PICKLE, buffer_callback=arrays.append)
         self._answer, self._progress = None, progress
-        self._requests.put([request, *(array.raw() for array in arrays)])
+        parts = [request, *(array.raw() for array in arrays)]
+        self._requests.put([len(parts).to_bytes(4), *parts])
 
     def poll(self, timeout_s: float) -> bool:
         """Wait so long for the answer, and hand on what comes of progress; return whether `answer` has something."""
@@ -178,7 +178,7 @@ class HelperProcess:
         with self._ending, self._socket:
             with suppress(OSError):  # it was ended before
                 self._socket.shutdown(socket.SHUT_RDWR)  # which wakes the thread, as to close it does not
-            self._requests.put([])
+            self._requests.put([b""])  # and this where it waits for a request
             try:
                 self._process.wait(grace_s)
             except subprocess.TimeoutExpired:
@@ -206,7 +206,7 @@ class HelperProcess:
 
 
 def _send_all(messages: Connection, parts: Sequence[Any]) -> None:
-    messages.send_bytes(len(parts).to_bytes(4))
+    """Send messages, none of which is held on to: a request may be large."""
     for part in parts:
         messages.send_bytes(part)
 
@@ -248,7 +248,7 @@ def serve(target: str) -> None:
                 time.sleep(made[0].farewell_s)
         except BaseException:
             status = 1
-            traceback.print_exc()
+            sys.excepthook(*sys.exc_info())
         finally:
             os._exit(status)
 
