@@ -24,6 +24,12 @@ TARGET = f"{__name__}:Echo"
 WAIT_S = 60.0
 
 
+@pytest.fixture(autouse=True)
+def importable(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let processes import these tests, wherever they are started."""
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+
+
 class Echo(Helper):
     idle_s = 0.01
     farewell_s = WAIT_S
