@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 
 from lightpage.errors import (
     BundleError,
@@ -22,7 +23,7 @@ from lightpage.runtime.model.bundle.manifest import Manifest, check_version
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import NOBODY, Actor
 from lightpage.runtime.service.models.audit import AuditLog, Entry
-from lightpage.runtime.service.models.database import Statement, audit_written
+from lightpage.runtime.service.models.database import Write
 from lightpage.runtime.service.models.history import History, Origin, State
 from lightpage.runtime.service.models.loader import Loader, Model
 from lightpage.runtime.service.models.store import Store
@@ -81,20 +82,20 @@ class Models:
     """Owns the models. Readers take what is there and wait for nobody; changes, from many threads, follow each other.
 
     A request takes `current` once and keeps it: no change pulls a model from under it. A change is on the disk, with
-    its line of the record, before it takes effect; where it cannot be written, nothing changes. The service goes on
+    its entry of the record, before it takes effect; where it cannot be written, nothing changes. The service goes on
     with what the store remembers, as far as it can be used; what cannot is logged and is the store's trouble.
 
     Args:
         first: the decoder that the operator gave.
         store: where models are kept; by default they end with the service.
         loader: loads the others.
-        audit: is told of every change, and of those that failed.
+        audit: of the store; keeps every change, and those that failed.
         kept: models held loaded at most; others of the history are loaded again when they are gone to.
 
     Attributes:
         base: manifest of the first decoder.
         now: the models at this moment.
-        in_service: is told which model is about to be in service.
+        in_service: is told which model has come into service.
     """
 
     def __init__(
@@ -106,7 +107,7 @@ class Models:
         kept: int = KEPT_MODELS,
     ) -> None:
         self.store, self.loader = store or Store(None, first.bundle), loader or Loader()
-        self._audit, self._kept = audit or AuditLog(), kept
+        self._audit, self._kept = audit or AuditLog(self.store), kept
         self.base, self._base_path = first.bundle.manifest, first.bundle.path
         self.in_service: Callable[[Model], None] = lambda model: None
         found = self.store.contents
@@ -114,7 +115,6 @@ class Models:
         self.now = Snapshot(begun, {})
         self._serve(begun, self.loader.tracked(first, first))
         self._resume(found.state)
-        self._audit.resume(found.audit)
 
     # ---- what is there ---------------------------------------------------------------------------------------------
 
@@ -169,9 +169,7 @@ class Models:
 
     # ---- changes ---------------------------------------------------------------------------------------------------
 
-    def adopt(
-        self, decoder: Decoder, expected: Model | None = None, actor: Actor = NOBODY, *more: Sequence[Statement]
-    ) -> Model:
+    def adopt(self, decoder: Decoder, expected: Model | None = None, actor: Actor = NOBODY, *more: Write) -> Model:
         """Put a recalibrated decoder in service, and return its model; the one before is kept to step back to.
 
         Args:
@@ -264,11 +262,11 @@ class Models:
             yield
         except Exception as error:
             with self.store.changing:
-                self._audit.append(Entry(what, actor, self.current.version, version, error))
+                self._audit.failed(Entry(what, actor, self.current.version, version, error))
             raise
 
-    def commit(self, entry: Entry, state: State, model: Model | None = None, *more: Sequence[Statement]) -> None:
-        """Write a change with its line of the record in one transaction, and make it. `store.changing` is held.
+    def commit(self, entry: Entry, state: State, model: Model | None = None, *more: Write) -> None:
+        """Write a change with its entry of the record in one transaction, and make it. `store.changing` is held.
 
         Args:
             entry: of the record.
@@ -279,13 +277,16 @@ class Models:
         Raises:
             StoreError: it cannot be written; then nothing changes.
         """
-        self.store.save(state, audit_written(self._audit.pending(entry)), *more, settles=model is not None)
+        self.store.save(state, partial(self._audit.write, entry), *more, settles=model is not None)
         if model is None:
             self.now = replace(self.now, state=state)
         else:
-            self.in_service(model)
             self._serve(state, model)
-        self._audit.append(entry)
+            try:
+                self.in_service(model)
+            except Exception:  # the change is made, and whoever asked for it must not hear otherwise
+                _log.exception("model %s is in service, and not everybody knows", model.version)
+        self._audit.done(entry)
 
     def _change(
         self, what: str, change: Callable[[History], History], expected: str, actor: Actor, version: str = ""

@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from lightpage.errors import BundleError, CallerLeft, InvalidInputError, LimitError, ModelExistsError, StoreError
-from lightpage.files import move_to_new_name, new_file, synchronise
+from lightpage.files import give_new_name, new_file, sync_folder, synchronise
 from lightpage.runtime.model.bundle.signature_file import MOST_BYTES, signature_path
 from lightpage.runtime.service.caller import NOBODY, Actor, Caller
 from lightpage.runtime.service.models.audit import Entry
@@ -52,12 +52,13 @@ def take_in(
                     raise FileExistsError
                 here()
                 taken = True
+                give_new_name(path, final)  # unlike a renaming, it replaces nothing that came in the meantime
                 if loader.wants_signatures:
                     with signature_path(final).open("wb") as file:
                         file.write(signature)
                         file.flush()
                         synchronise(file.fileno())
-                move_to_new_name(path, final)  # unlike a renaming, it replaces nothing that came in the meantime
+                sync_folder(final.parent)
                 state = models.now.state.among(models.versions()).noting(version, origin=Origin.UPLOADED, key=None)
                 models.commit(Entry("upload", actor, models.current.version, version), state)
             except FileExistsError:
@@ -67,6 +68,8 @@ def take_in(
                 if taken:
                     store.folder.delete(version)
                 raise
+        with suppress(OSError):  # the next start sweeps it; before, its two names told that it was not taken in
+            path.unlink()
     models.prune(version)
     return models.entry(decoder.bundle.manifest)
 
