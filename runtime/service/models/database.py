@@ -115,9 +115,11 @@ class Database:
             with _within(self._memory, anew) as database:
                 yield database
         elif anew is None:
-            with closing(self._opened(self.path)) as database, _within(database):
-                yield database
-            sync_folder(self.path.parent)  # the journal is gone: after a power cut it would undo the transaction
+            with closing(self._opened(self.path)) as database:
+                with _within(database):
+                    yield database
+                if database.total_changes:
+                    sync_folder(self.path.parent)  # the journal is gone: after a power cut it would undo all this
         else:
             descriptor, made = new_file(self.path.parent, DATABASE)
             os.close(descriptor)

@@ -276,6 +276,7 @@ def test_a_transaction_is_on_the_disk_where_a_folder_cannot_be_synchronised(
     monkeypatch.setattr(os, "fsync", sync)
     with worn.models.store.transaction() as database:
         assert database.execute("PRAGMA synchronous").fetchone() == (2,)
+        write_job(database, "job", b"message", 1)
         assert not synced
     assert synced == [True]
     worn.models.rollback()
