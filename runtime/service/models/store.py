@@ -58,10 +58,10 @@ class Store(AbstractContextManager["Store"]):
         self.changing, self.kept, self._clock = threading.RLock(), 0 if folder is None else kept, clock
         self.room_bytes, self.health = 0, StoreHealth(self.trouble)
         self._base = sha256(base.manifest.to_json())
-        self._is_begun = self._is_closed = False
+        self._is_begun = False
         """Whether there is a database to write to."""
-        self._unread: StoreError | None = None
-        """Why the database could not be read: then what it remembers is not written over."""
+        self._refused: tuple[str, str] | None = None
+        """What came and what is wanted, for the error of whoever writes; None where that may be."""
         self._damage: Trouble | None = None
         self._failure: Trouble | None = None
         self._probed = -float("inf")
@@ -80,7 +80,7 @@ class Store(AbstractContextManager["Store"]):
 
     def close(self) -> None:
         """Let go of the folder, and wait for no disk; whoever changes something later hears that it is closed."""
-        self._is_closed = True
+        self._refused = "a store that is closed", "one in use"
         self.folder.close()
 
     def save(self, state: State, *more: Write, settles: bool = False) -> None:
@@ -114,12 +114,11 @@ class Store(AbstractContextManager["Store"]):
             StoreError: it cannot be written; then all stays as it was.
         """
         with self.changing:
-            if self._is_closed:
-                raise StoreError(self.folder.subject, "a store that is closed", "one in use")
-            if self._unread is not None:
-                raise self._unread
+            refused = self._refused
             if self.contents.lost and not self._is_begun and not begins:
-                raise StoreError(self.folder.subject, "no database", "one, which a change of models begins")
+                refused = "no database", "one, which a change of models begins"
+            if refused is not None:
+                raise StoreError(self.folder.subject, *refused)
             try:
                 self.folder.check()
                 with self._database.transaction(None if self._is_begun else self.contents) as database:
@@ -135,8 +134,8 @@ class Store(AbstractContextManager["Store"]):
         except (OSError, sqlite3.Error) as error:
             if getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_BUSY:
                 raise StoreError(self.folder.subject, error, "one that no other program uses") from None
-            told = self.failed(error)
-            self._unread = StoreError(told.subject, told.got, "a database that can be read, at a start of the service")
+            # What it remembers is not written over.
+            self._refused = self.failed(error).got, "a database that can be read, at a start of the service"
             self._damage = self._failure
             return
         if found.base != self._base:
@@ -188,8 +187,8 @@ class Store(AbstractContextManager["Store"]):
         Raises:
             StoreError: it cannot, or has not.
         """
-        if self._unread is not None:
-            raise self._unread
+        if self._refused is not None:
+            raise StoreError(self.folder.subject, *self._refused)
         if not self.folder.is_kept:
             return
         self._probed = self._clock()
