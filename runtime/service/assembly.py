@@ -73,7 +73,7 @@ def assembled(settings: ServiceSettings, observer: Observer) -> Iterator[Assembl
     with ExitStack() as stack:
         source = None
         store = stack.enter_context(Store(service.store, base.bundle))
-        audit = AuditLog(settings.audit_file, settings.audit.file_bytes, settings.audit.kept)
+        audit = AuditLog(store, settings.audit_file, settings.audit.file_bytes, settings.audit.kept)
         models = Models(base, store, Loader(tracker_for if service.tracking else NoTracker, key), audit)
         if service.source is not None:
             source = stack.enter_context(checked_source(service.source, service.pages, base))
