@@ -14,7 +14,6 @@ from pathlib import Path
 
 from lightpage.errors import BundleError, LightpageError, StoreError
 from lightpage.runtime.model.bundle.bundle import Bundle
-from lightpage.runtime.model.bundle.manifest import sha256
 from lightpage.runtime.service.models.database import Contents, Database, Write, write_state
 from lightpage.runtime.service.models.earlier_store import CURRENT, read_earlier
 from lightpage.runtime.service.models.folder import BundleFolder
@@ -57,7 +56,7 @@ class Store(AbstractContextManager["Store"]):
     ) -> None:
         self.changing, self.kept, self._clock = threading.RLock(), 0 if folder is None else kept, clock
         self.room_bytes, self.health = 0, StoreHealth(self.trouble)
-        self._base = sha256(base.manifest.to_json())
+        self._base = base.digest
         self._is_begun = False
         """Whether there is a database to write to."""
         self._refused: tuple[str, str] | None = None

@@ -198,6 +198,7 @@ def test_a_caller_who_leaves_ends_it(start: Start) -> None:
     assert fit.ended.wait(60)
     eventually(lambda: service.count("lightpage_recalibrations_total", result="dropped") == 1)
     assert service.version == "toy-1"
+    eventually(lambda: service.client.jobs.list()[0].state.name != "RUNNING")  # its end is noted after it is counted
     fit.go.set()
     assert service.client.jobs.recalibrate(count=2).model_version == "toy-1+r1"
 
