@@ -138,6 +138,8 @@ class Store(AbstractContextManager["Store"]):
             self._damage = self._failure
             return
         if found.base != self._base:
+            served, base = found.state.history.current, self.contents.state.history.current
+            _log.warning("%s: %s served, made from another base; %s begins anew", self.folder.subject, served, base)
             found = replace(found, state=replace(found.state, history=self.contents.state.history))
         self.contents = found
         if found.lost:
