@@ -26,6 +26,8 @@ _SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
 _LOOK_S = 0.1
 _PAUSE_S = 0.01
 """After trouble, so that one that lasts takes no core."""
+_LEAVES_S = 0.2
+"""A client that wants more than there is waits so long for one that leaves."""
 _RETRY_S = 1.0
 
 _log = logging.getLogger(__name__)
@@ -166,8 +168,8 @@ class SharedMemory:
         self.most_bytes = most_bytes
         self._clients: set[socket.socket] = set()
         self._regions: dict[bytes, Region] = {}
-        self._lock = threading.Lock()
-        """Guards the two above."""
+        self._lock = threading.Condition()
+        """Guards the two above; told when a region ends."""
 
     @contextmanager
     def reading(self, handle: bytes, offset: int, size: int) -> Iterator[memoryview]:
@@ -241,6 +243,7 @@ class SharedMemory:
         finally:
             with self._lock:
                 del self._regions[region.handle]
+                self._lock.notify_all()
             region.drop()
 
     def _made(self, size: int) -> Region:
@@ -249,8 +252,14 @@ class SharedMemory:
         if not 0 < size <= self.most_bytes:
             raise LimitError(subject, f"{size} bytes", f"1 to {self.most_bytes}")
         with self._lock:
-            used = sum(region.size for region in self._regions.values())
-            if len(self._regions) >= self._most_regions or used + size > self.most_bytes:
+
+            def has_room() -> bool:
+                used = sum(region.size for region in self._regions.values())
+                return len(self._regions) < self._most_regions and used + size <= self.most_bytes
+
+            # A client that has just let go of a region may ask before the thread of that region has heard of its end.
+            if not self._lock.wait_for(has_room, _LEAVES_S):
+                used = sum(region.size for region in self._regions.values())
                 got = f"{len(self._regions)} regions of {used} bytes, and {size} more"
                 expected = f"at most {self._most_regions} of {self.most_bytes} bytes together; try again later"
                 raise OverloadedError(subject, got, expected, retry_s=_RETRY_S)
