@@ -21,8 +21,14 @@ Real = NDArray[np.float64]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 PageHash = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
-_ADDED = {"parameters": {"lens_path_relative": -1.0}, "deviations": {"lens_path_relative": 0.0}}
-"""What documents lack that were written before it: they took lenses for ideal."""
+_LATER = ("modulator_axial_rad", "in_phase_axial_rad", "quadrature_axial_rad") + tuple(
+    f"{camera}_keystone_{axis}_relative" for camera in ("in_phase", "quadrature") for axis in "xy"
+)
+_ADDED = {
+    "parameters": {"lens_path_relative": -1.0, **dict.fromkeys(_LATER, 0.0)},
+    "deviations": dict.fromkeys(("lens_path_relative", *_LATER), 0.0),
+}
+"""What documents lack that were written before it: they took lenses for ideal, and planes for those of the profile."""
 
 
 def _names_problem(values: dict[str, Any]) -> str:

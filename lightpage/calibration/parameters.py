@@ -62,6 +62,16 @@ PARAMETERS: tuple[Parameter, ...] = (
             ("turn_yx_slope", 0.005),
         )
     ),
+    # defocus: phase on the facet that a plane off its focal plane makes, radians at the middle of the facet's wall
+    Parameter("modulator_axial_rad", 0.5, "axial"),
+    Parameter("in_phase_axial_rad", 0.5, "axial"),
+    Parameter("quadrature_axial_rad", 0.5, "axial"),
+    # change of a camera's scale from the page's centre to its edge, as a tilted sensor has
+    *(
+        Parameter(f"{camera}_keystone_{axis}_relative", 0.001, "keystone")
+        for camera in ("in_phase", "quadrature")
+        for axis in "xy"
+    ),
 )
 
 NAMES: tuple[str, ...] = tuple(p.name for p in PARAMETERS)
