@@ -27,6 +27,7 @@ from lightpage.calibration.sampling_table import registration_coefficients
 from lightpage.calibration.waves.wave_fit import WaveFit
 from lightpage.device.profile import Profile
 from lightpage.errors import CalibrationError
+from lightpage.page.modulation import NOMINAL, Modulation
 from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
 from lightpage.waves.grid import field_grid, symbol_samples
@@ -37,7 +38,7 @@ SIGNIFICANT = 16.0
 _FEWEST = 5
 """Patches that must be looked for, and measurements that must be found, to fit anything."""
 _CAMERA_GROUPS = ("in_phase", "quadrature", "centre", "camera_phase")
-_SHAPE_GROUPS = (*_CAMERA_GROUPS, "lengths", "distortion", "launch")
+_SHAPE_GROUPS = (*_CAMERA_GROUPS, "lengths", "distortion", "keystone", "launch")
 _ALL_GROUPS = tuple(dict.fromkeys(p.group for p in PARAMETERS))
 _LEAST_OVER_CHANCE = 8.0
 """Coherence that a calibration must reach, in units of 1/sqrt(symbols of a page), what chance gives. Measured on the
@@ -92,6 +93,8 @@ class Registered:
         coherence_before, coherence_after: mean over the pages, at the start's geometry and at the fitted one.
         cost: mean squared normalised residual of the last fit of patches.
         significant: share of the measured patches that were found, in the last stage.
+        modulation: what the modulator makes of its levels.
+        modulation_deviations: standard deviations of its coefficients.
     """
 
     parameters: Real
@@ -101,6 +104,8 @@ class Registered:
     coherence_after: float
     cost: float
     significant: float
+    modulation: Modulation = NOMINAL
+    modulation_deviations: tuple[float, ...] = NOMINAL.coefficients
 
 
 @dataclass(frozen=True)
@@ -271,6 +276,7 @@ class _Registration:
         self.parameters = nominal()
         self.deviations = np.zeros_like(self.parameters)
         self.quadrature_phase = np.pi / 2
+        self.modulation, self.modulation_deviations = NOMINAL, NOMINAL.coefficients
         self.fit: PatchFit | None = None
         self.total = 1
         self._stage, self._done = "", 0
@@ -352,12 +358,19 @@ class _Registration:
         self._begin(what)
         page = self.pages[0]
         fit = WaveFit(self.twin, self.profile, page.pair, self.references, page.symbols)
-        found = fit.fit(self.parameters, self.quadrature_phase, groups, centre, prior_scale, self._tell)
-        self.parameters, self.deviations, self.quadrature_phase = (
-            found.parameters,
-            found.deviations,
-            found.quadrature_phase,
+        found = fit.fit(
+            self.parameters,
+            self.quadrature_phase,
+            groups,
+            centre,
+            prior_scale,
+            self._tell,
+            self.modulation,
+            levels=True,
         )
+        self.parameters, self.deviations = found.parameters, found.deviations
+        self.quadrature_phase = found.quadrature_phase
+        self.modulation, self.modulation_deviations = found.modulation, found.modulation_deviations
 
     def result(self, before: Real) -> Registered:
         """Judge the outcome; `before` is the geometry that it is compared with."""
@@ -383,6 +396,8 @@ class _Registration:
             coherence_after=after,
             cost=self.fit.cost,
             significant=significant,
+            modulation=self.modulation,
+            modulation_deviations=self.modulation_deviations,
         )
 
     def _share(self, branch: str) -> float:

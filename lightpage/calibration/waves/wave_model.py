@@ -148,20 +148,29 @@ class FittedWaves:
         at_camera = fitted_camera_phase(profile, value, geometry, grid_x[None, :], grid_y[:, None])
         self.launch: Complex = np.exp(1j * at_launch)
         self.against_reference: Complex = np.exp(1j * at_camera)
+        self._apart = defocus(axial_of_cameras(value)[1], geometry.pipe_width_m)
+        """Defocus of the in-phase camera beyond that of both on average, rad/m^2."""
         self._camera = self.against_reference / stride  # samples that stand for more area are larger
 
     def to_camera(self, field: Complex) -> Complex:
         """Field on the modulator [ny samples, nx samples] to the common grid [Gy, Gx], against the reference."""
         return np.asarray(self.channel.forward(field * self.launch) * self._camera)
 
+    def to_cameras(self, field: Complex) -> Complex:
+        """The same as either camera sees it from where it stands, in-phase and quadrature, [2, Gy, Gx]."""
+        leaving = self.channel.exit_field(field * self.launch)
+        beyond = (self._apart, -self._apart) if self._apart else (0.0,)
+        seen = [self.channel.camera_field(leaving, each) * self._camera for each in beyond]
+        return np.stack([seen[0], seen[-1]])
+
     def to_page(self, field: Complex) -> Complex:
         """Field on the common grid [Gy, Gx] back to the modulator, by the adjoint."""
         return np.asarray(self.channel.adjoint(field * self._camera.conj()) * self.launch.conj())
 
 
-def on_modulator(phases: Real, samples: int) -> Complex:
-    """A page's phases [ny, nx] as a field on the modulator, [ny samples, nx samples]."""
-    return np.asarray(np.exp(1j * np.kron(phases, np.ones((samples, samples)))))
+def on_modulator(page: NDArray[Any], samples: int) -> NDArray[Any]:
+    """A page of light, [ny, nx], on the modulator, [ny samples, nx samples]."""
+    return np.kron(page, np.ones((samples, samples)))
 
 
 def illumination_terms(x: Any, y: Any) -> list[Any]:

@@ -1,0 +1,67 @@
+"""What a modulator makes of a level: a complex number, smooth over the levels, told by a few coefficients.
+
+Nominally level s of M is light of unit amplitude and the phase 2 pi s / M. A real modulator has a phase stroke of less
+or more than 2 pi, a lookup table that is not straight, light that it does not modulate, and an amplitude that goes with
+the phase. The logarithm of what it makes, over what it should make, is a straight line and a short Fourier series.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.page.symbols import symbol_phases
+
+Real = NDArray[np.float64]
+
+HARMONICS = 3
+"""Of the Fourier series: a fifth of unmodulated light leaves an error of 4e-4."""
+_SERIES = tuple(f"{function}_{number}" for number in range(1, HARMONICS + 1) for function in ("cos", "sin"))
+NAMES = ("stroke_relative", *(f"phase_{name}_rad" for name in _SERIES), *(f"amplitude_{name}_log" for name in _SERIES))
+"""Of the coefficients, each zero nominally."""
+PRIORS: Real = np.array([0.02, *[0.2 / number for number in range(1, HARMONICS + 1) for _ in "cs"] * 2])
+"""Standard deviations of the coefficients about nominal, before data are seen."""
+
+
+def basis(phases: Real) -> Real:
+    """Functions of nominal phases [...] that the coefficients multiply, [1 + 2 HARMONICS, ...]."""
+    turns = [function(number * phases) for number in range(1, HARMONICS + 1) for function in (np.cos, np.sin)]
+    return np.stack([phases - np.pi, *turns])
+
+
+@dataclass(frozen=True)
+class Modulation:
+    """The light that a modulator makes of its levels.
+
+    Attributes:
+        coefficients: by `NAMES`.
+    """
+
+    coefficients: tuple[float, ...] = (0.0,) * len(NAMES)
+
+    @cached_property
+    def is_nominal(self) -> bool:
+        """Whether every coefficient is zero."""
+        return not any(self.coefficients)
+
+    def light(self, phases: Real) -> NDArray[np.complex128]:
+        """Complex light of nominal phases, 0 to 2 pi, in their shape."""
+        found, (stroke, *rest) = basis(phases), self.coefficients
+        phase, amplitude = np.array([stroke, *rest[: 2 * HARMONICS]]), np.array(rest[2 * HARMONICS :])
+        return np.exp(1j * (phases + np.tensordot(phase, found, 1)) + np.tensordot(amplitude, found[1:], 1))
+
+    def levels(self, count: int) -> NDArray[np.complex128]:
+        """Complex light of each of so many levels, [M]."""
+        return self.light(symbol_phases(np.arange(count), count))
+
+    def phases(self, count: int) -> Real:
+        """Phase of each of so many levels' light, radians, unwrapped, [M]; exactly 2 pi s / M nominally."""
+        nominal = symbol_phases(np.arange(count), count)
+        return nominal if self.is_nominal else nominal + np.angle(self.levels(count) * np.exp(-1j * nominal))
+
+
+NOMINAL = Modulation()
+"""Level s of M is the phase 2 pi s / M."""
