@@ -8,11 +8,12 @@ the phase. The logarithm of what it makes, over what it should make, is a straig
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.page.levels import Levels
 from lightpage.page.symbols import symbol_phases
 
 Real = NDArray[np.float64]
@@ -57,10 +58,34 @@ class Modulation:
         """Complex light of each of so many levels, [M]."""
         return self.light(symbol_phases(np.arange(count), count))
 
+    def phase(self, phases: Real) -> Real:
+        """Phase of the light of nominal phases, radians, in their shape: near each, and exactly it nominally."""
+        if self.is_nominal:
+            return phases
+        nominal = np.mod(phases, 2 * np.pi)
+        return phases + np.angle(self.light(nominal) * np.exp(-1j * nominal))
+
     def phases(self, count: int) -> Real:
         """Phase of each of so many levels' light, radians, unwrapped, [M]; exactly 2 pi s / M nominally."""
-        nominal = symbol_phases(np.arange(count), count)
-        return nominal if self.is_nominal else nominal + np.angle(self.levels(count) * np.exp(-1j * nominal))
+        return self.phase(symbol_phases(np.arange(count), count))
+
+    def page_levels(self, count: int) -> Levels:
+        """So many levels of a page, as the phases of their light tell them apart.
+
+        Raises:
+            PageError: a level count outside 2..256.
+        """
+        return _page_levels(self, count)
+
+    def as_dict(self) -> dict[str, float]:
+        """Coefficients by name."""
+        return dict(zip(NAMES, self.coefficients, strict=True))
+
+
+@lru_cache(16)
+def _page_levels(modulation: Modulation, count: int) -> Levels:
+    """Those of every page of one device: what is known of their neighbours is computed once."""
+    return Levels(count, None if modulation.is_nominal else tuple(modulation.phases(count).tolist()))
 
 
 NOMINAL = Modulation()

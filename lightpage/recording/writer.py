@@ -17,7 +17,8 @@ from lightpage.device.profile import Profile
 from lightpage.errors import LightpageError, NoSuchPageError, PageError, RecordingError
 from lightpage.failures import error_number, hdf5_failure, os_failure, short_resource
 from lightpage.files import lock, move_into_place, move_to_new_name
-from lightpage.page.symbols import check_levels, check_symbols
+from lightpage.page.levels import check_levels
+from lightpage.page.symbols import check_symbols
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.hdf5 import retried
 from lightpage.recording.hdf_file import open_to_write

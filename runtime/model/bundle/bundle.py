@@ -23,7 +23,8 @@ from lightpage.errors import BundleError, CalibrationError, InvalidInputError, P
 from lightpage.failures import os_errors, os_failure
 from lightpage.files import move_to_new_name, sync_folder, synchronise
 from lightpage.metrics.information import decide
-from lightpage.page.symbols import check_levels, pilot_mask, pilot_symbols
+from lightpage.page.levels import check_levels
+from lightpage.page.symbols import pilot_mask, pilot_symbols
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.archive import MAX_BYTES, MAX_FILES, check_name, read_files
 from lightpage.runtime.model.bundle.manifest import (

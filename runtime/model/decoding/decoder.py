@@ -24,9 +24,9 @@ from lightpage.errors import (
 )
 from lightpage.failures import short_resource
 from lightpage.metrics.information import decide_with_confidence
-from lightpage.page.levels import MAX_LEVELS
+from lightpage.page.levels import MAX_LEVELS, check_levels
 from lightpage.page.pilots import Pilots, read_pilots, remove_piston
-from lightpage.page.symbols import check_levels, symbol_phases
+from lightpage.page.symbols import symbol_phases
 from lightpage.recording.exposure import check_light
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.bundle import Bundle

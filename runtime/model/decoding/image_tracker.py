@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lightpage.calibration.image_search import FEWEST_SEARCHED, FoundImage
 from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.page.pilots import PilotCheck, Pilots, read_pilots
-from lightpage.page.symbols import check_levels
+from lightpage.page.levels import check_levels
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.manifest import FIELD
 from lightpage.runtime.model.decoding.decoder import Decoder

@@ -10,7 +10,8 @@ import numpy as np
 from lightpage.codec.page_bytes import FileFacts, PageBytes
 from lightpage.errors import CallerLeft, FrameError, InvalidInputError, LimitError, PageError
 from lightpage.page.pilots import Pilots
-from lightpage.page.symbols import check_levels, symbol_phases
+from lightpage.page.levels import check_levels
+from lightpage.page.symbols import symbol_phases
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import PIXEL_TYPES, message_of
