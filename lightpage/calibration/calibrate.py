@@ -189,19 +189,21 @@ def refine(
     start: Real,
     quadrature_phase: float,
     progress: Progress = lambda what, share: None,
+    modulation: Modulation = NOMINAL,
 ) -> Registered:
     """Register known pages from an earlier calibration that has drifted: the reflections need no search from nominal.
 
     Args:
         start: [P] earlier parameters.
         quadrature_phase: earlier angle between the homodyne arms.
+        modulation: earlier one, which is fitted again: a stroke changes with temperature.
         twin, solve_field, profile, references, pages, progress: as for `calibrate`.
 
     Raises:
         CalibrationError: the pages do not fit near the earlier calibration.
     """
     work = _Registration(twin, solve_field, profile, references, list(pages), progress)
-    work.parameters, work.quadrature_phase = start.copy(), quadrature_phase
+    work.parameters, work.quadrature_phase, work.modulation = start.copy(), quadrature_phase, modulation
     work.total = len(_DRIFTED) + 2
     for stage in _DRIFTED:
         work.complex_field(stage, start, _DRIFT_SCALE)

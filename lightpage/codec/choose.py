@@ -238,9 +238,7 @@ def _blocks(
     return blocks, bit_information(blocks, np.zeros(blocks.shape, np.uint8))
 
 
-def needed_information(
-    code: LdpcCode, pages: Sequence[DrawnPage], coded: int, rng: np.random.Generator
-) -> float:
+def needed_information(code: LdpcCode, pages: Sequence[DrawnPage], coded: int, rng: np.random.Generator) -> float:
     """Information per bit from which nearly all blocks decode: the pages' light is made noisier until 2% of them fail.
 
     Args:

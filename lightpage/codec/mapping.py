@@ -132,9 +132,7 @@ def to_levels(label: NDArray[np.uint8], upper: NDArray[np.integer], levels: int)
     return np.asarray(number + (upper.astype(np.int64) << bits), np.uint8)
 
 
-def decide_in_coset(
-    phase: NDArray[np.floating], label: NDArray[np.uint8], levels: int | Levels
-) -> NDArray[np.int64]:
+def decide_in_coset(phase: NDArray[np.floating], label: NDArray[np.uint8], levels: int | Levels) -> NDArray[np.int64]:
     """Number within its coset of the level that lies nearest to each phase, its label being known.
 
     Args:

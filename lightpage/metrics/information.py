@@ -102,7 +102,9 @@ def achievable_rate(
 
     Its mean over held-out symbols is a lower bound on what a code can carry (mismatched decoding); it can be negative.
     """
-    return np.asarray(np.log2(Levels.of(levels).count) + log_posterior(mu, kappa, symbols, levels) / np.log(2), np.float64)
+    return np.asarray(
+        np.log2(Levels.of(levels).count) + log_posterior(mu, kappa, symbols, levels) / np.log(2), np.float64
+    )
 
 
 def gray_rate(
@@ -177,9 +179,7 @@ Neighbours = NDArray[np.int64]
 """Levels that are summed over, by how many places further on the circle than the nearest each is."""
 
 
-def _parts(
-    phase: Floats, kappa: Floats, levels: Levels
-) -> Iterator[tuple[NDArray[np.bool_], Neighbours | None]]:
+def _parts(phase: Floats, kappa: Floats, levels: Levels) -> Iterator[tuple[NDArray[np.bool_], Neighbours | None]]:
     """Which symbols need which levels beside their nearest; None for those that need none."""
     everything, left = np.arange(levels.count), np.ones(kappa.shape, bool)
     if levels.count > 2 * _WINDOW + 1:
@@ -209,7 +209,7 @@ def _least_concentrations(levels: Levels, width: int) -> Floats:
 
 def _closest(phase: Floats, levels: Levels) -> Floats:
     """1 - cos of the distance to the nearest level."""
-    return np.asarray(2 * np.sin(0.5 * levels.beside(phase)) ** 2)
+    return np.asarray(2 * np.sin(0.5 * (levels.nearest_phases(phase) - phase)) ** 2)
 
 
 def _windows(
@@ -223,7 +223,7 @@ def _windows(
     sines, versines = np.sin(angles), 2 * np.sin(0.5 * angles) ** 2
 
     def window(k: Floats, mu: Floats) -> Iterator[tuple[Floats, Floats]]:
-        beside = levels.beside(mu)
+        beside = levels.nearest_phases(mu) - mu
         cos, sin = np.cos(beside), np.sin(beside)
         at = () if levels.is_nominal else levels.places(mu)
         for sine, versine in zip(sines, versines, strict=True):

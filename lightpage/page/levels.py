@@ -68,8 +68,8 @@ class Levels:
     @cached_property
     def phases(self) -> Real:
         """Phase of each level, radians, [M]."""
-        even = np.arange(self.count) * (2 * np.pi / self.count)
-        return even if self.uneven is None else np.array(self.uneven)
+        even: Real = np.arange(self.count) * (2 * np.pi / self.count)
+        return even if self.uneven is None else np.array(self.uneven, np.float64)
 
     def every(self, step: int, first: int = 0) -> Self:
         """Every so manieth of these levels, from level `first` on; at least two must be left."""
@@ -85,13 +85,19 @@ class Levels:
             return np.asarray(nearest.astype(np.int64) % self.count, np.uint8)
         return np.asarray(self._order[self.places(phase)], np.uint8)
 
-    def beside(self, mu: Real) -> Real:
-        """From each phase to its nearest level, radians; same shape."""
+    def nearest_phases(self, mu: Real) -> Real:
+        """Phase of the level nearest to each phase, radians, within pi of it; same shape."""
         if self.uneven is None:
             step = 2 * np.pi / self.count
-            return np.asarray(np.rint(mu / step) * step - mu)
-        away = self.circle[self.places(mu)] - mu
-        return np.asarray(away - 2 * np.pi * np.rint(away / (2 * np.pi)))
+            return np.asarray(np.rint(mu / step) * step)
+        phases = self.circle[self.places(mu)]
+        return np.asarray(phases + 2 * np.pi * np.rint((mu - phases) / (2 * np.pi)))
+
+    def half_way(self, mu: Real) -> Real | float:
+        """Half the distance from each phase's nearest level to the next one, radians: of even levels the same for all."""
+        if self.uneven is None:
+            return np.pi / self.count
+        return np.asarray(np.abs(self.gaps(np.array([-1, 1]))).min(axis=0)[self.places(mu)] / 2)
 
     @cached_property
     def _order(self) -> NDArray[np.intp]:
@@ -109,7 +115,7 @@ class Levels:
 
     @cached_property
     def _borders(self) -> tuple[float, Real]:
-        """Half way from the last level on the circle to the first, and from there to all other ways' halves, [M - 1]."""
+        """Half way from the last level on the circle to the first, and all other half ways from there, [M - 1]."""
         borders = self.circle + self.gaps(np.array([1]))[0] / 2
         first = float(borders[-1]) - 2 * np.pi
         return first, borders[:-1] - first

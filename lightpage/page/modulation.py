@@ -49,7 +49,10 @@ class Modulation:
         return not any(self.coefficients)
 
     def light(self, phases: Real) -> NDArray[np.complex128]:
-        """Complex light of nominal phases, 0 to 2 pi, in their shape."""
+        """Complex light of nominal phases, in their shape."""
+        if self.is_nominal:
+            return np.exp(1j * phases)
+        phases = np.mod(phases, 2 * np.pi)
         found, (stroke, *rest) = basis(phases), self.coefficients
         phase, amplitude = np.array([stroke, *rest[: 2 * HARMONICS]]), np.array(rest[2 * HARMONICS :])
         return np.exp(1j * (phases + np.tensordot(phase, found, 1)) + np.tensordot(amplitude, found[1:], 1))
@@ -62,8 +65,7 @@ class Modulation:
         """Phase of the light of nominal phases, radians, in their shape: near each, and exactly it nominally."""
         if self.is_nominal:
             return phases
-        nominal = np.mod(phases, 2 * np.pi)
-        return phases + np.angle(self.light(nominal) * np.exp(-1j * nominal))
+        return phases + np.angle(self.light(phases) * np.exp(-1j * phases))
 
     def phases(self, count: int) -> Real:
         """Phase of each of so many levels' light, radians, unwrapped, [M]; exactly 2 pi s / M nominally."""

@@ -13,6 +13,7 @@ from lightpage.metrics.accumulator import Accumulator
 from lightpage.metrics.information import achievable_rate, page_kilobytes
 from lightpage.metrics.measures import PageMeasures, SymbolMaps
 from lightpage.metrics.reliability import ConcentrationBin, ConfidenceBin
+from lightpage.page.levels import Levels
 from lightpage.page.pilots import Pilots, estimate_piston
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
@@ -155,7 +156,7 @@ def decode_unseen(
     """
     if symbols is None or was_seen(decoder, frames):
         return None
-    pilots = Pilots.of_symbols(mask, symbols, recording.levels)
+    pilots = Pilots.of_symbols(mask, symbols, decoder.bundle.levels(recording.levels))
     return tracker.decode(narrow(frames, recording.bit_depth), recording.levels, pilots)
 
 
@@ -174,7 +175,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
     """
     check_recording(decoder, recording)
     check_symbols(recording)
-    levels = recording.levels
+    levels = decoder.bundle.levels(recording.levels)
     mask = pilots_of(decoder, recording)
     data = ~mask
     accumulator = Accumulator(levels, data, recording.pages)
@@ -227,7 +228,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
     )
 
 
-def _describe(decoder: Decoder, levels: int) -> dict[str, Any]:
+def _describe(decoder: Decoder, levels: Levels) -> dict[str, Any]:
     """The bundle's device and origin, the hash of its golden page, and the piston in the answer to that, radians."""
     bundle, manifest = decoder.bundle, decoder.bundle.manifest
     return {
@@ -240,5 +241,5 @@ def _describe(decoder: Decoder, levels: int) -> dict[str, Any]:
         "metrics": manifest.metrics,
         "provenance": manifest.provenance.model_dump(),
         "golden_sha256": manifest.files[GOLDEN],
-        "golden_piston_rad": estimate_piston(bundle.golden.p, decoder.pilots(levels)).angle_rad,
+        "golden_piston_rad": estimate_piston(bundle.golden.p, decoder.pilots(levels.count)).angle_rad,
     }
