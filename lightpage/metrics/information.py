@@ -1,8 +1,8 @@
 """How much a decoded page carries and how well calibrated its confidence is: decisions and rates.
 
 A decoder's estimate of a symbol is a von Mises density of its phase, with mean phase `mu` (radians) and concentration
-`kappa`. All figures are computed in float64. `levels` is M, where symbol s stands for the phase 2 pi s / M, or says which
-phases stand for symbols.
+`kappa`. All figures are computed in float64. `levels` is M, where symbol s stands for the phase 2 pi s / M, or says
+which phases stand for symbols.
 """
 
 from __future__ import annotations

@@ -94,7 +94,7 @@ class Levels:
         return np.asarray(phases + 2 * np.pi * np.rint((mu - phases) / (2 * np.pi)))
 
     def half_way(self, mu: Real) -> Real | float:
-        """Half the distance from each phase's nearest level to the next one, radians: of even levels the same for all."""
+        """Half the distance from each phase's nearest level to the next one, radians; of even levels one number."""
         if self.uneven is None:
             return np.pi / self.count
         return np.asarray(np.abs(self.gaps(np.array([-1, 1]))).min(axis=0)[self.places(mu)] / 2)

@@ -51,11 +51,12 @@ class Modulation:
     def light(self, phases: Real) -> NDArray[np.complex128]:
         """Complex light of nominal phases, in their shape."""
         if self.is_nominal:
-            return np.exp(1j * phases)
+            return np.asarray(np.exp(1j * phases), np.complex128)
         phases = np.mod(phases, 2 * np.pi)
         found, (stroke, *rest) = basis(phases), self.coefficients
         phase, amplitude = np.array([stroke, *rest[: 2 * HARMONICS]]), np.array(rest[2 * HARMONICS :])
-        return np.exp(1j * (phases + np.tensordot(phase, found, 1)) + np.tensordot(amplitude, found[1:], 1))
+        turned = phases + np.tensordot(phase, found, 1)
+        return np.asarray(np.exp(1j * turned + np.tensordot(amplitude, found[1:], 1)), np.complex128)
 
     def levels(self, count: int) -> NDArray[np.complex128]:
         """Complex light of each of so many levels, [M]."""
@@ -65,7 +66,7 @@ class Modulation:
         """Phase of the light of nominal phases, radians, in their shape: near each, and exactly it nominally."""
         if self.is_nominal:
             return phases
-        return phases + np.angle(self.light(phases) * np.exp(-1j * phases))
+        return np.asarray(phases + np.angle(self.light(phases) * np.exp(-1j * phases)))
 
     def phases(self, count: int) -> Real:
         """Phase of each of so many levels' light, radians, unwrapped, [M]; exactly 2 pi s / M nominally."""

@@ -125,18 +125,18 @@ class DriftModel:
         """What `drift` [4] adds to decoded phases [ny, nx], radians, first order."""
         return np.asarray(np.tensordot(drift, self.slopes, 1))
 
-    def estimate(self, inference: Inference, levels: Levels, pilots: Pilots, prior: Real) -> Estimate | None:
+    def estimate(self, inference: Inference, levels: int | Levels, pilots: Pilots, prior: Real) -> Estimate | None:
         """Drift that a page still shows, from its pilots and then from safe decisions too; None where pilots disagree.
 
         The 54 pilots of a bench page show shift to 0.01 px per axis; with the safe decisions of 16 levels it is 0.005.
 
         Args:
             inference: what the graph says of the page.
-            levels: of the page.
+            levels: M, or uneven levels.
             pilots: its known symbols.
             prior: covariance [4, 4] of the drift about zero before the page was seen.
         """
-        concentration = inference.concentration.astype(np.float64)
+        levels, concentration = Levels.of(levels), inference.concentration.astype(np.float64)
         phase = inference.phase - read_pilots(inference.p, pilots).piston.angle_rad
         at = pilots.mask
         residual, weight = wrapped(phase[at] - pilots.phases), np.minimum(concentration[at], _CAP)
