@@ -96,7 +96,8 @@ def test_figures_of_uneven_levels_are_calibrated_where_those_of_even_ones_are_no
     symbols, mu = drawn_page(levels, kappa, 5)
     known, even = (measures.measure(mu, kappa, symbols, each) for each in (levels, levels.count))
     assert known.ece < 0.01 < 0.1 < even.ece
-    assert known.over_claim_bits_per_symbol == pytest.approx(0, abs=0.03) < even.over_claim_bits_per_symbol - 1
+    assert abs(known.over_claim_bits_per_symbol) < 0.03
+    assert even.over_claim_bits_per_symbol > 1
     assert known.levels == even.levels == levels.count
 
 
