@@ -30,7 +30,7 @@ def lookup_table(
 ) -> None:
     """Write a lookup table with which the modulator's levels are even.
 
-    It has the phase of each grey value, which serves pages of any levels, or with --levels the grey value of each level.
+    It has the phase of each grey value, which serves pages of any levels; with --levels, the grey value of each level.
     Calibrate anew once it is in use.
     """
     if (calibration is None) == (bundle is None):

@@ -73,7 +73,7 @@ def test_decisions_among_uneven_levels_say_as_much_as_among_even_ones() -> None:
     seen, pilots = page((0.1, 0.1), uneven(16))
     mistaken = DriftModel(SLOPES).estimate(seen, 16, pilots, ANYTHING)
     assert mistaken is not None
-    assert np.all(mistaken.deviations > 1.5 * other.deviations)
+    assert other.over_claim < 1.1 < 1.4 < mistaken.over_claim
 
 
 def test_a_few_wild_symbols_do_not_pull_the_estimate() -> None:
