@@ -68,8 +68,9 @@ class Levels:
     @cached_property
     def phases(self) -> Real:
         """Phase of each level, radians, [M]."""
-        even: Real = np.arange(self.count) * (2 * np.pi / self.count)
-        return even if self.uneven is None else np.array(self.uneven, np.float64)
+        if self.uneven is None:
+            return np.asarray(np.arange(self.count) * (2 * np.pi / self.count), np.float64)
+        return np.array(self.uneven, np.float64)
 
     def every(self, step: int, first: int = 0) -> Self:
         """Every so manieth of these levels, from level `first` on; at least two must be left."""
