@@ -26,8 +26,8 @@ _WINDOW = 12
 
 _ALIASING = 60.0
 
-_WIDER_WINDOW = 48
-"""To either side of the nearest of uneven levels, where twelve are not enough."""
+_WINDOWS = (6, _WINDOW, 48)
+"""Levels to either side of the nearest of uneven ones: the fewest that are enough are summed up."""
 
 _LEFT_OUT = 1e-12
 """Probability of all levels outside a window of uneven ones, beside the nearest level's."""
@@ -189,12 +189,14 @@ def _parts(phase: Floats, kappa: Floats, levels: Levels) -> Iterator[tuple[NDArr
             yield narrow, np.arange(-_WINDOW, _WINDOW + 1)
             return
         places = levels.places(phase)
-        for width in (_WINDOW, _WIDER_WINDOW):
+        for width in _WINDOWS:
             if 2 * width + 1 < levels.count:
                 narrow = left & (kappa > _least_concentrations(levels, width)[places])
-                yield narrow, np.arange(-width, width + 1)
+                if narrow.any():
+                    yield narrow, np.arange(-width, width + 1)
                 left &= ~narrow
-    yield left, everything
+    if left.any():
+        yield left, everything
 
 
 def _least_concentrations(levels: Levels, width: int) -> Floats:
@@ -223,9 +225,9 @@ def _windows(
     sines, versines = np.sin(angles), 2 * np.sin(0.5 * angles) ** 2
 
     def window(k: Floats, mu: Floats) -> Iterator[tuple[Floats, Floats]]:
-        beside = levels.nearest_phases(mu) - mu
+        at, nearest = levels.around(mu)
+        beside = nearest - mu
         cos, sin = np.cos(beside), np.sin(beside)
-        at = () if levels.is_nominal else levels.places(mu)
         for sine, versine in zip(sines, versines, strict=True):
             more = sin * sine[at] + cos * versine[at]
             yield np.exp(-k * more), more

@@ -16,6 +16,9 @@ MAX_LEVELS = 256
 
 Real = NDArray[np.float64]
 
+_STEPS = 4096
+"""Of a turn, to find the nearest of uneven levels by: a sixteenth of the distance of 256 levels."""
+
 
 def check_levels(levels: int, subject: str = "levels") -> None:
     """Check a level count.
@@ -88,11 +91,19 @@ class Levels:
 
     def nearest_phases(self, mu: Real) -> Real:
         """Phase of the level nearest to each phase, radians, within pi of it; same shape."""
+        return self.around(mu)[1]
+
+    def around(self, mu: Real) -> tuple[NDArray[np.intp] | tuple[()], Real]:
+        """Place on the circle and phase of the level nearest to each phase, radians, within pi of it; same shape.
+
+        Every place is like any other, and left out, where levels are even.
+        """
         if self.uneven is None:
             step = 2 * np.pi / self.count
-            return np.asarray(np.rint(mu / step) * step)
-        phases = self.circle[self.places(mu)]
-        return np.asarray(phases + 2 * np.pi * np.rint((mu - phases) / (2 * np.pi)))
+            return (), np.asarray(np.rint(mu / step) * step)
+        places = self.places(mu)
+        phases = self.circle[places]
+        return places, np.asarray(phases + 2 * np.pi * np.rint((mu - phases) / (2 * np.pi)))
 
     def half_way(self, mu: Real) -> Real | float:
         """Half the distance from each phase's nearest level to the next one, radians; of even levels one number."""
@@ -111,15 +122,28 @@ class Levels:
 
     def places(self, mu: Real) -> NDArray[np.intp]:
         """Place on the circle of the level nearest to each phase (radians, any winding); same shape."""
-        first, borders = self._borders
-        return np.asarray(np.searchsorted(borders, np.mod(mu - first, 2 * np.pi)))
+        first, borders, starts, most = self._borders
+        turns = (mu - first) / (2 * np.pi)
+        turns = turns - np.floor(turns)
+        found = starts[(turns * (len(starts) - 1)).astype(np.intp)]
+        for _ in range(most):  # a search by halves in a long table takes several times as long
+            found = found + (turns > borders[found])
+        return np.asarray(found)
 
     @cached_property
-    def _borders(self) -> tuple[float, Real]:
-        """Half way from the last level on the circle to the first, and all other half ways from there, [M - 1]."""
-        borders = self.circle + self.gaps(np.array([1]))[0] / 2
-        first = float(borders[-1]) - 2 * np.pi
-        return first, borders[:-1] - first
+    def _borders(self) -> tuple[float, Real, NDArray[np.intp], int]:
+        """Half ways between levels on the circle.
+
+        Returns:
+            That between the last level and the first, radians; how far from there the one behind each level is, turns,
+            [M]; how many lie before each of many equal steps of a turn; the most that lie within one.
+        """
+        ways = self.circle + self.gaps(np.array([1]))[0] / 2
+        first = float(ways[-1]) - 2 * np.pi
+        borders = (ways - first) / (2 * np.pi)
+        starts = np.searchsorted(borders[:-1], np.arange(_STEPS + 1) / _STEPS)
+        borders[-1] = np.inf
+        return first, borders, starts, int(np.diff(starts, append=self.count - 1).max())
 
     def gaps(self, neighbours: NDArray[np.integer]) -> Real:
         """From the level at each place on the circle to some of its neighbours there, radians, [neighbours, M].

@@ -155,6 +155,7 @@ class Bundle:
         Raises:
             CalibrationError: see `calibration`.
         """
+        # a document that tells nothing of it need not be read, which takes modules that decoding does without
         return self.calibration.modulator if "\n[modulation]" in self.manifest.calibration else NOMINAL
 
     def levels(self, count: int) -> Levels:

@@ -105,11 +105,12 @@ def _mean_distance(mu: NDArray[np.float64], kappa: NDArray[np.float64], levels: 
     """Distance of each phase to the levels about it, the mean over their posterior, radians [symbols]."""
     few = min(_NEIGHBOURS, (levels.count - 1) // 2)
     neighbours = np.arange(-few, few + 1)  # in rows: sums take whole arrays
+    places, nearest = levels.around(mu)
     if levels.is_nominal:
         offsets = np.float32(2 * np.pi / levels.count) * neighbours.astype(np.float32)[:, None]
     else:
-        offsets = levels.gaps(neighbours).astype(np.float32)[:, levels.places(mu)]
-    away = (mu - levels.nearest_phases(mu)).astype(np.float32)
+        offsets = levels.gaps(neighbours).astype(np.float32)[:, places]
+    away = (mu - nearest).astype(np.float32)
     near, k = np.cos(away), kappa.astype(np.float32)
     # cos(away - offset) - cos(away), without a cosine each
     weight = np.exp(np.sin(offsets) * (k * np.sin(away)) - 2 * np.sin(0.5 * offsets) ** 2 * (k * near))
