@@ -58,10 +58,6 @@ class Modulation:
         turned = phases + np.tensordot(phase, found, 1)
         return np.asarray(np.exp(1j * turned + np.tensordot(amplitude, found[1:], 1)), np.complex128)
 
-    def levels(self, count: int) -> NDArray[np.complex128]:
-        """Complex light of each of so many levels, [M]."""
-        return self.light(symbol_phases(np.arange(count), count))
-
     def phase(self, phases: Real) -> Real:
         """Phase of the light of nominal phases, radians, in their shape: near each, and exactly it nominally."""
         if self.is_nominal:
