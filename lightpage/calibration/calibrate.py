@@ -23,7 +23,7 @@ from lightpage.calibration.patches import (
     search_window,
 )
 from lightpage.calibration.samplers import FieldSampler, FrameSampler
-from lightpage.calibration.sampling_table import registration_coefficients
+from lightpage.calibration.sampling_table import cameras_apart, registration_coefficients, stand_apart
 from lightpage.calibration.waves.wave_fit import WaveFit
 from lightpage.device.profile import Profile
 from lightpage.errors import CalibrationError
@@ -417,12 +417,12 @@ class _Registration:
     def _field(
         self, page: KnownPage, parameters: Real | None = None, quadrature_phase: float | None = None
     ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
-        registration = registration_coefficients(
-            self.twin, self.parameters if parameters is None else parameters, self.profile
-        )
+        parameters = self.parameters if parameters is None else parameters
+        registration = registration_coefficients(self.twin, parameters, self.profile)
         quadrature_phase = self.quadrature_phase if quadrature_phase is None else quadrature_phase
         homodyne = np.array([np.cos(quadrature_phase), np.sin(quadrature_phase)], dtype=np.float32)
-        return self.solve_field(page.pair, self.references, registration, homodyne)
+        kernel = cameras_apart(parameters, self.profile) if stand_apart(parameters) else None
+        return self.solve_field(page.pair, self.references, registration, homodyne, kernel)
 
     def _frame_samplers(self, page: KnownPage, index: tuple[slice, slice] = _AS_IT_IS) -> list[FrameSampler]:
         frames = (page.pair.in_phase, page.pair.quadrature)

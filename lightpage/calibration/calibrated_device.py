@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.calibration.document import Calibration
+from lightpage.calibration.sampling_table import stand_apart
 from lightpage.device.profile import Profile
 from lightpage.recording.frame_pair import FramePair
 
@@ -28,6 +29,11 @@ class CalibratedDevice:
     parameters: NDArray[np.float64]
     quadrature_phase_rad: float
     references: FramePair
+
+    @property
+    def stands_apart(self) -> bool:
+        """Whether the cameras stand so far apart that each must be seen through a defocus of its own."""
+        return stand_apart(self.parameters)
 
     @classmethod
     def of(cls, profile: Profile, calibration: Calibration, references: FramePair) -> Self:

@@ -177,9 +177,7 @@ def modulated(slm: SlmDefects, phase: Real) -> Complex:
     turn = turn + slm.level_sine_rad * np.sin(phase) + slm.level_cosine_rad * np.cos(phase)
     turn = turn + slm.level_sine_twice_rad * np.sin(2 * phase)
     amplitude = 1 + slm.level_amplitude_relative * np.cos(phase)
-    return np.asarray(
-        amplitude * np.exp(1j * turn) + slm.unmodulated_relative * np.exp(1j * slm.unmodulated_phase_rad)
-    )
+    return np.asarray(amplitude * np.exp(1j * turn) + slm.unmodulated_relative * np.exp(1j * slm.unmodulated_phase_rad))
 
 
 def perfectly_calibrated(profile: Profile, device: Device, references: FramePair) -> CalibratedDevice:
