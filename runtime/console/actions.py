@@ -42,7 +42,7 @@ class Actions:
     def available(self) -> list[str]:
         """Those that make sense now."""
         found = ["recalibrate"] if self._plane.has_source else []
-        return [*found, "roll back"] if self._plane.registry.history.cursor else found
+        return [*found, "roll back"] if self._plane.models.now.state.history.cursor else found
 
     def job(self) -> dict[str, Any] | None:
         """How the newest recalibration stands, as JSON has it; None where there has been none."""

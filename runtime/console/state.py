@@ -10,7 +10,8 @@ from lightpage.runtime.console.actions import ROLE, Actions
 from lightpage.runtime.console.history import History, PageRow
 from lightpage.runtime.console.pictures import confidence_png, frame_png
 from lightpage.runtime.service.caller import Identity
-from lightpage.runtime.service.models.registry import Model, ModelRegistry
+from lightpage.runtime.service.models.loader import Model
+from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.monitoring.monitor import Monitor
 
 POINTS = 600
@@ -26,7 +27,7 @@ class ConsoleState:
 
     Args:
         history: of the pages.
-        registry: the models.
+        models: the models.
         monitor: says whether a recalibration is due.
         source: of the pages, for people.
         actions: what callers may do who prove that they may; None for nothing.
@@ -36,13 +37,13 @@ class ConsoleState:
     def __init__(
         self,
         history: History,
-        registry: ModelRegistry,
+        models: Models,
         monitor: Monitor,
         source: str,
         actions: Actions | None = None,
         clock: Callable[[], float] = time.time,
     ) -> None:
-        self._history, self._registry, self._monitor, self._source = history, registry, monitor, source
+        self._history, self._models, self._monitor, self._source = history, models, monitor, source
         self.actions, self.clock = actions, clock
         self._begun = clock()
 
@@ -66,7 +67,7 @@ class ConsoleState:
             "picture": {"number": number, "frames": pair is not None, "confidence": confidence is not None},
             "series": {name: [row[name] for row in told] for name in ("time_s", *_SERIES)},
             "losses": [vars(loss) for loss in self._history.losses()],
-            "models": [_model(model, model is self._registry.current) for model in self._registry.models],
+            "models": [_model(model, model is self._models.current) for model in self._models.loaded],
             "caller": "" if identity is None else identity.name,
             "actions": [] if actions is None else actions.available(),
             "job": None if actions is None else actions.job(),
@@ -80,7 +81,7 @@ class ConsoleState:
             return confidence_png(confidence)
         if path not in ("/frames/in_phase.png", "/frames/quadrature.png") or pair is None:
             return None
-        depth = self._registry.current.decoder.bundle.manifest.camera_bit_depth
+        depth = self._models.current.decoder.bundle.manifest.camera_bit_depth
         return frame_png(pair.in_phase if "in_phase" in path else pair.quadrature, depth)
 
 

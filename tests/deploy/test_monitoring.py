@@ -25,8 +25,8 @@ from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
-from lightpage.runtime.service.models.registry import ModelRegistry
-from lightpage.runtime.service.models.store import ModelStore
+from lightpage.runtime.service.models.models import Models
+from lightpage.runtime.service.models.store import Store
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.pages.reading import read_page
@@ -69,16 +69,16 @@ def shown(toy_zip: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
     """The metrics of a service with all its parts that has read pages, as Prometheus gets them."""
     bundle = Bundle.open(toy_zip)
     history, metrics, source = History(), ServiceMetrics(), toy.ToySource(toy.ToyDevice())
-    monitor, registry = Monitor(metrics=metrics), ModelRegistry(Decoder(bundle, threads=1))
-    store = ModelStore(tmp_path_factory.mktemp("store"), bundle)
-    plane = DataPlane(registry, source, store, metrics=metrics, observers=[history], monitor=monitor)
+    store = Store(tmp_path_factory.mktemp("store"), bundle)
+    monitor, models = Monitor(metrics=metrics), Models(Decoder(bundle, threads=1), store)
+    plane = DataPlane(models, source, metrics=metrics, observers=[history], monitor=monitor)
     metrics.watch_certificates(lambda: 2e9)
     for _ in range(3):
         stages = Stages()
         read_page(plane, None, None, Caller(), stages=stages)
         metrics.timed("ReadPage", stages)
         metrics.call_ended("ReadPage", "OK", "", stages.elapsed_s)
-    routes = console_routes(ConsoleState(history, registry, monitor, "toy:device"), metrics.registry)
+    routes = console_routes(ConsoleState(history, models, monitor, "toy:device"), metrics.registry)
     with serving(routes, 0) as port, urlopen(f"http://127.0.0.1:{port}/metrics", timeout=20) as reply:
         return str(reply.read(), "utf-8")
 

@@ -40,7 +40,7 @@ def calibrate(profile_name: str, recording: Path, out: Path, pages: int, json_pa
     profile = load_profile(profile_name)
     start = time.perf_counter()
     with Recording.open(recording) as file, percent_bar() as progress:
-        file.check_against(profile)
+        file.header.check_against(profile)
         calibration = calibrate_recording(file, profile, first_lit_pages(file, pages, warn), progress)
     seconds = time.perf_counter() - start
     calibration.save(out)
@@ -67,8 +67,8 @@ def calibrate_recording(
         RecordingError: no symbols, no such page, or shapes that are not the profile's.
         CalibrationError: nothing within the capture range explains the frames.
     """
-    recording.check_against(profile)
-    if others := recording.differences(profile):
+    recording.header.check_against(profile)
+    if others := recording.header.differences(profile):
         warn(f"recording {recording.path} says of its device: {'; '.join(others)}")
     known = known_pages(recording, profile, pages)
     registered = register(

@@ -124,21 +124,21 @@ def _serve(effective: Effective, wait_for_stop: Callable[[], None]) -> None:
     history = History()
     with ExitStack() as stack:
         own = stack.enter_context(assembled(settings, history))
-        plane, registry = own.plane, own.plane.registry
+        plane, models = own.plane, own.plane.models
         actions = Actions(plane, own.recalibrator, settings.self_calibration.pages)
-        state = ConsoleState(history, registry, own.monitor, own.source_name, actions)
+        state = ConsoleState(history, models, own.monitor, own.source_name, actions)
         stack.enter_context(_shown(state, plane.metrics, settings.metrics, certificates))
         endpoints = stack.enter_context(listening(settings, own, certificates))
         if endpoints.health is not None:
             click.echo(f"health checks at {endpoints.health}")
-        told = f"serving {registry.current.version} from {own.source_name} at {endpoints.target}"
+        told = f"serving {models.current.version} from {own.source_name} at {endpoints.target}"
         click.echo(told)
-        provider = registry.current.decoder.graph.provider
+        provider = models.current.decoder.graph.provider
         _log.info("%s on %s, %d settings given", told, provider, len(effective.origins), extra={"told": _versions()})
         wait_for_stop()
         with suppress(OSError):  # the terminal may have gone, and sent the signal
             click.echo("stopping")
-        _log.info("stopping with model %s", registry.current.version)
+        _log.info("stopping with model %s", models.current.version)
     _log.info("stopped")
 
 

@@ -14,7 +14,8 @@ from lightpage.calibration.parameters import NAMES, PRIORS
 from lightpage.device.profile import load_profile
 from lightpage.errors import CalibrationError, ProfileError, RecordingError
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.reader import Recording, RecordingWriter
+from lightpage.recording.reader import Recording
+from lightpage.recording.writer import RecordingWriter
 from tests.lightpage.calibration.flat_twin import FlatTwin
 from tests.lightpage.refused import refused
 

@@ -19,7 +19,8 @@ from lightpage.cli.main import RESUME_KEY, LazyGroup, lightpage
 from lightpage.errors import LightpageError, SurroundingsError
 from lightpage.page.pilots import Pilots
 from lightpage.recording.decoded_file import DecodedWriter
-from lightpage.recording.reader import Recording, RecordingWriter
+from lightpage.recording.reader import Recording
+from lightpage.recording.writer import RecordingWriter
 from lightpage.runtime.client.answers import RemotePage
 from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.client.pages import Pages
@@ -30,7 +31,7 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.recalibration import Refit
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
-from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.server.server import LightpageServer
 from tests.lightpage.full_disk import full_disk
 from tests.runtime import toy
@@ -263,7 +264,7 @@ def start(decoder: Decoder, tmp_path_factory: pytest.TempPathFactory) -> Iterato
     running: list[LightpageServer] = []
 
     def begin(fit: Refit = toy.fit_references) -> LightpageServer:
-        plane = DataPlane(ModelRegistry(decoder), toy.ToySource(toy.ToyDevice()))
+        plane = DataPlane(Models(decoder), toy.ToySource(toy.ToyDevice()))
         running.append(LightpageServer(plane, Recalibrator(plane, fit, folder)).start())
         return running[-1]
 
@@ -351,7 +352,7 @@ def test_decode_uses_the_devices_own_pilots_and_refuses_pages_where_they_disagre
             if name in file:
                 del file[name]
     decoder = Decoder.load(toy.write_own_pilots_bundle(tmp_path / "own.zip"), threads=1)
-    plane = DataPlane(ModelRegistry(decoder), open_source(f"recording:{path}"))
+    plane = DataPlane(Models(decoder), open_source(f"recording:{path}"))
     out = tmp_path / "out.h5"
     with LightpageServer(plane, Recalibrator(plane, toy.fit_references)) as server:
         for where in (["--recording", path], ["--source", "--pages", "2"]):

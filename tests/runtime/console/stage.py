@@ -18,7 +18,7 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
-from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.pages.reading import read_page
@@ -54,7 +54,7 @@ class Stage:
 @contextmanager
 def stage(decoder: Decoder, tls: TlsFiles | None = None) -> Iterator[Stage]:
     history, monitor, metrics = History(), Monitor(), ServiceMetrics()
-    registry = ModelRegistry(decoder)
+    registry = Models(decoder)
     plane = DataPlane(registry, Losing(toy.ToyDevice()), metrics=metrics, observers=[history], monitor=monitor)
     recalibrator = Recalibrator(plane, toy.fit_references)
     state = ConsoleState(history, registry, monitor, "toy:device", Actions(plane, recalibrator))

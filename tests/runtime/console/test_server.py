@@ -41,7 +41,7 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import Actor, Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
-from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.monitoring.observation import Observation
 from lightpage.runtime.service.pages.reading import read_page
@@ -123,7 +123,7 @@ def test_metrics_are_beside_it_and_nothing_takes_orders_or_tells_of_the_inside(
 def test_what_is_no_number_is_none_and_pages_are_bounded_and_thinned(decoder: Decoder) -> None:
     page = decoder.decode(toy.ToyDevice().page(toy.symbols_of(16, 1)[0], 16, 0.5), 16)
     page = replace(page, piston_rad=math.nan, check=replace(page.check, confirmed_bits=math.inf))
-    history, registry = History(pages=2 * POINTS), ModelRegistry(decoder)
+    history, registry = History(pages=2 * POINTS), Models(decoder)
     for number in range(3 * POINTS):
         history.observe(Observation("page", number, "toy-1", float(number), 0.1, page=page))
     state = ConsoleState(history, registry, Monitor(), "toy").to_json()
@@ -136,7 +136,7 @@ def test_what_is_no_number_is_none_and_pages_are_bounded_and_thinned(decoder: De
 
 def test_the_condition_is_that_of_the_last_pages(decoder: Decoder) -> None:
     clock, history, monitor = HandClock(1e9), History(), Monitor()
-    state = ConsoleState(history, ModelRegistry(decoder), monitor, "toy", clock=clock.now)
+    state = ConsoleState(history, Models(decoder), monitor, "toy", clock=clock.now)
     told = list[str]()
 
     def seen(*lost: Reason | None) -> None:
@@ -306,12 +306,12 @@ class Asked:
 
     def __init__(self, decoder: Decoder, folder: Path, stack: ExitStack) -> None:
         self.source, self.clock = Numbered(), HandClock(time.time())
-        self.plane = DataPlane(ModelRegistry(decoder), self.source)
+        self.plane = DataPlane(Models(decoder), self.source)
         self.plane.models.adopt(Decoder.load(toy.write_toy_bundle(folder / "c.zip", version="toy-2"), 1))
         self.recalibrator = Recalibrator(self.plane, toy.fit_references)
         stack.callback(self.recalibrator.close)
         monitor, actions = Monitor(), Actions(self.plane, self.recalibrator)
-        state = ConsoleState(History(), self.plane.registry, monitor, "toy", actions, self.clock.now)
+        state = ConsoleState(History(), self.plane.models, monitor, "toy", actions, self.clock.now)
         self.routes, authority = console_routes(state, self.plane.metrics.registry), Authority(folder)
         certificates = Certificates(authority.service())
         self.port = stack.enter_context(serving(self.routes, 0, certificates=certificates, names=["device.example"]))
@@ -319,7 +319,7 @@ class Asked:
 
     @property
     def version(self) -> str:
-        return self.plane.registry.current.version
+        return self.plane.models.current.version
 
     def shown(self, path: str, *roles: str) -> tuple[int, Any]:
         """Status and content of a page; of JSON, what it holds."""

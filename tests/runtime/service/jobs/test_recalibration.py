@@ -30,7 +30,7 @@ from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.device.acquisition.source import Shot, open_source
 from lightpage.runtime.recalibration.recalibration import RefitResult
 from lightpage.runtime.service.models.audit import AuditLog
-from lightpage.runtime.service.models.registry import KEPT_MODELS
+from lightpage.runtime.service.models.models import KEPT_MODELS
 from tests.runtime import toy
 from tests.runtime.service.stage import Running, Start, a_page, refused
 from tests.runtime.slow_fit import SlowFit
@@ -90,9 +90,9 @@ def test_without_a_store_it_goes_on_after_a_rollback_and_keeps_only_the_models_h
     assert service.client.models.roll_back() == ("toy-1", "toy-1+r1")
     versions = [service.client.jobs.recalibrate(count=2).model_version for _ in range(KEPT_MODELS + 1)]
     assert versions == [f"toy-1+r{number}" for number in range(2, KEPT_MODELS + 3)]
-    kept = [model.decoder.bundle.path for model in service.plane.registry.models]
+    kept = [model.decoder.bundle.path for model in service.plane.models.loaded]
     assert sorted(kept[0].parent.iterdir()) == sorted(kept)
-    service.recalibrator.close()
+    service.end()
     assert not kept[0].parent.exists()
 
 
@@ -186,7 +186,7 @@ def test_the_service_ends_beside_one_that_does_not_stop_and_it_changes_nothing_a
     assert service.count("lightpage_recalibrations_total", result="dropped") == 0  # it is still at work
     go.set()
     eventually(lambda: service.count("lightpage_recalibrations_total", result="dropped") == 1)
-    assert [model.version for model in service.plane.registry.models] == ["toy-1"]
+    assert [model.version for model in service.plane.models.loaded] == ["toy-1"]
 
 
 def test_a_caller_who_leaves_ends_it(start: Start) -> None:

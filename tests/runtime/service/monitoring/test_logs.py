@@ -22,9 +22,9 @@ from lightpage.runtime.service.caller import Actor
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 from lightpage.runtime.service.jobs.self_calibration import SelfCalibration
-from lightpage.runtime.service.models.audit import AuditLog
-from lightpage.runtime.service.models.registry import ModelRegistry
-from lightpage.runtime.service.models.store import ModelStore
+from lightpage.runtime.service.models.audit import AuditLog, Entry
+from lightpage.runtime.service.models.models import Models
+from lightpage.runtime.service.models.store import Store
 from lightpage.runtime.service.monitoring import logs
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.monitoring.observation import Observation
@@ -154,10 +154,8 @@ def test_lost_pages_are_logged_and_others_are_not() -> None:
 
 def test_every_change_of_models_is_written_down_with_who_made_it(decoder: Decoder, tmp_path: Path) -> None:
     file, monitor = tmp_path / "audit.jsonl", Monitor()
-    store = ModelStore(tmp_path / "store", decoder.bundle)
-    plane = DataPlane(
-        ModelRegistry(decoder), toy.ToySource(toy.ToyDevice()), store, monitor=monitor, audit=AuditLog(file)
-    )
+    models = Models(decoder, Store(tmp_path / "store", decoder.bundle), audit=AuditLog(file))
+    plane = DataPlane(models, toy.ToySource(toy.ToyDevice()), monitor=monitor)
     for _ in range(8):
         monitor.follow("toy-1", {"unread": 1.0})
     SelfCalibration(plane, monitor, Recalibrator(plane, toy.fit_references)).look()
@@ -186,7 +184,7 @@ def test_every_change_of_models_is_written_down_with_who_made_it(decoder: Decode
 def test_the_record_is_put_aside_when_it_is_large_and_only_so_many_stay(tmp_path: Path) -> None:
     file = tmp_path / "deep" / "audit.jsonl"
     for number in range(40):
-        AuditLog(file, 1000, 3).record("activate", f"a{number}", "b", actor=Actor("ipv4:1", f"é{number}"))
+        AuditLog(file, 1000, 3).append(Entry("activate", Actor("ipv4:1", f"é{number}"), f"a{number}", "b"))
     newest_last = [file.with_name(f"audit.jsonl{number}") for number in (".3", ".2", ".1", "")]
     assert set(file.parent.iterdir()) == set(newest_last)
     assert all(path.stat().st_size <= 1000 for path in newest_last)
@@ -194,16 +192,31 @@ def test_the_record_is_put_aside_when_it_is_large_and_only_so_many_stay(tmp_path
     assert [entry["correlation_id"] for entry in entries] == [f"é{number}" for number in range(40)][-len(entries) :]
 
 
-def test_a_change_that_cannot_be_written_down_is_logged_and_leaves_whole_lines(tmp_path: Path) -> None:
+def test_lines_that_the_service_before_could_not_write_are_written_once(decoder: Decoder, tmp_path: Path) -> None:
+    file, folder = tmp_path / "audit.jsonl", tmp_path / "store"
+    for start in range(3):
+        with Store(folder, decoder.bundle) as store:
+            models = Models(decoder, store, audit=AuditLog(file))
+            models.pin("toy-1", start == 1, Actor(f"{start}"))
+            with pytest.raises(BundleError):  # a line that is in the file alone
+                models.rollback(actor=Actor("failed"))
+            if start == 1:  # as if it had been killed in between
+                file.write_text("\n".join(file.read_text().splitlines()[:2]) + "\n")
+    assert [json.loads(line)["who"] for line in file.read_text().splitlines()] == ["0", "failed", "1", "2", "failed"]
+
+
+def test_a_change_that_cannot_be_written_down_is_logged_waits_and_leaves_whole_lines(tmp_path: Path) -> None:
     """A folder that has gone is not made again: it may be the place where a disk was mounted."""
     audit, file = AuditLog(tmp_path / "store" / "audit.jsonl"), tmp_path / "store" / "audit.jsonl"
-    audit.record("activate", "a", "b")
+    entries = [Entry("activate", Actor("one"), before, "z") for before in "abcd"]
+    audit.append(entries[0])
     with json_lines() as lines, full_disk(file.stat().st_size + 20):
-        audit.record("activate", "b", "c")
-    audit.record("activate", "c", "d")
-    assert [json.loads(line)["from"] for line in file.read_text().splitlines()] == ["a", "c"]
+        audit.append(entries[1])
+    assert audit.pending(entries[2]) == [entries[1].line, entries[2].line]
+    audit.append(entries[2])
+    assert [json.loads(line)["from"] for line in file.read_text().splitlines()] == ["a", "b", "c"]
     file.parent.rename(tmp_path / "away")
     with json_lines() as more:
-        audit.record("activate", "d", "e")
+        audit.append(entries[3])
     assert [line["level"] for line in (*lines, *more)] == ["INFO", "WARNING"] * 2
     assert not file.parent.exists()
