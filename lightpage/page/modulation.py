@@ -51,7 +51,8 @@ class Modulation:
         """Complex light of nominal phases, 0 to 2 pi, in their shape."""
         found, (stroke, *rest) = basis(phases), self.coefficients
         phase, amplitude = np.array([stroke, *rest[: 2 * HARMONICS]]), np.array(rest[2 * HARMONICS :])
-        return np.exp(1j * (phases + np.tensordot(phase, found, 1)) + np.tensordot(amplitude, found[1:], 1))
+        logarithm = 1j * (phases + np.tensordot(phase, found, 1)) + np.tensordot(amplitude, found[1:], 1)
+        return np.asarray(np.exp(logarithm), np.complex128)
 
     def levels(self, count: int) -> NDArray[np.complex128]:
         """Complex light of each of so many levels, [M]."""
