@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from lightpage.runtime.console.actions import ROLE, Actions
-from lightpage.runtime.console.history import History, PageRow
+from lightpage.runtime.console.last_pages import LastPages, PageRow
 from lightpage.runtime.console.pictures import confidence_png, frame_png
 from lightpage.runtime.service.caller import Identity
 from lightpage.runtime.service.models.loader import Model
@@ -26,7 +26,7 @@ class ConsoleState:
     """What the console says.
 
     Args:
-        history: of the pages.
+        last_pages: what is known of them.
         models: the models.
         monitor: says whether a recalibration is due.
         source: of the pages, for people.
@@ -36,26 +36,26 @@ class ConsoleState:
 
     def __init__(
         self,
-        history: History,
+        last_pages: LastPages,
         models: Models,
         monitor: Monitor,
         source: str,
         actions: Actions | None = None,
         clock: Callable[[], float] = time.time,
     ) -> None:
-        self._history, self._models, self._monitor, self._source = history, models, monitor, source
+        self._last_pages, self._models, self._monitor, self._source = last_pages, models, monitor, source
         self.actions, self.clock = actions, clock
         self._begun = clock()
 
     def to_json(self, identity: Identity | None = None) -> dict[str, Any]:
-        """All that the page shows to a caller, as JSON has it."""
+        """Return all that the page shows to a caller, as JSON has it."""
         actions = self.actions if identity is not None and identity.may(ROLE) else None
-        rows, now = self._history.rows(), self.clock()
+        rows, now = self._last_pages.rows(), self.clock()
         thinned = rows[:: max(1, -(-len(rows) // POINTS))]
         if rows and thinned[-1] is not rows[-1]:
             thinned.append(rows[-1])
         told = [row.to_json() for row in thinned]
-        number, pair, confidence = self._history.pictures()
+        number, pair, confidence = self._last_pages.pictures()
         monitor = self._monitor.state()
         return {
             "time_s": now,
@@ -63,10 +63,10 @@ class ConsoleState:
             "uptime_s": now - self._begun,
             "condition": _condition(rows, monitor.due, now),
             "reasons": list(monitor.reasons),
-            "pages": self._history.pages,
+            "pages": self._last_pages.pages,
             "picture": {"number": number, "frames": pair is not None, "confidence": confidence is not None},
             "series": {name: [row[name] for row in told] for name in ("time_s", *_SERIES)},
-            "losses": [vars(loss) for loss in self._history.losses()],
+            "losses": [vars(loss) for loss in self._last_pages.losses()],
             "models": [_model(model, model is self._models.current) for model in self._models.loaded],
             "caller": "" if identity is None else identity.name,
             "actions": [] if actions is None else actions.available(),
@@ -75,8 +75,8 @@ class ConsoleState:
         }
 
     def picture(self, path: str) -> bytes | None:
-        """A picture of the last page, as PNG; None where there is none of this path."""
-        _, pair, confidence = self._history.pictures()
+        """Return a picture of the last page, as PNG; None where there is none of this path."""
+        _, pair, confidence = self._last_pages.pictures()
         if path == "/confidence.png" and confidence is not None:
             return confidence_png(confidence)
         if path not in ("/frames/in_phase.png", "/frames/quadrature.png") or pair is None:

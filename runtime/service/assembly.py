@@ -53,12 +53,12 @@ class Assembly:
 
 
 @contextmanager
-def assembled(settings: ServiceSettings, history: Observer) -> Iterator[Assembly]:
+def assembled(settings: ServiceSettings, observer: Observer) -> Iterator[Assembly]:
     """Yield the service that is meant by settings; what it holds is closed at the end.
 
     Args:
         settings: of it.
-        history: is told of every page, before log and flight recorder are.
+        observer: is told of every page, before log and flight recorder are.
 
     Raises:
         LightpageError: bundle, store or source are not there, or do not go together.
@@ -69,11 +69,11 @@ def assembled(settings: ServiceSettings, history: Observer) -> Iterator[Assembly
     base = Decoder(Bundle.open(bundle_path(service.bundle), key=key), service.threads, provider=provider)
     metrics = ServiceMetrics()
     monitor = Monitor(metrics=metrics)
-    observers = [history, PageLog()]
+    observers = [observer, PageLog()]
     with ExitStack() as stack:
         source = None
         store = stack.enter_context(Store(service.store, base.bundle))
-        audit = AuditLog(settings.audit_file, settings.audit.file_bytes, settings.audit.kept)
+        audit = AuditLog(store, settings.audit_file, settings.audit.file_bytes, settings.audit.kept)
         models = Models(base, store, Loader(tracker_for if service.tracking else NoTracker, key), audit)
         if service.source is not None:
             source = stack.enter_context(checked_source(service.source, service.pages, base))

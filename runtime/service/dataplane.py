@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterator, Sequence
+import time
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 from lightpage.clock import SYSTEM, Clock
 from lightpage.codec.page_bytes import Header, Loss, PageBytes
 from lightpage.errors import (
     FrameError,
+    FramesDisagreeError,
     InvalidInputError,
     LostPageError,
     NoSourceError,
+    Reason,
+    SourceError,
     UnconfirmedPageError,
 )
 from lightpage.page.levels import MAX_LEVELS
@@ -29,13 +34,75 @@ from lightpage.runtime.service.limits import Limits
 from lightpage.runtime.service.models.loader import Model
 from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
-from lightpage.runtime.service.monitoring.monitor import Monitor
-from lightpage.runtime.service.monitoring.monitors import Monitors
-from lightpage.runtime.service.monitoring.observation import Observer
+from lightpage.runtime.service.monitoring.monitor import Monitor, Monitors
+from lightpage.runtime.service.monitoring.observation import Observation, Observer
 from lightpage.runtime.service.shared_memory import SharedMemory
 from lightpage.runtime.service.stages import Stage, Stages
 
 _log = logging.getLogger(__name__)
+
+
+class Seen:
+    """What becomes known of a page while it is read and decoded.
+
+    Args:
+        subject, page_index, model_version: see `Observation`.
+        clock: seconds since 1970.
+        lap: seconds that never go back, by which the page is timed.
+    """
+
+    def __init__(
+        self,
+        subject: str,
+        page_index: int | None,
+        model_version: str,
+        clock: Callable[[], float] = time.time,
+        lap: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        self._clock, self._lap = clock, lap
+        self.observation = Observation(subject, page_index, model_version, clock(), 0.0)
+        self._begun = lap()
+
+    def note(self, **known: Any) -> None:
+        """Take in fields of `Observation`."""
+        self.observation = replace(self.observation, **known)
+
+    def ended(self, lost: Reason | None, detail: str) -> Observation:
+        """The observation of the page, which was given out or lost now."""
+        seconds = self._lap() - self._begun
+        return replace(self.observation, time_s=self._clock(), seconds=seconds, lost=lost, detail=detail)
+
+
+@contextmanager
+def observed(observers: Sequence[Observer], seen: Seen) -> Iterator[Seen]:
+    """Tell the observers of a page that is read and decoded inside the block, given out or lost.
+
+    A page of the source whose frames contradict each other is told of as lost, with an unspecified reason. Other errors
+    say nothing of a page. What an observer raises is logged: it costs nobody a page.
+    """
+    try:
+        yield seen
+    except LostPageError as error:
+        if isinstance(error, UnconfirmedPageError):
+            seen.note(page=unconfirmed_page(error))
+        _tell(observers, seen, error.reason, str(error))
+        raise
+    except SourceError as error:
+        if isinstance(error.__cause__, FramesDisagreeError):
+            _tell(observers, seen, Reason.UNSPECIFIED, str(error))
+        raise
+    _tell(observers, seen, None, "")
+
+
+def _tell(observers: Sequence[Observer], seen: Seen, lost: Reason | None, detail: str) -> None:
+    if not observers:
+        return
+    observation = seen.ended(lost, detail)
+    for observer in observers:
+        try:
+            observer.observe(observation)
+        except Exception:
+            _log.exception("%s could not take note of %s", type(observer).__name__, observation.subject)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from lightpage.runtime.commands.execution import ENGINE_CACHE, THREADS
 from lightpage.runtime.commands.provider_option import PROVIDER
 from lightpage.runtime.commands.service.ending import leave_the_rest, stop_signals
 from lightpage.runtime.console.actions import Actions
-from lightpage.runtime.console.history import History
+from lightpage.runtime.console.last_pages import LastPages
 from lightpage.runtime.console.state import ConsoleState
 from lightpage.runtime.model.execution.memory import share_freed_memory
 from lightpage.runtime.model.execution.session import VERSION as RUNTIME_VERSION
@@ -121,12 +121,12 @@ def _serve(effective: Effective, wait_for_stop: Callable[[], None]) -> None:
     settings = effective.settings
     files = settings.tls.files()
     certificates = None if files is None else Certificates(files)
-    history = History()
+    last_pages = LastPages()
     with ExitStack() as stack:
-        own = stack.enter_context(assembled(settings, history))
+        own = stack.enter_context(assembled(settings, last_pages))
         plane, models = own.plane, own.plane.models
         actions = Actions(plane, own.recalibrator, settings.self_calibration.pages)
-        state = ConsoleState(history, models, own.monitor, own.source_name, actions)
+        state = ConsoleState(last_pages, models, own.monitor, own.source_name, actions)
         stack.enter_context(_shown(state, plane.metrics, settings.metrics, certificates))
         endpoints = stack.enter_context(listening(settings, own, certificates))
         if endpoints.health is not None:

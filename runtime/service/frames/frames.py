@@ -16,9 +16,8 @@ from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import PIXEL_TYPES, message_of
 from lightpage.runtime.service.admission import Bytes, ReceiveBudget
 from lightpage.runtime.service.caller import Caller
-from lightpage.runtime.service.dataplane import Answer, DataPlane, levels_for
+from lightpage.runtime.service.dataplane import Answer, DataPlane, Seen, levels_for, observed
 from lightpage.runtime.service.monitoring import monitor as signs
-from lightpage.runtime.service.monitoring.observation import Seen, observed
 from lightpage.runtime.service.stages import Stage, Stages
 
 SESSION_CHARACTERS = 1024

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from google.protobuf.message import DecodeError
 
@@ -28,7 +29,7 @@ from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.jobs.messages import result_message
 from lightpage.runtime.service.limits import JOBS_KEPT
-from lightpage.runtime.service.models.database import Statement, job_written
+from lightpage.runtime.service.models.database import Write, write_job
 from lightpage.runtime.service.models.store import Store
 
 _log = logging.getLogger(__name__)
@@ -103,11 +104,12 @@ class Jobs:
         """
         with self._store.changing:
             self.check_free()
-            self._running = running = RunningJob(secrets.token_hex(6), caller)
-            self._idle.clear()
+            running = RunningJob(secrets.token_hex(6), caller)
             job = pb.Job(id=running.id, state=pb.JOB_STATE_RUNNING, created_s=self._clock(), pages_of=pages_of)
             job.correlation_id, job.progress.step = correlation_id, "begin"
             self._keep(job)
+            self._running = running  # whoever hears of it now finds it
+            self._idle.clear()
         return running
 
     def check_free(self) -> None:
@@ -129,7 +131,7 @@ class Jobs:
         told.progress.CopyFrom(pb.Progress(step=step, fraction=fraction))
         self._jobs = {**self._jobs, running.id: told}
 
-    def done(self, running: RunningJob, outcome: RecalibrationOutcome) -> list[Statement]:
+    def done(self, running: RunningJob, outcome: RecalibrationOutcome) -> Write:
         """Return what writes that a job is done, to be written with its model."""
         return self._written(self._ended(self._jobs[running.id], outcome))
 
@@ -188,13 +190,14 @@ class Jobs:
             _log.exception("jobs: the end of job %s is not noted", job.id)
         return ended
 
-    def _written(self, job: pb.Job) -> list[Statement]:
-        return job_written(job.id, job.SerializeToString(), self._kept)
+    def _written(self, job: pb.Job) -> Write:
+        return partial(write_job, id_=job.id, message=job.SerializeToString(), kept=self._kept)
 
     def _keep(self, job: pb.Job) -> None:
         """Write a job to the store, then show it; the oldest beyond those that are kept are forgotten."""
         try:
-            self._store.write(self._written(job))
+            with self._store.transaction() as database:
+                self._written(job)(database)
         except StoreError as error:
             _log.warning("jobs: a restart will know less of them: %s", error)
         self._jobs = dict([*(self._jobs | {job.id: job}).items()][-self._kept :])

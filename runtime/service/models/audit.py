@@ -6,8 +6,8 @@ import errno
 import json
 import logging
 import os
-from collections import deque
-from collections.abc import Sequence
+import sqlite3
+from collections.abc import Collection
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -16,15 +16,17 @@ from logging.handlers import RotatingFileHandler
 from pathlib import Path
 from typing import cast
 
+from lightpage.errors import StoreError
 from lightpage.files import sync_folder, synchronise
 from lightpage.runtime.service.caller import Actor
+from lightpage.runtime.service.models.store import Store
 
 AUDIT_BYTES = 10 << 20
 """Of a record of model changes before a new one is begun: some 40,000 changes."""
 AUDIT_KEPT = 10
 """Earlier records that stay."""
-_WAITING = 10_000
-"""Lines that wait at most while the file cannot be written."""
+_NEWEST = 10_000
+"""Entries that the database keeps: so many wait at most while the file cannot be written."""
 _LAST_BYTES = 1 << 20
 """Of the file, in which a line is looked for that may have been appended."""
 
@@ -53,14 +55,14 @@ class Entry:
 
     @property
     def line(self) -> str:
-        """Itself in JSON."""
+        """Itself in JSON, in one line; what is no text is escaped."""
         who = {"who": self.actor.name, "correlation_id": self.actor.correlation_id}
         entry = {"time": self.time, "what": self.what, **who, "from": self.before, "to": self.after}
         how = {"outcome": "failed", "detail": self._detail} if self.failure else {"outcome": "done"}
-        return json.dumps(entry | how)
+        return json.dumps(entry | how, ensure_ascii=False).encode(errors="backslashreplace").decode()
 
     def log(self) -> None:
-        """Log it."""
+        """Have it in the service's log."""
         told = {"peer": self.actor.name, "correlation_id": self.actor.correlation_id, "method": self.what}
         change = f"from {self.before} to {self.after}" if self.after else f"of {self.before}"
         level, how = (logging.WARNING, f"failed: {self._detail}") if self.failure else (logging.INFO, "done")
@@ -72,54 +74,73 @@ class Entry:
 
 
 class AuditLog:
-    """Appends a line of JSON for each change to a file, and has it on the disk before `append` returns.
+    """Keeps every change in the store's database, and appends it from there to a file as a line of JSON.
 
-    Lines that cannot be written are logged, and wait. The database takes the lines that `pending` names together with
-    the change itself, so that a program that is killed between the two writes the line at its next start. A file that
-    has become too large is put aside as `NAME.1`, the one before it as `NAME.2`, and so on. One thread at a time may
-    use it.
+    A change is in the database with what it changes, or not at all. Its line is on the disk before `done` returns;
+    one that cannot be appended waits, also for the next start. Nothing here fails for the sake of the file's disk. A
+    file that has become too large is put aside as `NAME.1`, the one before it as `NAME.2`, and so on.
 
     Args:
-        path: the file, None for none: then changes are logged alone. Its folder is made if absent; one that
-            goes later, as that of a disk that is taken out, is not made again.
+        store: whose database it is.
+        path: of the file, None for none. Its folder is made if absent; one that goes later, as that of a disk that is
+            taken out, is not made again.
         most_bytes: of the file.
         kept: files put aside that stay.
     """
 
-    def __init__(self, path: Path | None = None, most_bytes: int = AUDIT_BYTES, kept: int = AUDIT_KEPT) -> None:
-        self._path, self._most_bytes, self._kept = path, most_bytes, kept
-        self._waiting: deque[str] = deque(maxlen=_WAITING)
+    def __init__(
+        self, store: Store, path: Path | None = None, most_bytes: int = AUDIT_BYTES, kept: int = AUDIT_KEPT
+    ) -> None:
+        self._store, self._path, self._most_bytes, self._kept = store, path, most_bytes, kept
+        self._waiting: list[str] = []
+        """Lines that the database could not be given."""
+        self._last = 0
+        """Number of the entry that was appended last."""
         if path is not None:
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.open("ab").close()
             except OSError as error:
                 _log.warning("model changes are not written down in %s: %s", path, error.strerror or error)
+            self._export(_last_lines(path))
 
-    def resume(self, lines: Sequence[str]) -> None:
-        """Append those of the lines that the service before was to write and has not."""
-        written = set() if self._path is None else _last_lines(self._path)
-        self._waiting.extend(line for line in lines if line not in written)
-        self._write()
+    def write(self, entry: Entry, database: sqlite3.Connection) -> None:
+        """Write an entry, after those that wait, in a transaction; once that has ended, `done` is to be called."""
+        lines = [(line,) for line in (*self._waiting, entry.line)]
+        database.executemany("INSERT INTO audit (line) VALUES (?)", lines)
+        database.execute("DELETE FROM audit WHERE number <= (SELECT max(number) FROM audit) - ?", (_NEWEST,))
 
-    def pending(self, entry: Entry) -> list[str]:
-        """Return the lines that the file lacks until `append` has ended, that of the entry last."""
-        return [] if self._path is None else [*self._waiting, entry.line]
-
-    def append(self, entry: Entry) -> None:
-        """Log an entry, and append its line after those that wait."""
+    def done(self, entry: Entry) -> None:
+        """Log an entry that is in the database, and append its line."""
         entry.log()
-        self._waiting.append(entry.line)
-        self._write()
+        self._waiting.clear()
+        self._export()
 
-    def _write(self) -> None:
+    def failed(self, entry: Entry) -> None:
+        """Keep an entry of a change that did not come about; where the database cannot be written, it waits."""
         try:
-            while self._waiting:
-                if self._path is not None:
-                    self._append(self._path, self._waiting[0].encode() + b"\n")
-                self._waiting.popleft()
-        except OSError as error:
-            _log.warning("model change not written down in %s: %s", self._path, error.strerror or error)
+            with self._store.transaction() as database:
+                self.write(entry, database)
+            self.done(entry)
+        except StoreError:  # which the store has logged
+            entry.log()
+            self._waiting = [*self._waiting, entry.line][-_NEWEST:]
+
+    def _export(self, known: Collection[str] = ()) -> None:
+        """Append the lines that the file lacks; of those that are `known` to be there, only note that."""
+        if self._path is None:
+            return
+        query = "SELECT number, line FROM audit WHERE NOT exported ORDER BY number"
+        with suppress(StoreError), self._store.transaction() as database:
+            for number, line in database.execute(query).fetchall():
+                try:
+                    if number > self._last and line not in known:
+                        self._append(self._path, line.encode() + b"\n")
+                except OSError as error:
+                    _log.warning("model change not written down in %s: %s", self._path, error.strerror or error)
+                    break
+                self._last = max(self._last, number)
+                database.execute("UPDATE audit SET exported = 1 WHERE number = ?", (number,))
 
     def _append(self, path: Path, line: bytes) -> None:
         """Append a line, whole or not at all, and have it on the disk.
@@ -128,7 +149,8 @@ class AuditLog:
             OSError: the file cannot be written.
         """
         with closing(RotatingFileHandler(path, maxBytes=self._most_bytes, backupCount=self._kept)) as file:
-            if file.shouldRollover(logging.makeLogRecord({"msg": line.decode()})):
+            as_long = logging.makeLogRecord({"msg": line.decode("latin-1")})  # it counts characters
+            if file.shouldRollover(as_long):
                 file.doRollover()
             descriptor = cast(TextIOWrapper, file.stream).fileno()  # which a roll-over has opened again
             size = os.fstat(descriptor).st_size
@@ -145,7 +167,10 @@ class AuditLog:
 
 
 def _last_lines(path: Path) -> set[str]:
-    with suppress(OSError), path.open("rb") as file:
-        file.seek(max(0, os.fstat(file.fileno()).st_size - _LAST_BYTES))
-        return {*file.read().decode(errors="replace").splitlines()}
-    return set()
+    """Return the last lines of the file, and of the one before it."""
+    lines = set[str]()
+    for each in (path.with_name(f"{path.name}.1"), path):
+        with suppress(OSError), each.open("rb") as file:
+            file.seek(max(0, os.fstat(file.fileno()).st_size - _LAST_BYTES))
+            lines.update(file.read().decode(errors="replace").split("\n"))
+    return lines

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import closing, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from lightpage.errors import BundleError
-from lightpage.runtime.model.bundle.manifest import check_version
-from lightpage.runtime.service.models.history import History, Known, Origin, State
+from lightpage.files import new_file, sync_folder
+from lightpage.runtime.service.models.history import State, state_of
 
 DATABASE = "models.db"
 DAMAGED = "models.db.damaged"
@@ -23,125 +22,125 @@ _IDENTITY = (0x4C504D44, 1)  # "LPMD"
 _SCHEMA = (
     f"PRAGMA application_id = {_IDENTITY[0]}",
     f"PRAGMA user_version = {_IDENTITY[1]}",
-    "CREATE TABLE service (base TEXT NOT NULL, cursor INTEGER NOT NULL)",
-    "CREATE TABLE history (place INTEGER PRIMARY KEY, version TEXT NOT NULL)",
-    "CREATE TABLE bundles (version TEXT PRIMARY KEY, origin TEXT, key TEXT, pinned INTEGER NOT NULL)",
+    "CREATE TABLE models (base TEXT NOT NULL, state TEXT NOT NULL, lost TEXT NOT NULL)",
     "CREATE TABLE jobs (number INTEGER PRIMARY KEY, id TEXT UNIQUE NOT NULL, message BLOB NOT NULL)",
-    "CREATE TABLE audit (line TEXT NOT NULL)",
+    "CREATE TABLE audit (number INTEGER PRIMARY KEY, line TEXT NOT NULL, exported INTEGER NOT NULL DEFAULT 0)",
 )
+_DAMAGE = {sqlite3.SQLITE_ERROR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB}
+"""Errors that say something of the content; all others say it of the disk, or of who else is there."""
+_BUSY_S = 1.0
+"""The transaction of another program is waited for so long; all changes wait with it."""
 
-Statement = tuple[str, Sequence[tuple[Any, ...]]]
-"""SQL that changes the database, and the rows of values that it is run with."""
+Write = Callable[[sqlite3.Connection], object]
+"""Writes something in a transaction."""
 
 
 @dataclass(frozen=True)
 class Contents:
-    """What a database holds.
+    """What a database holds, besides the record of changes.
 
     Attributes:
         base: digest of the base bundle that the history begins with.
         state: of the models.
         jobs: messages of jobs by id, the oldest first.
-        audit: lines that may not be in the record of model changes yet, the oldest first.
+        lost: why it is not known what was in service, empty where it is.
+        sources: files of an earlier version that it was read from.
     """
 
     base: str
     state: State
     jobs: Mapping[str, bytes] = field(default_factory=dict)
-    audit: Sequence[str] = ()
-
-    def check(self) -> None:
-        """See whether it makes sense.
-
-        Raises:
-            ValueError, BundleError: it contradicts itself, or names what is no version.
-        """
-        history = self.state.history
-        if not 0 <= history.cursor < len(history.versions):
-            raise ValueError(f"bundle {history.cursor} of {len(history.versions)} in service")
-        for version in history.versions:
-            check_version(version, "bundle in service")
-
-    def jobs_written(self) -> list[Statement]:
-        """Return what writes the jobs."""
-        return [part for job in self.jobs.items() for part in job_written(*job, kept=len(self.jobs))]
+    lost: str = ""
+    sources: tuple[Path, ...] = ()
 
 
 class Database:
-    """Is opened for each transaction, so that nobody writes to a file that was taken away or replaced.
+    """A file that is opened for each transaction: nobody writes to one that was taken away or replaced.
 
     Args:
-        folder: where it lies.
+        folder: where it lies; None for a database in memory.
         has_locks: whether other programs can be kept out by locks while it is written.
 
     Attributes:
         path: of it.
     """
 
-    def __init__(self, folder: Path, has_locks: bool) -> None:
-        self.path, self._options = folder / DATABASE, "" if has_locks else "&nolock=1"
+    def __init__(self, folder: Path | None, has_locks: bool) -> None:
+        self.path, self._options = (folder or Path()) / DATABASE, "" if has_locks else "&nolock=1"
+        self._memory: sqlite3.Connection | None = None
+        if folder is None:
+            self._memory = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
 
     @property
     def exists(self) -> bool:
-        """Whether there is a file, damaged or not; an empty one is what a killed program leaves that was to make it."""
-        return self.path.exists() and self.path.stat().st_size > 0
+        """Whether there is a file, damaged or not; an empty one holds nothing."""
+        return self._memory is None and self.path.exists() and self.path.stat().st_size > 0
 
     def read(self) -> Contents:
         """Return what it holds, checked; what a killed program has left of a transaction is undone.
 
         Raises:
             BundleError: it is damaged, or of another program.
-            sqlite3.OperationalError: another program has locked it.
+            OSError, sqlite3.OperationalError: it cannot be read, or another program has locked it.
         """
-        subject, expected = f"database {self.path}", "one of this program's that is whole"
         try:
-            with closing(self._opened("rw")) as database:
-
-                def values(query: str) -> list[Any]:
-                    return [row[0] for row in database.execute(query)]
-
-                identity = (*values("PRAGMA application_id"), *values("PRAGMA user_version"))
-                if identity != _IDENTITY or (told := values("PRAGMA quick_check(1)")) != ["ok"]:
-                    raise ValueError(told[0] if identity == _IDENTITY else f"application and version {identity}")
-                ((base, cursor),) = database.execute("SELECT base, cursor FROM service")
-                history = History(tuple(values("SELECT version FROM history ORDER BY place")), cursor)
-                bundles = {
-                    version: Known(None if origin is None else Origin(origin), key, bool(pinned))
-                    for version, origin, key, pinned in database.execute("SELECT * FROM bundles")
-                }
+            with closing(self._opened(self.path)) as database:
+                identity = tuple(
+                    database.execute(f"PRAGMA {name}").fetchone()[0] for name in ("application_id", "user_version")
+                )
+                if identity != _IDENTITY:
+                    raise ValueError(f"application and version {identity}")
+                if (told := database.execute("PRAGMA quick_check(1)").fetchone()[0]) != "ok":
+                    raise ValueError(told)
+                database.execute("SELECT number, line, exported FROM audit LIMIT 0")
+                ((base, state, lost),) = database.execute("SELECT base, state, lost FROM models")
                 jobs = dict(database.execute("SELECT id, message FROM jobs ORDER BY number"))
-                contents = Contents(base, State(history, bundles), jobs, values("SELECT line FROM audit"))
-                contents.check()
-        except (sqlite3.Error, ValueError, TypeError, BundleError) as error:
-            if getattr(error, "sqlite_errorcode", 0) == sqlite3.SQLITE_BUSY:
+                return Contents(base, state_of(state), jobs, lost)
+        except (sqlite3.Error, ValueError) as error:
+            if getattr(error, "sqlite_errorcode", sqlite3.SQLITE_ERROR) & 0xFF not in _DAMAGE:
                 raise
-            raise BundleError(subject, error, expected) from None
-        return contents
+            raise BundleError(f"database {self.path}", error, "one of this program's that is whole") from None
 
-    def write(self, statements: Sequence[Statement], anew: bool = False) -> None:
-        """Run statements in one transaction: all or none, also where the program is killed or the power cut.
+    @contextmanager
+    def transaction(self, anew: Contents | None = None) -> Iterator[sqlite3.Connection]:
+        """Yield the database; what is written is there at the end all or not at all, also after a kill or power cut.
 
-        With `anew` an empty database is begun, and the one before put aside.
+        With `anew` a database is begun that holds this. It gets its name once it is whole; what had the name is put
+        aside, and so are the files that the content was read from.
 
         Raises:
-            OSError, sqlite3.Error: it cannot be written.
+            OSError, sqlite3.Error: it cannot be written; then nothing has changed.
         """
-        if anew and self.exists:
-            self._put_aside()
-        with closing(self._opened("rwc" if anew else "rw")) as database:
-            database.execute("BEGIN IMMEDIATE")
-            for definition in _SCHEMA if anew else ():
-                database.execute(definition)
-            for sql, rows in statements:
-                database.executemany(sql, rows)
-            database.execute("COMMIT")
+        if self._memory is not None:
+            with _within(self._memory, anew) as database:
+                yield database
+        elif anew is None:
+            with closing(self._opened(self.path)) as database:
+                with _within(database):
+                    yield database
+                if database.total_changes:
+                    sync_folder(self.path.parent)  # the journal is gone: after a power cut it would undo all this
+        else:
+            descriptor, made = new_file(self.path.parent, DATABASE)
+            os.close(descriptor)
+            try:
+                with closing(self._opened(made)) as database, _within(database, anew):
+                    yield database
+                self._put_aside()
+                os.replace(made, self.path)
+            finally:
+                made.unlink(missing_ok=True)
+            sync_folder(self.path.parent)
+            for path in anew.sources:
+                with suppress(OSError):  # nobody reads it while there is a database
+                    path.rename(f"{path}.imported")
 
-    def _opened(self, mode: str) -> sqlite3.Connection:
-        uri = f"{self.path.absolute().as_uri()}?mode={mode}{self._options}"
-        database = sqlite3.connect(uri, uri=True, isolation_level=None)
-        # With a rollback journal: a write-ahead log needs shared memory, which network shares lack. Only EXTRA
-        # has the end of a transaction on the disk.
-        database.execute("PRAGMA synchronous = EXTRA")
+    def _opened(self, path: Path) -> sqlite3.Connection:
+        uri = f"{path.absolute().as_uri()}?mode=rw{self._options}"
+        database = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=_BUSY_S)
+        # With a rollback journal: a write-ahead log needs shared memory, which network shares lack. EXTRA would fail
+        # after the end of a transaction where a folder cannot be synchronised.
+        database.execute("PRAGMA synchronous = FULL")
         return database
 
     def _put_aside(self) -> None:
@@ -151,31 +150,32 @@ class Database:
                 os.replace(f"{self.path}{end}", self.path.with_name(DAMAGED + end))
 
 
-def history_written(history: History, base: str) -> list[Statement]:
-    """Return what writes a history that begins with the base bundle of this digest."""
-    return [
-        *_table("service", "?, ?", [(base, history.cursor)]),
-        *_table("history", "?, ?", enumerate(history.versions)),
-    ]
+@contextmanager
+def _within(database: sqlite3.Connection, anew: Contents | None = None) -> Iterator[sqlite3.Connection]:
+    """Yield the database in a transaction."""
+    database.execute("BEGIN IMMEDIATE")
+    try:
+        if anew is not None:
+            for definition in _SCHEMA:
+                database.execute(definition)
+            write_state(database, anew.base, anew.state, anew.lost)
+            for id_, message in anew.jobs.items():
+                write_job(database, id_, message, len(anew.jobs))
+        yield database
+        database.execute("COMMIT")
+    except BaseException:
+        database.rollback()
+        raise
 
 
-def bundles_written(state: State) -> list[Statement]:
-    """Return what writes all that is known of bundles."""
-    rows = [(version, known.origin, known.key, known.pinned) for version, known in state.bundles.items()]
-    return _table("bundles", "?, ?, ?, ?", rows)
+def write_state(database: sqlite3.Connection, base: str, state: State, lost: str) -> None:
+    """Write what `Contents` calls so, in place of what was."""
+    database.execute("DELETE FROM models")
+    database.execute("INSERT INTO models VALUES (?, ?, ?)", (base, state.to_json(), lost))
 
 
-def job_written(id_: str, message: bytes, kept: int) -> list[Statement]:
-    """Return what writes a job, and forgets all but the newest `kept`."""
+def write_job(database: sqlite3.Connection, id_: str, message: bytes, kept: int) -> None:
+    """Write a job, and forget all but the newest `kept`."""
     upsert = "INSERT INTO jobs (id, message) VALUES (?, ?) ON CONFLICT (id) DO UPDATE SET message = excluded.message"
-    forget = "DELETE FROM jobs WHERE number <= (SELECT max(number) FROM jobs) - ?"
-    return [(upsert, [(id_, message)]), (forget, [(kept,)])]
-
-
-def audit_written(lines: Sequence[str]) -> list[Statement]:
-    """Return what writes the lines that are not in the record of model changes yet, in place of those before."""
-    return _table("audit", "?", [(line,) for line in lines])
-
-
-def _table(name: str, values: str, rows: Iterable[tuple[Any, ...]]) -> list[Statement]:
-    return [(f"DELETE FROM {name}", [()]), (f"INSERT INTO {name} VALUES ({values})", list(rows))]
+    database.execute(upsert, (id_, message))
+    database.execute("DELETE FROM jobs WHERE number <= (SELECT max(number) FROM jobs) - ?", (kept,))

@@ -8,12 +8,13 @@ import os
 import shutil
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 from lightpage.errors import StoreError, SurroundingsError, raised_as
 from lightpage.files import lock, new_file, synchronise
 from lightpage.runtime.model.bundle.signature_file import signature_path
+from lightpage.runtime.service.models.database import DATABASE
 from lightpage.temporary import temporary_folder
 
 _log = logging.getLogger(__name__)
@@ -23,14 +24,14 @@ UPLOAD = ".upload-"
 """How the name of an unfinished upload begins."""
 PROBE = ".probe-"
 """How the name of a file begins that tries whether the folder can be written."""
-_LEFTOVERS = (f"{UPLOAD}*", f"{PROBE}*", ".*.json-*", ".*.zip-*")
+_LEFTOVERS = (f"{UPLOAD}*", f"{PROBE}*", f".{DATABASE}-*", ".*.json-*", ".*.zip-*")
 """Names of what a program that was killed leaves here."""
 
 _PREFIX = "lightpage-models-"
 
 
 class BundleFolder:
-    """Is used by one service at a time; without a path it is a temporary folder, made when it is first asked for.
+    """A folder that one service at a time uses; without a path a temporary one, made when it is first asked for.
 
     Args:
         path: made if absent; None for a temporary folder.
@@ -51,8 +52,7 @@ class BundleFolder:
         if path is not None:
             try:
                 path.mkdir(parents=True, exist_ok=True)
-                self._take(path / LOCK)
-                self._sweep(path)
+                self._take(path)
             except BlockingIOError:
                 self.close()
                 raise StoreError(self.subject, "a store in use", "one that no other service uses") from None
@@ -124,22 +124,46 @@ class BundleFolder:
         if (free := shutil.disk_usage(self.path).free) < needed_bytes:
             raise OSError(errno.ENOSPC, f"{free} bytes free, {needed_bytes} needed")
 
-    def _take(self, path: Path) -> None:
-        """Lock the folder; one that cannot be written, and never was used, goes without."""
-        try:
-            self._lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-        except OSError as error:
-            if not path.exists():
-                _log.warning("%s: cannot be locked: %s", self.subject, error)
-                return
-            self._lock = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-        self.has_locks = lock(self._lock, self.subject)
+    def sweep(self, noted: Collection[str], is_sure: bool) -> None:
+        """Remove what programs that were killed have left.
 
-    def _sweep(self, folder: Path) -> None:
-        for path in (path for pattern in _LEFTOVERS for path in folder.glob(pattern)):
+        Args:
+            noted: versions of bundles of which something is known.
+            is_sure: whether that is all: then a bundle that was about to be taken in, and is not noted, goes too.
+        """
+        if self._path is None:
+            return
+        for path in (path for pattern in _LEFTOVERS for path in self._path.glob(pattern)):
             try:
+                for version in self.versions() if is_sure and path.lstat().st_nlink > 1 else ():
+                    if version not in noted and path.samefile(self.bundle(version)):
+                        self.delete(version)
                 shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
             except OSError as error:
                 _log.warning("%s: %s stays: %s", self.subject, path.name, error)
             else:
                 _log.info("%s: removed %s, which was left unfinished", self.subject, path.name)
+
+    def _take(self, folder: Path) -> None:
+        """Lock the folder, where that can be done; see whether SQLite, which locks ranges of bytes, can."""
+        path = folder / LOCK
+        try:
+            self._lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        except OSError as error:
+            if not path.exists():  # nobody can write there, and nobody ever has
+                _log.warning("%s: cannot be locked: %s", self.subject, error)
+                return
+            self._lock = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            self.has_locks = lock(self._lock, self.subject)
+            descriptor, name = new_file(folder, PROBE.strip(".-"))  # shares let no file have locks of both kinds
+        except BlockingIOError:
+            raise
+        except OSError as error:
+            _log.warning("%s: locks cannot be tried: %s", self.subject, error)
+            return
+        try:
+            self.has_locks &= lock(descriptor, self.subject, ranges=True)
+        finally:
+            os.close(descriptor)
+            os.unlink(name)

@@ -7,7 +7,10 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any
 
+from pydantic import TypeAdapter, ValidationError
+
 from lightpage.errors import BundleError
+from lightpage.runtime.model.bundle.manifest import Version
 
 HISTORY = 64
 """Steps of the history that are kept: beyond the bundles of a store there is nothing to go back to."""
@@ -26,10 +29,17 @@ class History:
     """Versions in the order in which they came into service, at least one; `cursor` is the index of the present one.
 
     A version that was put in service twice is there twice.
+
+    Raises:
+        ValueError: there is none at the cursor.
     """
 
-    versions: tuple[str, ...]
+    versions: tuple[Version, ...]
     cursor: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.cursor < len(self.versions):
+            raise ValueError(f"bundle {self.cursor} of {len(self.versions)} in service")
 
     @property
     def current(self) -> str:
@@ -98,3 +108,23 @@ class State:
     def noting(self, version: str, **known: Any) -> State:
         """Return the state with fields of `Known` changed."""
         return replace(self, bundles={**self.bundles, version: replace(self.known(version), **known)})
+
+    def to_json(self) -> str:
+        """Return itself as JSON, which `state_of` reads."""
+        return _STATE.dump_json(self).decode()
+
+
+_STATE = TypeAdapter(State)
+
+
+def state_of(remembered: str | Mapping[str, Any]) -> State:
+    """Return what JSON says, or an object that was read from JSON.
+
+    Raises:
+        ValueError: it is no state, or contradicts itself.
+    """
+    try:
+        return _STATE.validate_json(remembered) if isinstance(remembered, str) else _STATE.validate_python(remembered)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None

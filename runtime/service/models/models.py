@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 
 from lightpage.errors import (
     BundleError,
@@ -22,7 +23,7 @@ from lightpage.runtime.model.bundle.manifest import Manifest, check_version
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import NOBODY, Actor
 from lightpage.runtime.service.models.audit import AuditLog, Entry
-from lightpage.runtime.service.models.database import Statement, audit_written
+from lightpage.runtime.service.models.database import Write
 from lightpage.runtime.service.models.history import History, Origin, State
 from lightpage.runtime.service.models.loader import Loader, Model
 from lightpage.runtime.service.models.store import Store
@@ -32,6 +33,8 @@ _log = logging.getLogger(__name__)
 
 KEPT_MODELS = 4
 """Models held loaded, the current one included: enough to step back over a bad day, and a bound on the memory."""
+
+Change = Callable[[State], tuple[State, Model | None]]
 
 
 @dataclass(frozen=True)
@@ -81,20 +84,20 @@ class Models:
     """Owns the models. Readers take what is there and wait for nobody; changes, from many threads, follow each other.
 
     A request takes `current` once and keeps it: no change pulls a model from under it. A change is on the disk, with
-    its line of the record, before it takes effect; where it cannot be written, nothing changes. The service goes on
+    its entry of the record, before it takes effect; where it cannot be written, nothing changes. The service goes on
     with what the store remembers, as far as it can be used; what cannot is logged and is the store's trouble.
 
     Args:
         first: the decoder that the operator gave.
         store: where models are kept; by default they end with the service.
         loader: loads the others.
-        audit: is told of every change, and of those that failed.
+        audit: of the store; keeps every change, and those that failed.
         kept: models held loaded at most; others of the history are loaded again when they are gone to.
 
     Attributes:
         base: manifest of the first decoder.
         now: the models at this moment.
-        in_service: is told which model is about to be in service.
+        in_service: is told which model has come into service.
     """
 
     def __init__(
@@ -106,7 +109,7 @@ class Models:
         kept: int = KEPT_MODELS,
     ) -> None:
         self.store, self.loader = store or Store(None, first.bundle), loader or Loader()
-        self._audit, self._kept = audit or AuditLog(), kept
+        self._audit, self._kept = audit or AuditLog(self.store), kept
         self.base, self._base_path = first.bundle.manifest, first.bundle.path
         self.in_service: Callable[[Model], None] = lambda model: None
         found = self.store.contents
@@ -114,7 +117,6 @@ class Models:
         self.now = Snapshot(begun, {})
         self._serve(begun, self.loader.tracked(first, first))
         self._resume(found.state)
-        self._audit.resume(found.audit)
 
     # ---- what is there ---------------------------------------------------------------------------------------------
 
@@ -169,9 +171,7 @@ class Models:
 
     # ---- changes ---------------------------------------------------------------------------------------------------
 
-    def adopt(
-        self, decoder: Decoder, expected: Model | None = None, actor: Actor = NOBODY, *more: Sequence[Statement]
-    ) -> Model:
+    def adopt(self, decoder: Decoder, expected: Model | None = None, actor: Actor = NOBODY, *more: Write) -> Model:
         """Put a recalibrated decoder in service, and return its model; the one before is kept to step back to.
 
         Args:
@@ -185,19 +185,20 @@ class Models:
             RecalibrationRefusedError: `expected` is no longer in service.
         """
         version = decoder.version
-        with self.store.changing, self.recorded("recalibrate", actor, version):
-            current, state = self.current, self.now.state
+
+        def adopted(state: State) -> tuple[State, Model]:
+            current = self.current
             if expected is not None and current is not expected:
                 wanted = f"{expected.version}, which was recalibrated"
                 raise RecalibrationRefusedError("model in service", f"{current.version} by now", wanted)
             model = self.loader.tracked(decoder, current.decoder)
             if version in state.history.versions:
                 raise ModelExistsError(f"{decoder.bundle.subject}: version", version, "a version not held already")
-            noted = self.now.state.among(self.versions())
+            noted = state.among(self.versions())
             noted = noted.noting(version, origin=Origin.RECALIBRATED, key=self.loader.fingerprint)
-            state = replace(noted, history=state.history.followed_by(version))
-            self.commit(Entry("recalibrate", actor, current.version, version), state, model, *more)
-            return model
+            return replace(noted, history=state.history.followed_by(version)), model
+
+        return self.change("recalibrate", actor, adopted, version, *more)[0]
 
     def rollback(self, expected: str = "", actor: Actor = NOBODY) -> tuple[Model, Model]:
         """Go back to the model before; returns (now current, before).
@@ -210,11 +211,11 @@ class Models:
             BundleError: there is none, it is damaged or foreign, or it cannot be remembered; then nothing changes.
             OtherModelError: another version is in service.
         """
-        return self._change("rollback", lambda history: history.stepped(-1), expected, actor)
+        return self._moved("rollback", lambda history: history.stepped(-1), expected, actor)
 
     def roll_forward(self, expected: str = "", actor: Actor = NOBODY) -> tuple[Model, Model]:
         """Go to the later model again: the opposite of `rollback`, which raises the same."""
-        return self._change("roll forward", lambda history: history.stepped(1), expected, actor)
+        return self._moved("roll forward", lambda history: history.stepped(1), expected, actor)
 
     def activate(self, version: str, expected: str = "", actor: Actor = NOBODY) -> tuple[Model, Model]:
         """Put a model in service that need not be loaded; as `rollback`."""
@@ -223,7 +224,7 @@ class Models:
             self._manifest(version)
             return history if version == history.current else history.followed_by(version)
 
-        return self._change("activate", followed, expected, actor, version)
+        return self._moved("activate", followed, expected, actor, version)
 
     def pin(self, version: str, pinned: bool, actor: Actor = NOBODY) -> ModelEntry:
         """Pin a model, or let go of it.
@@ -232,9 +233,7 @@ class Models:
             BundleError: there is none, or it cannot be remembered.
         """
         manifest, what = self._manifest(version), "pin" if pinned else "unpin"
-        with self.store.changing, self.recorded(what, actor, version):
-            entry = Entry(what, actor, self.current.version, version)
-            self.commit(entry, self.now.state.noting(version, pinned=pinned))
+        self.change(what, actor, lambda state: (state.noting(version, pinned=pinned), None), version)
         return self.entry(manifest)
 
     def prune(self, *more: str) -> None:
@@ -264,39 +263,51 @@ class Models:
             yield
         except Exception as error:
             with self.store.changing:
-                self._audit.append(Entry(what, actor, self.current.version, version, error))
+                self._audit.failed(Entry(what, actor, self.current.version, version, error))
             raise
 
-    def commit(self, entry: Entry, state: State, model: Model | None = None, *more: Sequence[Statement]) -> None:
-        """Write a change with its line of the record in one transaction, and make it. `store.changing` is held.
+    def change(self, what: str, actor: Actor, make: Change, version: str = "", *more: Write) -> tuple[Model, Model]:
+        """Make a change: it is written with its entry of the record in one transaction, and then takes effect.
 
         Args:
-            entry: of the record.
-            state: after the change.
-            model: that comes into service; None where the present one stays.
+            what: it is called in the record.
+            actor: who makes it.
+            make: returns the state after it, and the model that comes into service, None where the present one stays.
+            version: that it is about; empty for that in service after it.
             more: is written too.
+
+        Returns:
+            The model in service now, and the one before.
 
         Raises:
             StoreError: it cannot be written; then nothing changes.
+            Exception: what `make` raises.
         """
-        self.store.save(state, audit_written(self._audit.pending(entry)), *more, settles=model is not None)
-        if model is None:
-            self.now = replace(self.now, state=state)
-        else:
-            self.in_service(model)
-            self._serve(state, model)
-        self._audit.append(entry)
-
-    def _change(
-        self, what: str, change: Callable[[History], History], expected: str, actor: Actor, version: str = ""
-    ) -> tuple[Model, Model]:
         with self.store.changing, self.recorded(what, actor, version):
-            before, state = self.expect(expected), self.now.state
-            history = change(state.history)
-            model = None if history is state.history else self._model(history.current)
-            entry = Entry(what, actor, before.version, history.current)
-            self.commit(entry, replace(state, history=history), model)
-            return model or before, before
+            before = self.current
+            state, model = make(self.now.state)
+            entry = Entry(what, actor, before.version, version or state.history.current)
+            self.store.save(state, partial(self._audit.write, entry), *more, settles=model is not None)
+            if model is None:
+                self.now = replace(self.now, state=state)
+            else:
+                self._serve(state, model)
+                try:
+                    self.in_service(model)
+                except Exception:  # the change is made, and whoever asked for it must not hear otherwise
+                    _log.exception("model %s is in service, and not everybody knows", model.version)
+            self._audit.done(entry)
+            return self.current, before
+
+    def _moved(
+        self, what: str, move: Callable[[History], History], expected: str, actor: Actor, version: str = ""
+    ) -> tuple[Model, Model]:
+        def moved(state: State) -> tuple[State, Model | None]:
+            self.expect(expected)
+            history = move(state.history)
+            return replace(state, history=history), None if history is state.history else self._model(history.current)
+
+        return self.change(what, actor, moved, version)
 
     def _serve(self, state: State, model: Model) -> None:
         self.now = self.now.changed(state, model, self._kept)

@@ -7,23 +7,15 @@ import logging
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
 from lightpage.errors import BundleError, LightpageError, StoreError
 from lightpage.runtime.model.bundle.bundle import Bundle
-from lightpage.runtime.model.bundle.manifest import sha256
-from lightpage.runtime.service.models.database import (
-    DATABASE,
-    Contents,
-    Database,
-    Statement,
-    bundles_written,
-    history_written,
-)
-from lightpage.runtime.service.models.earlier_store import EARLIER, read_earlier
+from lightpage.runtime.service.models.database import Contents, Database, Write, write_state
+from lightpage.runtime.service.models.earlier_store import CURRENT, read_earlier
 from lightpage.runtime.service.models.folder import BundleFolder
 from lightpage.runtime.service.models.history import History, State
 from lightpage.runtime.service.models.store_health import Reason, StoreHealth, Trouble
@@ -64,17 +56,20 @@ class Store(AbstractContextManager["Store"]):
     ) -> None:
         self.changing, self.kept, self._clock = threading.RLock(), 0 if folder is None else kept, clock
         self.room_bytes, self.health = 0, StoreHealth(self.trouble)
-        self._base = sha256(base.manifest.to_json())
-        self._is_lost = self._is_closed = False
-        """Whether there is no database that can be written: what is next to be remembered of models begins one."""
+        self._base = base.digest
+        self._is_begun = False
+        """Whether there is a database to write to."""
+        self._refused: tuple[str, str] | None = None
+        """What came and what is wanted, for the error of whoever writes; None where that may be."""
         self._damage: Trouble | None = None
         self._failure: Trouble | None = None
         self._probed = -float("inf")
         self.contents = Contents(self._base, State(History((base.version,))))
         self.folder = BundleFolder(folder)
-        self._database = None if folder is None else Database(folder, self.folder.has_locks)
+        self._database = Database(folder, self.folder.has_locks)
         try:
             self._resume()
+            self.folder.sweep(self.contents.state.bundles, is_sure=self._is_begun)
         except BaseException:
             self.close()
             raise
@@ -84,77 +79,97 @@ class Store(AbstractContextManager["Store"]):
 
     def close(self) -> None:
         """Let go of the folder, and wait for no disk; whoever changes something later hears that it is closed."""
-        self._is_closed = True
+        self._refused = "a store that is closed", "one in use"
         self.folder.close()
 
-    def save(self, state: State, *more: Sequence[Statement], settles: bool = False) -> None:
+    def save(self, state: State, *more: Write, settles: bool = False) -> None:
         """Write the state of the models, and more with it, in one transaction.
 
-        While something is lost that was in service, the history stays as it was until a state `settles` that.
+        While something is lost that was in service, its history stays, or that it is lost, until a state `settles`
+        that.
 
         Raises:
             StoreError: it cannot be written; then all stays as it was.
         """
         with self.changing:
-            if settles or self._damage is None or self._is_lost:
-                more = (history_written(state.history, self._base), *more)
-            self._write([bundles_written(state), *more], self._is_lost)
-            self._is_lost = False
-            if settles:
-                self._damage = None
+            damage = None if settles else self._damage
+            lost = "" if damage is None else self.contents.lost
+            if damage is not None:
+                state = replace(state, history=self.contents.state.history)
+            with self.transaction(begins=True) as database:
+                write_state(database, self._base, state, lost)
+                for write in more:
+                    write(database)
+            self._damage = damage
 
-    def write(self, *parts: Sequence[Statement]) -> None:
-        """Write, in one transaction, what is no state of the models.
+    @contextmanager
+    def transaction(self, begins: bool = False) -> Iterator[sqlite3.Connection]:
+        """Yield the database, which holds all that is written to it at the end, or nothing of it.
+
+        Args:
+            begins: whether a new database may take the place of one that is damaged or gone.
 
         Raises:
             StoreError: it cannot be written; then all stays as it was.
         """
         with self.changing:
-            if self._is_lost:
-                raise StoreError(self.folder.subject, "no database", "one, which a change of models begins")
-            self._write(parts)
-
-    def _write(self, parts: Sequence[Sequence[Statement]], anew: bool = False) -> None:
-        if self._database is None:
-            return
-        if self._is_closed:
-            raise StoreError(self.folder.subject, "a store that is closed", "one in use")
-        try:
-            self.folder.check()
-            self._database.write([statement for part in parts for statement in part], anew)
-        except (OSError, sqlite3.Error) as error:
-            raise self.failed(error) from None
-        self._failure = None
+            refused = self._refused
+            if self.contents.lost and not self._is_begun and not begins:
+                refused = "no database", "one, which a change of models begins"
+            if refused is not None:
+                raise StoreError(self.folder.subject, *refused)
+            try:
+                self.folder.check()
+                with self._database.transaction(None if self._is_begun else self.contents) as database:
+                    yield database
+            except (OSError, sqlite3.Error) as error:
+                raise self.failed(error) from None
+            self._is_begun, self._failure = True, None
 
     def _resume(self) -> None:
-        """Read the database, or make one of what a store without one remembers."""
-        if self._database is None:
+        """Go on with what is remembered; where there is no database, begin one with it."""
+        try:
+            found = self._found()
+        except (OSError, sqlite3.Error) as error:
+            if getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_BUSY:
+                raise StoreError(self.folder.subject, error, "one that no other program uses") from None
+            # What it remembers is not written over.
+            self._refused = self.failed(error).got, "a database that can be read, at a start of the service"
+            self._damage = self._failure
             return
-        try:
-            self._is_lost = not self._database.exists
-            found = self._without_database() if self._is_lost else self._database.read()
-            history = found.state.history if found.base == self._base else self.contents.state.history
-            self.contents = replace(found, state=replace(found.state, history=history))
-            with suppress(StoreError, OSError):  # what cannot be written is logged, and the store's trouble
-                if self._is_lost:
-                    self.save(self.contents.state, found.jobs_written())
-                for path in (self.folder.path / name for name in EARLIER):
-                    path.rename(f"{path}.imported")
-        except (sqlite3.Error, OSError) as error:
-            raise StoreError(self.folder.subject, error, "one that no other program uses") from None
-        except BundleError as error:
-            self._is_lost = True
-            self.damaged(Reason.NOTE, error)
-            _log.warning("serving the base: %s", error)
+        if found.base != self._base:
+            served, base = found.state.history.current, self.contents.state.history.current
+            _log.warning("%s: %s served, made from another base; %s begins anew", self.folder.subject, served, base)
+            found = replace(found, state=replace(found.state, history=self.contents.state.history))
+        self.contents = found
+        if found.lost:
+            self._damage = Trouble(Reason.NOTE, found.lost)
+            _log.warning("serving the base: %s", found.lost)
+        elif not self._is_begun:
+            with suppress(StoreError), self.transaction():  # else it is logged, the store's trouble, and tried again
+                pass
 
-    def _without_database(self) -> Contents:
-        try:
-            return read_earlier(self.folder.path, self.contents.state.history.current)
-        except FileNotFoundError:
-            if made := [version for version in self.folder.versions() if "+r" in version]:
-                subject, expected = f"{self.folder.subject}: {DATABASE}", f"a database: there is {', '.join(made)}"
-                raise BundleError(subject, "no such file", expected) from None
+    def _found(self) -> Contents:
+        """Return what is remembered.
+
+        Raises:
+            OSError, sqlite3.Error: it cannot be read.
+        """
+        if not self.folder.is_kept:
             return self.contents
+        if self._database.exists:
+            try:
+                found = self._database.read()
+            except BundleError as error:
+                return replace(self.contents, lost=str(error))
+            self._is_begun = True
+            return found
+        found = read_earlier(self.folder.path, self.contents)
+        made = [version for version in self.folder.versions() if "+r" in version]
+        if made and not found.lost and self.folder.path / CURRENT not in found.sources:
+            expected = f"a database: there is {', '.join(made)}"
+            return replace(found, lost=str(BundleError(str(self._database.path), "no such file", expected)))
+        return found
 
     # ---- how it is -------------------------------------------------------------------------------------------------
 
@@ -173,7 +188,9 @@ class Store(AbstractContextManager["Store"]):
         Raises:
             StoreError: it cannot, or has not.
         """
-        if self._database is None:
+        if self._refused is not None:
+            raise StoreError(self.folder.subject, *self._refused)
+        if not self.folder.is_kept:
             return
         self._probed = self._clock()
         try:

@@ -9,12 +9,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from lightpage.errors import BundleError, CallerLeft, InvalidInputError, LimitError, ModelExistsError, StoreError
-from lightpage.files import move_to_new_name, new_file, synchronise
+from lightpage.files import give_new_name, new_file, sync_folder, synchronise
 from lightpage.runtime.model.bundle.signature_file import MOST_BYTES, signature_path
 from lightpage.runtime.service.caller import NOBODY, Actor, Caller
-from lightpage.runtime.service.models.audit import Entry
 from lightpage.runtime.service.models.folder import UPLOAD
-from lightpage.runtime.service.models.history import Origin
+from lightpage.runtime.service.models.history import Origin, State
 from lightpage.runtime.service.models.models import ModelEntry, Models
 
 
@@ -35,7 +34,7 @@ def take_in(
         ModelExistsError: there is a model of its version.
         BundleError: it is damaged, for another device, or lacks the signature that it needs.
     """
-    loader, store = models.loader, models.store
+    loader, folder = models.loader, models.store.folder
     with models.recorded("upload", actor):
         current = models.current.decoder
         try:
@@ -44,29 +43,36 @@ def take_in(
         except BundleError as error:
             subject = error.subject.replace(f"bundle {path}", "new bundle")
             raise type(error)(subject, error.got, error.expected) from None
-        version, taken = decoder.version, False
-        final = store.folder.bundle(version)
-        with store.changing:
-            try:
-                if version in models.versions():
-                    raise FileExistsError
-                here()
-                taken = True
-                if loader.wants_signatures:
-                    with signature_path(final).open("wb") as file:
-                        file.write(signature)
-                        file.flush()
-                        synchronise(file.fileno())
-                move_to_new_name(path, final)  # unlike a renaming, it replaces nothing that came in the meantime
-                state = models.now.state.among(models.versions()).noting(version, origin=Origin.UPLOADED, key=None)
-                models.commit(Entry("upload", actor, models.current.version, version), state)
-            except FileExistsError:
-                expected = "one that the service does not have"
-                raise ModelExistsError("new bundle: version", version, expected) from None
-            except BaseException:
-                if taken:
-                    store.folder.delete(version)
-                raise
+    version, taken = decoder.version, False
+    final = folder.bundle(version)
+
+    def named(state: State) -> tuple[State, None]:
+        nonlocal taken
+        try:
+            if version in models.versions():
+                raise FileExistsError
+            here()
+            give_new_name(path, final)  # unlike a renaming, it replaces nothing that came in the meantime
+        except FileExistsError:
+            expected = "one that the service does not have"
+            raise ModelExistsError("new bundle: version", version, expected) from None
+        taken = True
+        if loader.wants_signatures:
+            with signature_path(final).open("wb") as file:
+                file.write(signature)
+                file.flush()
+                synchronise(file.fileno())
+        sync_folder(final.parent)
+        return state.among(models.versions()).noting(version, origin=Origin.UPLOADED, key=None), None
+
+    try:
+        models.change("upload", actor, named, version)
+    except BaseException:
+        if taken:
+            folder.delete(version)
+        raise
+    with suppress(OSError):  # the next start sweeps it; its two names told that it was not taken in yet
+        path.unlink()
     models.prune(version)
     return models.entry(decoder.bundle.manifest)
 

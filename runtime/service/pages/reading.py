@@ -15,8 +15,7 @@ from lightpage.errors import LightpageError, LostPageError, PageError, SourceErr
 from lightpage.page.pilots import Pilots
 from lightpage.runtime.device.acquisition.source import FrameSource, Shot, own_fault
 from lightpage.runtime.service.caller import Caller
-from lightpage.runtime.service.dataplane import Answer, DataPlane, levels_for
-from lightpage.runtime.service.monitoring.observation import Seen, observed
+from lightpage.runtime.service.dataplane import Answer, DataPlane, Seen, levels_for, observed
 from lightpage.runtime.service.stages import Stage, Stages
 
 GROUPS = 4

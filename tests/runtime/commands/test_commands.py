@@ -23,7 +23,7 @@ from lightpage.recording.reader import Recording
 from lightpage.recording.writer import RecordingWriter
 from lightpage.runtime.client.answers import RemotePage
 from lightpage.runtime.client.client import LightpageClient
-from lightpage.runtime.client.pages import Pages
+from lightpage.runtime.client.pages import PagesClient
 from lightpage.runtime.commands.client import recalibrate as cli_recalibrate
 from lightpage.runtime.device.acquisition.source import open_source
 from lightpage.runtime.model.bundle.bundle import Bundle
@@ -372,14 +372,14 @@ def test_pages_of_the_source_that_came_before_the_end_are_kept(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """It would show other pages the next time."""
-    read, count = Pages.read, iter(range(100))
+    read, count = PagesClient.read, iter(range(100))
 
-    def ending(self: Pages, **options: Any) -> RemotePage:
+    def ending(self: PagesClient, **options: Any) -> RemotePage:
         if next(count) == 2:
             raise end
         return read(self, **options)
 
-    monkeypatch.setattr(Pages, "read", ending)
+    monkeypatch.setattr(PagesClient, "read", ending)
     out, figures = tmp_path / "decoded.h5", tmp_path / "d.json"
     arguments = ["decode", "--target", service.target, "--source", "--pages", "5", "--out", out, "--json", figures]
     assert run(*arguments) == (130 if end is KeyboardInterrupt else 2)

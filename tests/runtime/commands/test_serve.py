@@ -169,7 +169,9 @@ def test_a_service_keeps_to_its_limits_logs_json_and_writes_down_changes_and_los
     left_out = sum(line.get("left_out", 0) for line in lines if line["message"].startswith("ReadData TOO_LARGE: "))
     assert len(refused) < 8
     assert len(refused) + left_out == 8
-    (entry,) = [json.loads(line) for line in (tmp_path / "store" / "audit.jsonl").read_text().splitlines()]
+    # The first change was made where there was no file yet.
+    before, entry = [json.loads(line) for line in (tmp_path / "store" / "audit.jsonl").read_text().splitlines()]
+    assert (before["what"], before["to"]) == ("activate", "toy-1+r1")
     assert (entry["what"], entry["from"], entry["to"]) == ("rollback", "toy-1+r1", "toy-1")
     assert (entry["correlation_id"], entry["outcome"]) == ("shift 2", "done")
     kept = sorted((tmp_path / "flight").iterdir())

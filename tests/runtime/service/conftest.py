@@ -35,12 +35,13 @@ def begun(
     tracker: TrackerFactory = NoTracker,
     source: Any = "toy",
     monitor: Monitor | None = None,
-    audit: AuditLog | None = None,
+    audit: Path | None = None,
     **server: Any,
 ) -> Running:
     """A service, as `lightpage serve` starts one; further arguments are of `LightpageServer`."""
     shown = toy.ToySource(toy.ToyDevice()) if source == "toy" else source
-    models = Models(decoder, Store(store, decoder.bundle), Loader(tracker), audit)
+    kept = Store(store, decoder.bundle)
+    models = Models(decoder, kept, Loader(tracker), AuditLog(kept, audit))
     plane = DataPlane(models, shown, limits, monitor=monitor)
     recalibrator = Recalibrator(plane, fit, recordings)
     running = LightpageServer(plane, recalibrator, **server).start()

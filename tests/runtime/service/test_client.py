@@ -76,6 +76,7 @@ def test_many_pages_of_the_source_in_one_call(start: Start) -> None:
         (lambda client: client.frames.decode(a_page()[1], pilots=KnownPilots(MASK, 256 * MASK, 0)), "pilots"),
         (lambda client: client.models.activate("\ud800"), "version"),
         (lambda client: client.jobs.recalibrate(pages=[-1]), "pages"),
+        (lambda client: client.jobs.start(pages=[1, 2], recording="known.h5"), "pages to recalibrate with"),
         (lambda client: list(client.pages.read_data(0, 2**40)), "pages"),
     ],
 )
@@ -146,6 +147,7 @@ def test_what_cannot_be_asked_for_is_named(serve: Serve) -> None:
     client = serve()[0].client
     cases: list[tuple[Callable[[], object], type[LightpageError], str]] = [
         (lambda: client.pages.read(0, 16, user_data=True), InvalidInputError, "levels"),
+        (lambda: client.pages.read(0, 16, want_fase=True), InvalidInputError, "option of a page"),
         (lambda: list(client.pages.read_data(0, 0)), InvalidInputError, "pages"),
         (lambda: list(client.pages.read_data(0, 4097)), LimitError, "pages"),
         (lambda: list(client.pages.read_data((1 << 32) - 1, 2)), InvalidInputError, "first_page"),

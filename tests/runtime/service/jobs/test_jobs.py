@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import sqlite3
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,7 +29,7 @@ from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.jobs import Jobs
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
-from lightpage.runtime.service.models.database import job_written
+from lightpage.runtime.service.models.database import write_job
 from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.models.store import Store
 from tests.clock import HandClock
@@ -95,6 +97,20 @@ def test_one_runs_at_a_time_and_the_second_hears_which(start: Open) -> None:
     assert jobs.begin("frames", Caller()).id != running.id
 
 
+def test_a_job_is_named_to_others_once_it_can_be_found(stores: Callable[[], Store]) -> None:
+    store = stores()
+    jobs, transaction = Jobs(store), store.transaction
+
+    @contextmanager
+    def slow() -> Iterator[sqlite3.Connection]:
+        jobs.check_free()
+        with transaction() as database:
+            yield database
+
+    store.transaction = slow  # type: ignore[method-assign,assignment]
+    jobs.begin("source", Caller())
+
+
 @pytest.mark.parametrize(
     ("end", "state"),
     [
@@ -156,7 +172,8 @@ def test_a_job_that_a_kill_interrupted_is_done_where_its_model_is_written(
 def test_a_damaged_record_is_forgotten_with_a_warning(
     start: Open, stores: Callable[[], Store], caplog: pytest.LogCaptureFixture
 ) -> None:
-    stores().write(job_written("x", b"\xff", 9))
+    with stores().transaction() as database:
+        write_job(database, "x", b"\xff", 9)
     jobs = start()
     assert [record.levelname for record in caplog.records] == ["WARNING"]
     assert jobs.all() == []

@@ -28,8 +28,7 @@ from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 from lightpage.runtime.service.jobs.self_calibration import SelfCalibration, SelfCalibrationSettings
 from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
-from lightpage.runtime.service.monitoring.monitor import Monitor, MonitorSettings, PageFigures
-from lightpage.runtime.service.monitoring.monitors import Monitors
+from lightpage.runtime.service.monitoring.monitor import Monitor, Monitors, MonitorSettings, PageFigures
 from lightpage.runtime.service.monitoring.observation import Observation
 from lightpage.runtime.service.pages.reading import read_page
 from lightpage.runtime.service.settings import ServiceSettings

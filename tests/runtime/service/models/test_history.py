@@ -101,15 +101,22 @@ def test_a_change_that_breaks_in_the_middle_or_after_the_end_changes_nothing(
 ) -> None:
     models = make("toy-2")
     models.rollback()
-    before, wrong = models.now, [("INSERT INTO history VALUES (0, 'again')", [()])]
+    before = models.now
     new = Decoder.load(toy.write_toy_bundle(tmp_path / "toy-3.zip", version="toy-3"), 1)
     with pytest.raises(StoreError):
-        models.adopt(new, None, NOBODY, wrong)
+        models.adopt(new, None, NOBODY, lambda database: database.execute("INSERT INTO jobs VALUES (1, 'no message')"))
     assert models.now == before
     models.store.close()
     with pytest.raises(StoreError, match="closed"):
         models.roll_forward()
     assert Store(tmp_path, decoder.bundle).contents.state == before.state
+
+
+def test_a_change_is_made_though_somebody_who_is_told_of_it_fails(make: Make, caplog: pytest.LogCaptureFixture) -> None:
+    models = make("toy-2")
+    models.in_service = lambda model: 1 // 0  # type: ignore[assignment,return-value]
+    assert models.rollback()[0] is models.current
+    assert (models.current.version, "not everybody knows" in caplog.text) == ("toy-1", True)
 
 
 def test_readers_wait_for_no_change_and_changes_for_each_other(make: Make) -> None:

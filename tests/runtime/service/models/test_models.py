@@ -223,7 +223,7 @@ def test_a_disk_that_fails_during_an_upload_leaves_nothing(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("lightpage.runtime.service.models.uploads.move_to_new_name", full)
+        patch.setattr("lightpage.runtime.service.models.uploads.give_new_name", full)
         with pytest.raises(StoreError):
             service.client.models.upload(new)
         eventually(lambda: service.left_behind == service.store.versions() == [])

@@ -7,9 +7,11 @@ import fcntl
 import itertools
 import json
 import os
+import resource
 import shutil
 import signal
 import sqlite3
+import stat
 import threading
 from collections.abc import Callable
 from contextlib import closing
@@ -21,13 +23,15 @@ from types import SimpleNamespace
 import pytest
 from google.protobuf import json_format
 
-from lightpage.errors import StoreError
+from lightpage.errors import BundleError, StoreError
 from lightpage.files import WITHOUT_LOCKS
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.model.bundle.manifest import sha256
 from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.service.caller import NOBODY
 from lightpage.runtime.service.dataplane import DataPlane
-from lightpage.runtime.service.models.database import DAMAGED, DATABASE, audit_written, job_written
+from lightpage.runtime.service.models.audit import AuditLog, Entry
+from lightpage.runtime.service.models.database import DAMAGED, DATABASE, write_job
 from lightpage.runtime.service.models.folder import LOCK
 from lightpage.runtime.service.models.history import History, Known, Origin
 from lightpage.runtime.service.models.models import Models
@@ -76,6 +80,15 @@ def worn(start: Start, folder: Path) -> DataPlane:
     for number in (1, 2, 3):
         plane.models.activate(f"toy-1+r{number}")
     return plane
+
+
+def failing(number: int) -> Callable[..., None]:
+    """A call of the system that fails."""
+
+    def call(*_: object, **__: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    return call
 
 
 def trouble(plane: DataPlane) -> str:
@@ -129,19 +142,27 @@ def test_a_second_service_is_kept_out_and_what_a_killed_one_left_is_swept(decode
 
 
 @pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP])
-def test_a_file_system_without_locks_will_do(number: int, start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
-    def lacking(*_: object) -> None:
-        raise OSError(number, os.strerror(number))
-
+@pytest.mark.parametrize("lacking", ["flock", "lockf"])
+def test_a_file_system_without_locks_of_either_kind_will_do(
+    lacking: str, number: int, start: Start, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     opened, connect = [], sqlite3.connect
-    monkeypatch.setattr(fcntl, "flock", lacking)
-    monkeypatch.setattr(fcntl, "lockf", lacking)
+    monkeypatch.setattr(fcntl, lacking, failing(number))
     monkeypatch.setattr(sqlite3, "connect", lambda at, **options: opened.append(at) or connect(at, **options))
     WITHOUT_LOCKS.clear()
     start().models.pin("toy-1", True)
     assert start().models.now.state.known("toy-1").pinned
     assert opened
     assert all(uri.endswith("&nolock=1") for uri in opened)
+    assert caplog.text.count("no lock") == 1
+
+
+def test_a_lock_that_fails_in_another_way_is_logged(
+    start: Start, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(fcntl, "flock", failing(errno.EBADF))  # as over NFS, of a file that can only be read
+    assert trouble(start()) == ""
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
 
 
 def test_a_damaged_bundle_is_said_and_the_newest_before_it_that_is_there_serves(
@@ -193,11 +214,11 @@ def changed(sql: str) -> Callable[[Path], None]:
         lambda path: path.write_bytes(b"junk"),
         changed("PRAGMA application_id = 7"),
         changed("PRAGMA user_version = 9"),
-        changed("UPDATE service SET cursor = 7"),
-        changed("UPDATE service SET cursor = 'x'"),
-        changed("DELETE FROM service"),
-        changed("UPDATE history SET version = '../x'"),
-        changed("INSERT INTO bundles VALUES ('toy-1', 'stolen', NULL, 0)"),
+        changed("UPDATE models SET state = json_set(state, '$.history.cursor', 7)"),
+        changed("UPDATE models SET state = json_set(state, '$.history.cursor', 'x')"),
+        changed("UPDATE models SET state = json_set(state, '$.history.versions[1]', '../x')"),
+        changed('UPDATE models SET state = json_set(state, \'$.bundles\', json(\'{"a": {"origin": "stolen"}}\'))'),
+        changed("DELETE FROM models"),
         changed("DROP TABLE jobs"),
     ],
 )
@@ -208,13 +229,57 @@ def test_a_database_that_is_damaged_or_gone_is_said(damage: Callable[[Path], Non
     plane = start()
     assert (plane.models.current.version, DATABASE in trouble(plane)) == ("toy-1", True)
     assert figure(plane, "lightpage_store_trouble", reason="note") == 1
-    with pytest.raises(StoreError):
-        plane.models.store.write()  # what is no state of the models
+    with pytest.raises(StoreError), plane.models.store.transaction():  # what is no state of the models
+        pass
+    with pytest.raises(BundleError):
+        plane.models.rollback()
     assert (database.read_bytes() if database.exists() else None) == content  # the next start says it again
-    plane.models.activate("toy-1+r2")
+    plane.models.pin("toy-1", True)  # says nothing of what is to be in service
     kept = folder / DAMAGED
     assert (kept.read_bytes() if kept.exists() else None) == content
+    plane = start()
+    assert (plane.models.entry(plane.models.base).pinned, DATABASE in trouble(plane)) == (True, True)
+    plane.models.activate("toy-1+r2")
     assert trouble(plane) == ""
+    assert start().models.current.version == "toy-1+r2"
+
+
+@pytest.mark.usefixtures("worn")
+def test_a_database_that_cannot_be_read_is_no_damaged_one_and_nothing_is_written_over_it(
+    start: Start, folder: Path
+) -> None:
+    away = (folder / DATABASE).rename(folder / "away")
+    (folder / DATABASE).mkdir()  # it cannot be opened
+    plane = start(kept=0)
+    assert plane.models.current.version == "toy-1"
+    plane.models.prune()
+    for change in (lambda: plane.models.activate("toy-1+r2"), lambda: plane.models.store.check()):
+        with pytest.raises(StoreError, match="at a start"):
+            change()
+    assert "unable to open" in trouble(plane)
+    assert not (folder / DAMAGED).exists()
+    (folder / DATABASE).rmdir()
+    away.rename(folder / DATABASE)
+    assert start().models.current.version == "toy-1+r3"
+
+
+def test_a_transaction_is_on_the_disk_where_a_folder_cannot_be_synchronised(
+    worn: DataPlane, start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """SQLite itself would say that it failed, after its end, with a stricter setting."""
+    synced, fsync = list[bool](), os.fsync
+
+    def sync(descriptor: int) -> None:
+        synced.append(stat.S_ISDIR(os.fstat(descriptor).st_mode))
+        failing(errno.EINVAL)() if synced[-1] else fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", sync)
+    with worn.models.store.transaction() as database:
+        assert database.execute("PRAGMA synchronous").fetchone() == (2,)
+        write_job(database, "job", b"message", 1)
+        assert not synced
+    assert synced == [True]
+    worn.models.rollback()
     assert start().models.current.version == "toy-1+r2"
 
 
@@ -222,7 +287,7 @@ def test_a_database_that_another_program_holds_is_no_damaged_one(
     worn: DataPlane, start: Start, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     connect = sqlite3.connect
-    monkeypatch.setattr(sqlite3, "connect", lambda at, **options: connect(at, timeout=0.01, **options))
+    monkeypatch.setattr(sqlite3, "connect", lambda at, **options: connect(at, **{**options, "timeout": 0.01}))
     other = connect(folder / DATABASE, isolation_level=None)
     other.execute("BEGIN EXCLUSIVE")
     with pytest.raises(StoreError, match="locked"):
@@ -250,44 +315,90 @@ class Dying(sqlite3.Connection):
     execute, executemany = map(dying, (sqlite3.Connection.execute, sqlite3.Connection.executemany))
 
 
+def killed(work: Callable[[], object]) -> int:
+    """How a process ends that does a work, and ends or is killed."""
+    if not (child := os.fork()):
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        work()
+        os._exit(0)
+    return os.waitpid(child, 0)[1]
+
+
 def test_a_kill_at_any_statement_leaves_all_of_a_change_or_nothing(
     worn: DataPlane, start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store, state = worn.models.store, worn.models.now.state.noting("toy-1", pinned=True)
     later, found = replace(state, history=state.history.stepped(-1)), set()
+    entry = partial(AuditLog(store).write, Entry("rollback", NOBODY, "toy-1+r3", "toy-1+r2"))
+    job = partial(write_job, id_="job", message=b"message", kept=1)
     monkeypatch.setattr(sqlite3, "connect", partial(sqlite3.connect, factory=Dying))
     for Dying.left in range(20):
-        if not (child := os.fork()):
-            store.save(later, audit_written(["line"]), job_written("job", b"message", 1), settles=True)
-            os._exit(0)
-        _, status = os.waitpid(child, 0)
+        status = killed(partial(store.save, later, entry, job, settles=True))
         Dying.left = 999
         store = start().models.store
         kept = store.contents
-        found.add((status, kept.state == later, *kept.audit, *kept.jobs))
+        with store.transaction() as database:
+            ((lines,),) = database.execute("SELECT count(*) FROM audit WHERE NOT exported")
+        found.add((status, kept.state == later, lines, *kept.jobs))
         assert kept.state in (later, worn.models.now.state)
         if status == 0:
             break
-    assert found == {(signal.SIGKILL, False), (0, True, "line", "job")}
+    assert found == {(signal.SIGKILL, False, 3), (0, True, 4, "job")}
+
+
+def earlier_store(folder: Path, base: Decoder, **note: object) -> None:
+    """Make a store of a service that had no database, with two jobs."""
+    put(folder, "toy-1+r1", "toy-2")
+    result = pb.RecalibrationResult(model_version="toy-1+r1")
+    jobs = [pb.Job(id="a", state=pb.JOB_STATE_DONE), pb.Job(id="b", state=pb.JOB_STATE_RUNNING, result=result)]
+    if note:
+        (folder / "current.json").write_text(json.dumps(note | {"base": sha256(base.bundle.manifest.to_json())}))
+    (folder / "jobs.json").write_text(json.dumps({"jobs": [json_format.MessageToDict(job) for job in jobs]}))
+
+
+@pytest.mark.parametrize("how", ["at a statement", "in a write"])
+def test_a_kill_in_the_first_transaction_loses_nothing(
+    how: str, decoder: Decoder, start: Start, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A write that would make a file larger than the limit kills the process, also in the midst of a COMMIT."""
+
+    def first() -> None:
+        if how == "in a write":
+            signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (left, left))
+        else:
+            monkeypatch.setattr(sqlite3, "connect", partial(sqlite3.connect, factory=Dying))
+        Store(folder, decoder.bundle)
+
+    statuses = set()
+    for left in range(20) if how == "at a statement" else range(0, 40960, 1024):
+        shutil.rmtree(folder, ignore_errors=True)
+        earlier_store(folder, decoder, bundle="toy-1+r1.zip")
+        Dying.left = left
+        statuses.add(killed(first))
+        plane = start()
+        assert (plane.models.current.version, trouble(plane)) == ("toy-1+r1", "")
+        assert list(plane.models.store.contents.jobs) == ["a", "b"]
+        plane.models.store.close()
+    assert statuses == {signal.SIGKILL if how == "at a statement" else signal.SIGXFSZ, 0}
 
 
 @pytest.mark.parametrize("note", ["history", "bundle"])
 def test_what_a_store_without_a_database_remembers_is_taken_over_once(
     note: str, decoder: Decoder, start: Start, folder: Path
 ) -> None:
-    put(folder, "toy-1+r1", "toy-2")
     origins = {"toy-1+r1": "recalibrated", "toy-2": "uploaded"}
-    content = {
+    content: dict[str, object] = {
         "history": {"history": [None, "toy-1+r1.zip", "toy-2.zip"], "cursor": 1, "pinned": ["toy-2"]}
         | {"origins": origins, "keys": {"toy-1+r1": "a key"}},
         "bundle": {"bundle": "toy-1+r1.zip"},  # version 0.1.0
     }[note]
-    result = pb.RecalibrationResult(model_version="toy-1+r1")
-    jobs = [pb.Job(id="a", state=pb.JOB_STATE_DONE), pb.Job(id="b", state=pb.JOB_STATE_RUNNING, result=result)]
-    (folder / "current.json").write_text(json.dumps(content | {"base": sha256(decoder.bundle.manifest.to_json())}))
-    (folder / "jobs.json").write_text(json.dumps({"jobs": [json_format.MessageToDict(job) for job in jobs]}))
+    earlier_store(folder, decoder, **content)
     with full_disk(10):
-        assert start().models.current.version == "toy-1+r1"
+        plane = start()
+    assert plane.models.current.version == "toy-1+r1"
+    if note == "bundle":
+        plane.models.pin("toy-1", False)  # the first change begins the database, with all that was remembered
     for _ in range(2):
         plane = start()
         assert plane.models.current.version == "toy-1+r1"
@@ -299,6 +410,13 @@ def test_what_a_store_without_a_database_remembers_is_taken_over_once(
             known = {"toy-1+r1": Known(Origin.RECALIBRATED, "a key"), "toy-2": Known(Origin.UPLOADED, None, True)}
             assert (history(plane).versions, found.state.bundles) == (("toy-1", "toy-1+r1", "toy-2"), known)
         assert sorted(path.name for path in folder.glob("*.json*")) == ["current.json.imported", "jobs.json.imported"]
+
+
+def test_jobs_alone_are_taken_over(decoder: Decoder, start: Start, folder: Path) -> None:
+    earlier_store(folder, decoder)
+    (folder / "toy-1+r1.zip").unlink()
+    assert list(start().models.store.contents.jobs) == ["a", "b"]
+    assert [path.name for path in folder.glob("*.json*")] == ["jobs.json.imported"]
 
 
 @pytest.mark.parametrize("change", [{"cursor": 7}, {"cursor": "x"}, {"history": [3, "../x.zip"]}, {"pinned": 3}])
@@ -331,10 +449,6 @@ def test_pinned_loaded_and_foreign_bundles_are_never_pruned_and_pruned_ones_leav
     assert history(plane).versions == history(start()).versions == ("toy-1", *names[1:6])
 
 
-def _read_only(*_: object, **__: object) -> None:
-    raise OSError(errno.EROFS, "Read-only file system")
-
-
 def test_a_full_disk_is_noticed_and_said_until_there_is_room(
     decoder: Decoder, start: Start, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -359,7 +473,7 @@ def test_a_store_that_cannot_be_written_is_noticed_and_nothing_changes(
 ) -> None:
     models = worn.models
     with monkeypatch.context() as patch, full_disk(10):
-        patch.setattr("lightpage.runtime.service.models.folder.new_file", _read_only)
+        patch.setattr("lightpage.runtime.service.models.folder.new_file", failing(errno.EROFS))
         for change in (models.rollback, lambda: models.pin("toy-1", True), lambda: models.activate("toy-1")):
             with pytest.raises(StoreError, match="model store"):
                 change()
@@ -397,7 +511,7 @@ def test_the_store_is_tried_now_and_then_and_not_whenever_somebody_asks(
     clock = HandClock()
     plane = start(clock=clock.now)
     assert trouble(plane) == ""
-    monkeypatch.setattr("lightpage.runtime.service.models.folder.new_file", _read_only)
+    monkeypatch.setattr("lightpage.runtime.service.models.folder.new_file", failing(errno.EROFS))
     clock.advance(PROBE_S - 0.1)
     assert trouble(plane) == ""
     clock.advance(0.1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import sqlite3
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from lightpage.runtime.model.bundle.signature_file import signature_path
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import NOBODY
 from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.models.audit import AuditLog
 from lightpage.runtime.service.models.database import DATABASE
 from lightpage.runtime.service.models.incoming import Incoming
 from lightpage.runtime.service.models.loader import Loader
@@ -268,6 +270,24 @@ def test_a_bundle_of_the_same_version_that_came_meanwhile_stays(service: Signed)
     with pytest.raises(ModelExistsError, match=r"^new bundle: version"):
         take_in(service.models, path, NOBODY, (service.store / "toy-2.zip").touch, signature)
     assert (service.store / "toy-2.zip").read_bytes() == b""
+
+
+@pytest.mark.parametrize("end", ["save", "done"])
+def test_a_bundle_whose_taking_in_was_killed_is_there_with_all_that_belongs_to_it_or_not(
+    service: Signed, end: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, signature = service.bundle("toy-2")
+    hidden = path.rename(service.store / ".upload-x")
+    if not os.fork():
+        die = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)  # noqa: E731
+        monkeypatch.setattr(*{"save": (service.models.store, "save"), "done": (AuditLog, "done")}[end], die)
+        take_in(service.models, hidden, signature=signature)
+    os.wait()
+    assert signature_path(service.store / "toy-2.zip").read_bytes() == signature
+    after = begin(service.folder, service.signer).models
+    assert not hidden.exists()
+    assert sorted(path.name for path in service.store.glob("toy*")) == ["toy-2.zip", "toy-2.zip.sig"] * (end == "done")
+    assert (after.now.state.known("toy-2").origin == "uploaded") == (end == "done")
 
 
 def test_a_bundle_that_cannot_be_noted_is_not_taken(service: Signed) -> None:

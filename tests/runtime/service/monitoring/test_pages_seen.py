@@ -12,12 +12,12 @@ from lightpage.page.pilots import Pilots
 from lightpage.runtime.device.acquisition.source import SHOT_S, Shot
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import Caller
-from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.dataplane import DataPlane, Seen
 from lightpage.runtime.service.frames.frames import decode
 from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.monitoring.metrics import VERSIONS, ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import PageFigures
-from lightpage.runtime.service.monitoring.observation import Observation, Seen
+from lightpage.runtime.service.monitoring.observation import Observation
 from lightpage.runtime.service.pages.reading import read_page
 from lightpage.runtime.service.stages import CallTimes, Lap, Stage, Stages
 from lightpage.von_mises import information
