@@ -201,12 +201,14 @@ def refine(
     start: Real,
     quadrature_phase: float,
     progress: Progress = lambda what, share: None,
+    modulation: Modulation = NOMINAL,
 ) -> Registered:
     """Register known pages from an earlier calibration that has drifted: the reflections need no search from nominal.
 
     Args:
         start: [P] earlier parameters.
         quadrature_phase: earlier angle between the homodyne arms.
+        modulation: earlier one, which is fitted again: a stroke changes with temperature.
         twin, solve_field, profile, references, pages, progress: as for `calibrate`.
 
     Raises:
@@ -214,6 +216,7 @@ def refine(
     """
     work = _Registration(twin, solve_field, profile, references, list(pages), progress)
     work.parameters, work.centre, work.quadrature_phase = start.copy(), start, quadrature_phase
+    work.modulation = modulation
     work.total = len(_DRIFTED) + 2
     for stage in _DRIFTED:
         work.complex_field(stage, _DRIFT_SCALE)

@@ -8,11 +8,12 @@ the phase. The logarithm of what it makes, over what it should make, is a straig
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.page.levels import Levels
 from lightpage.page.symbols import symbol_phases
 
 Real = NDArray[np.float64]
@@ -48,7 +49,10 @@ class Modulation:
         return not any(self.coefficients)
 
     def light(self, phases: Real) -> NDArray[np.complex128]:
-        """Complex light of nominal phases, 0 to 2 pi, in their shape."""
+        """Complex light of nominal phases, in their shape."""
+        if self.is_nominal:
+            return np.asarray(np.exp(1j * phases), np.complex128)
+        phases = np.mod(phases, 2 * np.pi)
         found, (stroke, *rest) = basis(phases), self.coefficients
         phase, amplitude = np.array([stroke, *rest[: 2 * HARMONICS]]), np.array(rest[2 * HARMONICS :])
         logarithm = 1j * (phases + np.tensordot(phase, found, 1)) + np.tensordot(amplitude, found[1:], 1)
@@ -58,10 +62,33 @@ class Modulation:
         """Complex light of each of so many levels, [M]."""
         return self.light(symbol_phases(np.arange(count), count))
 
+    def phase(self, phases: Real) -> Real:
+        """Phase of the light of nominal phases, radians, in their shape: near each, and exactly it nominally."""
+        if self.is_nominal:
+            return phases
+        return np.asarray(phases + np.angle(self.light(phases) * np.exp(-1j * phases)))
+
     def phases(self, count: int) -> Real:
         """Phase of each of so many levels' light, radians, unwrapped, [M]; exactly 2 pi s / M nominally."""
-        nominal = symbol_phases(np.arange(count), count)
-        return nominal if self.is_nominal else nominal + np.angle(self.levels(count) * np.exp(-1j * nominal))
+        return self.phase(symbol_phases(np.arange(count), count))
+
+    def page_levels(self, count: int) -> Levels:
+        """So many levels of a page, as the phases of their light tell them apart.
+
+        Raises:
+            PageError: a level count outside 2..256.
+        """
+        return _page_levels(self, count)
+
+    def as_dict(self) -> dict[str, float]:
+        """Coefficients by name."""
+        return dict(zip(NAMES, self.coefficients, strict=True))
+
+
+@lru_cache(16)
+def _page_levels(modulation: Modulation, count: int) -> Levels:
+    """Those of every page of one device: what is known of their neighbours is computed once."""
+    return Levels(count, None if modulation.is_nominal else tuple(modulation.phases(count).tolist()))
 
 
 NOMINAL = Modulation()

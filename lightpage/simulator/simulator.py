@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile
 from lightpage.device.state import CameraPose, Device
-from lightpage.page.symbols import check_levels, check_symbols, symbol_phases
+from lightpage.page.levels import check_levels
+from lightpage.page.symbols import check_symbols, symbol_phases
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import frame_type
 from lightpage.simulator.cameras import (

@@ -12,6 +12,9 @@ from lightpage.calibration.parameters import NAMES, as_dict, as_vector
 from lightpage.calibration.waves.wave_model import defocus, fitted_geometry
 from lightpage.device.profile import Profile
 from lightpage.device.state import CameraPose, Device, SlmDefects
+from lightpage.page.levels import MAX_LEVELS
+from lightpage.page.modulation import NOMINAL, Modulation, basis
+from lightpage.page.symbols import symbol_phases
 from lightpage.recording.frame_pair import FramePair
 from lightpage.simulator.cameras import CameraView
 from lightpage.waves.channel import WaveChannel
@@ -182,7 +185,21 @@ def modulated(slm: SlmDefects, phase: Real) -> Complex:
 
 def perfectly_calibrated(profile: Profile, device: Device, references: FramePair) -> CalibratedDevice:
     """A device as a calibration without any error would find it."""
-    return CalibratedDevice(profile, true_parameters(profile, device), device.homodyne.turn_rad, references)
+    parameters, modulation = true_parameters(profile, device), true_modulation(device.slm)
+    return CalibratedDevice(profile, parameters, device.homodyne.turn_rad, references, modulation)
+
+
+def true_modulation(slm: SlmDefects) -> Modulation:
+    """The truth as a calibration without any error would tell it: what its few coefficients can."""
+    phases = symbol_phases(np.arange(MAX_LEVELS), MAX_LEVELS)
+    shown, (stroke, *series) = modulated(slm, phases), basis(phases)
+    if np.allclose(shown, np.exp(1j * phases), rtol=0, atol=1e-12):
+        return NOMINAL
+    even = np.ones(len(phases))
+    off = np.unwrap(np.angle(shown * np.exp(-1j * phases)))
+    phase = np.linalg.lstsq(np.stack([stroke, *series, even], axis=1), off, rcond=None)[0]
+    amplitude = np.linalg.lstsq(np.stack([*series, even], axis=1), np.log(np.abs(shown)), rcond=None)[0]
+    return Modulation((*phase[:-1].tolist(), *amplitude[:-1].tolist()))
 
 
 def true_parameters(profile: Profile, device: Device) -> NDArray[np.float64]:

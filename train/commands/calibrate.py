@@ -108,6 +108,7 @@ def figures(calibration: Calibration, profile: Profile, seconds: float, lost: in
         "coherence_after": calibration.coherence_after,
         "turn_deg": float(np.rad2deg(calibration.turn_rad)),
         "parameters": calibration.parameters,
+        "modulation": calibration.modulation,
         "symbols_beside_cameras": lost,
     }
 
@@ -128,6 +129,8 @@ def table(calibration: Calibration, profile: Profile) -> str:
         factor = nominal if unit is None else unit
         fitted, deviation = nominal + factor * value, factor * calibration.deviations[name]
         lines.append(f"{label:<32}{fitted:>12.6g}   {deviation:<10.2g}{nominal:>10.6g}")
+    for name, value in calibration.modulation.items():
+        lines.append(f"{name:<32}{value:>12.6g}   {calibration.modulation_deviations[name]:<10.2g}{0:>10.6g}")
     quadrature_phase = np.rad2deg(calibration.turn_rad)
     lines.append(f"{'between the arms, degree':<32}{quadrature_phase:>12.6g}   {'':<10}{'+90 or -90':>10}")
     return "\n".join(lines)

@@ -128,7 +128,7 @@ class FeatureExtractor:
         Raises:
             CalibrationError: it shows hardly more of them than chance does, or clearly less than those pages.
         """
-        field = self.known_field(page.pair, np.angle(page.symbols))
+        field = self.known_field(page.pair, self.device.modulation.phase(np.angle(page.symbols)))
         sampler = FieldSampler(field, self.grid)
         found = page_coherence(sampler, self._twin, self.device.parameters, self.device.profile, page.symbols)
         least = max(least_coherence(page.symbols.size), LEAST_KEPT * calibrated)
@@ -152,7 +152,7 @@ class FeatureExtractor:
         for index in indices:
             symbols = recording.symbols(index)
             assert symbols is not None
-            phases = symbol_phases(symbols, recording.levels)
+            phases = self.device.modulation.phase(symbol_phases(symbols, recording.levels))
             page, shift = self.page(self.field(recording.frames(index)), phases, shift)
             yield page
 
