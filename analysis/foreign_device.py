@@ -283,10 +283,6 @@ class ForeignDevice:
         field *= np.sinc(u) * np.sinc(v) * np.exp(-2 * (np.pi * self.parameters.blur_px) ** 2 * (u**2 + v**2))
         return field * SLM_PITCH**2 / (WAVELENGTH * f)
 
-    def propagate(self, facet: ComplexArray, steps: int | None = None) -> ComplexArray:
-        """Through the pipe, from facet to facet [y', x]."""
-        return propagate_pipe(facet, self.pipe_width, self.pipe_length, self.angle, steps or self.design.steps)
-
     def delaunch(self, facet: ComplexArray) -> Image:
         """Return the field on the camera plane of that on the exit facet, in the pipe's axes."""
         f, (facet_y, facet_x), (dy, dx) = self.focal_length, self.facet_coordinates, self.pitches
@@ -304,7 +300,8 @@ class ForeignDevice:
 
     def image(self, symbols: NDArray[np.integer], levels: int, rng: np.random.Generator) -> Image:
         """The whole way of one page's light, from symbols to the camera plane."""
-        return self.delaunch(self.propagate(self.launch(self.modulate(symbols, levels, rng))))
+        facet = self.launch(self.modulate(symbols, levels, rng))
+        return self.delaunch(propagate_pipe(facet, self.pipe_width, self.pipe_length, self.angle, self.design.steps))
 
     # --- cameras ------------------------------------------------------------------------------------------------------
 
@@ -387,24 +384,6 @@ class ForeignDevice:
 
     # --- recordings ---------------------------------------------------------------------------------------------------
 
-    def walk(
-        self, pages: int, rng: np.random.Generator, jumps_px: Mapping[int, tuple[float, float]] | None = None
-    ) -> list[PageDrift]:
-        """Piston and shift of each page: random walks from a random piston.
-
-        Args:
-            pages: how many.
-            rng: of the steps.
-            jumps_px: (x, y) by which the image jumps before a page, beside its walk; before page 0, while nobody read.
-        """
-        p = self.parameters
-        pistons = rng.uniform(-np.pi, np.pi) + np.cumsum(p.piston_drift_rad * rng.standard_normal(pages))
-        steps = p.shift_drift_px * rng.standard_normal((pages, 2))
-        for page, jump in (jumps_px or {}).items():
-            steps[page] += jump
-        shifts = np.cumsum(steps, axis=0)
-        return [PageDrift(float(a), (float(s[0]), float(s[1]))) for a, s in zip(pistons, shifts, strict=True)]
-
     def write(
         self,
         path: str | Path,
@@ -431,7 +410,7 @@ class ForeignDevice:
         rng = np.random.default_rng([seed, 2])
         drawn = rng.integers(0, levels, size=(pages, *self.design.page_shape), dtype=np.uint8)
         symbols = drawn if symbols is None else symbols
-        drifts = self.walk(pages, rng, jumps_px)
+        drifts = walk(self.parameters, pages, rng, jumps_px)
         with h5py.File(str(path), "w") as file:
             file.attrs["format"] = "lightpage-recording"
             file.attrs["version"] = 1
@@ -453,6 +432,25 @@ class ForeignDevice:
                 for name, intensity in zip(names, self.intensities(image, drifts[page]), strict=True):
                     file[name][page] = self.expose(intensity, rng)
         return symbols
+
+
+def walk(
+    p: Parameters, pages: int, rng: np.random.Generator, jumps_px: Mapping[int, tuple[float, float]] | None = None
+) -> list[PageDrift]:
+    """Piston and shift of each page: random walks from a random piston.
+
+    Args:
+        p: of the device.
+        pages: how many.
+        rng: of the steps.
+        jumps_px: (x, y) by which the image jumps before a page, beside its walk; before page 0, while nobody read.
+    """
+    pistons = rng.uniform(-np.pi, np.pi) + np.cumsum(p.piston_drift_rad * rng.standard_normal(pages))
+    steps = p.shift_drift_px * rng.standard_normal((pages, 2))
+    for page, jump in (jumps_px or {}).items():
+        steps[page] += jump
+    shifts = np.cumsum(steps, axis=0)
+    return [PageDrift(float(a), (float(s[0]), float(s[1]))) for a, s in zip(pistons, shifts, strict=True)]
 
 
 @dataclass(frozen=True)

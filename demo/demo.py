@@ -20,7 +20,8 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
-from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.models.loader import Loader
+from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.server.server import LightpageServer
 
 RECALIBRATION_PAGES = 2
@@ -52,7 +53,7 @@ def run_demo(
     with ExitStack() as stack:
         source, drift = simulated_device(spec, decoder.bundle.profile, out / "pages.h5")
         stack.enter_context(source)
-        plane = DataPlane(ModelRegistry(decoder, tracker_for), source)
+        plane = DataPlane(Models(decoder, loader=Loader(tracker_for)), source)
         server = stack.enter_context(LightpageServer(plane, Recalibrator(plane), "127.0.0.1:0"))
         client = stack.enter_context(LightpageClient(server.target))
         frames = source.shot(source.shot_s, 0).pair

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from lightpage.metrics.measures import PageMeasures, measure
     from lightpage.page.pilots import Pilots
     from lightpage.recording.frame_pair import FramePair
-    from lightpage.recording.reader import Recording, RecordingWriter
+    from lightpage.recording.reader import Recording
+    from lightpage.recording.writer import RecordingWriter
     from lightpage.runtime.archives.recordings.evaluation import Evaluation, evaluate
     from lightpage.runtime.client.client import LightpageClient
     from lightpage.runtime.client.wire.channel import TlsFiles
@@ -49,7 +50,7 @@ _HOMES = {
     "Pilots": "lightpage.page.pilots",
     "Profile": "lightpage.device.profile",
     "Recording": "lightpage.recording.reader",
-    "RecordingWriter": "lightpage.recording.reader",
+    "RecordingWriter": "lightpage.recording.writer",
     "Simulator": "lightpage.simulator.simulator",
     "TlsFiles": "lightpage.runtime.client.wire.channel",
     "evaluate": "lightpage.runtime.archives.recordings.evaluation",

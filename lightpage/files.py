@@ -67,13 +67,14 @@ def new_file(folder: Path, name: str) -> tuple[int, Path]:
             return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666), path
 
 
-def lock(descriptor: int, subject: str, *, shared: bool = False) -> bool:
+def lock(descriptor: int, subject: str, *, shared: bool = False, ranges: bool = False) -> bool:
     """Lock a file until its descriptor is closed; where its file system has no locks, warn once and go without.
 
     Args:
         descriptor: of the file.
         subject: what it is, for the warning.
         shared: whether others may have it locked so too.
+        ranges: whether with a lock of the kind that ranges of bytes have, which some file systems lack alone.
 
     Returns:
         Whether the file is locked.
@@ -83,7 +84,8 @@ def lock(descriptor: int, subject: str, *, shared: bool = False) -> bool:
         OSError: storage fails.
     """
     try:
-        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+        how = fcntl.LOCK_NB | (fcntl.LOCK_SH if shared else fcntl.LOCK_EX)
+        (fcntl.lockf if ranges else fcntl.flock)(descriptor, how)
     except BlockingIOError:
         raise
     except OSError as error:
@@ -165,6 +167,16 @@ def move_to_new_name(made: str | Path, path: Path) -> None:
         FileExistsError: something has it; both files stay as they are.
         OSError: the system does not let it.
     """
+    give_new_name(made, path)
+    Path(made).unlink(missing_ok=True)
+    sync_folder(path.parent)
+
+
+def give_new_name(made: str | Path, path: Path) -> None:
+    """Give a file its final name beside that which it has, and which it loses where the file system has no links.
+
+    It raises what `move_to_new_name` does. The names are on the disk once `sync_folder` has been called.
+    """
     with open(made, "r+b") as file:
         synchronise(file.fileno())
     try:
@@ -175,9 +187,6 @@ def move_to_new_name(made: str | Path, path: Path) -> None:
         if path.exists():
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path)) from None
         os.replace(made, path)
-    else:
-        os.unlink(made)
-    sync_folder(path.parent)
 
 
 def synchronise(descriptor: int) -> None:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import os
 import pickle
 import socket
-import struct
 import subprocess
 import sys
 import threading
@@ -27,9 +26,7 @@ from typing import IO, Any, ClassVar
 from lightpage.errors import LightpageError, WorkerError
 from lightpage.failures import short_resource
 
-_PROGRESS, _ANSWER, _ERROR = "progress", "answer", "error"
-_SEND_S = 60.0
-"""Longest time in which a child takes in a request, where its caller says nothing else."""
+_PROGRESS, _ANSWER, _ERROR, _END = "progress", "answer", "error", "end"
 _END_S = 5.0
 """Time that a process gets to end after its socket has."""
 _PARENT_GONE = 3
@@ -38,7 +35,7 @@ _PICKLE = 5
 
 
 class Helper:
-    """What a helper process makes: each of its public methods can be asked for."""
+    """Does the work of a helper process: each of its public methods can be asked for."""
 
     idle_s: ClassVar[float | None] = None
     """`idle` is called where no request has come for so long; None never calls it."""
@@ -53,7 +50,10 @@ class Helper:
 
 
 class HelperProcess:
-    """A process that makes a `Helper` and does what it is asked for, one request at a time; one thread uses it.
+    """A process that makes a `Helper` and does what it is asked for, one request at a time.
+
+    One thread at a time uses it, and any may `end` it: whoever waits for an answer then hears so. Another thread sends
+    requests and takes in what comes back, so that no wait is longer than its limit.
 
     Args:
         target: the helper, as ``package.module:Class``; it takes no arguments, and only that process imports it.
@@ -76,10 +76,13 @@ class HelperProcess:
         log: IO[bytes] | None = None,
     ) -> None:
         self._subject = subject
-        self._progress: Callable[..., None] = lambda *words: None
+        self._requests = SimpleQueue[list[Any]]()
+        self._told = SimpleQueue[tuple[str, Any]]()
+        self._progress: Callable[..., None] | None = None
         self._answer: tuple[str, Any] | None = _ANSWER, None  # None where a request is under way
+        self._thread = threading.Thread(target=self._converse, name="lightpage-helper", daemon=True)
+        self._ending = threading.Lock()
         self._socket, other = socket.socketpair()
-        self._messages = Connection(os.dup(self._socket.fileno()))
         with other:
             try:
                 # In a session of its own: Ctrl-C is for the service, which then ends its helpers.
@@ -92,8 +95,9 @@ class HelperProcess:
                     pass_fds=files,
                     env=environment,
                 )
-            except OSError as error:
-                self._hang_up()
+                self._thread.start()
+            except (OSError, RuntimeError) as error:  # the latter where there is no room for a thread
+                self._socket.close()
                 short = short_resource(subject, error)
                 raise WorkerError(subject, error, short.expected if short else "one that can be started") from error
 
@@ -109,62 +113,51 @@ class HelperProcess:
             WorkerError: no answer within `timeout_s`, or the process has ended; it is of no more use.
             LightpageError: what the method raised.
         """
-        until = time.monotonic() + timeout_s
-        self.send(method, *arguments, progress=progress, timeout_s=timeout_s)
-        if not self.poll(until - time.monotonic()):
+        self.send(method, *arguments, progress=progress)
+        if not self.poll(timeout_s):
             raise WorkerError(self._subject, f"no answer within {timeout_s:g} s", "one in time")
         return self.answer()
 
-    def send(
-        self, method: str, *arguments: Any, progress: Callable[..., None] | None = None, timeout_s: float = _SEND_S
-    ) -> None:
+    def send(self, method: str, *arguments: Any, progress: Callable[..., None] | None = None) -> None:
         """Have it call a method; `poll` says when it has.
 
         Args:
             method: of the helper.
-            arguments: of the method.
+            arguments: of the method; arrays among them stay as they are until then.
             progress: called by `poll` with the words of progress. The method gets what tells them as `progress`.
-            timeout_s: longest time in which they are taken in.
 
         Raises:
-            WorkerError: they are not taken in, or the process has ended; it is of no more use.
+            WorkerError: the request before has no answer yet.
         """
-        assert self._answer is not None  # else the last request's answer would pass for this one's
-        self._answer = None
-        if progress is not None:
-            self._progress = progress
-        seconds, rest = divmod(max(timeout_s, 1e-3), 1)  # 0 were no limit
-        limit = struct.pack("ll", int(seconds), int(1e6 * rest))
+        if self._answer is None:  # which would pass for this one's
+            raise WorkerError(self._subject, "a request before the last one's answer", "one at a time")
         arrays: list[pickle.PickleBuffer] = []
         request = pickle.dumps((method, arguments, progress is not None), _PICKLE, buffer_callback=arrays.append)
-        try:
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
-            self._messages.send((request, len(arrays)))
-            for array in arrays:
-                self._messages.send_bytes(array.raw())
-        except BlockingIOError:
-            raise WorkerError(self._subject, f"a request not taken in within {timeout_s:g} s", "all of it") from None
-        except OSError:
-            raise self._end() from None
+        self._answer, self._progress = None, progress
+        parts = [request, *(array.raw() for array in arrays)]
+        self._requests.put([len(parts).to_bytes(4), *parts])
 
     def poll(self, timeout_s: float) -> bool:
         """Wait so long for the answer, and hand on what comes of progress; return whether `answer` has something."""
         until = time.monotonic() + timeout_s
         while self._answer is None:
             try:
-                if not self._messages.poll(max(0.0, until - time.monotonic())):
-                    return False
-                kind, value = self._messages.recv()
-            except (OSError, EOFError):
-                kind, value = _ERROR, self._end()
-            if kind == _PROGRESS:
+                kind, value = self._told.get(timeout=max(0.0, until - time.monotonic()))
+            except Empty:
+                return False
+            if kind == _PROGRESS and self._progress is not None:
                 self._progress(*value)
-            else:
-                self._answer = kind, value
+                if time.monotonic() >= until:  # there may be ever more of it
+                    return False
+                continue
+            if kind == _END:
+                self._told.put((kind, value))  # for the next request
+                kind, value = _ERROR, WorkerError(self._subject, value, "an answer")
+            self._answer, self._progress = (kind, value), None
         return True
 
     def answer(self) -> Any:
-        """What the method has returned, once `poll` says that it has.
+        """Return what the method has returned, once `poll` says that it has.
 
         Raises:
             WorkerError: the process has ended before.
@@ -176,34 +169,50 @@ class HelperProcess:
             raise value
         return value
 
-    def fileno(self) -> int:
-        """Of the socket, for `select`: `poll` takes something in once the process has told something or ended."""
-        return self._messages.fileno()
-
     def ended(self) -> bool:
-        """Whether it runs no more."""
+        """Return whether it runs no more."""
         return self._process.poll() is not None
 
     def end(self, grace_s: float = 0.0) -> None:
-        """End it; it has `grace_s` to do so by itself once the socket is closed."""
-        self._hang_up()
+        """End it; it has `grace_s` to do so by itself once the socket is shut down."""
+        with self._ending, self._socket:
+            with suppress(OSError):  # it was ended before
+                self._socket.shutdown(socket.SHUT_RDWR)  # which wakes the thread, as to close it does not
+            self._requests.put([b""])  # and this where it waits for a request
+            try:
+                self._process.wait(grace_s)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+            self._thread.join()
+
+    def _converse(self) -> None:
+        """Send requests and take in what comes back, until the socket is shut down at either end."""
         try:
-            self._process.wait(grace_s)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+            with Connection(os.dup(self._socket.fileno())) as messages, suppress(OSError, EOFError):
+                while True:
+                    _send_all(messages, self._requests.get())
+                    message: tuple[str, Any] = _PROGRESS, None
+                    while message[0] == _PROGRESS:
+                        message = messages.recv()
+                        self._told.put(message)
+                    del message  # the answer may be large
+        finally:
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(_END_S)
+            status = self._process.poll()
+            how = f"by signal {-status}" if status is not None and status < 0 else f"with status {status}"
+            self._told.put((_END, f"the end of its process {how}"))
 
-    def _hang_up(self) -> None:
-        self._messages.close()
-        self._socket.close()
 
-    def _end(self) -> WorkerError:
-        """The error of a process whose socket has ended."""
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(_END_S)
-        status = self._process.poll()
-        how = f"by signal {-status}" if status is not None and status < 0 else f"with status {status}"
-        return WorkerError(self._subject, f"the end of its process {how}", "an answer")
+def _send_all(messages: Connection, parts: Sequence[Any]) -> None:
+    """Send messages, none of which is held on to: a request may be large."""
+    for part in parts:
+        messages.send_bytes(part)
+
+
+def _received(messages: Connection) -> list[bytearray]:
+    return [bytearray(messages.recv_bytes()) for _ in range(int.from_bytes(messages.recv_bytes()))]
 
 
 def same_packages(threads: int) -> dict[str, str]:
@@ -225,18 +234,23 @@ def serve(target: str) -> None:
     error that nobody foresaw ends the process.
     """
     messages = Connection(os.dup(sys.stdin.fileno()))
-    requests: SimpleQueue[tuple[bytes, list[bytearray]] | None] = SimpleQueue()
+    requests = SimpleQueue[list[bytearray]]()
     made: list[Helper] = []
 
     def listen() -> None:
-        with suppress(OSError, EOFError):
-            while True:
-                request, count = messages.recv()
-                requests.put((request, [bytearray(messages.recv_bytes()) for _ in range(count)]))
-        if made and made[0].farewell_s:
-            requests.put(None)
-            time.sleep(made[0].farewell_s)
-        os._exit(_PARENT_GONE)
+        status = _PARENT_GONE
+        try:
+            with suppress(OSError, EOFError):
+                while True:
+                    requests.put(_received(messages))
+            if made and made[0].farewell_s:
+                requests.put([])
+                time.sleep(made[0].farewell_s)
+        except BaseException:
+            status = 1
+            sys.excepthook(*sys.exc_info())
+        finally:
+            os._exit(status)
 
     def tell(kind: str, value: Any) -> None:
         with suppress(ConnectionError):  # `listen` ends the process
@@ -252,9 +266,9 @@ def serve(target: str) -> None:
         except Empty:
             helper.idle()
             continue
-        if request is None:
+        if not request:
             break
-        method, arguments, tells = pickle.loads(request[0], buffers=request[1])
+        method, arguments, tells = pickle.loads(request[0], buffers=request[1:])
         del request  # what it holds may be large
         options = {"progress": lambda *words: tell(_PROGRESS, words)} if tells else {}
         try:

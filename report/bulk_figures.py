@@ -133,10 +133,10 @@ def losses(causes: Sequence[tuple[str, int, float, str]], unit: str, lost: str) 
 
 def by_device(devices: Sequence[Device], measure: str, fleet: bool) -> Picture:
     """A measure of each: the mean of its pages, and down to the least."""
-    known = [device for device in devices if device.group.figures.value(measure) is not None][::-1]
+    known = [device for device in devices if device.group.figures[measure].value is not None][::-1]
     figure, axis = one_axis()
     for row, device in enumerate(known):
-        mean, least = device.group.figures.value(measure), device.group.figures.least(measure)
+        mean, least = device.group.figures[measure].value, device.group.figures[measure].least
         if mean is None or least is None:
             continue
         axis.plot([least, mean], [row, row], color=GREY, linewidth=1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from tests import house
@@ -22,3 +24,9 @@ def test_lines_of_code_are_counted_without_docstrings_comments_and_blank_lines()
         '"""One."""\n\n# two\nx = (\n    1\n)\n"""Three."""\n\n\ndef f():\n    """Four."""\n    return """\n\n"""\n'
     )
     assert house.code_lines(source) == 3 + 1 + 3
+
+
+def test_a_class_is_as_large_as_its_lines_and_methods_and_may_say_why(tmp_path: Path) -> None:
+    source = "class A:\n    x = 1\n\n    def f(self): ...\n\n    async def g(self):\n        def h(): ...\n\n\n"
+    (path := tmp_path / "a.py").write_text(source + "# Large: a table\n@dataclass\nclass B:\n    y: int\n")
+    assert house.classes(path) == [("A", 7, 2, ""), ("B", 2, 0, "a table")]

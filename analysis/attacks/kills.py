@@ -4,12 +4,13 @@
 
 A service with a store recalibrates itself from a recording, or changes between its models, and is killed at a random
 moment. The next one must start; the model that it serves must be the last that a caller heard of, or the one that was
-asked for and not yet heard of; it must read a page right; and nothing half-written may be left in the store or in the
-temporary folder.
+asked for and not yet heard of; the record of model changes and the jobs must say the same; it must read a page right;
+and nothing half-written may be left in the store or in the temporary folder.
 """
 
 from __future__ import annotations
 
+import json
 import random
 import sys
 import threading
@@ -30,23 +31,27 @@ from lightpage.files import write_json
 from lightpage.page.symbols import random_symbols
 from lightpage.progress import track
 from lightpage.recording.writer import RecordingWriter
+from lightpage.runtime.client.answers import JobState
 from lightpage.runtime.client.client import LightpageClient
 from lightpage.simulator.simulator import Simulator
 
 _LEVELS, _PAGES = 16, 3
+_ANGLE_DEG = -0.57
 _KNOWN = frozenset([".lock"])
 """Hidden files of a store that belong there."""
 
 
 def simulated(path: Path) -> Path:
-    """A recording of the shipped bundle's device with known symbols; made once."""
+    """A recording with known symbols of the shipped bundle's device after it has drifted; made once."""
     if path.exists():
         return path
     profile, device = load_profile("bench"), Device()
+    drifted = device.geometry.model_copy(update={"pipe_angle_deg": _ANGLE_DEG})
+    device = device.model_copy(update={"geometry": drifted})
     simulator = Simulator(profile, device, _LEVELS, 1)
     symbols = random_symbols(profile, _LEVELS, _PAGES, np.random.default_rng(1))
     bits = device.sensor.bit_depth
-    with RecordingWriter.resume(path, profile, _LEVELS, bits, simulator.references()) as writer:
+    with RecordingWriter(path, profile, _LEVELS, bits, simulator.references(), resume=True) as writer:
         for number in track(range(writer.pages, _PAGES), "simulate", total=_PAGES):
             writer.append(symbols[number], simulator.page(symbols[number]))
     return path
@@ -81,6 +86,13 @@ class Killed:
             version = client.describe().model.version
             if version not in expected:
                 self.bad.append(f"{version} serves in place of {' or '.join(sorted(expected))}")
+            changes = [json.loads(line) for line in (self.store / "audit.jsonl").read_text().splitlines()]
+            if (noted := [change["to"] for change in changes if change["outcome"] == "done"][-1]) != version:
+                self.bad.append(f"{version} serves, and the record says {noted}")
+            made = {change["to"] for change in changes if change["what"] == "recalibrate"}
+            for job in client.jobs.list():
+                if job.state is JobState.RUNNING or (job.result is not None and job.result.model_version not in made):
+                    self.bad.append(f"job {job.id} is {job.state}, and the record says {', '.join(sorted(made))}")
             page = client.pages.read(want_written=True)
             assert page.written is not None  # the recording knows
             errors = float(np.mean(page.symbols != page.written))
@@ -99,12 +111,15 @@ class Killed:
             asked: list[str] = []
             with LightpageClient(service.target, 60) as client:
                 before = client.describe().model.version
-                versions = [model.version for model in client.models.list(stored=True)]
+                models = client.models.list(stored=True)
+                versions = [model.version for model in models]
                 recalibrating = chance.random() < 0.5 or len(versions) < 2
 
                 def ask() -> None:
                     try:
-                        if recalibrating:
+                        if recalibrating:  # the base: another time would bring no more
+                            asked.extend(model.version for model in models if model.origin == "given")
+                            heard.append(client.models.activate(asked[-1])[0])
                             heard.append(client.jobs.recalibrate(count=2).model_version)
                         while not recalibrating:
                             asked.append(chance.choice(versions))

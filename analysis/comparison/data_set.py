@@ -14,7 +14,8 @@ from lightpage.cli.progress_bar import percent_bar
 from lightpage.device.profile import Profile, parse_profile
 from lightpage.device.state import Device, Sensor
 from lightpage.errors import InvalidInputError
-from lightpage.recording.reader import Recording, hash_frames
+from lightpage.recording.layout import hash_frames
+from lightpage.recording.reader import Recording
 from lightpage.simulator.recording_job import RecordingJob
 from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
 from lightpage.train.models.twin import RayTwin, TorchTwin

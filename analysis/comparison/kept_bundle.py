@@ -22,7 +22,8 @@ from lightpage.cli.paths import NewPath, OutputFolder
 from lightpage.errors import InvalidInputError
 from lightpage.export.from_run import export_run
 from lightpage.page.symbols import pilot_mask
-from lightpage.recording.reader import Recording, hash_frames
+from lightpage.recording.layout import hash_frames
+from lightpage.recording.reader import Recording
 from lightpage.train.fitting.fitted import FITTED
 from lightpage.train.models.decoder import COHERENT
 from lightpage.train.models.presets import FAST

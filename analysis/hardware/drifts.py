@@ -32,7 +32,8 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
-from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.models.loader import Loader
+from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.monitoring.monitor import Monitor, MonitorSettings, PageFigures
 from lightpage.runtime.service.monitoring.observation import Observation
 from lightpage.runtime.service.pages.reading import read_page
@@ -76,7 +77,7 @@ def read(
 ) -> None:
     """Read pages as a service does, and keep the figures of each until `keep` raises `StopIteration`."""
     recorder = Recorder(PageFigures(), {})
-    plane = DataPlane(ModelRegistry(decoder, tracker_for), source, observers=[recorder])
+    plane = DataPlane(Models(decoder, loader=Loader(tracker_for)), source, observers=[recorder])
     for number in pages:
         source.moment = float(number)
         lost = ""

@@ -33,7 +33,8 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
-from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.models.loader import Loader
+from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.pages.reading import read_page
 from lightpage.virtual_device.device import VirtualDevice
 from lightpage.virtual_device.namespace import go_on_inside
@@ -69,7 +70,7 @@ def measure(pages: int, folder: Path) -> dict[str, Any]:
         with source:
             timed = TimedTrigger(source._trigger)
             source._trigger = source._pairing.trigger = timed
-            plane = DataPlane(ModelRegistry(decoder, tracker_for), source)
+            plane = DataPlane(Models(decoder, loader=Loader(tracker_for)), source)
             read_page(plane, 0, None, Caller(), user_data=True)
             for page in track(range(pages), "pages", total=pages):
                 try:

@@ -36,7 +36,8 @@ from lightpage.runtime.model.execution.cpus import available_cpus
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
-from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.models.loader import Loader
+from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.pages.reading import read_page
 
 PAGES = 16
@@ -121,7 +122,7 @@ def main(rounds: int, load: float, threads: int | None, json_path: Path | None) 
     alone, beside = list[float](), list[float]()
     idle, busy = list[Taken](), list[Taken]()
     for _ in track(range(rounds), "recalibration", unit="round"):
-        plane = DataPlane(ModelRegistry(decoder, tracker_for), source)
+        plane = DataPlane(Models(decoder, loader=Loader(tracker_for)), source)
         recalibrator = Recalibrator(plane)
         pause_s = median(timed(plane) for _ in range(SETTLED)) * (1 / load - 1)
         alone += [timed(plane, pause_s) for _ in range(BEFORE)]

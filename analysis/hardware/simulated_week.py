@@ -23,8 +23,9 @@ from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.self_calibration import SelfCalibration, SelfCalibrationSettings
-from lightpage.runtime.service.models.registry import ModelRegistry
-from lightpage.runtime.service.models.store import ModelStore
+from lightpage.runtime.service.models.loader import Loader
+from lightpage.runtime.service.models.models import Models
+from lightpage.runtime.service.models.store import Store
 from lightpage.runtime.service.monitoring.flight_recorder import FlightRecorder
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.pages.reading import read_page
@@ -94,11 +95,6 @@ class Week:
         path = self.out / "rows.jsonl"
         self.rows = kept_rows(path)
         base = Decoder.load(bundle_path(DEFAULT), self.threads)
-        store = ModelStore(self.out / "models", base.bundle)
-        registry = ModelRegistry(base, tracker_for)
-        note = store.read()
-        if (last := note.history[note.cursor]) is not None:
-            registry.swap(Decoder.load(store.folder / last, self.threads))
         source = DriftingSource(base, lambda moment: state(moment, self.pages), seed=7)
         knock = int(KNOCK_SHARE * self.pages)
         if self.rows:
@@ -107,8 +103,10 @@ class Week:
                 source.knock(KNOCK_PX)
         true_table, monitor = TrueTable(base), Monitor()
         with ExitStack() as stack:
-            recorder = stack.enter_context(FlightRecorder(self.out / "flight", registry, monitor=monitor))
-            plane = DataPlane(registry, source, store, observers=[recorder], monitor=monitor)
+            store = stack.enter_context(Store(self.out / "models", base.bundle))
+            models = Models(base, store, Loader(tracker_for))
+            recorder = stack.enter_context(FlightRecorder(self.out / "flight", models, monitor=monitor))
+            plane = DataPlane(models, source, observers=[recorder], monitor=monitor)
             watched = WatchedRecalibrator(plane)
             stack.callback(watched.close)
             settings = SelfCalibrationSettings(pages=CALIBRATION_PAGES, busy_s=0.05)
@@ -131,7 +129,7 @@ class Week:
     ) -> dict[str, Any]:
         """Read a page; what it was like, and what it would have been like with the true table."""
         row: dict[str, Any] = {"page": number, "air": 0.0, "margin": None, "shift_px": None, "failed": False}
-        before = plane.registry.current.version
+        before = plane.models.current.version
         try:
             found = read_page(plane, number, None, Caller(), user_data=True)
         except LightpageError as error:

@@ -12,7 +12,8 @@ from lightpage.device.state import Device
 from lightpage.page.symbols import random_symbols
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.reader import Recording, RecordingWriter
+from lightpage.recording.reader import Recording
+from lightpage.recording.writer import RecordingWriter
 from lightpage.simulator.simulator import Simulator
 
 LEVELS = 16
@@ -36,7 +37,7 @@ def archive(folder: Path, pages: int, fields: int, seed: int, kept: Path | None 
     if not simulated.exists():
         simulator = Simulator(profile, device, LEVELS, seed)
         symbols = random_symbols(profile, LEVELS, fields, np.random.default_rng(seed))
-        with RecordingWriter.resume(simulated, profile, LEVELS, bits, simulator.references()) as writer:
+        with RecordingWriter(simulated, profile, LEVELS, bits, simulator.references(), resume=True) as writer:
             for number in track(range(writer.pages, fields), "simulate", total=fields, done=writer.pages):
                 writer.append(symbols[number], simulator.page(symbols[number]))
     if not out.exists():

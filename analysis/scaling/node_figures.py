@@ -138,11 +138,11 @@ def measure(recording: Path, folder: Path, range_pages: int, worker_counts: tupl
     return NodeFigures(
         cores=available_cpus(),
         range_pages=range_pages,
-        pages=found.tally.pages,
+        pages=found.pages,
         measured=tuple(runs[0]),
         checked=tuple(runs[1]),
-        read_bytes=sum(reading.read_bytes for reading in found.readings) / found.tally.pages,
-        written_bytes=shards / found.tally.pages,
+        read_bytes=sum(reading.read_bytes for reading in found.readings) / found.pages,
+        written_bytes=shards / found.pages,
         record_s=_record_s(like, folder),
         local=tuple(
             _driver(LocalEngine(workers, 1, partial(started, target=IDLE_WORKER)), workers) for workers in worker_counts

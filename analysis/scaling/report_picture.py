@@ -33,7 +33,7 @@ from lightpage.helper_process import same_packages
 from lightpage.page.symbols import random_symbols
 from lightpage.pictures import write_png
 from lightpage.progress import track
-from lightpage.recording.reader import RecordingWriter
+from lightpage.recording.writer import RecordingWriter
 from lightpage.report.contents.from_bulk import PAUSE_S
 from lightpage.runtime.archives.run.shard import RECORD
 from lightpage.runtime.model.bundle.shipped import DEFAULT

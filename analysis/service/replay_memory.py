@@ -34,7 +34,8 @@ from lightpage.runtime.model.decoding.page import DecodedPage
 from lightpage.runtime.model.decoding.tracking import NoTracker
 from lightpage.runtime.service.caller import Call, Caller
 from lightpage.runtime.service.dataplane import DataPlane
-from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.models.loader import Loader
+from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.pages.page_calls import PageCalls
 
@@ -80,8 +81,8 @@ def measured(pages: int = PAGES) -> dict[str, float]:
     decoder = Decoder(Bundle.open(bundle_path(DEFAULT)))
     golden, kind = decoder.bundle.golden, decoder.bundle.manifest.frame_dtype
     pair = FramePair(*(np.ascontiguousarray(frame, kind) for frame in (golden.pair.in_phase, golden.pair.quadrature)))
-    registry = ModelRegistry(decoder, lambda one: _Disbelief(one, pair))
-    plane = DataPlane(registry, _Photographs(decoder.bundle, pair), monitor=Monitor())
+    models = Models(decoder, loader=Loader(lambda one: _Disbelief(one, pair)))
+    plane = DataPlane(models, _Photographs(decoder.bundle, pair), monitor=Monitor())
     calls = PageCalls(plane)
 
     def lose(number: int, pool: ThreadPoolExecutor) -> None:

@@ -194,7 +194,7 @@ class PagesToSend:
         profile = self._bundle.profile
         shape, bits = profile.frame_shape, self._bundle.manifest.camera_bit_depth
         dark = np.full(shape, 20, self.pair.in_phase.dtype)
-        with RecordingWriter.resume(path, profile, 256, bits, FramePair(dark, dark)) as writer:
+        with RecordingWriter(path, profile, 256, bits, FramePair(dark, dark), resume=True) as writer:
             for _ in range(pages):
                 writer.append(None, self.pair)
         return path

@@ -18,7 +18,8 @@ from lightpage.export.from_run import export_run
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.page.symbols import pilot_mask, random_symbols
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.reader import Recording, hash_frames
+from lightpage.recording.layout import hash_frames
+from lightpage.recording.reader import Recording
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
@@ -65,7 +66,7 @@ def recorded(path: Path, profile: Profile, device: Device) -> Seen:
         RecordingError: no recording, or one of another profile.
     """
     with Recording.open(path) as recording:
-        recording.check_against(profile)
+        recording.header.check_against(profile)
         return Seen(device, recording.frames(0), recording.references())
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.calibration.document import Calibration
+from lightpage.calibration.sampling_table import stand_apart
 from lightpage.device.profile import Profile
 from lightpage.page.modulation import NOMINAL, Modulation
 from lightpage.recording.frame_pair import FramePair
@@ -31,6 +32,11 @@ class CalibratedDevice:
     quadrature_phase_rad: float
     references: FramePair
     modulation: Modulation = NOMINAL
+
+    @property
+    def stands_apart(self) -> bool:
+        """Whether the cameras stand so far apart that each must be seen through a defocus of its own."""
+        return stand_apart(self.parameters)
 
     @classmethod
     def of(cls, profile: Profile, calibration: Calibration, references: FramePair) -> Self:

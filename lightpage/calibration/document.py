@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, field_serializer
 
 from lightpage.calibration.calibrate import Registered
-from lightpage.calibration.parameters import NAMES, as_dict, as_vector
+from lightpage.calibration.parameters import KNOWN, NAMES, as_dict, as_vector
 from lightpage.device.profile import Count, Finite, Profile, TomlTable, to_toml, validate
 from lightpage.errors import ProfileError
 from lightpage.files import read_text, replace_text
@@ -23,9 +23,7 @@ Real = NDArray[np.float64]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 PageHash = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
-_LATER = ("modulator_axial_rad", "in_phase_axial_rad", "quadrature_axial_rad") + tuple(
-    f"{camera}_keystone_{axis}_relative" for camera in ("in_phase", "quadrature") for axis in "xy"
-)
+_LATER = NAMES[KNOWN[0] :]
 _ADDED = {
     "parameters": {"lens_path_relative": -1.0, **dict.fromkeys(_LATER, 0.0)},
     "deviations": dict.fromkeys(("lens_path_relative", *_LATER), 0.0),

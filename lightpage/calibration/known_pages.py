@@ -58,7 +58,7 @@ def known_pages(recording: Recording, profile: Profile, indices: Iterable[int]) 
         FrameError: a frame or reference that is black or saturated; it names recording, page and frame.
         RecordingError: no symbols, another shape than the profile's, no such page, or unreadable data.
     """
-    recording.check_against(profile)
+    recording.header.check_against(profile)
     check_pair_light(f"recording {recording.path}, reference, ", recording.references(), recording.bit_depth)
     pages = []
     for index in indices:

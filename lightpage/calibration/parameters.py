@@ -75,6 +75,8 @@ PARAMETERS: tuple[Parameter, ...] = (
 )
 
 NAMES: tuple[str, ...] = tuple(p.name for p in PARAMETERS)
+KNOWN = (NAMES.index("modulator_axial_rad"), len(NAMES))
+"""Counts of parameters that twins know: those of bundles of before, which took planes for those of the profile; all."""
 PRIORS: Real = np.array([p.prior for p in PARAMETERS])
 
 

@@ -65,7 +65,8 @@ class SeidelTerms(NamedTuple):
         """Derivatives of W by the aperture's two coordinates, rad/m."""
         r2, aperture2, product = x * x + y * y, across * across + up * up, x * across + y * up
         by_field = self.distortion * r2 + self.coma * aperture2 + 2 * self.astigmatism * product
-        by_aperture = 2 * (self.coma * product + self.field_curvature * r2 + self.defocus) + 4 * self.spherical * aperture2
+        even = self.coma * product + self.field_curvature * r2 + self.defocus
+        by_aperture = 2 * even + 4 * self.spherical * aperture2
         return by_field * x + by_aperture * across, by_field * y + by_aperture * up
 
     def slope_on_field(self, x: Any, y: Any, across: Any, up: Any) -> tuple[Any, Any]:

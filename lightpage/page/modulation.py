@@ -55,8 +55,8 @@ class Modulation:
         phases = np.mod(phases, 2 * np.pi)
         found, (stroke, *rest) = basis(phases), self.coefficients
         phase, amplitude = np.array([stroke, *rest[: 2 * HARMONICS]]), np.array(rest[2 * HARMONICS :])
-        turned = phases + np.tensordot(phase, found, 1)
-        return np.asarray(np.exp(1j * turned + np.tensordot(amplitude, found[1:], 1)), np.complex128)
+        logarithm = 1j * (phases + np.tensordot(phase, found, 1)) + np.tensordot(amplitude, found[1:], 1)
+        return np.asarray(np.exp(logarithm), np.complex128)
 
     def phase(self, phases: Real) -> Real:
         """Phase of the light of nominal phases, radians, in their shape: near each, and exactly it nominally."""

@@ -59,7 +59,7 @@ def _kind(path: Path) -> dict[str, Any]:
             "page": recording.page_shape,
             "bit depth": recording.bit_depth,
             "levels": recording.levels,
-            "black level": recording.black_level,
+            "black level": recording.header.black_level,
             "symbols": "known" if recording.has_symbols else "unknown",
             "pilots": "those of the profile" if pilots is None else np.flatnonzero(pilots).tolist(),
         }

@@ -198,8 +198,7 @@ class Pages:
         if not -len(self) <= page < len(self):
             raise IndexError(page)
         page %= len(self)
-        symbols: NDArray[np.uint8]
-        (symbols,) = self._file.rows("symbols", f"{self._subject}: page {page}", page, page + 1)
+        symbols: NDArray[np.uint8] = self._file.page("symbols", page)
         if int(symbols.max()) >= self.levels:
             raise RecordingError(
                 f"pages {self.path}: page {page}", f"a symbol of {symbols.max()}", f"0 to {self.levels - 1}"

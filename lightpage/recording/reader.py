@@ -11,52 +11,46 @@ Datasets: `in_phase` and `quadrature` [page, row, column], `reference_in_phase` 
 from __future__ import annotations
 
 import json
-import math
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.device.profile import Profile, parse_profile
-from lightpage.errors import ProfileError, RecordingError
-from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
+from lightpage.errors import RecordingError
 from lightpage.progress import warn
-from lightpage.recording.alignment import describe, unused_low_bits
 from lightpage.recording.black_level import without_black
+from lightpage.recording.exposure import describe, unused_low_bits
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.hdf5 import open_hdf5
+from lightpage.recording.header import read_header
 from lightpage.recording.layout import (
     CAMERAS,
     DARK,
-    FORMAT,
     FRAMES,
     HOT,
     LOSSES,
-    MAX_BIT_DEPTH,
-    MIN_BIT_DEPTH,
     REFERENCES,
     SHOT_DATA,
-    VERSION,
     FrameInfo,
     LostShot,
-    frame_type,
     hash_frames,
-    page_hashes,
 )
-from lightpage.recording.stored import ArrayFile, StoredArray
-from lightpage.recording.writer import RecordingWriter
-
-__all__ = ["Recording", "RecordingWriter", "hash_frames", "page_hashes"]
-
-_SYMBOL_PAGES_AT_ONCE = 64
-"""Pages of symbols checked in one read, so that opening a long recording stays small in memory."""
+from lightpage.recording.stored import ArrayFile
 
 
-class Recording:
-    """A recording opened for reading and checked; use it in a `with` statement, or close it."""
+class Recording(AbstractContextManager["Recording"]):
+    """A recording opened for reading and checked; use it in a `with` statement, or close it.
+
+    Attributes:
+        path: of the file.
+        header: what holds for all of its pages.
+        pages, levels, bit_depth, frame_shape, page_shape, has_symbols: see `Header`.
+        cameras: what cameras have noted.
+    """
 
     def __init__(self, file: h5py.File, path: Path) -> None:
         """Check `file`, which must be open for reading, and is closed with this; `Recording.open` is the usual way in.
@@ -68,14 +62,14 @@ class Recording:
         self._alignment_told = False
         self._file = ArrayFile(file, f"recording {path}")
         try:
-            self._check_header()
-            self._check_frames()
-            self._check_page()
-            for name in (*SHOT_DATA, *DARK, *HOT, LOSSES):
-                self._file.array(name)
+            self.header = header = read_header(self._file)
+            self.cameras = CameraNotes(self._file, header.pages)
+            self.cameras.check()
         except BaseException:
             self.close()
             raise
+        self.pages, self.levels, self.bit_depth = header.pages, header.levels, header.bit_depth
+        self.frame_shape, self.page_shape, self.has_symbols = header.frame_shape, header.page_shape, header.has_symbols
 
     @classmethod
     def open(cls, path: str | Path) -> Self:
@@ -88,12 +82,7 @@ class Recording:
         path = Path(path)
         return cls(open_hdf5(path, f"recording {path}"), path)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -101,67 +90,13 @@ class Recording:
         self._file.close()
 
     @property
-    def pages(self) -> int:
-        """Number of pages."""
-        return self._shape[0]
-
-    @property
-    def levels(self) -> int:
-        """Level count M of the symbols."""
-        return self._levels
-
-    @property
-    def bit_depth(self) -> int:
-        """Bits of a camera count; full scale is 2**bit_depth - 1."""
-        return self._bit_depth
-
-    @property
-    def black_level(self) -> int:
-        """Counts of a camera in the dark; `frames` and `references` are free of them."""
-        return self._black_level
-
-    @property
-    def frame_shape(self) -> tuple[int, int]:
-        """Camera pixels as (rows, columns)."""
-        return self._shape[1:]
-
-    @property
-    def page_shape(self) -> tuple[int, int] | None:
-        """Symbols as (rows, columns), or None when the file holds neither symbols nor pilots."""
-        for name in ("symbols", "pilots"):
-            if (found := self._file.array(name)) is not None:
-                rows, columns = found.shape[-2:]
-                return rows, columns
-        return None
-
-    @property
     def stored_page_bytes(self) -> float:
         """Bytes that the frame pair of a page takes in the file, compressed as it is; mean over the pages.
 
         Of recordings that are shown as one, it is what their own files take.
         """
-        return sum(self._array(name).stored_bytes for name in FRAMES) / max(1, self.pages)
-
-    @property
-    def has_symbols(self) -> bool:
-        """Whether the written symbols are known."""
-        return self._file.array("symbols") is not None
-
-    @property
-    def declared_levels(self) -> int | None:
-        """Level count as the file states it, None where it does not."""
-        return self._levels if self._attribute("levels") is not None else None
-
-    @property
-    def code_text(self) -> str | None:
-        """What the pages hold, JSON text, or None: then they were not made by an encoder, or it was not noted."""
-        text = self._attribute("code")
-        return text if isinstance(text, str) else None
-
-    @property
-    def profile_text(self) -> str | None:
-        """The nominal profile as TOML text, or None."""
-        return self._profile_text
+        found = map(self._file.array, FRAMES)
+        return sum(array.stored_bytes for array in found if array is not None) / self.pages
 
     def frames(self, page: int) -> FramePair:
         """The frame pair of one page, its black level taken off.
@@ -169,7 +104,7 @@ class Recording:
         Raises:
             RecordingError: no such page, or its data cannot be read.
         """
-        return FramePair(*(self._read_page(name, page) for name in FRAMES))
+        return FramePair(*(self._counts(name, f" page {page}", self._file.page(name, page)) for name in FRAMES))
 
     def references(self) -> FramePair:
         """The two reference-only frames, their black level taken off.
@@ -177,7 +112,7 @@ class Recording:
         Raises:
             RecordingError: the data cannot be read.
         """
-        return FramePair(*(self._read(name) for name in REFERENCES))
+        return FramePair(*(self._counts(name, "", self._file.rows(name)) for name in REFERENCES))
 
     def shown(self, index: int) -> tuple[FramePair, NDArray[np.uint8] | None]:
         """Frames and symbols of a page; see `frames` and `symbols`."""
@@ -189,7 +124,7 @@ class Recording:
         Raises:
             RecordingError: no such page, or its data cannot be read.
         """
-        return self._read_page("symbols", page) if self.has_symbols else None
+        return self._file.page("symbols", page) if self.has_symbols else None
 
     def pilots(self) -> NDArray[np.bool_] | None:
         """The recording's own pilot positions [ny, nx], or None: then the profile's default positions hold.
@@ -197,61 +132,7 @@ class Recording:
         Raises:
             RecordingError: the data cannot be read.
         """
-        return self._read("pilots").astype(np.bool_) if self._file.array("pilots") is not None else None
-
-    def frame_infos(self, page: int) -> tuple[FrameInfo, FrameInfo] | None:
-        """What the cameras said of a page's in-phase and quadrature frame, or None where that was not noted.
-
-        Raises:
-            RecordingError: no such page, or the data cannot be read, or do not fit the frames.
-        """
-        known = [self._file.array(name) for name in SHOT_DATA]
-        if None in known:
-            return None
-        subject, expected = self._subject(f"group '{CAMERAS}'"), f"({self.pages}, 2), and two serials and pixel formats"
-        names = [self._file.attribute(name, group=CAMERAS) for name in ("serials", "pixel_formats")]
-        shapes = {array.shape for array in known if array is not None}
-        if shapes != {(self.pages, 2)} or any(np.shape(name) != (2,) for name in names):
-            raise RecordingError(subject, f"shapes {sorted(shapes)}, {names}", expected)
-        ids, device, host, exposures = (self._read_page(name, page) for name in SHOT_DATA)
-        first, second = (
-            FrameInfo(
-                str(names[0][one]),
-                int(ids[one]),
-                float(device[one]),
-                float(host[one]),
-                str(names[1][one]),
-                None if np.isnan(exposures[one]) else float(exposures[one]),
-            )
-            for one in (0, 1)
-        )
-        return first, second
-
-    def dark_frames(self) -> FramePair | None:
-        """What the cameras saw without light, as it was, or None where that was not recorded."""
-        if any(self._file.array(name) is None for name in DARK):
-            return None
-        return FramePair(*(self._read(name) for name in DARK))
-
-    def hot_pixels(self) -> tuple[NDArray[np.intp], NDArray[np.intp]] | None:
-        """Row and column [n, 2] of the pixels of each camera that were mended, or None where that was not noted."""
-        if any(self._file.array(name) is None for name in HOT):
-            return None
-        first, second = (self._read(name).astype(np.intp).reshape(-1, 2) for name in HOT)
-        return first, second
-
-    def losses(self) -> list[LostShot]:
-        """Shots that gave no page.
-
-        Raises:
-            RecordingError: a note that cannot be read.
-        """
-        if self._file.array(LOSSES) is None:
-            return []
-        try:
-            return [LostShot(**json.loads(text)) for text in self._read(LOSSES)]
-        except (TypeError, ValueError) as error:
-            raise RecordingError(self._subject(f"dataset '{LOSSES}'"), error, "notes of lost shots") from None
+        return None if self._file.array("pilots") is None else self._file.rows("pilots").astype(np.bool_)
 
     def page_hash(self, page: int) -> str:
         """SHA-256 of one frame pair in hex, by which pages that were trained on are recognised; see `page_hashes`.
@@ -261,196 +142,89 @@ class Recording:
         """
         return hash_frames(self.frames(page))
 
-    def check_against(self, profile: Profile) -> None:
-        """Check that the recording belongs to devices of this profile.
+    def _counts(self, name: str, where: str, frame: NDArray[Any]) -> NDArray[Any]:
+        """A frame without its black level; counts that its bits do not hold are refused, and odd ones told once."""
+        header, highest = self.header, int(frame.max())
+        if highest > (full_scale := 2**header.bit_depth - 1):
+            expected = f"at most {full_scale}, since camera_bit_depth = {header.bit_depth}"
+            raise RecordingError(f"{header.subject}: dataset '{name}'{where}", f"a count of {highest}", expected)
+        if not self._alignment_told and (unused := unused_low_bits(frame, header.bit_depth)):
+            self._alignment_told = True
+            told = f"{describe(header.bit_depth, unused)}; right-aligned counts are wanted"
+            warn(f"{header.subject}: {name}: {told}")
+        return without_black(frame, header.black_level, header.bit_depth)
+
+
+@dataclass(frozen=True)
+class CameraNotes:
+    """What a recording has of its cameras beside the frames; each is None, or empty, where it was not noted.
+
+    Attributes:
+        file: the recording.
+        pages: that it has.
+    """
+
+    file: ArrayFile
+    pages: int
+
+    def check(self) -> None:
+        """Check that what is noted can be read, without reading it.
 
         Raises:
-            RecordingError: frames or page of another shape.
+            RecordingError: it is not whole.
         """
-        if self.frame_shape != profile.frame_shape:
-            raise RecordingError(
-                self._subject("in_phase"),
-                f"frames of {_size(self.frame_shape)} pixels",
-                f"{_size(profile.frame_shape)} (profile {profile.name})",
-            )
-        if self.page_shape not in (None, profile.page_shape):
-            raise RecordingError(
-                self._subject("symbols" if self.has_symbols else "pilots"),
-                f"pages of {_size(self.page_shape)} symbols",
-                f"{_size(profile.page_shape)} (profile {profile.name})",
-            )
+        for name in (*SHOT_DATA, *DARK, *HOT, LOSSES):
+            self.file.array(name)
 
-    def own_profile(self) -> Profile | None:
-        """The nominal profile that the recording carries; None where it has none that can be read."""
-        try:
-            return None if self._profile_text is None else parse_profile(self._profile_text, "profile of the recording")
-        except ProfileError:
+    def frame_infos(self, page: int) -> tuple[FrameInfo, FrameInfo] | None:
+        """What the cameras said of a page's in-phase and quadrature frame.
+
+        Raises:
+            RecordingError: no such page, or the data cannot be read, or do not fit the frames.
+        """
+        known = [array for name in SHOT_DATA if (array := self.file.array(name)) is not None]
+        if len(known) < len(SHOT_DATA):
             return None
+        names = [self.file.attribute(name, group=CAMERAS) for name in ("serials", "pixel_formats")]
+        shapes = {array.shape for array in known}
+        if shapes != {(self.pages, 2)} or any(np.shape(name) != (2,) for name in names):
+            subject = f"{self.file.subject}: group '{CAMERAS}'"
+            expected = f"({self.pages}, 2), and two serials and pixel formats"
+            raise RecordingError(subject, f"shapes {sorted(shapes)}, {names}", expected)
+        ids, device, host, exposures = (self.file.page(name, page).tolist() for name in SHOT_DATA)
+        first, second = (
+            FrameInfo(serial, number, device_s, host_s, form, None if np.isnan(exposure_s) else exposure_s)
+            for serial, number, device_s, host_s, form, exposure_s in zip(
+                map(str, names[0]), ids, device, host, map(str, names[1]), exposures, strict=True
+            )
+        )
+        return first, second
 
-    def differences(self, profile: Profile) -> list[str]:
-        """What the recording's own nominal profile says otherwise than `profile`, a line each.
+    def dark_frames(self) -> FramePair | None:
+        """What the cameras saw without light, as it was."""
+        found = self._both(DARK)
+        return None if found is None else FramePair(*found)
 
-        Empty where it has none that can be read: another program's notes are no reason to stop.
+    def hot_pixels(self) -> tuple[NDArray[np.intp], NDArray[np.intp]] | None:
+        """Row and column [n, 2] of the pixels of each camera that were mended."""
+        if (found := self._both(HOT)) is None:
+            return None
+        first, second = (pixels.astype(np.intp).reshape(-1, 2) for pixels in found)
+        return first, second
+
+    def losses(self) -> list[LostShot]:
+        """Shots that gave no page.
+
+        Raises:
+            RecordingError: a note that cannot be read.
         """
-        own = self.own_profile()
-        if own is None:
+        if (found := self.file.array(LOSSES)) is None:
             return []
-        told, expected = own.model_dump(), profile.model_dump()
-        return [
-            f"{table}.{key} = {value} (profile {profile.name}: {expected[table][key]})"
-            for table, values in told.items()
-            if isinstance(values, dict)
-            for key, value in values.items()
-            if expected[table][key] != value
-        ]
+        try:
+            return [LostShot(**json.loads(text)) for text in self.file.rows(LOSSES)]
+        except (TypeError, ValueError) as error:
+            raise RecordingError(found.subject, error, "notes of lost shots") from None
 
-    def _subject(self, name: str) -> str:
-        return f"recording {self.path}: {name}"
-
-    def _attribute(self, name: str, default: object = None) -> Any:
-        """A root attribute as a plain Python value."""
-        return self._file.attribute(name, default)
-
-    def _whole(self, name: str, default: int | None = None) -> int:
-        value = self._attribute(name, default)
-        if isinstance(value, float) and value.is_integer():
-            value = int(value)
-        if isinstance(value, bool) or not isinstance(value, int):
-            raise RecordingError(
-                self._subject(f"attribute '{name}'"), "none" if value is None else repr(value), "a whole number"
-            )
-        return value
-
-    def _check_header(self) -> None:
-        format_name = self._attribute("format")
-        if format_name != FORMAT:
-            got = "none" if format_name is None else repr(format_name)
-            raise RecordingError(self._subject("attribute 'format'"), got, repr(FORMAT))
-        version = self._whole("version")
-        if version != VERSION:
-            raise RecordingError(self._subject("attribute 'version'"), version, f"version {VERSION}")
-        self._bit_depth = self._whole("camera_bit_depth")
-        if not MIN_BIT_DEPTH <= self._bit_depth <= MAX_BIT_DEPTH:
-            raise RecordingError(
-                self._subject("attribute 'camera_bit_depth'"), self._bit_depth, f"{MIN_BIT_DEPTH} to {MAX_BIT_DEPTH}"
-            )
-        self._levels = self._whole("levels", MAX_LEVELS)
-        if not MIN_LEVELS <= self._levels <= MAX_LEVELS:
-            raise RecordingError(
-                self._subject("attribute 'levels'"), self._levels, f"a whole number from {MIN_LEVELS} to {MAX_LEVELS}"
-            )
-        self._black_level = self._whole("black_level", 0)
-        full_scale = 2**self._bit_depth - 1
-        if not 0 <= self._black_level < full_scale:
-            raise RecordingError(
-                self._subject("attribute 'black_level'"), self._black_level, f"0 to {full_scale - 1} counts"
-            )
-        text = self._attribute("profile")
-        if text is not None and not isinstance(text, str):
-            raise RecordingError(self._subject("attribute 'profile'"), type(text).__name__, "TOML text")
-        self._profile_text: str | None = text
-
-    def _array(self, name: str) -> StoredArray:
-        found = self._file.array(name)
-        if found is None:
-            raise RecordingError(self._subject(f"dataset '{name}'"), "none", "an array")
-        return found
-
-    def _dataset(self, name: str, dimensions: int) -> StoredArray:
-        found = self._array(name)
-        if len(found.shape) != dimensions:
-            raise RecordingError(found.subject, f"shape {found.shape}", f"{dimensions} dimensions")
-        return found
-
-    def _check_frames(self) -> None:
-        first = self._dataset("in_phase", 3)
-        pages, rows, columns = first.shape
-        self._shape = pages, rows, columns
-        wanted_type = frame_type(self._bit_depth)
-        for name, shape in {
-            "in_phase": first.shape,
-            "quadrature": first.shape,
-            "reference_in_phase": first.shape[1:],
-            "reference_quadrature": first.shape[1:],
-        }.items():
-            dataset = self._dataset(name, len(shape))
-            subject = self._subject(f"dataset '{name}'")
-            # 8-bit counts may come in either type; more bits fit into uint16 only.
-            fits = dataset.dtype.kind == "u" and wanted_type.itemsize <= dataset.dtype.itemsize <= 2
-            if not fits:
-                raise RecordingError(subject, f"type {dataset.dtype}", f"{wanted_type} for {self._bit_depth} bits")
-            if dataset.shape != shape:
-                raise RecordingError(subject, f"shape {dataset.shape}", f"shape {shape}, as 'in_phase' has")
-            if 0 in dataset.shape:
-                raise RecordingError(subject, f"shape {dataset.shape}", "at least one page and one pixel")
-
-    def _check_page(self) -> None:
-        if self._file.array("pilots") is not None:
-            pilots = self._dataset("pilots", 2)
-            if pilots.dtype.kind not in "bui":
-                raise RecordingError(self._subject("dataset 'pilots'"), f"type {pilots.dtype}", "booleans")
-            known, size = np.count_nonzero(self._read("pilots")), math.prod(pilots.shape)
-            if not 0 < known < size:
-                raise RecordingError(
-                    self._subject("dataset 'pilots'"),
-                    f"{known} pilots of {size} symbols",
-                    "some of them, not all",
-                )
-        if not self.has_symbols:
-            return
-        symbols = self._dataset("symbols", 3)
-        subject = self._subject("dataset 'symbols'")
-        if symbols.dtype != np.uint8:
-            raise RecordingError(subject, f"type {symbols.dtype}", "uint8")
-        if symbols.shape[0] != self.pages or 0 in symbols.shape[1:]:
-            raise RecordingError(subject, f"shape {symbols.shape}", f"shape ({self.pages}, ny, nx), as 'in_phase' has")
-        if (own := self._file.array("pilots")) is not None and own.shape != symbols.shape[1:]:
-            raise RecordingError(
-                own.subject,
-                f"shape {own.shape}",
-                f"shape {symbols.shape[1:]}, as 'symbols' has",
-            )
-        for start in range(0, self.pages, _SYMBOL_PAGES_AT_ONCE):
-            chunk = self._read("symbols", start, min(start + _SYMBOL_PAGES_AT_ONCE, self.pages))
-            if int(chunk.max()) >= self._levels:
-                raise RecordingError(
-                    subject, f"a symbol of {chunk.max()}", f"0 to {self._levels - 1}, since levels = {self._levels}"
-                )
-
-    def _read_page(self, name: str, page: int) -> NDArray[Any]:
-        if not 0 <= page < self.pages:
-            raise RecordingError(self._subject("page"), page, f"0 to {self.pages - 1}")
-        frame: NDArray[Any] = self._read(name, page, page + 1)[0]
-        if name in FRAMES:
-            self._check_counts(name, frame, f" page {page}")
-            frame = self._without_black(frame)
-        return frame
-
-    def _read(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
-        """An array, or its rows from `start` to `stop`, in this machine's byte order."""
-        page = f" page {start}" if stop == start + 1 else ""
-        data = self._file.rows(name, self._subject(f"dataset '{name}'{page}"), start, stop)
-        data = data.astype(data.dtype.newbyteorder("="), copy=False)  # torch takes no other byte order
-        if name in REFERENCES:
-            self._check_counts(name, data, "")
-            data = self._without_black(data)
-        return data
-
-    def _without_black(self, frame: NDArray[Any]) -> NDArray[Any]:
-        return without_black(frame, self._black_level, self._bit_depth)
-
-    def _check_counts(self, name: str, frame: NDArray[Any], where: str) -> None:
-        full_scale = 2**self._bit_depth - 1
-        if int(frame.max()) > full_scale:
-            raise RecordingError(
-                self._subject(f"dataset '{name}'{where}"),
-                f"a count of {frame.max()}",
-                f"at most {full_scale}, since camera_bit_depth = {self._bit_depth}",
-            )
-        if not self._alignment_told and (unused := unused_low_bits(frame, self._bit_depth)):
-            self._alignment_told = True
-            warn(f"{self._subject(name)}: {describe(self._bit_depth, unused)}; right-aligned counts are wanted")
-
-
-def _size(shape: tuple[int, int] | None) -> str:
-    return "unknown" if shape is None else f"{shape[0]} x {shape[1]}"
+    def _both(self, names: tuple[str, str]) -> list[NDArray[Any]] | None:
+        """The arrays of both cameras, or None where one is missing."""
+        return None if None in map(self.file.array, names) else [self.file.rows(name) for name in names]

@@ -114,7 +114,7 @@ class ArrayFile:
     """
 
     def __init__(self, file: h5py.File, subject: str) -> None:
-        self._file, self._subject = file, subject
+        self._file, self.subject = file, subject
         self._path = Path(file.filename).absolute()
         self._stamp, self._gone = patiently(self._found_stamp, subject, READABLE, RecordingError), False
         self._sources = Sources()
@@ -131,7 +131,7 @@ class ArrayFile:
         with self._lock:
             if name not in self._arrays:
                 self._be_open()
-                subject = f"{self._subject}: dataset '{name}'"
+                subject = f"{self.subject}: dataset '{name}'"
                 found = find(self._file, name, subject)
                 if not isinstance(found, (h5py.Dataset, type(None))):
                     got = "a group" if isinstance(found, h5py.Group) else "a named type"
@@ -139,28 +139,42 @@ class ArrayFile:
                 self._arrays[name] = None if found is None else StoredArray(found, subject, self._sources)
             return self._arrays[name]
 
-    def rows(self, name: str, subject: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
-        """An array, or its rows from `start` to `stop`; `subject` is what they are, for error messages.
+    def rows(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
+        """An array, or its rows from `start` to `stop`, in this machine's byte order.
 
         Raises:
-            RecordingError: there is no such array, or another file has its name by now; and see `array`.
+            RecordingError: there is no such array, or another file has the file's name by now; and see `array`.
             StorageError, SurroundingsError: it cannot be read.
         """
+        subject = f"{self.subject}: dataset '{name}'" + (f" page {start}" if stop == start + 1 else "")
 
         def read() -> NDArray[Any]:
             if self._gone:
                 self._open_again()
-            array = self.array(name)
-            if array is None:
+            if (array := self.array(name)) is None:
                 raise RecordingError(subject, "none", "an array")
             return array.rows(start, len(array) if stop is None else stop)
 
         with self._lock:
-            return patiently(read, subject, renew=self._let_go)
+            data = patiently(read, subject, renew=self._let_go)
+        return data.astype(data.dtype.newbyteorder("="), copy=False)  # torch takes no other byte order
+
+    def page(self, name: str, page: int) -> NDArray[Any]:
+        """A row of an array that has one for each page.
+
+        Raises:
+            RecordingError: no such page; and see `rows`.
+            StorageError, SurroundingsError: it cannot be read.
+        """
+        pages = 0 if (array := self.array(name)) is None else len(array)
+        if not 0 <= page < pages:
+            raise RecordingError(f"{self.subject}: page", page, f"0 to {pages - 1}")
+        row: NDArray[Any] = self.rows(name, page, page + 1)[0]
+        return row
 
     def attribute(self, name: str, default: object = None, group: str = "") -> Any:
         """An attribute of the file or of a group in it; see `read_attribute`."""
-        subject = f"{self._subject}: group '{group}'" if group else self._subject
+        subject = f"{self.subject}: group '{group}'" if group else self.subject
         with self._lock:
             self._be_open()
             place = find(self._file, group, subject) if group else self._file
@@ -187,13 +201,13 @@ class ArrayFile:
 
     def _open_again(self) -> None:
         if self._found_stamp() != self._stamp:
-            raise RecordingError(self._subject, "another file since it was opened", "the same file")
-        self._file, self._gone = open_once(self._path, self._subject), False
+            raise RecordingError(self.subject, "another file since it was opened", "the same file")
+        self._file, self._gone = open_once(self._path, self.subject), False
         self._arrays.clear()
 
     def _be_open(self) -> None:
         if self._gone:
-            patiently(self._open_again, self._subject, READABLE)
+            patiently(self._open_again, self.subject, READABLE)
 
 
 @dataclass(frozen=True)

@@ -3,29 +3,28 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, ExitStack, closing
+from dataclasses import asdict, astuple
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lightpage.device.profile import Profile
-from lightpage.errors import LightpageError, NoSuchPageError, PageError, RecordingError
-from lightpage.failures import error_number, hdf5_failure, os_failure, short_resource
-from lightpage.files import lock, move_into_place, move_to_new_name
+from lightpage.errors import LightpageError, PageError, RecordingError
+from lightpage.failures import os_failure
+from lightpage.files import move_into_place, move_to_new_name
 from lightpage.page.levels import check_levels
 from lightpage.page.symbols import check_symbols
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.hdf5 import retried
 from lightpage.recording.hdf_file import open_to_write
 from lightpage.recording.layout import (
     CAMERAS,
     DARK,
-    FORMAT,
     FRAMES,
     HOT,
     LOSSES,
@@ -33,153 +32,38 @@ from lightpage.recording.layout import (
     MIN_BIT_DEPTH,
     REFERENCES,
     SHOT_DATA,
-    VERSION,
     FrameInfo,
     LostShot,
     frame_type,
+)
+from lightpage.recording.unfinished import (
+    CUT_OFF,
+    Identity,
+    Symbols,
+    check_damage,
+    discard_partial,
+    growing,
+    other_pages,
+    pages_of,
+    partial_path,
+    taken,
 )
 from lightpage.words import counted
 
 Infos = tuple[FrameInfo, FrameInfo]
 HotPixels = tuple[NDArray[np.intp], NDArray[np.intp]]
 """Of both cameras, [n, 2]: row and column."""
-Symbols = Callable[[int], NDArray[np.uint8]]
-"""Of a page by its number; `NoSuchPageError` where there is none."""
 
 
-def partial_path(path: Path) -> Path:
-    """Where a recording lies until it is complete and gets its name `path`."""
-    return path.with_name(path.name + ".partial")
-
-
-def pages_there(
-    path: Path,
-    profile: Profile,
-    levels: int,
-    bit_depth: int,
-    *,
-    code: str | None = None,
-    symbols: Symbols | None = None,
-    overwrite: bool = False,
-) -> int:
-    """Pages of the unfinished recording `path` that `RecordingWriter.resume` would go on from; arguments as there.
-
-    Raises:
-        RecordingError: another process is writing them; or they are others, and `overwrite` is not asked for.
-    """
-    partial = partial_path(path)
-    if not _take(partial, remove=False):
-        return 0
-    try:
-        with retried(lambda: h5py.File(str(partial), "r", locking=False)) as file:
-            pages = _pages_of(file)
-            other = _difference(file, pages, _header(profile, levels, bit_depth, code), symbols)
-    except _CUT_OFF as error:
-        _check_damage(partial, error)
-        return 0
-    if not (pages and other):
-        return pages
-    if overwrite:
-        return 0
-    raise _others(partial, pages, other)
-
-
-_CUT_OFF = (OSError, KeyError, RuntimeError, TypeError, ValueError)
-"""What HDF5 raises of a file that was cut off while it was written; it is begun anew."""
-
-
-def _check_damage(partial: Path, error: Exception) -> None:
-    """Check that an error says something of an unfinished file, and not that it cannot be read now.
-
-    Raises:
-        StorageError, SurroundingsError, RecordingError: it cannot be read.
-    """
-    if error_number(error) is not None or short_resource("", error):
-        expected = "a file that can be read: its pages are not begun anew"
-        raise hdf5_failure(f"recording {partial}", error, expected, RecordingError) from None
-
-
-def _pages_of(file: h5py.File) -> int:
-    """Without its count a file was interrupted while it was completed: all of its pages are there."""
-    return int(file.attrs.get("pages_complete", file[FRAMES[0]].shape[0]))
-
-
-def _header(profile: Profile, levels: int, bit_depth: int, code: str | None) -> dict[str, Any]:
-    return {
-        "format": FORMAT,
-        "version": VERSION,
-        "camera_bit_depth": bit_depth,
-        "levels": levels,
-        "profile": profile.to_toml(),
-        **({} if code is None else {"code": code}),
-    }
-
-
-def _difference(file: h5py.File, pages: int, header: Mapping[str, Any], symbols: Symbols | None) -> str:
-    """Of what else than `header` and `symbols` the pages of a file are; empty if they are the same."""
-    for name, what in (("profile", "another profile"), ("camera_bit_depth", "another bit depth")):
-        if file.attrs.get(name) != header[name]:
-            return what
-    if any(file.attrs.get(name) != header.get(name) for name in ("levels", "code")):
-        return "other symbols"
-    if any(file.attrs.get(name) != header[name] for name in ("format", "version")):
-        return "another format"
-    if symbols is None or not pages:
-        return ""
-    if "symbols" not in file:
-        return "unknown symbols"
-    try:
-        same = all(np.array_equal(file["symbols"][page], symbols(page)) for page in range(pages))
-    except NoSuchPageError:
-        same = False
-    return "" if same else "other symbols"
-
-
-def _others(partial: Path, pages: int, other: str) -> RecordingError:
-    same = "symbols" if other.endswith("symbols") else other.removeprefix("another ").removeprefix("other ")
-    return RecordingError(
-        f"recording {partial}",
-        f"{counted(pages, 'page')} of {other}",
-        f"the same {'--symbols' if same == 'symbols' else same}, another name, or --force",
-    )
-
-
-def discard_partial(path: Path) -> None:
-    """Remove the unfinished pages of the recording `path`, if there are any.
-
-    Raises:
-        RecordingError: another process is writing them, or they cannot be removed.
-    """
-    _take(partial_path(path), remove=True)
-
-
-def _take(partial: Path, *, remove: bool) -> bool:
-    """Whether `partial` is there, writable and written by nobody else; `remove` unlinks it while that is certain.
-
-    HDF5 holds this same lock on a file as long as it is open for writing.
-    """
-    subject = f"recording {partial}"
-    try:
-        with partial.open("rb+") as file:
-            lock(file.fileno(), subject)
-            if remove:
-                partial.unlink()
-    except FileNotFoundError:
-        return False
-    except BlockingIOError:
-        raise RecordingError(
-            subject, "pages that another process is writing now", "another name, or to wait for its end"
-        ) from None
-    except OSError as error:
-        raise os_failure(subject, error, "a file that can be read and written", RecordingError) from None
-    return True
-
-
-class RecordingWriter:
+class RecordingWriter(AbstractContextManager["RecordingWriter"]):
     """Writes a recording page by page to `<path>.partial`, and moves it to `path` when the `with` statement ends well.
 
-    After an exception, Ctrl-C included, the partial file stays behind, complete up to the last page appended;
-    `RecordingWriter.resume` goes on from there. A half-written file is never found under the final name.
+    After an exception, Ctrl-C included, the partial file stays behind, complete up to the last page appended; a writer
+    that is to `resume` goes on from there. A half-written file is never found under the final name.
+
+    Attributes:
+        path, partial_path: final name, and the file that is being written.
+        pages: written so far.
     """
 
     def __init__(
@@ -206,7 +90,7 @@ class RecordingWriter:
             bit_depth: bits of a camera count, 8 to 16.
             references: reference-only frames.
             pilots: boolean [ny, nx]; None leaves the profile's default positions in force.
-            resume: as `RecordingWriter.resume` does.
+            resume: whether a partial file is gone on with that was started with the same arguments.
             code: what the pages hold, JSON text, where they were made by an encoder.
             keep_references: whether a recording that is gone on with keeps its own reference frames, where `references`
                 are others: no camera takes the same ones twice.
@@ -219,56 +103,19 @@ class RecordingWriter:
                 there is something that may not be lost.
             PageError: a level count outside 2..256.
         """
-        self._prepare(path, profile, levels, bit_depth)
-        self._code, self._keep_references = code, keep_references
-        self._symbols, self._overwrite = symbols, overwrite
+        self.path, self.pages = Path(path), 0
+        self.partial_path = partial_path(self.path)
+        self._subject = f"recording {self.path}"
+        check_levels(levels, f"{self._subject}: levels")
+        if not MIN_BIT_DEPTH <= bit_depth <= MAX_BIT_DEPTH:
+            raise RecordingError(f"{self._subject}: bit depth", bit_depth, f"{MIN_BIT_DEPTH} to {MAX_BIT_DEPTH}")
+        self._identity = Identity(profile, levels, bit_depth, code, symbols)
+        self._overwrite = overwrite
         if not overwrite and self.path.exists():
             raise self._exists()
-        if not (resume and self._continue(references, pilots)):
-            self._create(references, pilots)
-
-    @classmethod
-    def resume(
-        cls,
-        path: str | Path,
-        profile: Profile,
-        levels: int,
-        bit_depth: int,
-        references: FramePair,
-        pilots: ArrayLike | None = None,
-        code: str | None = None,
-        *,
-        keep_references: bool = False,
-        symbols: Symbols | None = None,
-        overwrite: bool = True,
-    ) -> Self:
-        """Go on with `<path>.partial` if it was started with the same arguments, else start anew.
-
-        `pages` tells how many pages are there already. Arguments and errors as for the constructor.
-        """
-        return cls(
-            path,
-            profile,
-            levels,
-            bit_depth,
-            references,
-            pilots,
-            resume=True,
-            code=code,
-            keep_references=keep_references,
-            symbols=symbols,
-            overwrite=overwrite,
-        )
-
-    @property
-    def pages(self) -> int:
-        """Pages written so far."""
-        return self._pages
-
-    @property
-    def partial_path(self) -> Path:
-        """The file that is being written."""
-        return self._partial
+        fixed = self._checked_fixed(references, pilots)
+        if not (resume and self._continue(fixed, REFERENCES if keep_references else ())):
+            self._create(fixed)
 
     def append(
         self,
@@ -291,10 +138,10 @@ class RecordingWriter:
         """
         data = {name: self._checked(name, getattr(frames, name)) for name in FRAMES}
         if symbols is not None:
-            subject = f"{self._subject}: symbols"
-            data["symbols"] = check_symbols(symbols, self._profile.page_shape, self._levels, subject)
+            subject, identity = f"{self._subject}: symbols", self._identity
+            data["symbols"] = check_symbols(symbols, identity.profile.page_shape, identity.levels, subject)
             if data["symbols"].ndim != 2:
-                raise PageError(f"{self._subject}: symbols", f"shape {data['symbols'].shape}", "one page [ny, nx]")
+                raise PageError(subject, f"shape {data['symbols'].shape}", "one page [ny, nx]")
         data |= {f"truth/{name}": np.asarray(value) for name, value in (truth or {}).items()}
         if infos is not None:
             data |= _shot_data(infos)
@@ -304,19 +151,16 @@ class RecordingWriter:
             group.attrs["pixel_formats"] = [info.pixel_format for info in infos]
         try:
             for name, value in data.items():
-                self._write_page(name, value)
+                dataset = self._file[name] if name in self._file else self._grow(name, value.shape, value.dtype)
+                dataset.resize(self.pages + 1, axis=0)
+                dataset[self.pages] = value
             # The count comes last: pages beyond it were cut off in the middle, and resuming drops them.
-            self._file.attrs["pages_complete"] = self._pages + 1
+            self._file.attrs["pages_complete"] = self.pages + 1
             self._file.flush()
             self._disk.check()
         except OSError as error:
-            raise self._failure(f"{self._subject}: page {self._pages}", error, "room for it on the disk") from None
-        self._pages += 1
-
-    def set_truth(self, device_toml: str) -> None:
-        """Keep the true state of a simulated device as TOML text, where no decoder looks."""
-        self._file.require_group("truth").attrs["device"] = device_toml
-        self._file.flush()
+            raise self._failure(f"{self._subject}: page {self.pages}", error, "room for it on the disk") from None
+        self.pages += 1
 
     def set_dark_frames(self, dark: FramePair, hot: HotPixels) -> None:
         """Keep what the cameras see without light, and the pixels that were mended because they always see some.
@@ -333,7 +177,10 @@ class RecordingWriter:
         self._file.flush()
 
     def add_note(self, name: str, values: Mapping[str, str | float]) -> None:
-        """Keep remarks on the whole recording as attributes of the group `name`, where no decoder looks."""
+        """Keep remarks on the whole recording as attributes of the group `name`, where no decoder looks.
+
+        The group `truth` has the true state of a simulated device.
+        """
         self._file.require_group(name).attrs.update(values)
         self._file.flush()
 
@@ -345,9 +192,6 @@ class RecordingWriter:
         losses.resize(losses.shape[0] + 1, axis=0)
         losses[-1] = json.dumps(asdict(loss))
         self._file.flush()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -368,7 +212,7 @@ class RecordingWriter:
                 del self._file.attrs["pages_complete"]
             self._file.close()
             self._disk.check()
-            (move_into_place if self._overwrite else move_to_new_name)(self._partial, self.path)  # still locked
+            (move_into_place if self._overwrite else move_to_new_name)(self.partial_path, self.path)  # still locked
         except FileExistsError:
             raise self._exists() from None
         except OSError as error:
@@ -377,177 +221,126 @@ class RecordingWriter:
             self._disk.close()
 
     def abandon(self) -> None:
-        """Close the partial file and leave it for `resume`."""
+        """Close the partial file and leave it for a writer that is to `resume`."""
         self._file.close()
         self._disk.close()
-
-    def _prepare(self, path: str | Path, profile: Profile, levels: int, bit_depth: int) -> None:
-        self.path = Path(path)
-        self._subject = f"recording {self.path}"
-        self._partial = partial_path(self.path)
-        check_levels(levels, f"{self._subject}: levels")
-        if not MIN_BIT_DEPTH <= bit_depth <= MAX_BIT_DEPTH:
-            raise RecordingError(f"{self._subject}: bit depth", bit_depth, f"{MIN_BIT_DEPTH} to {MAX_BIT_DEPTH}")
-        self._profile, self._levels, self._bit_depth = profile, levels, bit_depth
-        self._pages = 0
 
     def _failure(self, subject: str, error: OSError, expected: str) -> LightpageError:
         """The error of a write, which says what stays of the pages before."""
         failure = os_failure(subject, error, expected, RecordingError)
-        if not self._pages:
+        if not self.pages:
             return failure
-        kept = f"{counted(self._pages, 'page')} stay in {self._partial.name}; the same command goes on with them"
+        kept = f"{counted(self.pages, 'page')} stay in {self.partial_path.name}; the same command goes on with them"
         return type(failure)(subject, failure.got, f"{failure.expected}. {kept}")
 
     def _exists(self) -> RecordingError:
-        there = f"; the pages are in {self._partial}" if self._pages else ""
+        there = f"; the pages are in {self.partial_path}" if self.pages else ""
         return RecordingError(self._subject, "a file that exists by now", f"a new name, or --force{there}")
-
-    def _header(self) -> dict[str, Any]:
-        return _header(self._profile, self._levels, self._bit_depth, self._code)
 
     def _checked(self, name: str, frame: NDArray[Any]) -> NDArray[Any]:
         frame = np.asarray(frame)
-        subject = f"{self._subject}: {name}"
+        subject, identity = f"{self._subject}: {name}", self._identity
         if frame.dtype.kind not in "ui":
             raise RecordingError(subject, f"type {frame.dtype}", "whole counts")
-        if frame.shape != self._profile.frame_shape:
-            raise RecordingError(subject, f"shape {frame.shape}", f"shape {self._profile.frame_shape}")
-        full_scale = 2**self._bit_depth - 1
+        if frame.shape != identity.profile.frame_shape:
+            raise RecordingError(subject, f"shape {frame.shape}", f"shape {identity.profile.frame_shape}")
+        full_scale = 2**identity.bit_depth - 1
         if int(frame.min()) < 0 or int(frame.max()) > full_scale:
             raise RecordingError(subject, f"counts from {frame.min()} to {frame.max()}", f"0 to {full_scale}")
-        return frame.astype(frame_type(self._bit_depth), copy=False)
+        return frame.astype(frame_type(identity.bit_depth), copy=False)
 
     def _checked_fixed(self, references: FramePair, pilots: ArrayLike | None) -> dict[str, NDArray[Any]]:
         """The datasets that do not grow."""
-        fixed = {f"reference_{name}": self._checked(f"reference_{name}", getattr(references, name)) for name in FRAMES}
+        fixed = {name: self._checked(name, getattr(references, name.removeprefix("reference_"))) for name in REFERENCES}
         if pilots is not None:
-            mask = np.asarray(pilots)
-            if mask.dtype != np.bool_ or mask.shape != self._profile.page_shape:
-                raise RecordingError(
-                    f"{self._subject}: pilots",
-                    f"{mask.dtype} of shape {mask.shape}",
-                    f"bool of shape {self._profile.page_shape}",
-                )
+            mask, shape = np.asarray(pilots), self._identity.profile.page_shape
+            if mask.dtype != np.bool_ or mask.shape != shape:
+                got = f"{mask.dtype} of shape {mask.shape}"
+                raise RecordingError(f"{self._subject}: pilots", got, f"bool of shape {shape}")
             fixed["pilots"] = mask
         return fixed
 
-    def _create(self, references: FramePair, pilots: ArrayLike | None) -> None:
-        fixed = self._checked_fixed(references, pilots)
+    def _create(self, fixed: Mapping[str, NDArray[Any]]) -> None:
         discard_partial(self.path)
-        self._disk = open_to_write(self._partial, f"recording {self._partial}")
+        self._disk = open_to_write(self.partial_path, f"recording {self.partial_path}")
         self._file = h5py.File(self._disk, "w")  # type: ignore[arg-type]  # the stubs know only names
-        for name, value in self._header().items():
-            self._file.attrs[name] = value
+        self._file.attrs.update(self._identity.attributes())
         for name, value in fixed.items():
             self._file.create_dataset(name, data=value)
         for name in FRAMES:
-            self._grow(name, self._profile.frame_shape, frame_type(self._bit_depth))
+            self._grow(name, self._identity.profile.frame_shape, frame_type(self._identity.bit_depth))
         self._file.attrs["pages_complete"] = 0
         self._file.flush()
         try:
             self._disk.check()
         except OSError as error:
             self.abandon()
-            raise self._failure(f"recording {self._partial}", error, "room for it on the disk") from None
+            raise self._failure(f"recording {self.partial_path}", error, "room for it on the disk") from None
 
-    def _continue(self, references: FramePair, pilots: ArrayLike | None) -> bool:
+    def _continue(self, fixed: Mapping[str, NDArray[Any]], kept: tuple[str, ...]) -> bool:
         """Open the partial file if it is sound and was started with the same arguments.
+
+        Args:
+            fixed: the datasets that do not grow.
+            kept: names of those that may hold something else.
 
         Raises:
             RecordingError: another process is writing it, the system does not let it be read, or it has other pages
                 that may not be lost.
         """
-        fixed = self._checked_fixed(references, pilots)
-        if not _take(self._partial, remove=False):
+        partial, pages, other = self.partial_path, 0, ""
+        if not taken(partial, remove=False):
             return False
-        subject, expected = f"recording {self._partial}", "a file that can be read and written"
-        disk = open_to_write(self._partial, subject, expected, keep=True)
-        try:
-            file = h5py.File(disk, "r+")  # type: ignore[arg-type]
-        except _CUT_OFF as error:
-            disk.close()
-            _check_damage(self._partial, error)
-            return False
-        pages, other = 0, ""
-        try:
-            pages = _pages_of(file)
-            other = _difference(file, pages, self._header(), self._symbols)
-            if not other and not (
-                all(self._is_same(file[name], name, value) for name, value in fixed.items())
-                and ("pilots" in file) == ("pilots" in fixed)
-            ):
-                other = "other settings"
-            if same := not other:
-                self._file, self._disk = file, disk
-                for name in self._growing():
-                    if file[name].shape[0] < pages:
-                        same = False
-                    file[name].resize(pages, axis=0)
-                disk.check()
-        except _CUT_OFF as error:
+        disk = open_to_write(partial, f"recording {partial}", "a file that can be read and written", keep=True)
+        with ExitStack() as opened:
+            opened.enter_context(closing(disk))
             try:
-                _check_damage(self._partial, error)
-            except LightpageError:
-                disk.give_up()
-                file.close()
-                disk.close()
-                raise
-            same = False
-        except BaseException:
-            file.close()
-            disk.close()
-            raise
-        if same:
-            self._pages = pages
-            return True
-        file.close()
-        disk.close()
+                file = opened.enter_context(h5py.File(disk, "r+"))  # type: ignore[arg-type]
+                pages = pages_of(file)
+                other = self._identity.difference(file, pages)
+                if not other and not (
+                    all(_is_same(file[name], value, name not in kept) for name, value in fixed.items())
+                    and ("pilots" in file) == ("pilots" in fixed)
+                ):
+                    other = "other settings"
+                if not other and all(file[name].shape[0] >= pages for name in growing(file)):
+                    for name in growing(file):
+                        file[name].resize(pages, axis=0)
+                    disk.check()
+                    self._file, self._disk, self.pages = file, disk, pages
+                    opened.pop_all()
+                    return True
+            except CUT_OFF as error:
+                try:
+                    check_damage(partial, error)
+                except LightpageError:
+                    disk.give_up()
+                    raise
         if pages and other and not self._overwrite:
-            raise _others(self._partial, pages, other)
+            raise other_pages(partial, pages, other)
         return False
 
-    def _is_same(self, dataset: h5py.Dataset, name: str, value: NDArray[Any]) -> bool:
-        if self._keep_references and name in REFERENCES:
-            return dataset.shape == value.shape and dataset.dtype == value.dtype
-        return np.array_equal(dataset[()], value)
-
-    def _growing(self) -> list[str]:
-        """The datasets that grow by one with each page."""
-        names = [name for name in (*FRAMES, "symbols", *SHOT_DATA) if name in self._file]
-        truth = self._file.get("truth")
-        return names + ([f"truth/{name}" for name in truth] if isinstance(truth, h5py.Group) else [])
-
     def _check_same_datasets(self, data: Mapping[str, NDArray[Any]]) -> None:
-        if self._pages and set(self._growing()) != set(data):
-            raise RecordingError(
-                f"{self._subject}: page {self._pages}",
-                f"datasets {', '.join(sorted(data))}",
-                f"{', '.join(sorted(self._growing()))}, as on the pages before",
-            )
+        if self.pages and set(there := growing(self._file)) != set(data):
+            expected = f"{', '.join(sorted(there))}, as on the pages before"
+            raise RecordingError(f"{self._subject}: page {self.pages}", f"datasets {', '.join(sorted(data))}", expected)
         for name, value in data.items():
-            if name in self._file and self._file[name].shape[1:] != value.shape:
-                raise RecordingError(
-                    f"{self._subject}: {name}", f"shape {value.shape}", f"shape {self._file[name].shape[1:]}"
-                )
+            if name in self._file and (expected := self._file[name].shape[1:]) != value.shape:
+                raise RecordingError(f"{self._subject}: {name}", f"shape {value.shape}", f"shape {expected}")
 
     def _grow(self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> h5py.Dataset:
-        return self._file.create_dataset(
-            name, shape=(0, *shape), maxshape=(None, *shape), chunks=(1, *shape), dtype=dtype
-        )
+        return self._file.create_dataset(name, (0, *shape), dtype, maxshape=(None, *shape), chunks=(1, *shape))
 
-    def _write_page(self, name: str, value: NDArray[Any]) -> None:
-        dataset = self._file[name] if name in self._file else self._grow(name, value.shape, value.dtype)
-        dataset.resize(self._pages + 1, axis=0)
-        dataset[self._pages] = value
+
+def _is_same(dataset: h5py.Dataset, value: NDArray[Any], exactly: bool) -> bool:
+    """Whether a dataset holds a value, or at least one of its kind."""
+    if exactly:
+        return np.array_equal(dataset[()], value)
+    return dataset.shape == value.shape and dataset.dtype == value.dtype
 
 
 def _shot_data(infos: Infos) -> dict[str, NDArray[Any]]:
-    exposures = [np.nan if info.exposure_s is None else info.exposure_s for info in infos]
-    columns = (
-        [info.frame_id for info in infos],
-        [info.device_time_s for info in infos],
-        [info.host_time_s for info in infos],
-        exposures,
-    )
-    return {name: np.array(values, kind) for (name, kind), values in zip(SHOT_DATA.items(), columns, strict=True)}
+    _, ids, device, host, _, exposures = zip(*map(astuple, infos), strict=True)
+    known = [np.nan if exposure is None else exposure for exposure in exposures]
+    columns = zip(SHOT_DATA.items(), (ids, device, host, known), strict=True)
+    return {name: np.array(values, kind) for (name, kind), values in columns}

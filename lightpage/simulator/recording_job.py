@@ -15,8 +15,8 @@ from lightpage.page.symbols import random_symbols
 from lightpage.progress import track
 from lightpage.recording.hdf5 import patiently
 from lightpage.recording.pages import Pages
-from lightpage.recording.reader import RecordingWriter
-from lightpage.recording.writer import discard_partial, partial_path
+from lightpage.recording.unfinished import discard_partial, partial_path
+from lightpage.recording.writer import RecordingWriter
 from lightpage.simulator.simulator import LIGHT, Simulator
 
 _SYMBOLS = 3
@@ -98,12 +98,14 @@ class RecordingJob:
         simulator = self._simulator
         bits = self.device.sensor.bit_depth
         code = None if self._written is None else self._written.code
-        writer = RecordingWriter.resume(self.out, self.profile, self.levels, bits, simulator.references(), code=code)
+        writer = RecordingWriter(
+            self.out, self.profile, self.levels, bits, simulator.references(), resume=True, code=code
+        )
         with writer:
             if writer.pages > pages:
                 raise InvalidInputError("--pages", pages, f"at least the {writer.pages} pages that are there already")
             if self.truth:
-                writer.set_truth(to_toml(self.device))
+                writer.add_note("truth", {"device": to_toml(self.device)})
             simulator.skip(writer.pages)
             for page in track(range(writer.pages, pages), "simulate", total=pages, done=writer.pages):
                 self._append(writer, simulator, page)

@@ -130,7 +130,7 @@ class TrueOptics:
     def _beyond_mean(self, camera: CameraPose) -> float:
         """Defocus of a camera beyond that of both on average, rad/m^2 of the facet."""
         mean = (self.device.in_phase_camera.axial_rad + self.device.quadrature_camera.axial_rad) / 2
-        return defocus(camera.axial_rad - mean, self.geometry.pipe_width_m)
+        return float(defocus(camera.axial_rad - mean, self.geometry.pipe_width_m))
 
     @cached_property
     def reference_in_place(self) -> Complex:

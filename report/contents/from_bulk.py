@@ -50,13 +50,13 @@ class Device:
     def text(self, measure: str, *, least: bool = False) -> str:
         """A mean, or the least, of its pages; empty where it is not known."""
         figures = self.group.figures
-        value = figures.least(measure) if least else figures.value(measure)
+        value = figures[measure].least if least else figures[measure].value
         return "" if value is None else number(value, 3)
 
     @property
     def losses(self) -> str:
         """How many pages by cause, for people."""
-        return ", ".join(f"{count:,} {cause}" for cause, count in self.group.tally.lost.most_common())
+        return ", ".join(f"{count:,} {cause}" for cause, count in self.group.lost.most_common())
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ class BulkData:
     @property
     def measures(self) -> list[str]:
         """Which of `MEASURES` are known."""
-        return [name for name in MEASURES if self.found.figures.value(name) is not None]
+        return [name for name in MEASURES if self.found.figures[name].value is not None]
 
     @property
     def lost(self) -> str:
@@ -160,9 +160,9 @@ class BulkData:
     @property
     def summary(self) -> str:
         """What matters most, in a few words."""
-        tally = self.found.tally
-        done = f"{tally.pages - tally.missing:,} of {tally.pages:,} {self.unit} done"
-        return f"{done}, {tally.lost.total():,} {self.lost}"
+        found = self.found
+        done = f"{found.pages - found.missing:,} of {found.pages:,} {self.unit} done"
+        return f"{done}, {found.lost.total():,} {self.lost}"
 
 
 def report_of_bulk(folder: Path) -> BulkData:
@@ -176,7 +176,6 @@ def report_of_bulk(folder: Path) -> BulkData:
         raise InvalidInputError(f"folder {folder}", "no job.json", "the folder of a bulk run")
     ledger, operation = Ledger(folder), job.choices.operation
     found = totals(ledger, job)
-    tally = found.tally
     recalibrated = operation is Operation.RECALIBRATE
     unit = DEVICES if recalibrated else PAGES
     common = _common_folder(job)
@@ -188,8 +187,8 @@ def report_of_bulk(folder: Path) -> BulkData:
         unit=unit,
         found=found,
         causes=[
-            (cause, count, count / tally.pages, _meaning(cause, found.examples.get(cause, "").replace(common, "")))
-            for cause, count in tally.lost.most_common()
+            (cause, count, count / found.pages, _meaning(cause, found.examples.get(cause, "").replace(common, "")))
+            for cause, count in found.lost.most_common()
         ],
         devices=_devices(found, common),
         fleet=any(source.device for source in job.sources),
@@ -205,16 +204,15 @@ def begun_s(readings: Sequence[Reading]) -> float:
 
 
 def _told(job: Job, found: Totals, unit: str) -> str:
-    tally = found.tally
     unopened, failed = sum(source.problem is not None for source in job.sources), _failed(found)
     named = f" {counted(unopened, 'recording')} could not be opened." if unopened else ""
     if unit == DEVICES:
         named = f" {counted(failed, 'device')} failed; the next run tries again." if failed else ""
-    if tally.missing:
-        missing = f"{tally.missing:,} of {tally.pages:,} {unit} have no result yet"
+    if found.missing:
+        missing = f"{found.missing:,} of {found.pages:,} {unit} have no result yet"
         return f"Not finished: {missing}. The same command goes on with them.{named}"
-    lost = tally.lost.total()
-    end = f"{lost:,} of {tally.pages:,} {unit} are {_LOST[unit]}" if lost else f"none is {_LOST[unit]}"
+    lost = found.lost.total()
+    end = f"{lost:,} of {found.pages:,} {unit} are {_LOST[unit]}" if lost else f"none is {_LOST[unit]}"
     return f"Finished: {end}.{named}"
 
 
@@ -224,17 +222,17 @@ def _failed(found: Totals) -> int:
 
 
 def _cards(found: Totals, unit: str) -> list[tuple[str, str, str]]:
-    tally, readings = found.tally, found.readings
+    readings = found.readings
     cards = [
-        ("Done", f"{tally.pages - tally.missing:,}", f"of {tally.pages:,} {unit}"),
-        (_LOST[unit].capitalize(), f"{tally.lost.total():,}", unit),
+        ("Done", f"{found.pages - found.missing:,}", f"of {found.pages:,} {unit}"),
+        (_LOST[unit].capitalize(), f"{found.lost.total():,}", unit),
     ]
     if failed := _failed(found):
         cards.append(("Failed", f"{failed:,}", f"{unit}, not among those"))
-    if tally.left_out:
-        cards.append(("Left out", f"{tally.left_out:,}", "pages that a bundle was made from"))
+    if found.left_out:
+        cards.append(("Left out", f"{found.left_out:,}", "pages that a bundle was made from"))
     for measure, name in MEASURES.items():
-        if (value := found.figures.value(measure)) is not None:
+        if (value := found.figures[measure].value) is not None:
             cards.append((f"{name[0].upper()}{name[1:]}", number(value, 3), "bit/symbol, mean"))
     if readings:
         at_work = sum(end - begin for begin, end in sessions(readings))
@@ -250,13 +248,13 @@ def _bundle(bundle: NamedBundle) -> str:
 
 
 def _facts(job: Job, found: Totals) -> list[tuple[str, str]]:
-    choices, readings, tally = job.choices, found.readings, found.tally
+    choices, readings = job.choices, found.readings
     facts = [
         ("Recordings", f"{len(job.sources):,}, of {counted(len(found.groups or found.devices), 'device')}")
         if any(source.device for source in job.sources)
         else ("Recordings", f"{len(job.sources):,}"),
         ("Bundles", _few([_bundle(each) for each in job.bundles])),
-        ("Read by", _few([f"{version}: {count:,}" for version, count in tally.models.most_common()])),
+        ("Read by", _few([f"{version}: {count:,}" for version, count in found.models.most_common()])),
     ]
     if choices.operation is Operation.RECALIBRATE:
         pages, tuning = choices.device_pages, choices.fine_tuning
@@ -266,7 +264,7 @@ def _facts(job: Job, found: Totals) -> list[tuple[str, str]]:
     else:
         followed = "the image is followed" if choices.tracking else "the image is not followed"
         facts.append(("Ranges", f"of {counted(choices.range_pages, 'page')}, {followed} within each"))
-        facts.append(("Device has changed", f"by the pilots of {tally.recalibration_due:,} pages"))
+        facts.append(("Device has changed", f"by the pilots of {found.recalibration_due:,} pages"))
     if found.ece is not None:
         facts.append(("ECE", number(found.ece, 4)))
     if readings:
@@ -292,10 +290,10 @@ def _devices(found: Totals, common: str) -> list[Device]:
     ]
 
     def rank(device: Device) -> tuple[float, float]:
-        tally, figures = device.group.tally, device.group.figures
-        known = (figures.value(name) for name in MEASURES)
+        group = device.group
+        known = (group.figures[name].value for name in MEASURES)
         value = next((value for value in known if value is not None), None)
-        return -tally.lost.total() / max(1, tally.pages), float("inf") if value is None else value
+        return -group.lost.total() / max(1, group.pages), float("inf") if value is None else value
 
     return sorted(devices, key=rank)
 

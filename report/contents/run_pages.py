@@ -15,7 +15,8 @@ from torch.utils.data import Dataset
 from lightpage.errors import InvalidInputError, RecordingError
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.reader import Recording, page_hashes
+from lightpage.recording.layout import page_hashes
+from lightpage.recording.reader import Recording
 from lightpage.train.data.feature_store import FeatureStore
 from lightpage.train.data.features import PageState
 from lightpage.train.data.pages import Page
@@ -87,7 +88,7 @@ def validation_pages(run: Run, recording: Recording) -> list[int]:
     Raises:
         RecordingError: it is not that recording.
     """
-    recording.check_against(run.profile)
+    recording.header.check_against(run.profile)
     subject = f"recording {recording.path}"
     if not recording.has_symbols:
         raise RecordingError(subject, "no symbols", "the recording that the run was trained on")

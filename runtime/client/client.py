@@ -9,11 +9,11 @@ from warnings import warn
 from lightpage.clock import SYSTEM, Clock
 from lightpage.runtime.client.answers import Description
 from lightpage.runtime.client.connection import Connection
-from lightpage.runtime.client.display import Display
-from lightpage.runtime.client.frames import Frames
-from lightpage.runtime.client.jobs import Jobs
-from lightpage.runtime.client.models import Models
-from lightpage.runtime.client.pages import Pages
+from lightpage.runtime.client.display import DisplayClient
+from lightpage.runtime.client.frames import FramesClient
+from lightpage.runtime.client.jobs import JobsClient
+from lightpage.runtime.client.models import ModelsClient
+from lightpage.runtime.client.pages import PagesClient
 from lightpage.runtime.client.wire.channel import TlsFiles
 
 CALL_S = 60.0
@@ -61,11 +61,11 @@ class LightpageClient:
     ) -> None:
         self.target = target
         self._connection = Connection(target, timeout_s, tls, clock)
-        self.frames = Frames(self._connection)
-        self.pages = Pages(self._connection)
-        self.display = Display(self._connection)
-        self.jobs = Jobs(self._connection)
-        self.models = Models(self._connection)
+        self.frames = FramesClient(self._connection)
+        self.pages = PagesClient(self._connection)
+        self.display = DisplayClient(self._connection)
+        self.jobs = JobsClient(self._connection)
+        self.models = ModelsClient(self._connection)
 
     def __enter__(self) -> Self:
         return self

@@ -101,7 +101,7 @@ class Connection:
             raise error_of(error, self.target) from None
 
 
-class Part:
+class SubClient:
     """What a client has of one kind of calls.
 
     Args:

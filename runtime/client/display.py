@@ -8,20 +8,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.runtime.client.answers import DisplayOrder, display_order
-from lightpage.runtime.client.connection import Part
+from lightpage.runtime.client.connection import SubClient
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import CHUNK_BYTES, message_of
 
 
-class Display(Part):
+class DisplayClient(SubClient):
     """Shows pages and moves shutters for the service, where the caller works them and not the service itself::
 
-    first = client.display.upload_pages(symbols, levels=16)  # a modulator of the service's own shows these too
+        first = client.display.upload_pages(symbols, levels=16)  # a modulator of the service's own shows these too
 
-    for order in client.display.watch():
-        if order.page is not None:
-            modulator.show(order.page)
-            client.display.report_page(order.page)
+        for order in client.display.watch():
+            if order.page is not None:
+                modulator.show(order.page)
+                client.display.report_page(order.page)
+
+    What is reported has settled: the service takes its frames at once.
     """
 
     def upload_pages(self, symbols: NDArray[np.uint8], levels: int) -> int:

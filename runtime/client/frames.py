@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lightpage.errors import LightpageError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.answers import RemotePage, remote_page
-from lightpage.runtime.client.connection import DATA_S, Part
+from lightpage.runtime.client.connection import DATA_S, SubClient
 from lightpage.runtime.client.outgoing import FrameOptions, header_message, sent_frames
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.shared_memory import SharedMemory
@@ -19,7 +19,7 @@ from lightpage.runtime.client.wire.messages import FramePart, chunks_of
 from lightpage.runtime.client.wire.status import error_from
 
 
-class Frames(Part):
+class FramesClient(SubClient):
     """Decodes frame pairs that the caller has, with the model in service::
 
         page = client.frames.decode(FramePair(in_phase, quadrature), levels=16, want_phase=True)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lightpage.errors import InvalidInputError, LightpageError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.answers import JobInfo, Recalibrated, job_info
-from lightpage.runtime.client.connection import DATA_S, Part
+from lightpage.runtime.client.connection import DATA_S, SubClient
 from lightpage.runtime.client.outgoing import format_of, sent_frames, sent_symbols
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import answer_of, chunks_of, message_of
@@ -44,7 +44,7 @@ class RecalibrationOptions(TypedDict, total=False):
     expected_version: str
 
 
-class Jobs(Part):
+class JobsClient(SubClient):
     """Recalibrates, at once or by a job of the service, which goes on when its caller leaves::
 
         result = client.jobs.recalibrate(count=2)
@@ -219,7 +219,7 @@ class Jobs(Part):
                     raise error_of(error, self._connection.target) from None
             finally:
                 call.cancel()
-            clock.sleep(min(_AGAIN_S, until - clock.now()))
+            clock.sleep(max(0.0, min(_AGAIN_S, until - clock.now())))
 
     def cancel(self, job_id: str) -> JobInfo:
         """Have a job end at its next step; return it as it is then. One that has ended stays as it is.
@@ -231,9 +231,18 @@ class Jobs(Part):
 
 
 def _fields(options: RecalibrationOptions) -> dict[str, Any]:
-    """Options as the fields of a request."""
+    """Return options as the fields of a request.
+
+    Raises:
+        InvalidInputError: pages both of the source and of a recording.
+    """
     asked: dict[str, Any] = dict(options)
     count, pages, recording = asked.pop("count", 0), asked.pop("pages", ()), asked.pop("recording", None)
     if recording is not None:
+        if pages:
+            got = f"{recording!r} and pages {[*pages]} of the source"
+            raise InvalidInputError(
+                "pages to recalibrate with", got, "one of both; `count` takes a recording's first ones"
+            )
         return asked | {"recording": recording, "recording_count": count}
     return asked | {"source": message_of(pb.SourcePages, count=count, pages=pages)}

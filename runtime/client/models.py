@@ -10,13 +10,13 @@ from warnings import warn
 
 from lightpage.errors import InvalidInputError
 from lightpage.runtime.client.answers import ModelInfo
-from lightpage.runtime.client.connection import DATA_S, Part
+from lightpage.runtime.client.connection import DATA_S, SubClient
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import CHUNK_BYTES, answer_of
 from lightpage.runtime.model.bundle.signature_file import read_signature
 
 
-class Models(Part):
+class ModelsClient(SubClient):
     """Lists the models of the service, adds to them, and changes which of them decodes::
 
         version = client.models.upload("mine.zip").version

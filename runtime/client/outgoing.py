@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import Any, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.errors import FrameError, PageError
+from lightpage.errors import FrameError, InvalidInputError, PageError
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.connection import Connection
@@ -69,6 +70,9 @@ def options_message(levels: int, options: Mapping[str, Any]) -> pb.DecodeOptions
     Raises:
         InvalidInputError: values that no message can hold, or an option that there is not.
     """
+    for name in options.keys() - PageOptions.__annotations__.keys():
+        close = get_close_matches(name, PageOptions.__annotations__, 1) or sorted(PageOptions.__annotations__)
+        raise InvalidInputError("option of a page", name, " or ".join(close))
     asked = {name: value for name, value in options.items() if name != "correlation_id"}
     quantised, stateless = asked.pop("quantised", False), asked.pop("stateless", False)
     return message_of(

@@ -7,21 +7,23 @@ from typing import Unpack
 
 from lightpage.errors import LightpageError
 from lightpage.runtime.client.answers import RemoteData, RemotePage, remote_data, remote_page
-from lightpage.runtime.client.connection import DATA_S, Part
+from lightpage.runtime.client.connection import DATA_S, SubClient
 from lightpage.runtime.client.outgoing import PageOptions, options_message
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.status import error_from
 
 
-class Pages(Part):
+class PagesClient(SubClient):
     """Has the service read pages from its own source, as symbols or as the bytes that they carry::
 
-    page = client.pages.read(7, request_id="order-7")  # asked again, it takes no second shot
+        page = client.pages.read(7, request_id="order-7")  # asked again, it takes no second shot
 
-    for found in client.pages.read_many([1, 2, 5]):  # a page, or the error that it ended with
-        print(found if isinstance(found, Exception) else found.page)
+        for found in client.pages.read_many([1, 2, 5]):  # a page, or the error that it ended with
+            print(found if isinstance(found, Exception) else found.page)
 
-    content = [found.user_data.data for found in client.pages.read_data(0, 30)]
+        content = [found.user_data.data for found in client.pages.read_data(0, 30)]
+
+    `read` raises the error of a page that is lost; the others go on with the next one.
     """
 
     def read(

@@ -27,7 +27,7 @@ class _Asked(BaseModel):
 
 
 class Actions:
-    """Does it.
+    """Does what the console asks for with a service's models and recalibrator.
 
     Args:
         plane: whose models.
@@ -40,12 +40,12 @@ class Actions:
         self._plane, self._recalibrator, self._pages = plane, recalibrator, pages or range(MIN_PAGES)
 
     def available(self) -> list[str]:
-        """Those that make sense now."""
+        """Return the actions that make sense now."""
         found = ["recalibrate"] if self._plane.has_source else []
-        return [*found, "roll back"] if self._plane.registry.history.cursor else found
+        return [*found, "roll back"] if self._plane.models.now.state.history.cursor else found
 
     def job(self) -> dict[str, Any] | None:
-        """How the newest recalibration stands, as JSON has it; None where there has been none."""
+        """Return how the newest recalibration stands, as JSON has it; None where there has been none."""
         jobs = self._recalibrator.jobs.all()
         if not jobs:
             return None
@@ -54,7 +54,7 @@ class Actions:
         return {"id": job.id, "state": job.state, "fraction": job.fraction, "told": told}
 
     def do(self, content: bytes, actor: Actor) -> str:
-        """Do what a JSON object asks for: its `action`, with the model `expected` in service; tells what came of it.
+        """Do what a JSON object asks for: its `action`, with the model `expected` in service; return what came of it.
 
         Raises:
             InvalidInputError: no such object.

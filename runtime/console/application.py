@@ -72,6 +72,7 @@ def _refusing() -> Iterator[None]:
         raise HTTPError(status, without_folders(str(error))) from None
 
 
+@stream_request_body
 class _Handler(RequestHandler):
     """Answers callers who ask for this machine; says in a line of text why it does not.
 
@@ -81,6 +82,11 @@ class _Handler(RequestHandler):
 
     identity: Identity | None = None
     """Of the caller; None without TLS."""
+    _content = b""
+
+    def __init__(self, *arguments: Any, **given: Any) -> None:
+        super().__init__(*arguments, **given)
+        self._late = asyncio.get_running_loop().call_later(self.settings["silence_s"], self.send_error, 408)
 
     def set_default_headers(self) -> None:
         """See `RequestHandler`."""
@@ -88,7 +94,7 @@ class _Handler(RequestHandler):
             self.set_header(name, value)
 
     def prepare(self) -> None:
-        """Find out who asks for whom."""
+        """Find out who asks for whom; refuse what is far too large before it comes."""
         if not names_machine(self.request.host, self.settings["names"]()):
             raise HTTPError(421)
         if self.request.protocol == "https":
@@ -98,6 +104,17 @@ class _Handler(RequestHandler):
                 raise Finish from None
             with _refusing():
                 self.identity = identity_of(certificate)
+        with suppress(ValueError):  # Tornado refuses it
+            if int(self.request.headers.get("Content-Length", "0")) > MOST_BODY_BYTES:
+                raise HTTPError(413)
+
+    def data_received(self, chunk: bytes) -> None:
+        """Take a part of the content."""
+        self._content += chunk
+
+    def on_finish(self) -> None:
+        """Wait no longer."""
+        self._late.cancel()
 
     def in_thread(self, work: Callable[..., T], *arguments: Any) -> asyncio.Future[T]:
         """Do in a thread what would hold up other callers."""
@@ -115,44 +132,28 @@ class _Page(_Handler):
 
     def initialize(self, content: Content, clock: Callable[[], float] = time.time) -> None:
         """Take what the route gives."""
-        self._content, self._clock = content, clock
+        self._page, self._clock = content, clock
 
     async def get(self) -> None:
-        """Show it."""
+        """Show what `content` makes of the request."""
+        self._late.cancel()
         if self.identity is not None:  # whose certificate was checked when the connection began, and not since
             with _refusing():
                 self.identity.check(Role.READ, "a page of the console", self._clock())
-        self.finish(await self.in_thread(self._content, self))
+        self.finish(await self.in_thread(self._page, self))
 
     head = get
 
 
-@stream_request_body
 class _Action(_Handler):
     """Does what an administrator asks for."""
 
     def initialize(self, state: ConsoleState) -> None:
-        """Take what the route gives, and begin to wait for the content."""
-        self._state, self._content = state, b""
-        self._late = asyncio.get_running_loop().call_later(self.settings["silence_s"], self.send_error, 408)
-
-    def prepare(self) -> None:
-        """Refuse what is far too large before it comes."""
-        super().prepare()
-        with suppress(ValueError):  # Tornado refuses it
-            if int(self.request.headers.get("Content-Length", "0")) > MOST_BODY_BYTES:
-                raise HTTPError(413)
-
-    def data_received(self, chunk: bytes) -> None:
-        """Take a part of the content."""
-        self._content += chunk
-
-    def on_finish(self) -> None:
-        """Wait no longer."""
-        self._late.cancel()
+        """Take what the route gives."""
+        self._state = state
 
     async def post(self) -> None:
-        """Do it."""
+        """Do what the content asks for, and say what came of it."""
         self._late.cancel()
         if self.identity is None or (actions := self._state.actions) is None:
             raise HTTPError(403, "actions need TLS, and a certificate with role admin")

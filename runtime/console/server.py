@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import logging
 import socket
 import threading
@@ -32,7 +33,8 @@ LONGEST_S = 60.0
 """For one connection: more than any answer takes, and too little to hold one for hours by a byte now and then."""
 SILENCE_S = 20.0
 """A caller that has not said what it wants after so long is hung up on."""
-_PAUSE_S = 0.1
+PAUSE_S = 0.1
+"""Between two tries to take a connection that there is no descriptor for."""
 _THREADS = 8
 """They make the answers."""
 
@@ -129,4 +131,5 @@ def _report(caller: str, handshake: asyncio.Future[SSLIOStream]) -> None:
 def _pause(_loop: object, failed: dict[str, Any]) -> None:
     """Wait where there is no descriptor for a connection: there is none for the next try either."""
     _log.debug("console: %s", failed["message"], exc_info=failed.get("exception"))
-    time.sleep(_PAUSE_S)
+    if getattr(failed.get("exception"), "errno", None) in (errno.EMFILE, errno.ENFILE):
+        time.sleep(PAUSE_S)

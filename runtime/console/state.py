@@ -7,10 +7,11 @@ from collections.abc import Callable
 from typing import Any
 
 from lightpage.runtime.console.actions import ROLE, Actions
-from lightpage.runtime.console.history import History, PageRow
+from lightpage.runtime.console.last_pages import LastPages, PageRow
 from lightpage.runtime.console.pictures import confidence_png, frame_png
 from lightpage.runtime.service.caller import Identity
-from lightpage.runtime.service.models.registry import Model, ModelRegistry
+from lightpage.runtime.service.models.loader import Model
+from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.monitoring.monitor import Monitor
 
 POINTS = 600
@@ -25,8 +26,8 @@ class ConsoleState:
     """What the console says.
 
     Args:
-        history: of the pages.
-        registry: the models.
+        last_pages: what is known of them.
+        models: the models.
         monitor: says whether a recalibration is due.
         source: of the pages, for people.
         actions: what callers may do who prove that they may; None for nothing.
@@ -35,26 +36,26 @@ class ConsoleState:
 
     def __init__(
         self,
-        history: History,
-        registry: ModelRegistry,
+        last_pages: LastPages,
+        models: Models,
         monitor: Monitor,
         source: str,
         actions: Actions | None = None,
         clock: Callable[[], float] = time.time,
     ) -> None:
-        self._history, self._registry, self._monitor, self._source = history, registry, monitor, source
+        self._last_pages, self._models, self._monitor, self._source = last_pages, models, monitor, source
         self.actions, self.clock = actions, clock
         self._begun = clock()
 
     def to_json(self, identity: Identity | None = None) -> dict[str, Any]:
-        """All that the page shows to a caller, as JSON has it."""
+        """Return all that the page shows to a caller, as JSON has it."""
         actions = self.actions if identity is not None and identity.may(ROLE) else None
-        rows, now = self._history.rows(), self.clock()
+        rows, now = self._last_pages.rows(), self.clock()
         thinned = rows[:: max(1, -(-len(rows) // POINTS))]
         if rows and thinned[-1] is not rows[-1]:
             thinned.append(rows[-1])
         told = [row.to_json() for row in thinned]
-        number, pair, confidence = self._history.pictures()
+        number, pair, confidence = self._last_pages.pictures()
         monitor = self._monitor.state()
         return {
             "time_s": now,
@@ -62,11 +63,11 @@ class ConsoleState:
             "uptime_s": now - self._begun,
             "condition": _condition(rows, monitor.due, now),
             "reasons": list(monitor.reasons),
-            "pages": self._history.pages,
+            "pages": self._last_pages.pages,
             "picture": {"number": number, "frames": pair is not None, "confidence": confidence is not None},
             "series": {name: [row[name] for row in told] for name in ("time_s", *_SERIES)},
-            "losses": [vars(loss) for loss in self._history.losses()],
-            "models": [_model(model, model is self._registry.current) for model in self._registry.models],
+            "losses": [vars(loss) for loss in self._last_pages.losses()],
+            "models": [_model(model, model is self._models.current) for model in self._models.loaded],
             "caller": "" if identity is None else identity.name,
             "actions": [] if actions is None else actions.available(),
             "job": None if actions is None else actions.job(),
@@ -74,13 +75,13 @@ class ConsoleState:
         }
 
     def picture(self, path: str) -> bytes | None:
-        """A picture of the last page, as PNG; None where there is none of this path."""
-        _, pair, confidence = self._history.pictures()
+        """Return a picture of the last page, as PNG; None where there is none of this path."""
+        _, pair, confidence = self._last_pages.pictures()
         if path == "/confidence.png" and confidence is not None:
             return confidence_png(confidence)
         if path not in ("/frames/in_phase.png", "/frames/quadrature.png") or pair is None:
             return None
-        depth = self._registry.current.decoder.bundle.manifest.camera_bit_depth
+        depth = self._models.current.decoder.bundle.manifest.camera_bit_depth
         return frame_png(pair.in_phase if "in_phase" in path else pair.quadrature, depth)
 
 

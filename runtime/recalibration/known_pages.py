@@ -13,8 +13,8 @@ from lightpage.page.symbols import check_symbols
 from lightpage.progress import warn
 from lightpage.recording.exposure import check_pair_light
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.layout import narrow
-from lightpage.recording.reader import Recording, hash_frames
+from lightpage.recording.layout import hash_frames, narrow
+from lightpage.recording.reader import Recording
 from lightpage.runtime.model.decoding.decoder import Decoder
 
 MIN_PAGES = 2

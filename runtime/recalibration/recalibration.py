@@ -18,7 +18,7 @@ from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.errors import CalibrationError, FrameError, RecalibrationRefusedError, raised_as
 from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.reader import hash_frames
+from lightpage.recording.layout import hash_frames
 from lightpage.runtime.model.bundle.bundle import Bundle, in_few_counts, npz, shows_page, write_bundle
 from lightpage.runtime.model.bundle.manifest import GOLDEN, TABLE, Manifest, Provenance, check_version
 from lightpage.runtime.model.decoding.decoder import Decoder

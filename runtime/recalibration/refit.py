@@ -16,7 +16,7 @@ from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import symbol_phases
 from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.reader import hash_frames
+from lightpage.recording.layout import hash_frames
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_drift import BundleSearch
@@ -106,6 +106,8 @@ def refit(
         "reference_quadrature": references.quadrature,
         **sampling_table(twin, registered.parameters, registered.quadrature_phase, profile),
     }
+    if "parameters" in decoder.graph.ports:
+        table["parameters"] = table["parameters"][: decoder.graph.ports["parameters"].shape[0]]
     return RefitResult(
         table={name: value for name, value in table.items() if name in decoder.graph.ports},
         calibration_toml=fitted.to_toml(),

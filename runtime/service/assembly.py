@@ -22,8 +22,9 @@ from lightpage.runtime.model.execution.providers import Provider
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 from lightpage.runtime.service.models.audit import AuditLog
-from lightpage.runtime.service.models.registry import ModelRegistry
-from lightpage.runtime.service.models.store import ModelStore
+from lightpage.runtime.service.models.loader import Loader
+from lightpage.runtime.service.models.models import Models
+from lightpage.runtime.service.models.store import Store
 from lightpage.runtime.service.monitoring.flight_recorder import FlightRecorder
 from lightpage.runtime.service.monitoring.logs import PageLog
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
@@ -52,12 +53,12 @@ class Assembly:
 
 
 @contextmanager
-def assembled(settings: ServiceSettings, history: Observer) -> Iterator[Assembly]:
+def assembled(settings: ServiceSettings, observer: Observer) -> Iterator[Assembly]:
     """Yield the service that is meant by settings; what it holds is closed at the end.
 
     Args:
         settings: of it.
-        history: is told of every page, before log and flight recorder are.
+        observer: is told of every page, before log and flight recorder are.
 
     Raises:
         LightpageError: bundle, store or source are not there, or do not go together.
@@ -66,33 +67,29 @@ def assembled(settings: ServiceSettings, history: Observer) -> Iterator[Assembly
     key = None if service.bundle_key is None else BundleKey(service.bundle_key)
     provider = Provider.parse(service.provider, service.engine_cache)
     base = Decoder(Bundle.open(bundle_path(service.bundle), key=key), service.threads, provider=provider)
-    registry = ModelRegistry(base, tracker_for if service.tracking else NoTracker, key=key)
     metrics = ServiceMetrics()
     monitor = Monitor(metrics=metrics)
-    observers = [history, PageLog()]
+    observers = [observer, PageLog()]
     with ExitStack() as stack:
-        models = source = None
-        if service.store is not None:
-            models = ModelStore(service.store, base.bundle)
-            stack.enter_context(models.locked())
+        source = None
+        store = stack.enter_context(Store(service.store, base.bundle))
+        audit = AuditLog(store, settings.audit_file, settings.audit.file_bytes, settings.audit.kept)
+        models = Models(base, store, Loader(tracker_for if service.tracking else NoTracker, key), audit)
         if service.source is not None:
             source = stack.enter_context(checked_source(service.source, service.pages, base))
             take_dark_frames(source)
         if flight.folder is not None:
-            recorder = FlightRecorder(flight.folder, registry, flight, monitor, metrics)
+            recorder = FlightRecorder(flight.folder, models, flight, monitor, metrics)
             observers.append(stack.enter_context(recorder))
         plane = DataPlane(
-            registry,
-            source,
             models,
+            source,
             settings.limits,
             metrics=metrics,
             observers=observers,
             monitor=monitor,
-            audit=AuditLog(settings.audit_file, settings.audit.file_bytes, settings.audit.kept),
             device_sessions=settings.device_sessions,
         )
-        plane.models.resume()
         recalibrator = Recalibrator(plane, recordings=service.recordings)
         try:
             recalibrator.check_start()

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterator, Sequence
+import time
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 from lightpage.clock import SYSTEM, Clock
 from lightpage.codec.page_bytes import Header, Loss, PageBytes
 from lightpage.errors import (
     FrameError,
+    FramesDisagreeError,
     InvalidInputError,
     LostPageError,
     NoSourceError,
+    Reason,
+    SourceError,
     UnconfirmedPageError,
 )
 from lightpage.page.levels import MAX_LEVELS
@@ -26,18 +31,78 @@ from lightpage.runtime.model.decoding.tracking import unconfirmed_page
 from lightpage.runtime.service.admission import Heart, ReceiveBudget, Slots
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.limits import Limits
-from lightpage.runtime.service.models.audit import AuditLog
+from lightpage.runtime.service.models.loader import Model
 from lightpage.runtime.service.models.models import Models
-from lightpage.runtime.service.models.registry import Model, ModelRegistry
-from lightpage.runtime.service.models.store import ModelStore
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
-from lightpage.runtime.service.monitoring.monitor import Monitor
-from lightpage.runtime.service.monitoring.monitors import Monitors
-from lightpage.runtime.service.monitoring.observation import Observer
+from lightpage.runtime.service.monitoring.monitor import Monitor, Monitors
+from lightpage.runtime.service.monitoring.observation import Observation, Observer
 from lightpage.runtime.service.shared_memory import SharedMemory
 from lightpage.runtime.service.stages import Stage, Stages
 
 _log = logging.getLogger(__name__)
+
+
+class Seen:
+    """What becomes known of a page while it is read and decoded.
+
+    Args:
+        subject, page_index, model_version: see `Observation`.
+        clock: seconds since 1970.
+        lap: seconds that never go back, by which the page is timed.
+    """
+
+    def __init__(
+        self,
+        subject: str,
+        page_index: int | None,
+        model_version: str,
+        clock: Callable[[], float] = time.time,
+        lap: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        self._clock, self._lap = clock, lap
+        self.observation = Observation(subject, page_index, model_version, clock(), 0.0)
+        self._begun = lap()
+
+    def note(self, **known: Any) -> None:
+        """Take in fields of `Observation`."""
+        self.observation = replace(self.observation, **known)
+
+    def ended(self, lost: Reason | None, detail: str) -> Observation:
+        """The observation of the page, which was given out or lost now."""
+        seconds = self._lap() - self._begun
+        return replace(self.observation, time_s=self._clock(), seconds=seconds, lost=lost, detail=detail)
+
+
+@contextmanager
+def observed(observers: Sequence[Observer], seen: Seen) -> Iterator[Seen]:
+    """Tell the observers of a page that is read and decoded inside the block, given out or lost.
+
+    A page of the source whose frames contradict each other is told of as lost, with an unspecified reason. Other errors
+    say nothing of a page. What an observer raises is logged: it costs nobody a page.
+    """
+    try:
+        yield seen
+    except LostPageError as error:
+        if isinstance(error, UnconfirmedPageError):
+            seen.note(page=unconfirmed_page(error))
+        _tell(observers, seen, error.reason, str(error))
+        raise
+    except SourceError as error:
+        if isinstance(error.__cause__, FramesDisagreeError):
+            _tell(observers, seen, Reason.UNSPECIFIED, str(error))
+        raise
+    _tell(observers, seen, None, "")
+
+
+def _tell(observers: Sequence[Observer], seen: Seen, lost: Reason | None, detail: str) -> None:
+    if not observers:
+        return
+    observation = seen.ended(lost, detail)
+    for observer in observers:
+        try:
+            observer.observe(observation)
+        except Exception:
+            _log.exception("%s could not take note of %s", type(observer).__name__, observation.subject)
 
 
 @dataclass(frozen=True)
@@ -64,15 +129,13 @@ class DataPlane:
     """The service's logic. Every method may be called from many threads.
 
     Args:
-        registry: the models.
+        models: it decodes with them, and hears of what comes into service.
         source: where `read_page` reads from, or None.
-        store: remembers which model is in service, or None.
         limits: what is accepted.
         metrics: what is counted.
         observers: are told of every page.
         monitor: says by all pages of the service's own device whether a recalibration is due: those of the source, and
             those of `device_sessions`. Other sessions of callers get monitors of their own with the same settings.
-        audit: where changes of models are written down, None for the log alone.
         device_sessions: sessions of callers whose frames are of the device, by their names in `Caller.session`.
         clock: by which callers wait for slots and answers, and what hangs is known.
 
@@ -82,25 +145,23 @@ class DataPlane:
 
     def __init__(
         self,
-        registry: ModelRegistry,
+        models: Models,
         source: FrameSource | None = None,
-        store: ModelStore | None = None,
         limits: Limits | None = None,
         metrics: ServiceMetrics | None = None,
         observers: Sequence[Observer] = (),
         monitor: Monitor | None = None,
-        audit: AuditLog | None = None,
         device_sessions: Collection[str] = (),
         clock: Clock = SYSTEM,
     ) -> None:
-        self.registry, self.store, self.clock = registry, store, clock
+        self.models, self.clock = models, clock
         self.limits = limits or Limits()
         self.metrics = metrics or ServiceMetrics()
         self.monitors = Monitors(monitor, device_sessions, observers, shows_device=source is not None)
         self.metrics.sessions_due.set_function(self.monitors.sessions_due)
         self._source = source
         if source is not None:
-            _check_source(source, registry.current.decoder)
+            _check_source(source, models.current.decoder)
         self.received = ReceiveBudget(self.limits.receive_bytes)
         self.shared: SharedMemory | None = None
         """Memory that clients share with the service."""
@@ -108,11 +169,12 @@ class DataPlane:
         self.decodes = Slots(self.limits.concurrent_decodes, "decodes", self.limits.deadline_s, clock)
         self.ranges = Slots(self.limits.concurrent_ranges, "ranges of pages", self.limits.deadline_s, clock)
         self.watches = Slots(self.limits.concurrent_watches, "watches of the display", self.limits.deadline_s, clock)
-        self.models = Models(registry, store, self.limits, self._in_service, audit, clock)
-        self._in_service(registry.current)
+        self.uploads = Slots(1, "uploads of models", self.limits.deadline_s, clock)
+        models.in_service = self._in_service
+        self._in_service(models.current)
         self.metrics.watch_load(self.decodes, self.received)
-        if store is not None:
-            self.metrics.watch_store(self.models.store_health, store.known_trouble)
+        if models.store.folder.is_kept:
+            self.metrics.watch_store(models.store.health, models.store.known_trouble)
         if source is not None:
             self.metrics.watch(source)
             if source.pages is not None:

@@ -68,7 +68,7 @@ def listening(settings: ServiceSettings, assembly: Assembly, certificates: Certi
             health = stack.enter_context(HealthServer(address, server.health, files)).target
         stack.enter_context(server)
         if service.incoming is not None:
-            stack.enter_context(Incoming(plane.models, service.incoming))
+            stack.enter_context(Incoming(plane.models, plane.limits.model_bytes, plane.uploads, service.incoming))
         if (own := settings.self_calibration).is_on:
             stack.enter_context(SelfCalibration(plane, assembly.monitor, recalibrator, own))
         yield Endpoints(server.target, health)

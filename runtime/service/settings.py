@@ -19,6 +19,7 @@ from lightpage.device.problems import problem_of
 from lightpage.device.profile import toml_value
 from lightpage.errors import InvalidInputError
 from lightpage.files import read_text
+from lightpage.progress import warn
 from lightpage.runtime.client.wire.address import check_address, is_local
 from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.model.bundle.shipped import DEFAULT
@@ -294,6 +295,11 @@ def _of_environment(environment: Mapping[str, str]) -> Iterator[Given]:
     """Yield what variables set, each value in the type of its key, or else as text, which is refused with the rest."""
     longer = {_STORE: f"{_PREFIX}SERVICE__STORE"}
     named = sorted(name for name in environment if name.startswith(_PREFIX) and "__" in name)
+    for name in (each for each in sorted(environment) if each.startswith(_PREFIX) and "__" not in each):
+        table = next((table for table in TABLES if name.startswith(f"{_PREFIX}{table.upper()}_")), None)
+        if table is not None:  # what other programs are told has other names
+            start = f"{_PREFIX}{table.upper()}"
+            warn(f"environment {name} sets nothing; perhaps {start}__{name.removeprefix(start).lstrip('_')} is meant")
     for variable in (name for name in [*longer, *named] if environment.get(name)):
         table, _, key = longer.get(variable, variable).removeprefix(_PREFIX).lower().partition("__")
         field = TABLES[table].model_fields.get(key) if table in TABLES else None

@@ -18,15 +18,15 @@ from click.testing import CliRunner
 
 from lightpage.runtime.commands.service.serve import serve
 from lightpage.runtime.console.application import console_routes
-from lightpage.runtime.console.history import History
+from lightpage.runtime.console.last_pages import LastPages
 from lightpage.runtime.console.server import serving
 from lightpage.runtime.console.state import ConsoleState
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
-from lightpage.runtime.service.models.registry import ModelRegistry
-from lightpage.runtime.service.models.store import ModelStore
+from lightpage.runtime.service.models.models import Models
+from lightpage.runtime.service.models.store import Store
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.pages.reading import read_page
@@ -68,17 +68,17 @@ def rules() -> list[dict[str, Any]]:
 def shown(toy_zip: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
     """The metrics of a service with all its parts that has read pages, as Prometheus gets them."""
     bundle = Bundle.open(toy_zip)
-    history, metrics, source = History(), ServiceMetrics(), toy.ToySource(toy.ToyDevice())
-    monitor, registry = Monitor(metrics=metrics), ModelRegistry(Decoder(bundle, threads=1))
-    store = ModelStore(tmp_path_factory.mktemp("store"), bundle)
-    plane = DataPlane(registry, source, store, metrics=metrics, observers=[history], monitor=monitor)
+    last_pages, metrics, source = LastPages(), ServiceMetrics(), toy.ToySource(toy.ToyDevice())
+    store = Store(tmp_path_factory.mktemp("store"), bundle)
+    monitor, models = Monitor(metrics=metrics), Models(Decoder(bundle, threads=1), store)
+    plane = DataPlane(models, source, metrics=metrics, observers=[last_pages], monitor=monitor)
     metrics.watch_certificates(lambda: 2e9)
     for _ in range(3):
         stages = Stages()
         read_page(plane, None, None, Caller(), stages=stages)
         metrics.timed("ReadPage", stages)
         metrics.call_ended("ReadPage", "OK", "", stages.elapsed_s)
-    routes = console_routes(ConsoleState(history, registry, monitor, "toy:device"), metrics.registry)
+    routes = console_routes(ConsoleState(last_pages, models, monitor, "toy:device"), metrics.registry)
     with serving(routes, 0) as port, urlopen(f"http://127.0.0.1:{port}/metrics", timeout=20) as reply:
         return str(reply.read(), "utf-8")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -21,6 +22,12 @@ from tests.waiting import eventually
 ROOT = Path(__file__).resolve().parents[2]
 TARGET = f"{__name__}:Echo"
 WAIT_S = 60.0
+
+
+@pytest.fixture(autouse=True)
+def importable(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let processes import these tests, wherever they are started."""
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
 
 
 class Echo(Helper):
@@ -54,6 +61,17 @@ class Echo(Helper):
 
     def wait(self) -> None:
         threading.Event().wait()
+
+    def say_half(self, steps: int, said: Path, progress: Callable[[int], None]) -> None:
+        for step in range(steps):
+            progress(step)
+        os.write(sys.stdin.fileno(), (1 << 10).to_bytes(4) + b"x")
+        said.touch()
+        self.wait()
+
+    def leave_room_for(self, size: int) -> None:
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (used + size, resource.RLIM_INFINITY))
 
     def tell_of_its_end(self, path: Path) -> None:
         self.left = path
@@ -98,10 +116,13 @@ def test_one_that_breaks_hangs_or_cannot_be_started_is_told_apart(
 ) -> None:
     with pytest.raises(WorkerError, match=r"no answer .*0\.05"):
         process.ask("wait", timeout_s=0.05)
-    process.end()
+    for _ in range(2):  # it is of no more use
+        with pytest.raises(WorkerError, match=r"^echo:"):
+            process.ask("same", 1, timeout_s=WAIT_S)
+        process.end()
     stopped = HelperProcess(TARGET, subject="echo")
     os.kill(stopped.pid, signal.SIGSTOP)
-    with pytest.raises(WorkerError, match=r"taken in .*0\.05"):
+    with pytest.raises(WorkerError, match=r"no answer .*0\.05"):
         stopped.ask("same", bytes(1 << 22), timeout_s=0.05)
     stopped.end()
     broken = HelperProcess(TARGET, subject="echo")
@@ -112,6 +133,46 @@ def test_one_that_breaks_hangs_or_cannot_be_started_is_told_apart(
     monkeypatch.setattr(sys, "executable", "/nowhere/python")
     with pytest.raises(WorkerError, match="can be started"):
         HelperProcess(TARGET, subject="echo")
+
+
+def test_what_comes_at_once_or_by_half_holds_nobody_longer_than_the_limit(
+    process: HelperProcess, tmp_path: Path
+) -> None:
+    told: list[int] = []
+    process.send("say_half", 100, tmp_path / "said", progress=told.append)
+    eventually((tmp_path / "said").exists)
+    heard: list[int] = []
+    polling = threading.Thread(
+        target=lambda: [heard.append(process.poll(0.0) or len(told)) for _ in range(200)], daemon=True
+    )
+    polling.start()
+    polling.join(WAIT_S)
+    assert (polling.is_alive(), heard[0] <= 1, told) == (False, True, [*range(100)])
+
+
+def test_any_thread_may_end_it_while_another_waits_for_its_answer(process: HelperProcess) -> None:
+    found: list[str] = []
+
+    def asked() -> None:
+        with pytest.raises(WorkerError) as error:
+            process.ask("wait", timeout_s=WAIT_S)
+        found.append(str(error.value))
+
+    waiting = threading.Thread(target=asked)
+    waiting.start()
+    process.end()
+    waiting.join(WAIT_S)
+    assert "signal 9" in found[0]
+
+
+def test_a_process_that_cannot_take_in_what_it_hears_ends(tmp_path: Path) -> None:
+    with (tmp_path / "log").open("w+b") as log:
+        process = HelperProcess(TARGET, subject="echo", log=log)
+        process.ask("leave_room_for", 1 << 26, timeout_s=WAIT_S)
+        with pytest.raises(WorkerError, match="with status 1"):
+            process.ask("same", np.zeros(1 << 28, np.uint8), timeout_s=WAIT_S)
+        process.end()
+    assert "MemoryError" in (tmp_path / "log").read_text()
 
 
 PARENT = """

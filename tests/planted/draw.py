@@ -26,9 +26,9 @@ AREAS = {
     },
     "tracking": {"runtime/model/decoding": "image_tracker following tracking image_drift"},
     "calibration": {"lightpage/calibration": "*", "train/fitting": "fit fitted"},
-    "registry": {"runtime/service": "models/registry models/models pages/replays"},
+    "registry": {"runtime/service": "models/history models/loader models/models models/uploads pages/replays"},
     "store": {
-        "runtime/service/models": "store store_health",
+        "runtime/service/models": "store store_health folder database audit",
         "runtime/service/monitoring": "flight_recorder",
         "runtime/service/jobs": "jobs",
     },

@@ -12,7 +12,7 @@ from lightpage.codec.code import Code
 from lightpage.errors import PageError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.pages import Pages
-from lightpage.recording.reader import RecordingWriter
+from lightpage.recording.writer import RecordingWriter
 from lightpage.runtime.commands.archives.encode import encode
 from lightpage.runtime.device.acquisition.source import SHOT_S, FrameSource, Shot
 from tests.runtime import toy

@@ -22,7 +22,8 @@ from lightpage.page.levels import Levels
 from lightpage.page.symbols import random_symbols, symbol_phases
 from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.reader import Recording, RecordingWriter
+from lightpage.recording.reader import Recording
+from lightpage.recording.writer import RecordingWriter
 from lightpage.runtime.device.acquisition.source import SHOT_S, FrameSource, Shot
 from lightpage.runtime.model.bundle.bundle import Bundle, npz, write_bundle
 from lightpage.runtime.model.bundle.manifest import DECODER, GOLDEN, PILOTS, TWIN, Manifest

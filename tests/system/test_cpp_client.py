@@ -22,7 +22,7 @@ from lightpage.runtime.client.wire.status import status_of, told, trailers
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
-from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.server.certificates import Certificates
 from lightpage.runtime.service.server.server import LightpageServer
 from tests.runtime import toy
@@ -87,7 +87,7 @@ def succeeds(program: Path, target: str, *words: object) -> str:
 @pytest.fixture(scope="module")
 def service(decoder: Decoder, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, DataPlane]]:
     """Where a service of the toy device is, and its plane."""
-    plane = DataPlane(ModelRegistry(decoder), toy.ToySource(toy.ToyDevice()))
+    plane = DataPlane(Models(decoder), toy.ToySource(toy.ToyDevice()))
     recalibrator = Recalibrator(plane, toy.fit_references, tmp_path_factory.mktemp("work"))
     with LightpageServer(plane, recalibrator) as server:
         yield server.target, plane
@@ -121,7 +121,7 @@ def test_it_says_what_the_service_does_not_like(program: Path, service: tuple[st
 
 def test_it_connects_with_certificates(program: Path, decoder: Decoder, tmp_path: Path) -> None:
     authority = Authority(tmp_path / "certificates")
-    plane = DataPlane(ModelRegistry(decoder))
+    plane = DataPlane(Models(decoder))
     with LightpageServer(plane, Recalibrator(plane), certificates=Certificates(authority.service())) as server:
         files = vars(authority.caller("caller", ["read"]))
         options = [word for name, path in files.items() for word in (f"--{name}", path)]
@@ -130,7 +130,7 @@ def test_it_connects_with_certificates(program: Path, decoder: Decoder, tmp_path
 
 def test_it_recalibrates_a_service(program: Path, service: tuple[str, DataPlane]) -> None:
     said = succeeds(program, service[0], "recalibrate", "--pages", 2)
-    assert service[1].registry.current.version == "toy-1+r1"
+    assert service[1].models.current.version == "toy-1+r1"
     assert "toy-1+r1" in said
     assert "toy-1+r1" in succeeds(program, service[0], "watch", said.split()[1])
 

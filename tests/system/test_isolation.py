@@ -31,8 +31,8 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.server.server import LightpageServer
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
-from lightpage.runtime.service.models.registry import ModelRegistry
-plane = DataPlane(ModelRegistry(Decoder(Bundle.open(sys.argv[1]))), open_source("recording:" + sys.argv[2]))
+from lightpage.runtime.service.models.models import Models
+plane = DataPlane(Models(Decoder(Bundle.open(sys.argv[1]))), open_source("recording:" + sys.argv[2]))
 server = LightpageServer(plane, Recalibrator(plane, None))
 with server, LightpageClient(server.target) as client:
     page = client.pages.read(want_written=True)

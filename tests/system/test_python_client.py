@@ -18,7 +18,7 @@ from grpc_tools import protoc
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
-from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.server.server import LightpageServer
 from tests.runtime import toy
 
@@ -103,7 +103,7 @@ def test_it_decodes_a_page_as_the_services_own_client_does(decoder: Decoder, tmp
     symbols = toy.symbols_of(16, 3)[0]
     pair = toy.ToyDevice(seed=3).page(symbols, 16, 0.7)
     np.save(tmp_path / "frames.npy", np.stack([pair.in_phase, pair.quadrature]))
-    plane = DataPlane(ModelRegistry(decoder), toy.ToySource(toy.ToyDevice()))
+    plane = DataPlane(Models(decoder), toy.ToySource(toy.ToyDevice()))
     with LightpageServer(plane, Recalibrator(plane, None, tmp_path)) as server:
         files = (tmp_path / "frames.npy", tmp_path / "symbols.npy", installed)
         told = json.loads(run(sys.executable, "-I", "-c", DECODE, server.target, *files, cwd=tmp_path))

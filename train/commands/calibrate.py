@@ -34,14 +34,24 @@ MAX_PAGES = 4
 @click.option(
     "--pages", default=DEFAULT_PAGES, show_default=True, type=click.IntRange(1, MAX_PAGES), help="Pages used."
 )
+@click.option(
+    "--orientation",
+    default="profile",
+    show_default=True,
+    type=click.Choice(["profile", "any"]),
+    help="any: take frames of a camera that shows the image mirrored or turned, each camera by itself.",
+)
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
-def calibrate(profile_name: str, recording: Path, out: Path, pages: int, json_path: Path | None) -> None:
+def calibrate(
+    profile_name: str, recording: Path, out: Path, pages: int, orientation: str, json_path: Path | None
+) -> None:
     """Find this device's geometry, from nominal, with the first pages of a recording that show light."""
     profile = load_profile(profile_name)
     start = time.perf_counter()
     with Recording.open(recording) as file, percent_bar() as progress:
-        file.check_against(profile)
-        calibration = calibrate_recording(file, profile, first_lit_pages(file, pages, warn), progress)
+        file.header.check_against(profile)
+        chosen = first_lit_pages(file, pages, warn)
+        calibration = calibrate_recording(file, profile, chosen, progress, any_orientation=orientation == "any")
     seconds = time.perf_counter() - start
     calibration.save(out)
     lost = int(np.sum(seen_share(TorchTwin(RayTwin(profile)), calibration.vector, profile) < 0.5))
@@ -59,7 +69,12 @@ def calibrate(profile_name: str, recording: Path, out: Path, pages: int, json_pa
 
 
 def calibrate_recording(
-    recording: Recording, profile: Profile, pages: Sequence[int], progress: Progress
+    recording: Recording,
+    profile: Profile,
+    pages: Sequence[int],
+    progress: Progress,
+    *,
+    any_orientation: bool = False,
 ) -> Calibration:
     """Calibrate from nominal with some pages of a recording.
 
@@ -67,8 +82,8 @@ def calibrate_recording(
         RecordingError: no symbols, no such page, or shapes that are not the profile's.
         CalibrationError: nothing within the capture range explains the frames.
     """
-    recording.check_against(profile)
-    if others := recording.differences(profile):
+    recording.header.check_against(profile)
+    if others := recording.header.differences(profile):
         warn(f"recording {recording.path} says of its device: {'; '.join(others)}")
     known = known_pages(recording, profile, pages)
     registered = register(
@@ -78,6 +93,7 @@ def calibrate_recording(
         recording.references(),
         known,
         progress,
+        any_orientation=any_orientation,
     )
     return Calibration.from_registered(registered, profile, [recording.page_hash(page) for page in pages])
 

@@ -85,7 +85,7 @@ def train(
         context.with_resource(reporting(Silence()))
     profile = load_profile(profile_name)
     with Recording.open(recording_path) as recording:
-        recording.check_against(profile)
+        recording.header.check_against(profile)
         if not recording.has_symbols:
             raise RecordingError(f"recording {recording_path}", "no dataset 'symbols'", "known symbols to train on")
         context.with_resource(sole_writer(out))

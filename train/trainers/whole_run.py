@@ -18,7 +18,8 @@ from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError, RecordingError
 from lightpage.page.symbols import pilot_mask, pilot_symbols, symbol_phases
 from lightpage.progress import note, warn
-from lightpage.recording.reader import Recording, hash_frames
+from lightpage.recording.layout import hash_frames
+from lightpage.recording.reader import Recording
 from lightpage.train.data.features import FeatureExtractor
 from lightpage.train.data.training_inputs import TrainingInputs
 from lightpage.train.fitting.provenance import provenance

@@ -268,8 +268,8 @@ class WaveFit:
         even = self._page(state.levels)
         by_term = np.stack([here.to_cameras(even * term) for term in self._terms])
         page, field = even * np.tensordot(state.light, self._terms, 1), np.tensordot(state.light, by_term, 1)
-        functions = modulations.basis(self._phases) if levels else []
-        by_level = [here.to_cameras(page * on_modulator(one, self._samples)) for one in functions]
+        functions = [on_modulator(one, self._samples) for one in modulations.basis(self._phases)] if levels else []
+        by_level = [here.to_cameras(page * one) for one in functions]
         light, pixels = list[Complex](), list[Real]()
         for number, index in enumerate(of_light):
             progress(number / len(of_light))

@@ -8,15 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.codec.choose import HEADROOM, Choice, DrawnPage, choose
-from lightpage.errors import InvalidInputError, LostPageError
 from lightpage.metrics.information import achievable_rate
 from lightpage.page.levels import Levels
 from lightpage.page.pilots import Pilots, remove_piston
 from lightpage.page.symbols import symbol_phases
-from lightpage.progress import track, warn
+from lightpage.progress import warn
 from lightpage.recording.reader import Recording
-from lightpage.runtime.archives.recordings.evaluation import check_recording, check_symbols, decode_unseen, pilots_of
-from lightpage.runtime.archives.recordings.read_ahead import read_ahead
+from lightpage.runtime.archives.recordings.evaluation import check_recording, check_symbols, pilots_of, unseen_pages
 from lightpage.runtime.archives.recordings.refused import RefusedPage, refusal
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.page import DecodedPage
@@ -59,17 +57,9 @@ def choose_code(
     errors: list[NDArray[np.float32]] = []
     concentrations: list[NDArray[np.float32]] = []
     refused: list[RefusedPage] = []
-    shown = read_ahead(recording.shown, range(recording.pages))
-    for index, read in track(shown, "choose a code", total=recording.pages):
-        try:
-            frames, symbols = read.result()
-            page = decode_unseen(decoder, recording, tracker, mask, frames, symbols)
-        except (InvalidInputError, LostPageError) as error:
-            refused.append(RefusedPage.of(index, error))  # a page that is lost to the optics is lost to every code
-            continue
-        if page is not None and symbols is not None:
-            errors.append(phase_errors(page, symbols, levels))
-            concentrations.append(page.concentration)
+    for page, symbols in unseen_pages(decoder, recording, tracker, "choose a code", refused):
+        errors.append(phase_errors(page, symbols, levels))  # a page that is lost to the optics is lost to every code
+        concentrations.append(page.concentration)
     if refused:
         lost = refusal(f"recording {recording.path}", refused, recording.pages)
         warn(f"{lost.subject}: {lost.got}; they do not count")

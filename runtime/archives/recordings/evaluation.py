@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -17,8 +18,8 @@ from lightpage.page.levels import Levels
 from lightpage.page.pilots import Pilots, estimate_piston
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.layout import narrow
-from lightpage.recording.reader import Recording, page_hashes
+from lightpage.recording.layout import narrow, page_hashes
+from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.read_ahead import read_ahead
 from lightpage.runtime.archives.recordings.refused import RefusedPage, refusal, refused_json
 from lightpage.runtime.model.bundle.manifest import GOLDEN
@@ -114,7 +115,7 @@ def check_recording(decoder: Decoder, recording: Recording) -> None:
     Raises:
         RecordingError: other shapes or another bit depth.
     """
-    recording.check_against(decoder.bundle.profile)
+    recording.header.check_against(decoder.bundle.profile)
     depth = decoder.bundle.manifest.camera_bit_depth
     if recording.bit_depth != depth:
         raise RecordingError(f"recording {recording.path}", f"{recording.bit_depth} bits", f"{depth}, as the bundle")
@@ -160,6 +161,35 @@ def decode_unseen(
     return tracker.decode(narrow(frames, recording.bit_depth), recording.levels, pilots)
 
 
+def unseen_pages(
+    decoder: Decoder,
+    recording: Recording,
+    tracker: Tracker,
+    what: str,
+    refused: list[RefusedPage],
+    *more: type[LightpageError],
+) -> Iterator[tuple[DecodedPage, NDArray[np.uint8]]]:
+    """Decode all pages of a recording in their order and yield those that the bundle has not seen, with their symbols.
+
+    Args:
+        decoder, recording, tracker: see `evaluate`.
+        what: is being done, for whoever watches.
+        refused: takes the pages that could not be decoded, or were not confirmed.
+        more: errors that it takes pages for, too.
+    """
+    losses: tuple[type[LightpageError], ...] = (InvalidInputError, LostPageError, *more)
+    mask, shown = pilots_of(decoder, recording), read_ahead(recording.shown, range(recording.pages))
+    for index, read in track(shown, what, total=recording.pages):
+        try:
+            frames, symbols = read.result()
+            page = decode_unseen(decoder, recording, tracker, mask, frames, symbols)
+        except losses as error:
+            refused.append(RefusedPage.of(index, error))
+            continue
+        if page is not None and symbols is not None:
+            yield page, symbols
+
+
 def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evaluation:
     """Decode all unseen pages in their order and measure them against their symbols; a bad page is left out and told.
 
@@ -176,26 +206,18 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
     check_recording(decoder, recording)
     check_symbols(recording)
     levels = decoder.bundle.levels(recording.levels)
-    mask = pilots_of(decoder, recording)
-    data = ~mask
+    data = ~pilots_of(decoder, recording)
     accumulator = Accumulator(levels, data, recording.pages)
     timings: list[Timings] = []
     refused: list[RefusedPage] = []
     due = 0
     before: list[float] = []
-    for index, read in track(read_ahead(recording.shown, range(recording.pages)), "evaluate", total=recording.pages):
-        page = symbols = None
-        try:
-            frames, symbols = read.result()
-            page = decode_unseen(decoder, recording, tracker, mask, frames, symbols)
-        except (InvalidInputError, LostPageError, StorageError) as error:
-            refused.append(RefusedPage.of(index, error))
-        if page is not None and symbols is not None:
-            accumulator.add(page.phase[data], page.concentration[data], symbols[data])
-            unfitted = (page.phase + page.phase_error)[data]
-            before.append(float(achievable_rate(unfitted, page.concentration[data], symbols[data], levels).mean()))
-            timings.append(page.timings)
-            due += page.check.recalibration_due
+    for page, symbols in unseen_pages(decoder, recording, tracker, "evaluate", refused, StorageError):
+        accumulator.add(page.phase[data], page.concentration[data], symbols[data])
+        unfitted = (page.phase + page.phase_error)[data]
+        before.append(float(achievable_rate(unfitted, page.concentration[data], symbols[data], levels).mean()))
+        timings.append(page.timings)
+        due += page.check.recalibration_due
     if not timings and refused:
         told = refusal(f"recording {recording.path}", refused, recording.pages)
         figures = {
@@ -233,13 +255,8 @@ def _describe(decoder: Decoder, levels: Levels) -> dict[str, Any]:
     bundle, manifest = decoder.bundle, decoder.bundle.manifest
     return {
         "path": str(bundle.path.resolve()),
-        "name": manifest.name,
-        "precision": manifest.precision,
         "provider": str(decoder.graph.provider),
-        "profile": manifest.profile,
-        "calibration": manifest.calibration,
-        "metrics": manifest.metrics,
-        "provenance": manifest.provenance.model_dump(),
+        **manifest.model_dump(include={"name", "precision", "profile", "calibration", "metrics", "provenance"}),
         "golden_sha256": manifest.files[GOLDEN],
         "golden_piston_rad": estimate_piston(bundle.golden.p, decoder.pilots(levels.count)).angle_rad,
     }

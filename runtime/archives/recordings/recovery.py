@@ -165,7 +165,7 @@ def code_of(recording: Recording, bundle: Bundle) -> Code:
         RecordingError: the recording's attribute `code` cannot be understood.
         InvalidInputError: neither has one.
     """
-    text = recording.code_text
+    text = recording.header.code_text
     if text is None:
         if bundle.code is None:
             expected = "--code CODE.toml, as `lightpage code` makes it"
@@ -253,7 +253,7 @@ class PageReader:
     ) -> None:
         check_recording(decoder, recording)
         subject, mask = f"recording {recording.path}", decoder.bundle.pilot_mask
-        if recording.declared_levels not in (None, code.levels):
+        if recording.header.declared_levels not in (None, code.levels):
             raise RecordingError(f"{subject}: levels", recording.levels, f"{code.levels}, as the code has")
         if not np.array_equal(pilots_of(decoder, recording), mask):
             raise RecordingError(f"{subject}: pilots", "other places", "those of the bundle")

@@ -56,33 +56,25 @@ class Mean:
         return self._sum / self._count if self._count else None
 
 
-class Means:
-    """Means of the figures of pages, by name."""
+class Means(dict[str, Mean]):
+    """Means of the figures of pages, by name; of a figure that no page has, a mean of nothing."""
 
-    def __init__(self) -> None:
-        self._means: dict[str, Mean] = {}
+    def __missing__(self, name: str) -> Mean:
+        return Mean()
 
-    def add(self, figures: dict[str, float | int | None]) -> None:
+    def add(self, figures: Mapping[str, float | int | None]) -> None:
         """Count a page."""
         for name, value in figures.items():
-            self._means.setdefault(name, Mean()).add(value)
-
-    def value(self, name: str) -> float | None:
-        """The mean of a figure; None where no page has it."""
-        return self._means[name].value if name in self._means else None
-
-    def least(self, name: str) -> float | None:
-        """The least of them."""
-        return self._means[name].least if name in self._means else None
+            self.setdefault(name, Mean()).add(value)
 
     def to_json(self) -> dict[str, float | None]:
         """All of them."""
-        return {name: mean.value for name, mean in self._means.items()}
+        return {name: mean.value for name, mean in self.items()}
 
 
 @dataclass
-class Tally:
-    """Pages of a recording, or of all.
+class Counts:
+    """What was found of pages, of a recording or of all.
 
     Attributes:
         pages: all of them; of a fleet that is recalibrated, its devices.
@@ -90,6 +82,7 @@ class Tally:
         lost: by cause.
         recalibration_due: read, and show that the device has changed.
         models: pages by the version of what read them.
+        figures: of those that were read.
     """
 
     pages: int = 0
@@ -98,6 +91,7 @@ class Tally:
     lost: Counter[str] = field(default_factory=Counter)
     recalibration_due: int = 0
     models: Counter[str] = field(default_factory=Counter)
+    figures: Means = field(default_factory=Means)
 
     @property
     def missing(self) -> int:
@@ -107,13 +101,16 @@ class Tally:
     def add(self, page: PageRecord, version: str) -> None:
         """Count a page that has a result, by the version of what read it."""
         self.models[version] += 1
-        self.read += page.state is PageState.READ
         self.left_out += page.state is PageState.LEFT_OUT
-        self.recalibration_due += page.recalibration_due and page.state is PageState.READ
         if page.state is PageState.LOST:
             self.lost[page.loss or UNKNOWN] += 1
+        if page.state is PageState.READ:
+            self.read += 1
+            self.recalibration_due += page.recalibration_due
+            confirmed = {} if page.confirmed_bits is None else {CONFIRMED: page.confirmed_bits}
+            self.figures.add({**page.figures, **confirmed})
 
-    def to_json(self) -> dict[str, Any]:
+    def counts_json(self) -> dict[str, Any]:
         """The counts under the names that other programs read."""
         return {
             "pages": self.pages,
@@ -133,17 +130,17 @@ class Round:
     Attributes:
         model: what read.
         pages: that were read again.
-        won: that were lost before, and are read now.
-        better: that were read before, and are read better now.
-        lost: that are lost still.
+        pages_won: that were lost before, and are read now.
+        pages_better: that were read before, and are read better now.
+        pages_lost_still: that are lost still.
         air_before, air_after: mean AIR of all of them where it is known, a lost page counting nothing.
     """
 
     model: NamedBundle
     pages: int = 0
-    won: int = 0
-    better: int = 0
-    lost: int = 0
+    pages_won: int = 0
+    pages_better: int = 0
+    pages_lost_still: int = 0
     air_before: Mean = field(default_factory=Mean)
     air_after: Mean = field(default_factory=Mean)
 
@@ -151,24 +148,18 @@ class Round:
         """Count a page that was read again."""
         took = now.better_than(before)
         self.pages += 1
-        self.won += took and before.state is PageState.LOST
-        self.better += took and before.state is PageState.READ
-        self.lost += not took and before.state is PageState.LOST
+        self.pages_won += took and before.state is PageState.LOST
+        self.pages_better += took and before.state is PageState.READ
+        self.pages_lost_still += not took and before.state is PageState.LOST
         if AIR in now.figures or AIR in before.figures:
             self.air_before.add(_air(before))
             self.air_after.add(_air(now if took else before))
 
     def to_json(self) -> dict[str, Any]:
         """The figures under the names that other programs read."""
-        return {
-            "version": self.model.version,
-            "pages": self.pages,
-            "pages_won": self.won,
-            "pages_better": self.better,
-            "pages_lost_still": self.lost,
-            "air_before": self.air_before.value,
-            "air_after": self.air_after.value,
-        }
+        counts = {name: count for name, count in vars(self).items() if isinstance(count, int)}
+        means = {"air_before": self.air_before.value, "air_after": self.air_after.value}
+        return {"version": self.model.version, **counts, **means}
 
 
 @dataclass(frozen=True)
@@ -196,26 +187,6 @@ class Reading:
 
 
 @dataclass
-class Counts:
-    """What was found of pages.
-
-    Attributes:
-        tally: of all of them.
-        figures: of those that were read.
-    """
-
-    tally: Tally = field(default_factory=Tally)
-    figures: Means = field(default_factory=Means)
-
-    def add(self, page: PageRecord, version: str) -> None:
-        """Count a page that has a result, by the version of what read it."""
-        self.tally.add(page, version)
-        if page.state is PageState.READ:
-            confirmed = {} if page.confirmed_bits is None else {CONFIRMED: page.confirmed_bits}
-            self.figures.add({**page.figures, **confirmed})
-
-
-@dataclass
 class Group(Counts):
     """What was found of a device, or of a recording where there is no fleet.
 
@@ -237,7 +208,7 @@ class Totals(Counts):
         rounds: what later readings have brought.
         recordings: a row each, unless devices are recalibrated.
         devices: a row each, where they are.
-        lost: the first lost pages, or devices, and why.
+        told: the first lost pages, or devices, and why.
         examples: the first one of each cause.
         groups: by device, unless devices are recalibrated; by recording where there is no fleet.
         readings: all ranges that were done, a few numbers each.
@@ -247,7 +218,7 @@ class Totals(Counts):
     rounds: list[Round] = field(default_factory=list)
     recordings: list[dict[str, Any]] = field(default_factory=list)
     devices: list[dict[str, Any]] = field(default_factory=list)
-    lost: list[str] = field(default_factory=list)
+    told: list[str] = field(default_factory=list)
     examples: dict[str, str] = field(default_factory=dict)
     groups: dict[str, Group] = field(default_factory=dict)
     readings: list[Reading] = field(default_factory=list)
@@ -264,8 +235,8 @@ class Totals(Counts):
     def to_json(self) -> dict[str, Any]:
         """The figures under the names that other programs read."""
         return {
-            **self.tally.to_json(),
-            "models": dict(self.tally.models),
+            **self.counts_json(),
+            "models": dict(self.models),
             "figures": {**self.figures.to_json(), **({} if self.ece is None else {"ece": self.ece})},
             "rounds": [each.to_json() for each in self.rounds],
             **({"devices": self.devices} if self.devices else {"recordings": self.recordings}),
@@ -300,12 +271,12 @@ def _add_device(
     row: dict[str, Any] = {"device": first.device, "recordings": [str(source.path) for source in own]}
     problem = next((source.problem for source in own if source.problem is not None), None)
     if problem is None:
-        found.tally.pages += 1
+        found.pages += 1
         problem = failures.get((first.device, first.path))
     if ledger.recalibrated(index):
         record = ShardRecord.read(shard)
         page = record.pages[0]
-        found.tally.add(page, record.model.version)
+        found.add(page, record.model.version)
         found.readings.append(Reading.of(record, 1))
         state = DeviceState.RECALIBRATED if page.state is PageState.READ else DeviceState.REFUSED
         row |= {"state": state, "air_before": None, "air_after": None, **record.summary, "reason": page.reason}
@@ -328,7 +299,7 @@ def _add_recording(found: Totals, ledger: Ledger, job: Job, index: int, source: 
         group.told = group.told or str(source.problem)
     for task in ledger.ranges(job, index, source):
         for counts in (own, group, found):
-            counts.tally.pages += task.weight
+            counts.pages += task.weight
         for record, page in _pages(found, ledger, job, index, task, there):
             for counts in (own, group, found):
                 counts.add(page, record.model.version)
@@ -336,7 +307,7 @@ def _add_recording(found: Totals, ledger: Ledger, job: Job, index: int, source: 
                 lost.setdefault(page.loss or UNKNOWN, []).append(page.page)
                 group.told = group.told or page.reason
                 _tell_lost(found, page, f"{_recording(source)}: page {page.page}: {page.reason}")
-    row = {"device": source.device, "recording": str(source.path), **own.tally.to_json()}
+    row = {"device": source.device, "recording": str(source.path), **own.counts_json()}
     row |= {"lost_pages": {cause: ranges(pages) for cause, pages in lost.items()}, "figures": own.figures.to_json()}
     if source.problem is not None:
         row["problem"] = str(source.problem)
@@ -368,8 +339,8 @@ def _pages(
 
 def _tell_lost(found: Totals, page: PageRecord, told: str) -> None:
     found.examples.setdefault(page.loss or UNKNOWN, told)
-    if len(found.lost) < TOLD:
-        found.lost.append(told)
+    if len(found.told) < TOLD:
+        found.told.append(told)
 
 
 def _recording(source: Source) -> str:

@@ -76,8 +76,8 @@ class LocalEngine:
                     if outcome is not None:
                         yield outcome
             finally:
-                for worker in alive:  # which wakes the threads that wait for their answers
-                    worker.end()
+                for worker in alive:
+                    worker.end()  # which wakes the thread that waits for its answer
                 self.in_flight = self.workers_alive = 0
 
     def _answer(self, worker: HelperProcess, task: Task) -> Outcome:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -112,15 +113,14 @@ class PageRange:
         reader = PageReader(self.decoder, self.recording, self.tracker, code, give_up=self.task.give_up)
         kept: list[tuple[int, PageBytes]] = []
         records: list[PageRecord] = []
+
+        def take(page: int, found: PageBytes) -> Volume | None:
+            if (volume := Volume.of_page(found)) is not None:
+                kept.append((page, found))
+            return volume
+
         for page, shown in read_ahead(self.recording.shown, self.task.pages):
-
-            def take(found: PageBytes, page: int = page) -> Volume | None:
-                volume = Volume.of_page(found)
-                if volume is not None:
-                    kept.append((page, found))
-                return volume
-
-            records.append(_recovered_record(reader.read(page, shown, take)))
+            records.append(_recovered_record(reader.read(page, shown, partial(take, page))))
         write_user_bytes(self.task.shard, kept)
         return Findings(pages=tuple(records))
 
@@ -150,32 +150,15 @@ def lost_page(page: int, error: LightpageError) -> PageRecord:
 
 
 def _read_record(page: int, found: DecodedPage, measures: PageMeasures | None) -> PageRecord:
-    return PageRecord(
-        page=page,
-        state=PageState.READ,
-        recalibration_due=found.check.recalibration_due,
-        confirmed_bits=found.check.confirmed_bits,
-        figures={
-            "mean_confidence": float(found.confidence.mean()),
-            "pilot_trust": found.pilot_trust,
-            "claimed_bits": found.check.claimed_bits,
-            **({} if measures is None else vars(measures)),
-        },
-    )
+    due, confirmed, claimed = found.check.recalibration_due, found.check.confirmed_bits, found.check.claimed_bits
+    own = {"mean_confidence": float(found.confidence.mean()), "pilot_trust": found.pilot_trust, "claimed_bits": claimed}
+    figures = own | ({} if measures is None else vars(measures))
+    read = PageState.READ
+    return PageRecord(page=page, state=read, recalibration_due=due, confirmed_bits=confirmed, figures=figures)
 
 
 def _recovered_record(page: RecoveredPage) -> PageRecord:
-    return PageRecord(
-        page=page.page,
-        state=PageState.READ if page.loss is None else PageState.LOST,
-        loss=page.loss,
-        reason=page.reason,
-        figures={
-            "number": page.number,
-            "volume": page.volume,
-            "margin_bits": page.margin_bits,
-            "corrected": page.corrected,
-            "failed_blocks": page.failed_blocks,
-            "air_bits_per_symbol": page.air_bits,
-        },
-    )
+    state = PageState.READ if page.loss is None else PageState.LOST
+    figures = {name: getattr(page, name) for name in ("number", "volume", "margin_bits", "corrected", "failed_blocks")}
+    figures["air_bits_per_symbol"] = page.air_bits
+    return PageRecord(page=page.page, state=state, loss=page.loss, reason=page.reason, figures=figures)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,7 @@ from lightpage.runtime.model.execution.providers import Provider
 CLOCK = SYSTEM
 """Of the pauses before what may pass is tried again."""
 _FILE = click.Path(path_type=Path)
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
 @click.group(cls=Group)
@@ -50,41 +51,43 @@ def bulk() -> None:
     """
 
 
-def _options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Options of all operations."""
-    for option in (
-        click.option("--metrics-file", type=OutputFile(), help="Write metrics at the end, for node_exporter: *.prom."),
-        click.option("--metrics-insecure", is_flag=True, help="Let other machines read the metrics, without TLS."),
-        click.option("--metrics", "metrics_address", metavar="HOST:PORT", help="Show metrics there while it runs."),
-        click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file."),
-        click.option(
-            "--part", metavar="K/N", help="Do every Nth recording or device from the Kth, K from 0; others do the rest."
-        ),
-        click.option("--threads", type=click.IntRange(1), help="Threads of a worker; by default its share of cores."),
-        PROVIDER,
-        click.option("--workers", type=click.IntRange(1), help="How many; by default one for every two cores."),
-        click.option("--address", help="With --engine ray: of the cluster, `auto` for the one that runs here."),
-        click.option("--engine", type=click.Choice([LOCAL, RAY]), default=LOCAL, show_default=True, help="Who works."),
-        click.option("--bundle", help=f"A bundle's path, or the name of a shipped one; {DEFAULT} by default."),
-        click.option("--fleet", type=_FILE, help="TOML file of devices: name, bundle, recordings."),
-        click.option("--recordings", multiple=True, metavar="GLOB", help="HDF5 recordings; may be given repeatedly."),
-        click.argument("out", type=OutputFolder()),
-    ):
-        command = option(command)
-    return command
+def _tuning(name: str, kind: click.ParamType[Any], what: str) -> Decorator:
+    """An option of `FineTuning`."""
+    told = f"With --deep: {what}; {getattr(FineTuning(), name):g} by default."
+    return click.option(f"--{name.replace('_', '-')}", type=kind, help=told)
 
 
-def _pages_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Options of operations on page ranges."""
-    for option in (
-        click.option("--give-up", is_flag=True, help="Take pages that storage does not give in the end for lost."),
-        click.option("--retry-lost", is_flag=True, help="Read ranges with lost pages once more, whatever the cause."),
-        click.option("--again-with", metavar="BUNDLE", help="Read pages again that were not read well."),
-        click.option("--tracking/--no-tracking", default=None, help="Follow the image within a range; the default."),
-        click.option("--range-pages", type=click.IntRange(1), help=f"Pages of a range; {RANGE_PAGES} by default."),
-    ):
-        command = option(command)
-    return command
+def _together(*options: Decorator) -> Decorator:
+    return lambda command: reduce(lambda made, option: option(made), options, command)
+
+
+_options = _together(
+    click.option("--metrics-file", type=OutputFile(), help="Write metrics at the end, for node_exporter: *.prom."),
+    click.option("--metrics-insecure", is_flag=True, help="Let other machines read the metrics, without TLS."),
+    click.option("--metrics", "metrics_address", metavar="HOST:PORT", help="Show metrics there while it runs."),
+    click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file."),
+    click.option(
+        "--part", metavar="K/N", help="Do every Nth recording or device from the Kth, K from 0; others do the rest."
+    ),
+    click.option("--threads", type=click.IntRange(1), help="Threads of a worker; by default its share of cores."),
+    PROVIDER,
+    click.option("--workers", type=click.IntRange(1), help="How many; by default one for every two cores."),
+    click.option("--address", help="With --engine ray: of the cluster, `auto` for the one that runs here."),
+    click.option("--engine", type=click.Choice([LOCAL, RAY]), default=LOCAL, show_default=True, help="Who works."),
+    click.option("--bundle", help=f"A bundle's path, or the name of a shipped one; {DEFAULT} by default."),
+    click.option("--fleet", type=_FILE, help="TOML file of devices: name, bundle, recordings."),
+    click.option("--recordings", multiple=True, metavar="GLOB", help="HDF5 recordings; may be given repeatedly."),
+    click.argument("out", type=OutputFolder()),
+)
+"""Options of all operations."""
+_pages_options = _together(
+    click.option("--give-up", is_flag=True, help="Take pages that storage does not give in the end for lost."),
+    click.option("--retry-lost", is_flag=True, help="Read ranges with lost pages once more, whatever the cause."),
+    click.option("--again-with", metavar="BUNDLE", help="Read pages again that were not read well."),
+    click.option("--tracking/--no-tracking", default=None, help="Follow the image within a range; the default."),
+    click.option("--range-pages", type=click.IntRange(1), help=f"Pages of a range; {RANGE_PAGES} by default."),
+)
+"""Options of operations on page ranges."""
 
 
 @bulk.command()
@@ -120,20 +123,10 @@ def evaluate(**asked: Any) -> None:
 @_options
 @click.option("--pages", type=click.IntRange(2), help=f"Known pages to use; {KNOWN_PAGES} by default, all with --deep.")
 @click.option("--deep", is_flag=True, help="Train the network on, too, from the run that the fleet names; needs torch.")
-@click.option(
-    "--steps", type=click.IntRange(10), help=f"With --deep: of the optimiser; {FineTuning().steps} by default."
-)
-@click.option(
-    "--learning-rate",
-    type=FiniteRange(0, min_open=True),
-    help=f"With --deep: at its peak; {FineTuning().learning_rate:g} by default.",
-)
-@click.option(
-    "--synthetic-pages",
-    type=click.IntRange(0),
-    help=f"With --deep: of the drifted device, trained on too; {FineTuning().synthetic_pages} by default.",
-)
-@click.option("--seed", type=click.IntRange(0), help=f"With --deep: of the training; {FineTuning().seed} by default.")
+@_tuning("steps", click.IntRange(10), "of the optimiser")
+@_tuning("learning_rate", FiniteRange(0, min_open=True), "at its peak")
+@_tuning("synthetic_pages", click.IntRange(0), "of the drifted device, trained on too")
+@_tuning("seed", click.IntRange(0), "of the training")
 def recalibrate(pages: int | None, deep: bool, fleet: Path | None, **asked: Any) -> None:
     """Recalibrate devices, each from recordings of its own; the new bundles are in OUT."""
     given = {name: value for name in FineTuning.model_fields if (value := asked.pop(name)) is not None}

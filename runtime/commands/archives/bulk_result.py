@@ -44,12 +44,8 @@ class Result:
             "part": None if self.part == WHOLE else str(self.part),
             "bundles": [bundle.model_dump(mode="json") for bundle in job.bundles],
             "this_run": {
-                "pages": made.pages,
-                "ranges": made.ranges,
-                "failed": made.failed,
-                "given_up": made.given_up,
+                **{name: getattr(made, name) for name in ("pages", "ranges", "failed", "given_up", "seconds")},
                 "problems": [str(problem) for problem in made.problems],
-                "seconds": made.seconds,
                 "pages_per_s": made.pages_per_s,
                 "worker_restarts": made.restarts,
             },
@@ -60,21 +56,21 @@ class Result:
     def table(self) -> str:
         """The figures for people."""
         made, found, part = self.made, self.found, self.part
-        tally, air = found.tally, found.figures.value(AIR)
+        air = found.figures[AIR].value
         recalibrated = self._recalibrates
         unit = "devices" if recalibrated else "pages"
         speed = "" if made.pages_per_s is None else f" in {made.seconds:.1f} s, {made.pages_per_s:.2f} a second"
-        causes = ", ".join(f"{count} {cause}" for cause, count in tally.lost.most_common())
+        causes = ", ".join(f"{count} {cause}" for cause, count in found.lost.most_common())
         rows = [
             ("part", "" if part == WHOLE else f"{part}; without --part, the same command says it of all parts"),
-            (unit, f"{len(found.devices)}" if recalibrated else f"{tally.pages} of {len(found.recordings)} recordings"),
+            (unit, f"{len(found.devices)}" if recalibrated else f"{found.pages} of {len(found.recordings)} recordings"),
             ("this run", f"{made.pages} {unit}{speed}" if made.pages or made.failed else "nothing was missing"),
-            ("recalibrated" if recalibrated else "read", f"{tally.read}"),
-            ("left out", f"{tally.left_out} that a bundle was made from" if tally.left_out else ""),
-            ("refused" if recalibrated else "lost", f"{tally.lost.total()} ({causes})" if causes else "0"),
-            ("missing", f"{tally.missing}, the next run tries them again" if tally.missing else ""),
-            ("models", ", ".join(f"{version}: {count}" for version, count in tally.models.items())),
-            ("device has changed", f"by {tally.recalibration_due} pages" if tally.recalibration_due else ""),
+            ("recalibrated" if recalibrated else "read", f"{found.read}"),
+            ("left out", f"{found.left_out} that a bundle was made from" if found.left_out else ""),
+            ("refused" if recalibrated else "lost", f"{found.lost.total()} ({causes})" if causes else "0"),
+            ("missing", f"{found.missing}, the next run tries them again" if found.missing else ""),
+            ("models", ", ".join(f"{version}: {count}" for version, count in found.models.items())),
+            ("device has changed", f"by {found.recalibration_due} pages" if found.recalibration_due else ""),
             ("AIR", "" if air is None else f"{air:.3f} bit/symbol"),
             ("workers that died", f"{made.restarts}" if made.restarts else ""),
         ]
@@ -82,8 +78,8 @@ class Result:
             gain = ""
             if each.air_before.value is not None and each.air_after.value is not None:
                 gain = f"; AIR of them {each.air_before.value:.3f} before, {each.air_after.value:.3f} now"
-            told = f"{each.pages} pages: {each.won} won, {each.better} better, {each.lost} lost still{gain}"
-            rows.append((f"again, {each.model.version}", told))
+            counts = f"{each.pages_won} won, {each.pages_better} better, {each.pages_lost_still} lost still"
+            rows.append((f"again, {each.model.version}", f"{each.pages} pages: {counts}{gain}"))
         rows += [(f"volume {f.volume.id}", f.error or f"{f.path}, {f.volume.file_bytes} bytes") for f in self.files]
         told = "\n".join(f"{name:<20} {value}" for name, value in rows if value)
         return f"{told}\n\n{_device_table(found.devices)}" if found.devices else told
@@ -95,11 +91,10 @@ class Result:
             subject: the run, for people.
         """
         made, found, files = self.made, self.found, self.files
-        tally, lost = found.tally, found.tally.lost.total()
-        told = [*map(str, made.problems), *found.lost]
+        lost, told = found.lost.total(), [*map(str, made.problems), *found.told]
         if (more := made.failed + lost - len(told)) > 0:
             told.append(f"and {more} more")
-        got, expected = f"{lost} of {tally.pages} lost and {tally.missing} missing", "pages that can be read"
+        got, expected = f"{lost} of {found.pages} lost and {found.missing} missing", "pages that can be read"
         if made.given_up:
             got += f", {made.given_up} recordings given up"
         if made.failed:

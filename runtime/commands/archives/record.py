@@ -7,7 +7,6 @@ import time
 from collections import Counter
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -21,7 +20,8 @@ from lightpage.recording.exposure import check_pair_light
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import LostShot
 from lightpage.recording.pages import Pages
-from lightpage.recording.writer import RecordingWriter, pages_there, partial_path
+from lightpage.recording.unfinished import Identity, pages_there, partial_path
+from lightpage.recording.writer import RecordingWriter
 from lightpage.runtime.device.acquisition.page_store import PageStore
 from lightpage.runtime.device.acquisition.source import FrameSource, Shot, open_source
 from lightpage.words import counted
@@ -71,14 +71,15 @@ def record(
         if symbols is not None:
             source.show_pages(PageStore(profile, Pages.open(symbols)))
         count = _count(source, pages, symbols)
-        there = pages_there(out, profile, source.levels, source.bit_depth, overwrite=force, **_shown(source))
+        identity = _identity(source, profile)
+        there = pages_there(out, identity, overwrite=force)
         _check_room(count, there)
         _tell_where(out, there)
         source.on_lost = _tell_loss
         longest_s = max(_SHOT_S, source.shot_s) if shot_seconds is None else shot_seconds
         try:
             with source:
-                _record(source, profile, count, out, longest_s, dark, force, json_path)
+                _record(source, identity, count, out, longest_s, dark, force, json_path)
         except LostShotError as error:  # of dark or reference frames
             raise LostDataError(error.subject, error.got, f"{error.expected} ({error.reason.value})") from None
 
@@ -100,10 +101,12 @@ def _count(source: FrameSource, asked: int | None, symbols: Path | None) -> int:
     return asked or there or 0
 
 
-def _shown(source: FrameSource) -> dict[str, Any]:
-    """What is known of the pages that a source shows before they are photographed, as a recording's writer takes it."""
-    pages = source.pages
-    return {"code": pages.code, "symbols": pages.__getitem__ if len(pages) else None} if pages is not None else {}
+def _identity(source: FrameSource, profile: Profile) -> Identity:
+    """What is known of the pages that a source shows before they are photographed."""
+    if (pages := source.pages) is None:
+        return Identity(profile, source.levels, source.bit_depth)
+    symbols = pages.__getitem__ if len(pages) else None
+    return Identity(profile, source.levels, source.bit_depth, pages.code, symbols)
 
 
 def _check_room(count: int, there: int) -> None:
@@ -125,7 +128,7 @@ def _tell_loss(page: int, error: LostShotError) -> None:
 
 def _record(
     source: FrameSource,
-    profile: Profile,
+    identity: Identity,
     count: int,
     out: Path,
     shot_seconds: float,
@@ -144,15 +147,17 @@ def _record(
     losses: list[LostShot] = []
     repeated = 0
     begun = time.perf_counter()
-    with RecordingWriter.resume(
+    with RecordingWriter(
         out,
-        profile,
-        source.levels,
-        source.bit_depth,
+        identity.profile,
+        identity.levels,
+        identity.bit_depth,
         references,
+        resume=True,
+        code=identity.code,
         keep_references=True,
+        symbols=identity.symbols,
         overwrite=force,
-        **_shown(source),
     ) as writer:
         _check_room(count, writer.pages)
         if dark_frames is not None:

@@ -191,7 +191,7 @@ def _sent(client: LightpageClient, file: Recording, count: int, levels: int) -> 
     own = file.pilots()
     mask = description.pilot_mask if own is None else own
     profile = parse_profile(description.profile_toml, "profile of the service")
-    file.check_against(profile)
+    file.header.check_against(profile)
     pattern = pilot_symbols(profile, file.levels)
     fixed = description.pilot_phases is not None and np.array_equal(mask, description.pilot_mask)
     for index in range(count):

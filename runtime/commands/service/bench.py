@@ -17,7 +17,7 @@ from lightpage.runtime.commands.execution import Load, decoder_options
 from lightpage.runtime.model.execution.cpus import available_cpus
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
-from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.server.server import LightpageServer
 
 LEVELS = 16
@@ -32,7 +32,7 @@ def bench(load: Load, rounds: int, json_path: Path | None) -> None:
     """Time one page three ways in turn, so that a machine whose speed drifts does not tilt the comparison."""
     decoder = load()
     pair = decoder.bundle.golden.pair
-    plane = DataPlane(ModelRegistry(decoder))
+    plane = DataPlane(Models(decoder))
     with LightpageServer(plane, Recalibrator(plane)) as server, LightpageClient(server.target) as client:
         client.describe()
         ways: dict[str, Callable[[], object]] = {

@@ -19,7 +19,7 @@ from lightpage.runtime.commands.execution import ENGINE_CACHE, THREADS
 from lightpage.runtime.commands.provider_option import PROVIDER
 from lightpage.runtime.commands.service.ending import leave_the_rest, stop_signals
 from lightpage.runtime.console.actions import Actions
-from lightpage.runtime.console.history import History
+from lightpage.runtime.console.last_pages import LastPages
 from lightpage.runtime.console.state import ConsoleState
 from lightpage.runtime.model.execution.memory import share_freed_memory
 from lightpage.runtime.model.execution.session import VERSION as RUNTIME_VERSION
@@ -121,24 +121,24 @@ def _serve(effective: Effective, wait_for_stop: Callable[[], None]) -> None:
     settings = effective.settings
     files = settings.tls.files()
     certificates = None if files is None else Certificates(files)
-    history = History()
+    last_pages = LastPages()
     with ExitStack() as stack:
-        own = stack.enter_context(assembled(settings, history))
-        plane, registry = own.plane, own.plane.registry
+        own = stack.enter_context(assembled(settings, last_pages))
+        plane, models = own.plane, own.plane.models
         actions = Actions(plane, own.recalibrator, settings.self_calibration.pages)
-        state = ConsoleState(history, registry, own.monitor, own.source_name, actions)
+        state = ConsoleState(last_pages, models, own.monitor, own.source_name, actions)
         stack.enter_context(_shown(state, plane.metrics, settings.metrics, certificates))
         endpoints = stack.enter_context(listening(settings, own, certificates))
         if endpoints.health is not None:
             click.echo(f"health checks at {endpoints.health}")
-        told = f"serving {registry.current.version} from {own.source_name} at {endpoints.target}"
+        told = f"serving {models.current.version} from {own.source_name} at {endpoints.target}"
         click.echo(told)
-        provider = registry.current.decoder.graph.provider
+        provider = models.current.decoder.graph.provider
         _log.info("%s on %s, %d settings given", told, provider, len(effective.origins), extra={"told": _versions()})
         wait_for_stop()
         with suppress(OSError):  # the terminal may have gone, and sent the signal
             click.echo("stopping")
-        _log.info("stopping with model %s", registry.current.version)
+        _log.info("stopping with model %s", models.current.version)
     _log.info("stopped")
 
 

@@ -26,13 +26,13 @@ class RecordingSource(FrameSource):
         """Guards the file and the position; held while one page is read."""
         self._next = 0
         self.name = f"recording:{path}"
-        self.profile = self._recording.own_profile()
+        self.profile = self._recording.header.own_profile()
         self.levels, self.bit_depth = self._recording.levels, self._recording.bit_depth
         self.frame_shape, self.page_shape = self._recording.frame_shape, self._recording.page_shape
 
     def check_against(self, profile: Profile) -> None:
         """Raise `RecordingError` unless the recording's shapes are those of `profile`."""
-        self._recording.check_against(profile)
+        self._recording.header.check_against(profile)
 
     def shot(self, timeout_s: float = SHOT_S, page: int | None = None) -> Shot:
         """Read page `page` of the file, or the next one.
@@ -49,7 +49,7 @@ class RecordingSource(FrameSource):
                 raise NoSuchPageError(f"page of {self.name}", page, f"0..{recording.pages - 1}")
             try:
                 pair, symbols = narrow(recording.frames(page), self.bit_depth), recording.symbols(page)
-                return Shot(pair, page, symbols, recording.pilots(), recording.frame_infos(page))
+                return Shot(pair, page, symbols, recording.pilots(), recording.cameras.frame_infos(page))
             except (RecordingError, StorageError) as error:
                 raise type(error)(f"page {page}, {error.subject}", error.got, error.expected) from None
 

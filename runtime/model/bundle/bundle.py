@@ -78,11 +78,18 @@ class Golden:
 @dataclass(frozen=True)
 class Bundle:
     """A bundle whose files match their hashes. `Decoder` checks its decoder and runs its golden page;
-    `lightpage.runtime.model.execution.twin.OnnxTwin` checks the twin, where it is needed."""
+    `lightpage.runtime.model.execution.twin.OnnxTwin` checks the twin, where it is needed.
+
+    Attributes:
+        path, manifest: of it.
+        files: contents of the others by name.
+        digest: SHA-256 of the manifest as it is written, and so of all of the bundle.
+    """
 
     path: Path
     manifest: Manifest
     files: Mapping[str, bytes]
+    digest: str
 
     @classmethod
     def open(cls, path: str | Path, key: BundleKey | None = None, signature: bytes = b"") -> Bundle:
@@ -103,7 +110,8 @@ class Bundle:
         subject = f"bundle {path}"
         if MANIFEST not in files:
             raise BundleError(subject, f"no {MANIFEST}", f"a bundle with its {MANIFEST}")
-        manifest = parse_manifest(files.pop(MANIFEST), f"{subject}: {MANIFEST}")
+        written = files.pop(MANIFEST)
+        manifest = parse_manifest(written, f"{subject}: {MANIFEST}")
         _check_listing(set(manifest.files), subject)
         for name in sorted(set(manifest.files) | set(files)):
             if name not in files:
@@ -112,7 +120,7 @@ class Bundle:
                 raise BundleError(f"{subject}: {name}", "a file that the manifest does not list", "listed files only")
             if (found := sha256(files[name])) != manifest.files[name]:
                 raise BundleError(f"{subject}: {name}", f"SHA-256 {found}", manifest.files[name])
-        return cls(path, manifest, files)
+        return cls(path, manifest, files, sha256(written))
 
     @property
     def subject(self) -> str:

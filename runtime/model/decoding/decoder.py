@@ -345,7 +345,12 @@ class BundleFieldSolver:
             raise BundleError(f"{self._subject}: outputs", f"no {', '.join(sorted(missing))}", "a graph with its field")
 
     def __call__(
-        self, pair: FramePair, references: FramePair, registration: NDArray[np.float32], homodyne: NDArray[np.float32]
+        self,
+        pair: FramePair,
+        references: FramePair,
+        registration: NDArray[np.float32],
+        homodyne: NDArray[np.float32],
+        apart: NDArray[np.float32] | None = None,
     ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
         """Field and what is left of the equations, see `FieldSolver`; whatever the page's residual is.
 
@@ -359,6 +364,8 @@ class BundleFieldSolver:
             "registration": registration,
             "homodyne": homodyne,
         }
+        if "apart" in self._graph.ports:
+            table["apart"] = _together(self._graph.value("apart")) if apart is None else apart
         self._graph.check(table)
         feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **table}
         if not self._alone:
@@ -369,3 +376,10 @@ class BundleFieldSolver:
             expected = f"{wanted}, or a {FIELD} beside it"
             raise BundleError(f"{self._subject}: output field", f"shape {real.shape}", expected)
         return np.asarray(real + 1j * imaginary, np.complex64), left
+
+
+def _together(apart: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The kernel of cameras that see the same plane, in the shape of another one."""
+    kernel = np.zeros_like(apart)
+    kernel[0, apart.shape[1] // 2] = 1
+    return kernel

@@ -34,7 +34,7 @@ class DisplayCalls:
     @rpc(Role.DECODE, is_upload=True)
     async def UploadPages(self, requests: AsyncIterator[pb.UploadPagesRequest], call: Call) -> pb.UploadPagesReply:
         """Receive pages to show."""
-        limits, shape = self._plane.limits, self._plane.registry.current.decoder.bundle.profile.page_shape
+        limits, shape = self._plane.limits, self._plane.models.current.decoder.bundle.profile.page_shape
         try:
             async with asyncio.timeout(limits.receive_s):
                 levels, symbols = await uploaded_pages(requests, shape, limits.uploaded_bytes)

@@ -227,7 +227,7 @@ class FrameCalls:
 
     def _pilots(self, header: pb.DecodeHeader) -> Pilots | None:
         """The caller's own pilots."""
-        options, decoder = header.options, self._plane.registry.current.decoder
+        options, decoder = header.options, self._plane.models.current.decoder
         levels = levels_for(decoder, options.levels or None, self._plane.default_levels, options.want_user_data)
         if not header.HasField("pilots"):
             return None

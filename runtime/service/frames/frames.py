@@ -17,9 +17,8 @@ from lightpage.runtime.client.wire.messages import PIXEL_TYPES, message_of
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.service.admission import Bytes, ReceiveBudget
 from lightpage.runtime.service.caller import Caller
-from lightpage.runtime.service.dataplane import Answer, DataPlane, levels_for
+from lightpage.runtime.service.dataplane import Answer, DataPlane, Seen, levels_for, observed
 from lightpage.runtime.service.monitoring import monitor as signs
-from lightpage.runtime.service.monitoring.observation import Seen, observed
 from lightpage.runtime.service.stages import Stage, Stages
 
 SESSION_CHARACTERS = 1024
@@ -160,7 +159,7 @@ def check_format(plane: DataPlane, shape: tuple[int, int], dtype: str, bit_depth
     # Size first: a header may claim anything, and a limit is the service's, not the camera's.
     if (size := 2 * shape[0] * shape[1] * np.dtype(dtype).itemsize) > (most := plane.limits.pair_bytes):
         raise LimitError("frame pair", f"{size} bytes", f"at most {most}")
-    bundle = plane.registry.current.decoder.bundle
+    bundle = plane.models.current.decoder.bundle
     expected = (bundle.profile.frame_shape, bundle.manifest.frame_dtype, bundle.manifest.camera_bit_depth)
     if (shape, dtype, bit_depth) != expected:
         raise FrameError(
@@ -206,7 +205,7 @@ def decode(
     with plane.decodes.held(caller):
         began = time.perf_counter()
         # Taken once: a swap in the meantime changes the next request, not this one.
-        model = plane.registry.expect(version)
+        model = plane.models.expect(version)
         sure = pilots is None
         levels = levels_for(model.decoder, levels, plane.default_levels, user_data)
         if user_data:

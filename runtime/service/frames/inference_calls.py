@@ -92,7 +92,7 @@ def model_inputs(bundle: Bundle) -> dict[str, Tensor]:
 
 def large_messages(plane: DataPlane) -> dict[str, int]:
     """Bytes of the largest ModelInfer that makes sense, by its full name: a pair of the device, and pilots."""
-    bundle = plane.registry.current.decoder.bundle
+    bundle = plane.models.current.decoder.bundle
     pixels, symbols = (int(np.prod(shape)) for shape in (bundle.profile.frame_shape, bundle.profile.page_shape))
     size = 2 * pixels * np.dtype(bundle.manifest.frame_dtype).itemsize + 2 * symbols + _BESIDE
     return {f"/{INFERENCE.full_name}/ModelInfer": min(max(size, _most_beside(plane)), _MOST_BYTES)}
@@ -100,7 +100,7 @@ def large_messages(plane: DataPlane) -> dict[str, int]:
 
 def _most_beside(plane: DataPlane) -> int:
     """Bytes that a ModelInfer may have beside raw contents: typed ones, as far as they make sense."""
-    bundle = plane.registry.current.decoder.bundle
+    bundle = plane.models.current.decoder.bundle
     pixels, symbols = (int(np.prod(shape)) for shape in (bundle.profile.frame_shape, bundle.profile.page_shape))
     size = 2 * pixels * _WIDEST[bundle.manifest.frame_dtype] + 4 * symbols + _BESIDE
     return max(min(size, _TYPED_BYTES), plane.limits.message_bytes)
@@ -130,7 +130,7 @@ class InferenceCalls:
     @rpc(Role.READ)
     async def ModelReady(self, request: oip.ModelReadyRequest, call: Call) -> oip.ModelReadyResponse:
         """Whether a version is in service."""
-        current = self._plane.registry.current.version
+        current = self._plane.models.current.version
         ready = self._ready and request.name == MODEL and request.version in ("", current)
         return oip.ModelReadyResponse(ready=ready)
 
@@ -143,7 +143,7 @@ class InferenceCalls:
     def ModelMetadata(self, request: oip.ModelMetadataRequest, call: Call) -> oip.ModelMetadataResponse:
         """The model's tensors and versions."""
         self._check_known(request.name, request.version)
-        decoder = self._plane.registry.current.decoder
+        decoder = self._plane.models.current.decoder
         bundle, tensor = decoder.bundle, oip.ModelMetadataResponse.TensorMetadata
         inputs, page = model_inputs(bundle), bundle.profile.page_shape
         optional = [f"{name} {known}" for name, known in inputs.items() if known.optional]
@@ -191,7 +191,7 @@ class InferenceCalls:
         """Check that there is a model, and a version of it; an empty one stands for that in service."""
         if name != MODEL:
             raise NoSuchModelError("model name", repr(name), MODEL)
-        if version not in ("", self._plane.registry.current.version) and version not in (known := self._versions()):
+        if version not in ("", self._plane.models.current.version) and version not in (known := self._versions()):
             raise NoSuchModelError("model version", repr(version), f"one of {', '.join(known)}, or none")
 
     def _infer(self, sent: _Sent, call: Call, stages: Stages) -> oip.ModelInferResponse:
@@ -207,8 +207,8 @@ class InferenceCalls:
     ) -> tuple[list[str], pb.DecodeHeader, FramePair]:
         """Names of the outputs, and the pair with a header as DecodeFrames has it."""
         self._check_known(request.model_name, request.model_version)
-        self._plane.registry.expect(request.model_version)
-        bundle = self._plane.registry.current.decoder.bundle
+        self._plane.models.expect(request.model_version)
+        bundle = self._plane.models.current.decoder.bundle
         depth, dtype = bundle.manifest.camera_bit_depth, bundle.manifest.frame_dtype
         rows, columns = bundle.profile.frame_shape
         names = list(outputs_of(request, [*OUTPUTS, USER_DATA], list(OUTPUTS)))

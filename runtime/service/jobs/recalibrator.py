@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import queue
-import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -25,10 +24,8 @@ from lightpage.errors import (
     RecordingError,
     SourceError,
     StoppingError,
-    StoreError,
     let_go,
 )
-from lightpage.failures import os_failure
 from lightpage.progress import Progress
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.evaluation import check_recording
@@ -49,16 +46,12 @@ from lightpage.runtime.service.caller import NOBODY, Actor, Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.jobs import Jobs, RunningJob
 from lightpage.runtime.service.limits import GRACE_S
-from lightpage.runtime.service.models.registry import Model
-from lightpage.runtime.service.models.store import ModelStore
+from lightpage.runtime.service.models.loader import Model
 
 _log = logging.getLogger(__name__)
 
 _POLL_S = 0.25
 """How often a silent recalibration looks whether its caller is still there."""
-
-
-_ROOM = "a service started with --store FOLDER, or a temporary folder that can be written: TMPDIR, or --tmpfs /tmp"
 
 
 @dataclass(frozen=True)
@@ -107,17 +100,13 @@ class Recalibrator:
         recordings: folder whose recordings a caller may name, or None for none.
 
     Attributes:
-        jobs: that run or have ended; kept in the store's folder where there is a store.
+        jobs: that run or have ended.
     """
 
     def __init__(self, plane: DataPlane, fit: Refit | None = None, recordings: Path | None = None) -> None:
         self._plane, self._fit, self._recordings = plane, fit, recordings
-        folder = None if plane.store is None else plane.store.folder
-        self.jobs = Jobs(folder, plane.limits.jobs_kept, plane.registry.current.version)
+        self.jobs = Jobs(plane.models.store, plane.limits.jobs_kept)
         self._stop = threading.Event()
-        self._making = threading.Lock()
-        """Held while the folder below is looked for and made."""
-        self._temporary: tempfile.TemporaryDirectory[str] | None = None
 
     def source_pages(self, count: int, pages: Sequence[int] = ()) -> PagesToUse:
         """`pages` of the source, or its next `count`.
@@ -150,7 +139,7 @@ class Recalibrator:
             with own_fault():
                 opened = Recording.open(path)
             with opened as recording:
-                check_recording(self._plane.registry.current.decoder, recording)
+                check_recording(self._plane.models.current.decoder, recording)
                 if recording.pages < count:
                     raise RecordingError(f"recording {name}", f"{recording.pages} pages", f"at least {count}")
                 self.check_count(count or recording.pages)
@@ -171,7 +160,7 @@ class Recalibrator:
             FrameError: a bad frame, or too few pages with light.
             PageError: symbols of the wrong shape or range.
         """
-        decoder = self._plane.registry.current.decoder
+        decoder = self._plane.models.current.decoder
         lit = pages.lit(decoder.bundle.manifest.camera_bit_depth)
         lit.check(decoder)
         return PagesToUse("frames", lambda heard, caller: lit, own=False, release=release)
@@ -220,20 +209,17 @@ class Recalibrator:
         """See whether a job may begin now; raises as `start` would, and `StoreError` without a folder for it."""
         self._check_serving()
         self.jobs.check_free()
-        _check_version(self._plane.registry.current, expected_version)
-        self._store()
+        _check_version(self._plane.models.current, expected_version)
+        _ = self._plane.models.store.folder.path  # it is there
 
     def close(self, wait_s: float = GRACE_S) -> None:
-        """Stop a running recalibration at its next step, which is waited for at most `wait_s`; drop temporary bundles.
+        """Stop a running recalibration at its next step, which is waited for at most `wait_s`.
 
-        One that takes longer changes nothing any more; its temporary bundles are dropped when the process ends.
+        One that takes longer changes nothing any more.
         """
         self._stop.set()
         if not self.jobs.wait_idle(wait_s):
             _log.warning("recalibration: not stopped after %.1f s, left to itself", wait_s)
-        elif self._temporary is not None:
-            self._temporary.cleanup()
-            self._temporary = None
 
     def _check_serving(self) -> None:
         if self._stop.is_set():
@@ -271,7 +257,7 @@ class Recalibrator:
 
         def progress(name: str, fraction: float) -> None:
             check()
-            self.jobs.tell(name, fraction)
+            self.jobs.tell(running, name, fraction)
             tell(Step(name, fraction))
 
         share, read = reading_share(pages.count), counting()
@@ -282,12 +268,11 @@ class Recalibrator:
         def working(name: str, fraction: float) -> None:
             progress(name, share + (1 - share) * fraction)
 
-        actor = running.caller.actor
         end: RecalibrationOutcome | BaseException
         try:
             heard()
-            self._plane.models.check_store()
-            end = self._work(pages, pages.read(heard, running.caller), working, check, expected_version, actor)
+            self._plane.models.store.check()
+            end = self._work(running, pages, pages.read(heard, running.caller), working, check, expected_version)
         except CallerLeft as left:  # whoever waits for a slot knows no more than that
             end = _cause(check, left)
         except BaseException as error:
@@ -304,58 +289,36 @@ class Recalibrator:
 
     def _work(
         self,
+        running: RunningJob,
         task: PagesToUse,
         pages: KnownPages,
         progress: Progress,
         check: Callable[[], None],
         expected_version: str,
-        actor: Actor,
     ) -> RecalibrationOutcome:
-        plane = self._plane
-        model = plane.registry.current
+        models = self._plane.models
+        model, folder = models.current, models.store.folder
         _check_version(model, expected_version)  # it may have changed while pages were read
         with own_fault() if task.own else nullcontext():
             pages = pages.lit(model.decoder.bundle.manifest.camera_bit_depth)
             pages.check(model.decoder)
-        store = self._store()
-        version = next_version(model.version, [*plane.models.versions(), *store.versions()])
-        path = store.path_of(version)
+        version = next_version(model.version, models.versions())
+        path = folder.bundle(version)
         # Judged against what is in service now: the model with what its tracker has learnt.
         if self._fit is None:
-            limit_s = plane.limits.recalibration_s
+            limit_s = self._plane.limits.recalibration_s
             outcome = recalibrate_apart(model.decoder, model.tracker, pages, path, version, progress, check, limit_s)
         else:
             outcome = recalibrate(model.decoder, pages, path, version, self._fit, progress, model.tracker)
         try:
             progress("put the new model in service", 1.0)
-            self.jobs.foretell(outcome)
             decoder = model.decoder.of_another(Bundle.open(path))
-            plane.models.adopt(decoder, expected=model, actor=actor)
+            models.adopt(decoder, model, running.caller.actor, self.jobs.done(running, outcome))
         except BaseException:
             path.unlink(missing_ok=True)
             raise
-        plane.models.prune(store)
+        models.prune()
         return outcome
-
-    def _store(self) -> ModelStore:
-        """The service's store; without one, a temporary folder that keeps no more than the models held.
-
-        Raises:
-            StoreError: there is no folder that can be written.
-            StorageError, SurroundingsError: the disk fails, or has no room.
-        """
-        if self._plane.store is not None:
-            return self._plane.store
-        with self._making:
-            if self._temporary is None:
-                try:
-                    self._temporary = tempfile.TemporaryDirectory(prefix="lightpage-models-")
-                except OSError as error:
-                    subject = "temporary folder of recalibrated models"
-                    if isinstance(error, FileNotFoundError):
-                        raise StoreError(subject, error, _ROOM) from None
-                    raise os_failure(subject, error, _ROOM, StoreError) from None
-        return ModelStore(Path(self._temporary.name), self._plane.registry.current.decoder.bundle, kept=0)
 
     def _count(self, result: RecalibrationOutcome | BaseException) -> None:
         if isinstance(result, RecalibrationOutcome):

@@ -136,7 +136,8 @@ class SelfCalibration:
 
     def _try_once(self) -> None:
         """Recalibrate, and decide when the next time may be; not while the model in service is pinned."""
-        if self._plane.models.current_pinned:
+        now = self._plane.models.now
+        if now.state.known(now.current.version).pinned:
             if not self._pinned:
                 _log.info("self-calibration: put off, since the model in service is pinned")
             self._pinned = True

@@ -41,7 +41,7 @@ class SentPages:
 
     def __init__(self, header: pb.RecalibrateFramesHeader, plane: DataPlane) -> None:
         self._header, self._limits, self._budget = header, plane.limits, plane.received
-        self._page_shape = plane.registry.current.decoder.bundle.profile.page_shape
+        self._page_shape = plane.models.current.decoder.bundle.profile.page_shape
         self._shape, self._dtype = (header.rows_px, header.columns_px), pixel_type(header.pixel_type)
         check_format(plane, self._shape, self._dtype, header.bit_depth)
         check_black(header)

@@ -12,9 +12,11 @@ from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import BusyError, CallerLeft, LightpageError, StoreError
 from lightpage.runtime.client.wire.messages import CHUNK_BYTES
 from lightpage.runtime.model.bundle.signature_file import read_signature, signature_path
+from lightpage.runtime.service.admission import Slots
 from lightpage.runtime.service.caller import Actor, Caller
 from lightpage.runtime.service.limits import GRACE_S
 from lightpage.runtime.service.models.models import Models
+from lightpage.runtime.service.models.uploads import Upload
 
 _log = logging.getLogger(__name__)
 
@@ -33,16 +35,27 @@ class Incoming:
 
     Args:
         models: of a service that has a store.
+        most_bytes: of a bundle.
+        uploads: the slot for one.
         folder: is looked at for files that end in .zip.
         look_s: how often.
         clock: by which it waits between two looks.
     """
 
-    def __init__(self, models: Models, folder: Path, look_s: float = LOOK_S, clock: Clock = SYSTEM) -> None:
-        self._models, self._folder, self._look_s, self._clock = models, folder, look_s, clock
+    def __init__(
+        self,
+        models: Models,
+        most_bytes: int,
+        uploads: Slots,
+        folder: Path,
+        look_s: float = LOOK_S,
+        clock: Clock = SYSTEM,
+    ) -> None:
+        self._models, self._most_bytes, self._uploads = models, most_bytes, uploads
+        self._folder, self._look_s, self._clock = folder, look_s, clock
         self._seen: dict[Path, _Stamp] = {}
-        self._refused: dict[Path, _Stamp] = {}
-        self._put_off: dict[Path, _Stamp] = {}
+        self._told: dict[Path, tuple[_Stamp, bool]] = {}
+        """What was said to fail, and whether it is tried again."""
         self._caller, self._stopping = Caller(actor=Actor("incoming folder")), threading.Event()
         self._thread = threading.Thread(target=self._run, name="lightpage-incoming", daemon=True)
 
@@ -59,12 +72,10 @@ class Incoming:
         """Take in what is new and whole."""
         seen = {path: stamp for path in sorted(self._folder.glob("[!.]*.zip")) if (stamp := _stamp(path)) is not None}
         for path, stamp in seen.items():
-            if self._seen.get(path) == stamp and self._refused.get(path) != stamp:
+            if self._seen.get(path) == stamp and self._told.get(path) != (stamp, False):
                 self._take(path, stamp)
         self._seen = seen
-        for told in (self._refused, self._put_off):
-            for path in told.keys() - seen.keys():
-                del told[path]
+        self._told = {path: told for path, told in self._told.items() if path in seen}
 
     def _run(self) -> None:
         while not self._clock.wait(self._stopping, self._look_s):
@@ -78,21 +89,20 @@ class Incoming:
     def _take(self, path: Path, stamp: _Stamp) -> None:
         try:
             version = self._take_in(path)
-        except (StoreError, BusyError) as error:
-            if self._put_off.get(path) != stamp:
-                _log.warning("incoming: %s is left for later: %s", path.name, error)
-            self._put_off[path] = stamp
         except (LightpageError, OSError) as error:
-            self._refused[path] = stamp
-            _log.warning("incoming: %s is refused: %s", path.name, error)
+            told = stamp, isinstance(error, StoreError | BusyError)
+            if self._told.get(path) != told:
+                how = "left for later" if told[1] else "refused"
+                _log.warning("incoming: %s is %s: %s", path.name, how, error)
+            self._told[path] = told
         else:
             _log.info("incoming: %s is in the store as %s", path.name, version)
 
     def _take_in(self, path: Path) -> str:
         """Move a bundle to the store; returns its version."""
-        with path.open("rb") as file, self._models.uploads.held_at_once():
+        with path.open("rb") as file, self._uploads.held_at_once():
             size, signature = os.fstat(file.fileno()).st_size, read_signature(path)
-            upload = self._models.upload(size, b"", self._caller, signature)
+            upload = Upload(self._models, self._most_bytes, self._caller, size, signature=signature)
             try:
                 upload.begin()
                 while chunk := file.read(CHUNK_BYTES):

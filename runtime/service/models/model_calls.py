@@ -9,8 +9,11 @@ from functools import partial
 from lightpage.errors import MalformedError, StalledError
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import message_of
+from lightpage.runtime.service.admission import Slots
 from lightpage.runtime.service.caller import Call, Role
-from lightpage.runtime.service.models.models import ModelEntry, Models, Upload
+from lightpage.runtime.service.limits import Limits
+from lightpage.runtime.service.models.models import ModelEntry, Models
+from lightpage.runtime.service.models.uploads import Upload
 from lightpage.runtime.service.rpc import rpc
 
 
@@ -19,10 +22,12 @@ class ModelCalls:
 
     Args:
         models: of the service.
+        limits: of uploads.
+        uploads: the slot for one.
     """
 
-    def __init__(self, models: Models) -> None:
-        self._models = models
+    def __init__(self, models: Models, limits: Limits, uploads: Slots) -> None:
+        self._models, self._limits, self._uploads = models, limits, uploads
 
     @rpc(Role.READ)
     def ListModels(self, request: pb.ListModelsRequest, call: Call) -> pb.ListModelsReply:
@@ -58,11 +63,12 @@ class ModelCalls:
         first = await anext(requests, None)
         if first is None or first.WhichOneof("part") != "header":
             raise MalformedError("first message of UploadModel", "no header", "a header, then chunks")
-        header, limit_s = first.header, self._models.limits.model_s
+        header, limit_s = first.header, self._limits.model_s
         call.correlation_id = header.correlation_id or call.correlation_id
         call.caller.actor = call.actor
-        with self._models.uploads.held_at_once():
-            upload = self._models.upload(header.bytes, header.sha256, call.caller, header.signature)
+        with self._uploads.held_at_once():
+            given = (header.bytes, header.sha256, header.signature)
+            upload = Upload(self._models, self._limits.model_bytes, call.caller, *given)
             try:
                 async with asyncio.timeout(limit_s):
                     await self._receive(upload, requests, call)

@@ -1,376 +1,242 @@
-"""The folder in which a service keeps its bundles, and remembers across restarts which of them it used."""
+"""What a service remembers across restarts, in a folder with its bundles, and how the disk of the folder is."""
 
 from __future__ import annotations
 
 import errno
-import fcntl
-import json
 import logging
-import os
-import shutil
+import sqlite3
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
-from enum import StrEnum
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from lightpage.errors import BundleError, LightpageError, StoreError
-from lightpage.files import new_file, replace_text, synchronise
 from lightpage.runtime.model.bundle.bundle import Bundle
-from lightpage.runtime.model.bundle.manifest import sha256
-from lightpage.runtime.model.bundle.signature_file import signature_path
+from lightpage.runtime.service.models.database import Contents, Database, Write, write_state
+from lightpage.runtime.service.models.earlier_store import CURRENT, read_earlier
+from lightpage.runtime.service.models.folder import BundleFolder
+from lightpage.runtime.service.models.history import History, State
+from lightpage.runtime.service.models.store_health import Reason, StoreHealth, Trouble
 
 _log = logging.getLogger(__name__)
 
-CURRENT = "current.json"
-
-DAMAGED = "current.damaged.json"
-"""Where a note that cannot be read is kept when a change writes a new one: somebody may read more in it."""
-
-LOCK = ".lock"
-
-UPLOAD = ".upload-"
-"""How the name of an unfinished upload begins."""
-
-PROBE = ".probe-"
-"""How the name of a file begins that tries whether the store can be written."""
-
-_LEFTOVERS = (f"{UPLOAD}*", f"{PROBE}*", f".{CURRENT}-*", ".*.zip-*")
-"""Names of what a program that was killed leaves here."""
-
 KEPT_BUNDLES = 32
 """Bundles kept: a device that recalibrates itself for years shall not fill its disk, yet leave a trail to follow."""
-
 PROBE_S = 30.0
 """Time after which it is tried again whether the store can be written, when somebody asks."""
 
 
-class Origin(StrEnum):
-    """Where a bundle came from."""
+class Store(AbstractContextManager["Store"]):
+    """Bundles descended from one base bundle, and what is remembered of them; to be closed at the end.
 
-    GIVEN = "given"
-    RECALIBRATED = "recalibrated"
-    UPLOADED = "uploaded"
-
-
-class Reason(StrEnum):
-    """What is wrong with a store."""
-
-    NOTE = "note"
-    """Its note is damaged or gone, so that it is not known what was in service."""
-    BUNDLE = "bundle"
-    """The bundle that was in service is damaged or gone."""
-    FULL = "full"
-    READ_ONLY = "read_only"
-    GONE = "gone"
-    HUNG = "hung"
-    """The disk does not answer."""
-    FAILED = "failed"
-    """The disk fails in another way."""
-
-
-@dataclass(frozen=True)
-class Trouble:
-    """What is wrong with a store, and the same for people."""
-
-    reason: Reason
-    text: str
-
-
-@dataclass(frozen=True)
-class Note:
-    """What a store remembers.
-
-    Attributes:
-        history: names of bundles in the order in which they came into service, None for the base.
-        cursor: index of the one in service.
-        pinned: versions that are never deleted.
-        origins: of bundles by version, where they are known.
-        keys: fingerprints by version of the bundle keys that recalibrations were made under.
-    """
-
-    history: tuple[str | None, ...] = (None,)
-    cursor: int = 0
-    pinned: frozenset[str] = frozenset()
-    origins: Mapping[str, Origin] = field(default_factory=dict)
-    keys: Mapping[str, str] = field(default_factory=dict)
-
-
-class ModelStore:
-    """A folder of bundles descended from one base bundle.
+    Without a folder nothing outlives the service. Methods may be called from many threads.
 
     Args:
-        folder: made if absent.
+        folder: one service at a time uses it; None for none.
         base: the bundle that the operator gave; another base has its own history.
-        kept: how many of the newest bundles `prune` leaves.
+        kept: how many of the newest bundles stay.
         clock: by which it is tried again now and then.
 
     Attributes:
-        note: as it was read or written last.
+        folder: of the bundles.
+        kept: as above; without a folder none but those that are held.
+        changing: held while models, jobs or the record of changes are changed: one change at a time.
+        contents: of the database at the start.
+        room_bytes: that a store which is well has for more.
+        health: tells how it is without waiting for its disk.
 
     Raises:
-        StoreError: the folder cannot be made.
+        StoreError: the folder cannot be made, or another program uses it.
     """
 
     def __init__(
-        self, folder: Path, base: Bundle, kept: int = KEPT_BUNDLES, clock: Callable[[], float] = time.monotonic
+        self, folder: Path | None, base: Bundle, kept: int = KEPT_BUNDLES, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self.folder, self._kept, self._clock = folder, kept, clock
-        self._base = sha256(base.manifest.to_json())
-        self._lock_file: int | None = None
-        self._writing = threading.Lock()
-        self._guard = threading.Lock()
-        """Guards what is known of the store's state."""
+        self.changing, self.kept, self._clock = threading.RLock(), 0 if folder is None else kept, clock
+        self.room_bytes, self.health = 0, StoreHealth(self.trouble)
+        self._base = base.digest
+        self._is_begun = False
+        """Whether there is a database to write to."""
+        self._refused: tuple[str, str] | None = None
+        """What came and what is wanted, for the error of whoever writes; None where that may be."""
         self._damage: Trouble | None = None
         self._failure: Trouble | None = None
         self._probed = -float("inf")
+        self.contents = Contents(self._base, State(History((base.version,))))
+        self.folder = BundleFolder(folder)
+        self._database = Database(folder, self.folder.has_locks)
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise StoreError(self._subject, error, "a folder that can be written") from None
-        try:
-            self.note = self.read()
-        except BundleError as error:
-            self.note = Note()
-            self.damaged(Reason.NOTE, error)
+            self._resume()
+            self.folder.sweep(self.contents.state.bundles, is_sure=self._is_begun)
+        except BaseException:
+            self.close()
+            raise
 
-    @property
-    def _subject(self) -> str:
-        return f"model store {self.folder}"
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
-    def path_of(self, version: str) -> Path:
-        """Where the bundle of this version is or will be."""
-        return self.folder / f"{version}.zip"
+    def close(self) -> None:
+        """Let go of the folder, and wait for no disk; whoever changes something later hears that it is closed."""
+        self._refused = "a store that is closed", "one in use"
+        self.folder.close()
 
-    def versions(self) -> list[str]:
-        """Versions that exist here."""
-        return sorted(path.name.removesuffix(".zip") for path in self._bundles())
+    def save(self, state: State, *more: Write, settles: bool = False) -> None:
+        """Write the state of the models, and more with it, in one transaction.
 
-    def origin(self, version: str) -> Origin | None:
-        """Where the bundle of this version came from, None where that is not known."""
-        known = self.note.origins.get(version)
-        return known or (Origin.RECALIBRATED if "+r" in version else None)
+        While something is lost that was in service, its history stays, or that it is lost, until a state `settles`
+        that.
+
+        Raises:
+            StoreError: it cannot be written; then all stays as it was.
+        """
+        with self.changing:
+            damage = None if settles else self._damage
+            lost = "" if damage is None else self.contents.lost
+            if damage is not None:
+                state = replace(state, history=self.contents.state.history)
+            with self.transaction(begins=True) as database:
+                write_state(database, self._base, state, lost)
+                for write in more:
+                    write(database)
+            self._damage = damage
 
     @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Keep other services out of the store, and sweep it first.
+    def transaction(self, begins: bool = False) -> Iterator[sqlite3.Connection]:
+        """Yield the database, which holds all that is written to it at the end, or nothing of it.
+
+        Args:
+            begins: whether a new database may take the place of one that is damaged or gone.
 
         Raises:
-            StoreError: another service uses it.
+            StoreError: it cannot be written; then all stays as it was.
         """
-        self._lock_file = self._open_lock()
-        try:
-            if self._lock_file is not None:
-                try:
-                    fcntl.flock(self._lock_file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError:
-                    got, expected = "a store in use", "one that no other service uses"
-                    raise StoreError(self._subject, got, expected) from None
-                except OSError as error:
-                    _log.warning("%s: cannot be locked: %s", self._subject, error)
-            self.sweep()
-            yield
-        finally:
-            if self._lock_file is not None:
-                os.close(self._lock_file)
-                self._lock_file = None
-
-    def sweep(self) -> None:
-        """Remove what programs that were killed have left: unfinished bundles and uploads."""
-        for pattern in _LEFTOVERS:
-            for path in self.folder.glob(pattern):
-                try:
-                    shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
-                except OSError as error:
-                    _log.warning("%s: %s stays: %s", self._subject, path.name, error)
-                else:
-                    _log.info("%s: removed %s, which was left unfinished", self._subject, path.name)
-
-    def surplus(self, held: Collection[Path]) -> list[Path]:
-        """Bundles that `prune` would delete."""
-        own = [path for path in self._bundles() if self.origin(path.name.removesuffix(".zip")) is not None]
-        newest_first = sorted(own, key=lambda path: path.stat().st_mtime_ns, reverse=True)
-        return [path for path in newest_first[self._kept :] if path not in held]
-
-    def prune(self, held: Collection[Path]) -> list[Path]:
-        """Delete all but the newest bundles and those `held`; returns what was deleted."""
-        dropped = self.surplus(held)
-        for path in dropped:
-            path.unlink(missing_ok=True)
-            signature_path(path).unlink(missing_ok=True)
-        return dropped
-
-    def change(self, **changes: Any) -> None:
-        """Change fields of the note and write it; a crash or power cut leaves one note, whole.
-
-        Raises:
-            StoreError: it cannot be written; then it stays as it was.
-        """
-        with self._writing:
-            note = replace(self.note, **changes)
-            data: dict[str, Any] = {
-                "base": self._base,
-                "history": note.history,
-                "cursor": note.cursor,
-                "pinned": sorted(note.pinned),
-                "origins": dict(sorted(note.origins.items())),
-            }
-            if note.keys:
-                data["keys"] = dict(sorted(note.keys.items()))
+        with self.changing:
+            refused = self._refused
+            if self.contents.lost and not self._is_begun and not begins:
+                refused = "no database", "one, which a change of models begins"
+            if refused is not None:
+                raise StoreError(self.folder.subject, *refused)
             try:
-                self._check_folder()
-                self._keep_damaged()
-                replace_text(self.folder / CURRENT, json.dumps(data))
-            except OSError as error:
+                self.folder.check()
+                with self._database.transaction(None if self._is_begun else self.contents) as database:
+                    yield database
+            except (OSError, sqlite3.Error) as error:
                 raise self.failed(error) from None
-            except LightpageError as error:
-                cause = error.__context__  # what the system said
-                raise self.failed(cause if isinstance(cause, OSError) else OSError(error.got)) from None
-            self.note = note
-        with self._guard:
-            self._failure = None
+            self._is_begun, self._failure = True, None
 
-    def _keep_damaged(self) -> None:
-        """Set a damaged note aside, before a new one takes its place."""
-        with self._guard:
-            damaged = self._damage is not None and self._damage.reason is Reason.NOTE
-        if damaged and self.has_note:
-            os.replace(self.folder / CURRENT, self.folder / DAMAGED)
-            _log.warning("%s: a new note is written; the damaged one is %s now", self._subject, DAMAGED)
+    def _resume(self) -> None:
+        """Go on with what is remembered; where there is no database, begin one with it."""
+        try:
+            found = self._found()
+        except (OSError, sqlite3.Error) as error:
+            if getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_BUSY:
+                raise StoreError(self.folder.subject, error, "one that no other program uses") from None
+            # What it remembers is not written over.
+            self._refused = self.failed(error).got, "a database that can be read, at a start of the service"
+            self._damage = self._failure
+            return
+        if found.base != self._base:
+            served, base = found.state.history.current, self.contents.state.history.current
+            _log.warning("%s: %s served, made from another base; %s begins anew", self.folder.subject, served, base)
+            found = replace(found, state=replace(found.state, history=self.contents.state.history))
+        self.contents = found
+        if found.lost:
+            self._damage = Trouble(Reason.NOTE, found.lost)
+            _log.warning("serving the base: %s", found.lost)
+        elif not self._is_begun:
+            with suppress(StoreError), self.transaction():  # else it is logged, the store's trouble, and tried again
+                pass
 
-    @property
-    def has_note(self) -> bool:
-        """Whether there is a note, whole or not."""
-        return (self.folder / CURRENT).exists()
-
-    def read(self) -> Note:
-        """The note, without a history where there is none or another base's.
+    def _found(self) -> Contents:
+        """Return what is remembered.
 
         Raises:
-            BundleError: it is damaged, or gone while there are bundles that a service made.
+            OSError, sqlite3.Error: it cannot be read.
         """
-        subject = f"{self._subject}: {CURRENT}"
-        try:
-            data = json.loads((self.folder / CURRENT).read_text("utf-8"))
-            base, history, cursor = data["base"], tuple(data["history"]), int(data["cursor"])
-            pinned = frozenset(map(str, data["pinned"]))
-            origins = {version: Origin(origin) for version, origin in data["origins"].items()}
-            keys = {version: str(key) for version, key in data.get("keys", {}).items()}
-        except FileNotFoundError:
-            if made := [version for version in self.versions() if "+r" in version]:
-                raise BundleError(subject, "no such file", f"a note: there is {', '.join(made)}") from None
-            return Note()
-        except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
-            raise BundleError(subject, repr(error), "a note that can be read") from None
-        if base != self._base:
-            return Note(pinned=pinned, origins=origins, keys=keys)
-        if not 0 <= cursor < len(history):
-            raise BundleError(subject, f"bundle {cursor} of {len(history)} in service", "one of them")
-        for each in history:
-            if each is not None and not (isinstance(each, str) and Path(each).name == each and each.endswith(".zip")):
-                raise BundleError(subject, repr(each), "the name of a bundle")
-        return Note(history, cursor, pinned, origins, keys)
+        if not self.folder.is_kept:
+            return self.contents
+        if self._database.exists:
+            try:
+                found = self._database.read()
+            except BundleError as error:
+                return replace(self.contents, lost=str(error))
+            self._is_begun = True
+            return found
+        found = read_earlier(self.folder.path, self.contents)
+        made = [version for version in self.folder.versions() if "+r" in version]
+        if made and not found.lost and self.folder.path / CURRENT not in found.sources:
+            expected = f"a database: there is {', '.join(made)}"
+            return replace(found, lost=str(BundleError(str(self._database.path), "no such file", expected)))
+        return found
+
+    # ---- how it is -------------------------------------------------------------------------------------------------
 
     def damaged(self, reason: Reason, error: LightpageError) -> None:
-        """Say that the note or the bundle that was in service is lost; so it stays until `settled`."""
-        with self._guard:
-            self._damage = Trouble(reason, str(error))
-
-    def settled(self) -> None:
-        """Say that what is in service was changed and noted: what was lost counts no more."""
-        with self._guard:
-            self._damage = None
+        """Say that what was in service is lost; so it stays until a state that is saved settles it."""
+        self._damage = Trouble(reason, str(error))
 
     @property
     def is_damaged(self) -> bool:
         """Whether it is not as it was left, and nobody has settled yet what is to be in service."""
-        with self._guard:
-            return self._damage is not None
+        return self._damage is not None
 
-    def check(self, needed_bytes: int) -> None:
-        """Try whether the store can be written and has room.
+    def check(self, needed_bytes: int = 0) -> None:
+        """Try whether the store can be written and has room: `room_bytes`, or what is needed if that is more.
 
         Raises:
             StoreError: it cannot, or has not.
         """
-        with self._guard:
-            self._probed = self._clock()
+        if self._refused is not None:
+            raise StoreError(self.folder.subject, *self._refused)
+        if not self.folder.is_kept:
+            return
+        self._probed = self._clock()
         try:
-            self._probe(needed_bytes)
+            self.folder.probe(max(self.room_bytes, needed_bytes))
         except OSError as error:
             raise self.failed(error) from None
-        with self._guard:
-            self._failure = None
+        self._failure = None
 
-    def failed(self, error: OSError) -> StoreError:
+    def failed(self, error: OSError | sqlite3.Error) -> StoreError:
         """Remember that the store cannot be written; returns the error that says so."""
-        told = StoreError(self._subject, error, "a folder that can be written and has room")
-        reason = _REASONS.get(error.errno or 0, Reason.FAILED)
-        with self._guard:
-            is_new = self._failure is None
-            self._failure = Trouble(reason, str(told))
-        if is_new:
+        if isinstance(error, sqlite3.Error):
+            error = self._told_by_the_system(error)
+        told = StoreError(self.folder.subject, error, "a folder that can be written and has room")
+        if self._failure is None:
             _log.warning("%s", told)
+        self._failure = Trouble(_REASONS.get(error.errno or 0, Reason.FAILED), str(told))
         return told
 
-    def trouble(self, needed_bytes: int) -> Trouble | None:
+    def _told_by_the_system(self, error: sqlite3.Error) -> OSError:
+        """Why the database cannot be written: the system says it, which SQLite keeps to itself."""
+        try:
+            self.folder.probe()
+        except OSError as told:
+            return told
+        return OSError(_NUMBERS.get(getattr(error, "sqlite_errorcode", 0) & 0xFF, errno.EIO), str(error))
+
+    def trouble(self) -> Trouble | None:
         """What is wrong with the store, None where nothing is; it is tried again where that was long ago."""
         if self._clock() - self._probed >= PROBE_S:
             with suppress(StoreError):
-                self.check(needed_bytes)
+                self.check()
         return self.known_trouble()
 
     def known_trouble(self) -> Trouble | None:
         """What was wrong with the store when it was tried last; its disk is left alone."""
-        with self._guard:
-            return self._failure or self._damage
-
-    def _bundles(self) -> list[Path]:
-        return [path for path in self.folder.glob("*.zip") if not path.name.startswith(".")]
-
-    def _open_lock(self) -> int | None:
-        """The lock file; None, with a warning, where a store cannot be written and has none."""
-        path = self.folder / LOCK
-        try:
-            return os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-        except OSError as error:
-            with suppress(OSError):
-                return os.open(path, os.O_RDONLY)
-            _log.warning("%s: cannot be locked: %s", self._subject, error)
-            return None
-
-    def _check_folder(self) -> None:
-        """Check that the folder is the one that was locked: under a disk that is gone there may be an empty one."""
-        if self._lock_file is not None:
-            here, own = os.stat(self.folder / LOCK), os.fstat(self._lock_file)
-            if (here.st_dev, here.st_ino) != (own.st_dev, own.st_ino):
-                raise FileNotFoundError(errno.ENOENT, "another folder than at the start")
-
-    def _probe(self, needed_bytes: int) -> None:
-        self._check_folder()
-        descriptor, name = new_file(self.folder, PROBE.strip(".-"))
-        try:
-            with os.fdopen(descriptor, "wb") as file:
-                file.write(bytes(4096))
-                file.flush()
-                synchronise(file.fileno())
-        finally:
-            os.unlink(name)
-        if (free := shutil.disk_usage(self.folder).free) < needed_bytes:
-            raise OSError(errno.ENOSPC, f"{free} bytes free, {needed_bytes} needed")
+        return self._failure or self._damage
 
 
+_NUMBERS = {
+    sqlite3.SQLITE_FULL: errno.ENOSPC,
+    sqlite3.SQLITE_READONLY: errno.EROFS,
+    sqlite3.SQLITE_PERM: errno.EACCES,
+    sqlite3.SQLITE_CANTOPEN: errno.ENOENT,
+}
 _REASONS = {
-    errno.ENOSPC: Reason.FULL,
-    errno.EDQUOT: Reason.FULL,
-    errno.EROFS: Reason.READ_ONLY,
-    errno.EACCES: Reason.READ_ONLY,
-    errno.EPERM: Reason.READ_ONLY,
-    errno.ENOENT: Reason.GONE,
-    errno.ENOTDIR: Reason.GONE,
-    errno.ESTALE: Reason.GONE,
-    errno.ENODEV: Reason.GONE,
+    **dict.fromkeys([errno.ENOSPC, errno.EDQUOT], Reason.FULL),
+    **dict.fromkeys([errno.EROFS, errno.EACCES, errno.EPERM], Reason.READ_ONLY),
+    **dict.fromkeys([errno.ENOENT, errno.ENOTDIR, errno.ESTALE, errno.ENODEV], Reason.GONE),
 }

@@ -1,9 +1,11 @@
-"""Whether the store can be written, for health checks and metrics: a disk that hangs must not silence the rest."""
+"""How the store is, for health checks and metrics: a disk that hangs must not silence the rest."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
 
 from lightpage.clock import SYSTEM, Clock
 
@@ -11,10 +13,32 @@ LONGEST_S = 5.0
 """A look at the store that takes longer has hung."""
 
 
-class StoreHealth:
-    """Looks at the store in a thread of its own, which does not hold the end of the process either.
+class Reason(StrEnum):
+    """What is wrong with a store."""
 
-    It may be asked from many threads.
+    NOTE = "note"
+    """Its database is damaged or gone, so that it is not known what was in service."""
+    BUNDLE = "bundle"
+    """The bundle that was in service is damaged or gone."""
+    FULL = "full"
+    READ_ONLY = "read_only"
+    GONE = "gone"
+    HUNG = "hung"
+    """The disk does not answer."""
+    FAILED = "failed"
+    """The disk fails in another way."""
+
+
+@dataclass(frozen=True)
+class Trouble:
+    """What is wrong with a store, and the same for people."""
+
+    reason: Reason
+    text: str
+
+
+class StoreHealth:
+    """Looks at the store in a thread of its own, which does not hold the end of the process; many threads may ask.
 
     Args:
         trouble: says what is wrong with the store, nothing where it is well.
@@ -24,7 +48,7 @@ class StoreHealth:
 
     def __init__(self, trouble: Callable[[], object], longest_s: float = LONGEST_S, clock: Clock = SYSTEM) -> None:
         self._trouble, self._longest_s, self._clock = trouble, longest_s, clock
-        self._lock = threading.Lock()
+        self._beginning = threading.Lock()
         """Held while a look begins, so that there is one at a time."""
         self._ended = threading.Event()
         """Of the present look; set while there is none."""
@@ -34,7 +58,7 @@ class StoreHealth:
 
     def is_well(self, wait_s: float = 0.0) -> bool:
         """What the last look that ended found; begins the next one, and waits for its end for `wait_s` at most."""
-        with self._lock:
+        with self._beginning:
             if self._ended.is_set():
                 self._begun, ended = self._clock.now(), threading.Event()
                 threading.Thread(target=self._look, args=[ended], name="lightpage-store-look", daemon=True).start()
@@ -47,7 +71,7 @@ class StoreHealth:
     @property
     def hangs(self) -> bool:
         """Whether the present look takes longer than any should."""
-        with self._lock:
+        with self._beginning:
             return not self._ended.is_set() and self._clock.now() - self._begun > self._longest_s
 
     def _look(self, ended: threading.Event) -> None:

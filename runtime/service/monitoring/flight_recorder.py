@@ -22,7 +22,8 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import frame_type
 from lightpage.recording.writer import RecordingWriter
 from lightpage.runtime.service.limits import GRACE_S
-from lightpage.runtime.service.models.registry import Model, ModelRegistry
+from lightpage.runtime.service.models.loader import Model
+from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.monitoring.observation import Observation
@@ -135,7 +136,7 @@ class FlightRecorder:
 
     Args:
         folder: made if absent; what an earlier service kept there counts.
-        registry: the models, whose device the pages are of.
+        models: the models, whose device the pages are of.
         settings: what is kept.
         monitor: says whether a recalibration is due, None for never.
         metrics: what is counted.
@@ -147,12 +148,12 @@ class FlightRecorder:
     def __init__(
         self,
         folder: Path,
-        registry: ModelRegistry,
+        models: Models,
         settings: FlightSettings | None = None,
         monitor: Monitor | None = None,
         metrics: ServiceMetrics | None = None,
     ) -> None:
-        self._registry, self._settings, self._monitor = registry, settings or FlightSettings(), monitor
+        self._models, self._settings, self._monitor = models, settings or FlightSettings(), monitor
         self._metrics = metrics or ServiceMetrics()
         self._ring = FileRing(folder, self._settings.pages, self._settings.ring_bytes)
         self._waiting: queue.Queue[_Kept | None] = queue.Queue(_WAITING)
@@ -179,8 +180,8 @@ class FlightRecorder:
         """See `Observer`."""
         if observation.pair is None or (why := self._why(observation)) is None:
             return
-        held = [model for model in self._registry.models if model.version == observation.model_version]
-        kept = _Kept(observation, *why, held[0] if held else self._registry.current)
+        held = [model for model in self._models.loaded if model.version == observation.model_version]
+        kept = _Kept(observation, *why, held[0] if held else self._models.current)
         try:
             self._waiting.put_nowait(kept)
         except queue.Full:

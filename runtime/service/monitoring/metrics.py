@@ -27,8 +27,7 @@ from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.device.acquisition.source import FrameSource
 from lightpage.runtime.model.decoding.page import DecodedPage
 from lightpage.runtime.model.decoding.tracking import unconfirmed_page
-from lightpage.runtime.service.models.store import Reason, Trouble
-from lightpage.runtime.service.models.store_health import StoreHealth
+from lightpage.runtime.service.models.store_health import Reason, StoreHealth, Trouble
 
 if TYPE_CHECKING:
     from lightpage.runtime.service.admission import ReceiveBudget, Slots

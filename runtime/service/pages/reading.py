@@ -15,8 +15,7 @@ from lightpage.errors import LightpageError, LostPageError, PageError, SourceErr
 from lightpage.page.pilots import Pilots
 from lightpage.runtime.device.acquisition.source import FrameSource, Shot, own_fault
 from lightpage.runtime.service.caller import Caller
-from lightpage.runtime.service.dataplane import Answer, DataPlane, levels_for
-from lightpage.runtime.service.monitoring.observation import Seen, observed
+from lightpage.runtime.service.dataplane import Answer, DataPlane, Seen, levels_for, observed
 from lightpage.runtime.service.stages import Stage, Stages
 
 GROUPS = 4
@@ -104,7 +103,7 @@ def read_page(
     stages.begin(Stage.QUEUE)
     # The slot first: pages that wait for one shall not be read yet, nor lie in memory.
     with plane.decodes.held(caller):
-        model, begun = plane.registry.current, time.perf_counter()
+        model, begun = plane.models.current, time.perf_counter()
         seen = Seen(f"{'next page' if page is None else f'page {page}'} of {source.name}", page, model.version)
         with observed(plane.monitors.told_by(monitor), seen):
             stages.begin(Stage.RECEIVE)
@@ -156,7 +155,7 @@ def read_data(
         SourceError: there is no source.
         PageError: there is no page `first`.
     """
-    _ = plane.source, plane.registry.current.decoder.page_codec  # they are there
+    _ = plane.source, plane.models.current.decoder.page_codec  # they are there
     groups: dict[tuple[Volume, int], _Group] = {}
     successor = Successor()
     for index in range(first, first + count):

@@ -25,7 +25,7 @@ def handlers(plane: DataPlane, recalibrator: Recalibrator) -> tuple[object, ...]
         FrameCalls(plane),
         PageCalls(plane),
         DisplayCalls(plane),
-        ModelCalls(plane.models),
+        ModelCalls(plane.models, plane.limits, plane.uploads),
         JobCalls(plane, recalibrator),
     )
 
@@ -43,14 +43,14 @@ class Describing:
     @rpc(Role.READ)
     def Describe(self, request: pb.DescribeRequest, call: Call) -> pb.DescribeReply:
         """What the service is."""
-        plane, model = self._plane, self._plane.registry.current
+        plane, model = self._plane, self._plane.models.current
         bundle, limits = model.decoder.bundle, self._plane.limits
         shared_bytes = 0 if plane.shared is None else plane.shared.most_bytes
         (rows_px, columns_px), (rows, columns) = bundle.profile.frame_shape, bundle.profile.page_shape
         return message_of(
             pb.DescribeReply,
             service_version=installed_version("lightpage"),
-            model=model_message(plane.models.entry(model)),
+            model=model_message(plane.models.entry(bundle.manifest)),
             camera=message_of(
                 pb.Camera,
                 rows_px=rows_px,

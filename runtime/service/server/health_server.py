@@ -16,7 +16,10 @@ from lightpage.runtime.client.wire.channel import TlsFiles
 
 _PROCESS = "lightpage.runtime.service.server.health_process:HealthAnswers"
 _BEAT_S = 0.5
-_ANSWER_S = 20.0
+_START_S = 20.0
+"""Longest time in which the process starts."""
+_TOLD_S = 5.0
+"""A process that has not taken in for so long how the service fares is started again."""
 _AGAIN_S = 5.0
 """Between two attempts to start the process again."""
 
@@ -80,7 +83,7 @@ class HealthServer:
         with raised_as(InvalidInputError, WorkerError):
             process = HelperProcess(_PROCESS, subject="health checks")
             try:
-                return process, process.ask("listen", self._address, self._tls, timeout_s=_ANSWER_S)
+                return process, process.ask("listen", self._address, self._tls, timeout_s=_START_S)
             except BaseException:
                 process.end()
                 raise
@@ -88,12 +91,12 @@ class HealthServer:
     def __exit__(self, *_: object) -> None:
         """Answer no more."""
         self._stop.set()
-        self._thread.join(2 * _BEAT_S)
         if self._process is not None:
-            self._process.end()
-            if self._address.startswith("unix:"):
-                with suppress(OSError):
-                    os.unlink(self._address.removeprefix("unix:"))
+            self._process.end()  # which wakes the thread where it waits for an answer
+        self._thread.join(2 * _BEAT_S)
+        if self._address.startswith("unix:"):
+            with suppress(OSError):
+                os.unlink(self._address.removeprefix("unix:"))
 
     def _beat(self) -> None:
         while True:
@@ -104,13 +107,15 @@ class HealthServer:
             else:
                 self._tell(states)
             if self._stop.wait(_BEAT_S):
-                return
+                break
+        assert self._process is not None  # it was started
+        self._process.end()  # it may be one that was started since
 
     def _tell(self, states: dict[str, bool]) -> None:
         """Tell the process how the service fares; one that has ended is started again at the same port."""
         assert self._process is not None  # it was started
         try:
-            self._process.ask("tell", states, timeout_s=_ANSWER_S)
+            self._process.ask("tell", states, timeout_s=_TOLD_S)
             return
         except WorkerError as error:
             if self._stop.is_set():

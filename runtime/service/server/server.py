@@ -84,7 +84,7 @@ class LightpageServer:
         self._thread = threading.Thread(target=self._run, name="lightpage-rpc", daemon=True)
         self._pool = ThreadPoolExecutor(plane.limits.concurrent_calls, thread_name_prefix="lightpage-call")
         self._names = ("", *(service.descriptor.full_name for service in self._services))
-        self._store = plane.models.store_health
+        self._store = plane.models.store.health
         self._serving = self._stopping = self._started = False
         self.port = 0
 

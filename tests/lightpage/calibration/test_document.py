@@ -16,7 +16,8 @@ from lightpage.errors import CalibrationError, ProfileError, RecordingError
 from lightpage.page.modulation import NOMINAL
 from lightpage.page.modulation import PRIORS as PRIORS_OF_LEVELS
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.reader import Recording, RecordingWriter
+from lightpage.recording.reader import Recording
+from lightpage.recording.writer import RecordingWriter
 from tests.lightpage.calibration.flat_twin import FlatTwin
 from tests.lightpage.refused import refused
 from tests.lightpage.uneven import UNEVEN

@@ -65,9 +65,9 @@ def interrupt_after(pages: int, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_recording_opens_with_its_profile_levels_and_symbols(whole: Path, profile_file: Path) -> None:
     profile = load_profile(profile_file)
     with Recording.open(whole) as recording:
-        recording.check_against(profile)
+        recording.header.check_against(profile)
         symbols = recording.symbols(0)
-        assert (recording.pages, recording.levels, recording.profile_text) == (PAGES, 16, profile.to_toml())
+        assert (recording.pages, recording.levels, recording.header.profile_text) == (PAGES, 16, profile.to_toml())
     assert symbols is not None
     assert symbols.max() == 15
 

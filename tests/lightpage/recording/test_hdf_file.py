@@ -13,8 +13,9 @@ from lightpage.errors import LightpageError, StorageError, SurroundingsError
 from lightpage.page.symbols import random_symbols
 from lightpage.recording import hdf5, hdf_file
 from lightpage.recording.pages import Pages, PagesWriter
-from lightpage.recording.reader import Recording, RecordingWriter
-from lightpage.recording.writer import pages_there, partial_path
+from lightpage.recording.reader import Recording
+from lightpage.recording.unfinished import Identity, pages_there, partial_path
+from lightpage.recording.writer import RecordingWriter
 from tests.clock import HandClock
 from tests.lightpage.recording.test_recording import LEVELS, random_frames, small_profile
 
@@ -53,7 +54,7 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> type[Disk]:
 
 
 def writer(path: Path) -> RecordingWriter:
-    return RecordingWriter.resume(path, PROFILE, LEVELS, 12, random_frames(100))
+    return RecordingWriter(path, PROFILE, LEVELS, 12, random_frames(100), resume=True)
 
 
 def write(path: Path, pages: int = 4) -> None:
@@ -93,7 +94,7 @@ def test_wherever_writing_fails_the_pages_before_stay(
         with pytest.raises(kind) as caught:
             write(path)
         disk.bad_writes = range(0)
-        if kept := pages_there(path, PROFILE, LEVELS, 12):
+        if kept := pages_there(path, Identity(PROFILE, LEVELS, 12)):
             assert f"{kept} page" in str(caught.value)
             assert partial_path(path).name in str(caught.value)
         assert kept in (1, 2, 3)
@@ -122,7 +123,7 @@ def test_a_failure_to_read_does_not_begin_the_pages_anew(tmp_path: Path, disk: t
             with pytest.raises(StorageError):
                 writer(path)
         assert partial_path(path).read_bytes() == content
-    assert pages_there(path, PROFILE, LEVELS, 12) == 2
+    assert pages_there(path, Identity(PROFILE, LEVELS, 12)) == 2
     disk.bad_reads = 2
     write(path)
     check(path)

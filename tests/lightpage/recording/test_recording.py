@@ -14,7 +14,9 @@ from lightpage.device.profile import Profile, load_profile, parse_profile
 from lightpage.errors import PageError, RecordingError
 from lightpage.page.symbols import pilot_mask, random_symbols
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.reader import Recording, RecordingWriter, hash_frames
+from lightpage.recording.layout import hash_frames
+from lightpage.recording.reader import Recording
+from lightpage.recording.writer import RecordingWriter
 from tests.lightpage.refused import refused
 
 LEVELS = 16
@@ -77,7 +79,7 @@ class TestReading:
             assert recording.frame_shape == (14, 20)
             assert recording.page_shape == (6, 9)
             assert recording.has_symbols
-            assert recording.profile_text is None
+            assert recording.header.profile_text is None
             for page in range(PAGES):
                 assert np.array_equal(recording.frames(page).in_phase, file["in_phase"][page])
                 assert np.array_equal(recording.frames(page).quadrature, file["quadrature"][page])
@@ -95,7 +97,7 @@ class TestReading:
             assert recording.page_shape is None
             assert recording.symbols(0) is None
             assert recording.pilots() is None
-            recording.check_against(small_profile())
+            recording.header.check_against(small_profile())
 
     def test_pilots_alone_and_as_numbers_tell_the_page_shape(self, foreign: Path) -> None:
         with h5py.File(foreign, "r+") as file:
@@ -134,7 +136,7 @@ class TestReading:
         with h5py.File(foreign, "r+") as file:
             file.attrs["black_level"] = black
         with Recording.open(foreign) as recording, h5py.File(foreign) as file:
-            assert recording.black_level == black
+            assert recording.header.black_level == black
             for got, prefix, where in ((recording.frames(1), "", 1), (recording.references(), "reference_", ())):
                 for name in ("in_phase", "quadrature"):
                     counts = file[prefix + name][where].astype(int)
@@ -161,7 +163,7 @@ class TestReading:
             with h5py.File(foreign, "r+") as file:
                 file.attrs["profile"] = text
             with Recording.open(foreign) as recording:
-                assert recording.differences(profile) == expected
+                assert recording.header.differences(profile) == expected
 
     def test_left_aligned_counts_are_told_of_once(self, foreign: Path, caplog: pytest.LogCaptureFixture) -> None:
         with h5py.File(foreign, "r+") as file:
@@ -184,11 +186,11 @@ class TestReading:
         camera = profile.camera.model_copy(update={"rows_px": 15})
         page = profile.page.model_copy(update={"columns": 8})
         with Recording.open(foreign) as recording:
-            recording.check_against(profile)
+            recording.header.check_against(profile)
             with refused(got="14 x 20", kind=RecordingError):
-                recording.check_against(profile.model_copy(update={"camera": camera}))
+                recording.header.check_against(profile.model_copy(update={"camera": camera}))
             with refused(got="6 x 9", kind=RecordingError):
-                recording.check_against(profile.model_copy(update={"page": page}))
+                recording.header.check_against(profile.model_copy(update={"page": page}))
 
 
 def attribute(name: str, value: object) -> Callable[[h5py.File], None]:
@@ -273,8 +275,8 @@ class TestWriting:
         symbols = write_own(path, bit_depth=bit_depth)
         with Recording.open(path) as recording:
             assert (recording.pages, recording.levels, recording.bit_depth) == (PAGES, LEVELS, bit_depth)
-            recording.check_against(small_profile())
-            assert parse_profile(recording.profile_text or "") == small_profile()
+            recording.header.check_against(small_profile())
+            assert parse_profile(recording.header.profile_text or "") == small_profile()
             assert np.array_equal(recording.pilots(), pilot_mask(small_profile()))
             assert np.array_equal(recording.references().quadrature, random_frames(100, bit_depth).quadrature)
             for page in range(PAGES):
@@ -297,7 +299,7 @@ class TestWriting:
         path = tmp_path / "truth.h5"
         facet = np.exp(1j * np.linspace(0, 1, 12)).reshape(3, 4).astype(np.complex64)
         with RecordingWriter(path, small_profile(), 256, 12, random_frames(9)) as writer:
-            writer.set_truth("[geometry]\npipe_angle_deg = 1.0\n")
+            writer.add_note("truth", {"device": "[geometry]\npipe_angle_deg = 1.0\n"})
             for page in range(2):
                 writer.append(None, random_frames(page), truth={"facet_field": facet * (page + 1)})
         with h5py.File(path) as file:
@@ -374,7 +376,7 @@ def interrupted(path: Path, pages: int) -> None:
 
 
 def resumed(path: Path) -> RecordingWriter:
-    return RecordingWriter.resume(path, *ARGUMENTS)
+    return RecordingWriter(path, *ARGUMENTS, resume=True)
 
 
 class TestInterruption:
@@ -417,7 +419,7 @@ class TestInterruption:
         with pytest.raises(KeyboardInterrupt):
             interrupted(path, 2)
         arguments[place] = other
-        with RecordingWriter.resume(path, *arguments) as writer:
+        with RecordingWriter(path, *arguments, resume=True) as writer:
             assert writer.pages == 0
 
     @pytest.mark.parametrize("damaged", [False, True])
@@ -448,22 +450,22 @@ class TestInterruption:
                 writer.append(None, random_frames(page))
             with pytest.raises(KeyboardInterrupt):
                 writer.commit()
-        with RecordingWriter.resume(path, profile, LEVELS, 12, random_frames(100)) as writer:
+        with RecordingWriter(path, profile, LEVELS, 12, random_frames(100), resume=True) as writer:
             assert writer.pages == 3
             writer.append(None, random_frames(3))
         with Recording.open(path) as recording:
             assert recording.pages == 4
             assert np.array_equal(recording.frames(2).in_phase, random_frames(2).in_phase)
 
-    @pytest.mark.parametrize("begin", [RecordingWriter, RecordingWriter.resume])
+    @pytest.mark.parametrize("resume", [False, True])
     def test_pages_that_are_being_written_are_neither_gone_on_with_nor_destroyed(
-        self, tmp_path: Path, begin: Callable[..., RecordingWriter]
+        self, tmp_path: Path, resume: bool
     ) -> None:
         path, profile = tmp_path / "own.h5", small_profile()
         with RecordingWriter(path, profile, LEVELS, 12, random_frames(100)) as writer:
             writer.append(None, random_frames(0))
             with refused("own.h5.partial", kind=RecordingError):
-                begin(path, profile, LEVELS, 12, random_frames(100))
+                RecordingWriter(path, profile, LEVELS, 12, random_frames(100), resume=resume)
             writer.append(None, random_frames(1))
         with Recording.open(path) as recording:
             assert recording.pages == 2

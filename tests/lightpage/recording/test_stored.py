@@ -441,9 +441,10 @@ class TestAttributes:
         for name in ("symbols", "pilots"):
             replace(foreign, name, lambda file, _, name=name: file.__setitem__(name, null))
         with Recording.open(foreign) as recording:
-            assert (recording.levels, recording.black_level, recording.declared_levels) == (256, 0, None)
-            assert (recording.profile_text, recording.code_text, recording.page_shape) == (None, None, None)
-            assert (recording.symbols(0), recording.pilots(), recording.own_profile()) == (None, None, None)
+            header = recording.header
+            assert (header.levels, header.black_level, header.declared_levels) == (256, 0, None)
+            assert (header.profile_text, header.code_text, header.page_shape) == (None, None, None)
+            assert (recording.symbols(0), recording.pilots(), header.own_profile()) == (None, None, None)
         self.change(foreign, camera_bit_depth=null)
         assert refusal(foreign).subject.endswith("'camera_bit_depth'")
 
@@ -466,8 +467,8 @@ class TestAttributes:
     def test_texts_of_any_kind_are_read(self, foreign: Path) -> None:
         self.change(foreign, format=np.bytes_(b"lightpage-recording".ljust(40, b"\0")), code=b"\xff caf\xe9")
         with Recording.open(foreign) as recording:
-            assert recording.code_text is not None
-            recording.code_text.encode()
+            assert recording.header.code_text is not None
+            recording.header.code_text.encode()
         self.change(foreign, format=np.array(["lightpage-recording"], object))
         Recording.open(foreign).close()
 
@@ -530,7 +531,7 @@ class TestStorageThatFails:
                 recording.frames(1)
             away.rename(foreign)
             assert recording.frames(1).in_phase.any()
-            assert recording.code_text is None
+            assert recording.header.code_text is None
 
     def test_damaged_data_are_told_once_and_in_words(self, foreign: Path, paused: Callable[[], float]) -> None:
         replace(

@@ -19,10 +19,11 @@ from lightpage.cli.main import RESUME_KEY, LazyGroup, lightpage
 from lightpage.errors import LightpageError, SurroundingsError
 from lightpage.page.pilots import Pilots
 from lightpage.recording.decoded_file import DecodedWriter
-from lightpage.recording.reader import Recording, RecordingWriter
+from lightpage.recording.reader import Recording
+from lightpage.recording.writer import RecordingWriter
 from lightpage.runtime.client.answers import RemotePage
 from lightpage.runtime.client.client import LightpageClient
-from lightpage.runtime.client.pages import Pages
+from lightpage.runtime.client.pages import PagesClient
 from lightpage.runtime.commands.client import recalibrate as cli_recalibrate
 from lightpage.runtime.device.acquisition.source import open_source
 from lightpage.runtime.model.bundle.bundle import Bundle
@@ -30,7 +31,7 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.recalibration import Refit
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
-from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.server.server import LightpageServer
 from tests.lightpage.full_disk import full_disk
 from tests.runtime import toy
@@ -263,7 +264,7 @@ def start(decoder: Decoder, tmp_path_factory: pytest.TempPathFactory) -> Iterato
     running: list[LightpageServer] = []
 
     def begin(fit: Refit = toy.fit_references) -> LightpageServer:
-        plane = DataPlane(ModelRegistry(decoder), toy.ToySource(toy.ToyDevice()))
+        plane = DataPlane(Models(decoder), toy.ToySource(toy.ToyDevice()))
         running.append(LightpageServer(plane, Recalibrator(plane, fit, folder)).start())
         return running[-1]
 
@@ -351,7 +352,7 @@ def test_decode_uses_the_devices_own_pilots_and_refuses_pages_where_they_disagre
             if name in file:
                 del file[name]
     decoder = Decoder.load(toy.write_own_pilots_bundle(tmp_path / "own.zip"), threads=1)
-    plane = DataPlane(ModelRegistry(decoder), open_source(f"recording:{path}"))
+    plane = DataPlane(Models(decoder), open_source(f"recording:{path}"))
     out = tmp_path / "out.h5"
     with LightpageServer(plane, Recalibrator(plane, toy.fit_references)) as server:
         for where in (["--recording", path], ["--source", "--pages", "2"]):
@@ -371,14 +372,14 @@ def test_pages_of_the_source_that_came_before_the_end_are_kept(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """It would show other pages the next time."""
-    read, count = Pages.read, iter(range(100))
+    read, count = PagesClient.read, iter(range(100))
 
-    def ending(self: Pages, **options: Any) -> RemotePage:
+    def ending(self: PagesClient, **options: Any) -> RemotePage:
         if next(count) == 2:
             raise end
         return read(self, **options)
 
-    monkeypatch.setattr(Pages, "read", ending)
+    monkeypatch.setattr(PagesClient, "read", ending)
     out, figures = tmp_path / "decoded.h5", tmp_path / "d.json"
     arguments = ["decode", "--target", service.target, "--source", "--pages", "5", "--out", out, "--json", figures]
     assert run(*arguments) == (130 if end is KeyboardInterrupt else 2)

@@ -116,16 +116,16 @@ def test_a_recording_holds_what_the_cameras_say(record: Record, asked: list[str]
     assert record(source, "--symbols", pages, "--json", figures) == 0
     assert (asked, source.armed) == (["block the signal beam"], False)
     with Recording.open(out) as recording:
-        assert (recording.pages, recording.code_text) == (3, '{"levels": 16}')
+        assert (recording.pages, recording.header.code_text) == (3, '{"levels": 16}')
         assert (recording.symbols(2) == toy.symbols_of(16, 7)[0]).all()
-        infos = recording.frame_infos(0)
+        infos = recording.cameras.frame_infos(0)
         assert infos is not None
         assert infos[1] == FrameInfo("CAM", 1, 100.0, 1e9, "Mono8", 2e-4)
-        dark, hot = recording.dark_frames(), recording.hot_pixels()
+        dark, hot = recording.cameras.dark_frames(), recording.cameras.hot_pixels()
         assert dark is not None
         assert hot is not None
         assert (dark.in_phase[0, 0], hot[0].tolist()) == (2, [[1, 2]])
-        assert [(loss.page, loss.reason) for loss in recording.losses()] == [(1, "MISSING_FRAME")] * 2
+        assert [(loss.page, loss.reason) for loss in recording.cameras.losses()] == [(1, "MISSING_FRAME")] * 2
     told = json.loads(figures.read_text())
     assert (told["pages"], told["shots_lost"], told["pages_repeated"]) == (3, 2, 2)
     assert told["losses"] == {"MISSING_FRAME": 2}
@@ -149,7 +149,7 @@ def test_a_page_that_no_shot_gives_ends_the_recording_and_keeps_the_others(
     assert told[-1].startswith("lightpage: error: page 1 of toy:bench: I: frame:")
     assert record(Bench(), "--pages", 3) == 0
     with Recording.open(out) as recording:
-        assert len(recording.losses()) == module.ATTEMPTS
+        assert len(recording.cameras.losses()) == module.ATTEMPTS
 
 
 def test_what_cannot_be_recorded_is_refused_before_anything_is_connected(

@@ -31,7 +31,8 @@ from lightpage.runtime.commands.service.healthcheck import is_serving
 from lightpage.runtime.commands.service.healthcheck import main as healthcheck
 from lightpage.runtime.commands.service.serve import serve
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.service.models.store import ModelStore
+from lightpage.runtime.service.models.models import Models
+from lightpage.runtime.service.models.store import Store
 from lightpage.runtime.service.settings import ServiceSettings
 from tests.runtime import toy
 
@@ -120,9 +121,9 @@ class Served:
 def test_a_service_keeps_to_its_limits_logs_json_and_writes_down_changes_and_lost_pages(
     toy_zip: Path, decoder: Decoder, tmp_path: Path
 ) -> None:
-    store = ModelStore(tmp_path / "store", decoder.bundle)
-    made = toy.write_toy_bundle(store.path_of("toy-1+r1"), version="toy-1+r1")
-    store.change(history=(None, made.name), cursor=1)
+    with Store(tmp_path / "store", decoder.bundle) as store:
+        toy.write_toy_bundle(store.folder.bundle("toy-1+r1"), version="toy-1+r1")
+        Models(decoder, store).activate("toy-1+r1")
     toy.write_toy_recording(tmp_path / "lost.h5", toy.ToyDevice((60.0, 170.0)), 16, 4)
     file = tmp_path / "service.toml"
     file.write_text(
@@ -134,8 +135,8 @@ def test_a_service_keeps_to_its_limits_logs_json_and_writes_down_changes_and_los
     served = Served("--config", file, "--metrics-port", "0")
     try:
         target = served.target()
-        with pytest.raises(StoreError), store.locked():
-            raise AssertionError("two at once")
+        with pytest.raises(StoreError):
+            Store(tmp_path / "store", decoder.bundle)
         with LightpageClient(target, timeout_s=60) as client:
             assert client.describe().model.version == "toy-1+r1"
             for page in range(3):
@@ -158,7 +159,8 @@ def test_a_service_keeps_to_its_limits_logs_json_and_writes_down_changes_and_los
         served.process.kill()
         served.process.wait()
     assert (status, "stopping" in out) == (0, True), err
-    assert store.read().cursor == 0
+    with Store(tmp_path / "store", decoder.bundle) as store:
+        assert store.contents.state.history.cursor == 0
     lines = [json.loads(line) for line in err.splitlines()]
     start = next(line for line in lines if "lightpage" in line)
     assert (start["python"], target in start["message"]) == (sys.version.split()[0], True)
@@ -167,7 +169,9 @@ def test_a_service_keeps_to_its_limits_logs_json_and_writes_down_changes_and_los
     left_out = sum(line.get("left_out", 0) for line in lines if line["message"].startswith("ReadData TOO_LARGE: "))
     assert len(refused) < 8
     assert len(refused) + left_out == 8
-    (entry,) = [json.loads(line) for line in (tmp_path / "store" / "audit.jsonl").read_text().splitlines()]
+    # The first change was made where there was no file yet.
+    before, entry = [json.loads(line) for line in (tmp_path / "store" / "audit.jsonl").read_text().splitlines()]
+    assert (before["what"], before["to"]) == ("activate", "toy-1+r1")
     assert (entry["what"], entry["from"], entry["to"]) == ("rollback", "toy-1+r1", "toy-1")
     assert (entry["correlation_id"], entry["outcome"]) == ("shift 2", "done")
     kept = sorted((tmp_path / "flight").iterdir())

@@ -10,7 +10,7 @@ from lightpage.errors import LostPageError, LostShotError, Reason
 from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.console.actions import Actions
 from lightpage.runtime.console.application import Route, console_routes
-from lightpage.runtime.console.history import History
+from lightpage.runtime.console.last_pages import LastPages
 from lightpage.runtime.console.server import serving
 from lightpage.runtime.console.state import ConsoleState
 from lightpage.runtime.device.acquisition.source import SHOT_S, Shot
@@ -18,7 +18,7 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
-from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.pages.reading import read_page
@@ -53,11 +53,11 @@ class Stage:
 
 @contextmanager
 def stage(decoder: Decoder, tls: TlsFiles | None = None) -> Iterator[Stage]:
-    history, monitor, metrics = History(), Monitor(), ServiceMetrics()
-    registry = ModelRegistry(decoder)
-    plane = DataPlane(registry, Losing(toy.ToyDevice()), metrics=metrics, observers=[history], monitor=monitor)
+    last_pages, monitor, metrics = LastPages(), Monitor(), ServiceMetrics()
+    registry = Models(decoder)
+    plane = DataPlane(registry, Losing(toy.ToyDevice()), metrics=metrics, observers=[last_pages], monitor=monitor)
     recalibrator = Recalibrator(plane, toy.fit_references)
-    state = ConsoleState(history, registry, monitor, "toy:device", Actions(plane, recalibrator))
+    state = ConsoleState(last_pages, registry, monitor, "toy:device", Actions(plane, recalibrator))
     routes = console_routes(state, metrics.registry)
     with ExitStack() as stack:
         port = stack.enter_context(serving(routes, 0, certificates=None if tls is None else Certificates(tls)))

@@ -54,7 +54,8 @@ def test_a_browser_shows_pages_and_losses_acts_for_administrators_and_says_when_
     authority = Authority(tmp_path / "certificates")
     with stage(decoder, authority.service()) as running:
         other = toy.write_toy_bundle(tmp_path / "c.zip", version="toy-2")
-        running.plane.models.adopt(running.plane.registry.opened(other))
+        models = running.plane.models
+        models.adopt(models.loader.opened(other, models.current.decoder))
         running.read(7)
         watcher = Visitor(browser, running.url, authority.caller("watcher", ["read"]))
         watcher.sees("facts", "7 pages")

@@ -31,7 +31,7 @@ from lightpage.cli.main import EXIT_ERROR, lightpage
 from lightpage.errors import InvalidInputError, Reason
 from lightpage.runtime.console.actions import Actions
 from lightpage.runtime.console.application import console_routes
-from lightpage.runtime.console.history import History
+from lightpage.runtime.console.last_pages import LastPages
 from lightpage.runtime.console.pictures import SIDE_PX, confidence_png, frame_png
 from lightpage.runtime.console.scrapes import fetch
 from lightpage.runtime.console.server import serving
@@ -41,7 +41,7 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import Actor, Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
-from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.monitoring.observation import Observation
 from lightpage.runtime.service.pages.reading import read_page
@@ -123,10 +123,10 @@ def test_metrics_are_beside_it_and_nothing_takes_orders_or_tells_of_the_inside(
 def test_what_is_no_number_is_none_and_pages_are_bounded_and_thinned(decoder: Decoder) -> None:
     page = decoder.decode(toy.ToyDevice().page(toy.symbols_of(16, 1)[0], 16, 0.5), 16)
     page = replace(page, piston_rad=math.nan, check=replace(page.check, confirmed_bits=math.inf))
-    history, registry = History(pages=2 * POINTS), ModelRegistry(decoder)
+    last_pages, registry = LastPages(pages=2 * POINTS), Models(decoder)
     for number in range(3 * POINTS):
-        history.observe(Observation("page", number, "toy-1", float(number), 0.1, page=page))
-    state = ConsoleState(history, registry, Monitor(), "toy").to_json()
+        last_pages.observe(Observation("page", number, "toy-1", float(number), 0.1, page=page))
+    state = ConsoleState(last_pages, registry, Monitor(), "toy").to_json()
     times = [*map(float, range(POINTS, 3 * POINTS, 2)), 3 * POINTS - 1]
     assert (state["series"]["time_s"], state["pages"]) == (times, 3 * POINTS)
     assert state["series"]["piston_rad"][-1] is state["series"]["share"][-1] is None
@@ -135,13 +135,13 @@ def test_what_is_no_number_is_none_and_pages_are_bounded_and_thinned(decoder: De
 
 
 def test_the_condition_is_that_of_the_last_pages(decoder: Decoder) -> None:
-    clock, history, monitor = HandClock(1e9), History(), Monitor()
-    state = ConsoleState(history, ModelRegistry(decoder), monitor, "toy", clock=clock.now)
+    clock, last_pages, monitor = HandClock(1e9), LastPages(), Monitor()
+    state = ConsoleState(last_pages, Models(decoder), monitor, "toy", clock=clock.now)
     told = list[str]()
 
     def seen(*lost: Reason | None) -> None:
         for each in lost:
-            history.observe(Observation("page", 1, "toy-1", clock.now(), 0.1, each))
+            last_pages.observe(Observation("page", 1, "toy-1", clock.now(), 0.1, each))
         told.append(state.to_json()["condition"])
 
     for lost in ((), (None,), (Reason.MISSING_FRAME, None, None, None, None), (None,)):
@@ -230,13 +230,21 @@ def test_callers_that_say_nothing_or_hang_up_hold_up_nobody(
     assert capfd.readouterr().err == ""
 
 
-def test_a_body_that_does_not_come_is_refused_and_nothing_else_is_said(
-    decoder: Decoder, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("request_line", ["POST /actions", "POST /", "GET /metrics", "HEAD /"])
+@pytest.mark.parametrize(("length", "status"), [(100, b" 408 "), (100_000, b" 413 ")])
+def test_a_body_that_does_not_come_or_is_too_large_is_refused_and_nothing_else_is_said(
+    request_line: str,
+    length: int,
+    status: bytes,
+    decoder: Decoder,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr("lightpage.runtime.console.server.SILENCE_S", 0.1)
     with stage(decoder) as running, connected(running) as connection:
-        connection.sendall(b"POST /actions HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100\r\n\r\nx")
-        assert b" 408 " in connection.recv(1000)
+        connection.settimeout(20.0)  # an end of `LONGEST_S` comes later
+        connection.sendall(f"{request_line} HTTP/1.1\r\nHost: localhost\r\nContent-Length: {length}\r\n\r\nx".encode())
+        assert status in connection.recv(1000)
     assert capfd.readouterr().err == ""
 
 
@@ -264,13 +272,17 @@ def test_an_answer_that_hangs_holds_up_no_stop(decoder: Decoder, monkeypatch: py
     go.set()
 
 
-def test_where_there_is_no_descriptor_callers_wait(decoder: Decoder, monkeypatch: pytest.MonkeyPatch) -> None:
-    accept = Mock(side_effect=OSError(errno.EMFILE, "Too many open files"))
+@pytest.mark.parametrize(("number", "pause_s"), [(errno.EMFILE, 0.1), (errno.EPERM, 200.0)])
+def test_where_there_is_no_descriptor_callers_wait_and_whatever_else_fails_holds_up_nobody(
+    number: int, pause_s: float, decoder: Decoder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    accepting, accept = socket.socket.accept, Mock(side_effect=OSError(number, os.strerror(number)))
+    monkeypatch.setattr("lightpage.runtime.console.server.PAUSE_S", pause_s)
     with stage(decoder) as running:
         monkeypatch.setattr("socket.socket.accept", accept)
         with connected(running) as waiting:
             assert eventually(lambda: accept.call_count > 1)
-            monkeypatch.undo()
+            monkeypatch.setattr("socket.socket.accept", accepting)
             waiting.sendall(b"GET /metrics HTTP/1.0\r\n\r\n")
             assert b" 200 " in waiting.recv(1000)
 
@@ -306,12 +318,12 @@ class Asked:
 
     def __init__(self, decoder: Decoder, folder: Path, stack: ExitStack) -> None:
         self.source, self.clock = Numbered(), HandClock(time.time())
-        self.plane = DataPlane(ModelRegistry(decoder), self.source)
+        self.plane = DataPlane(Models(decoder), self.source)
         self.plane.models.adopt(Decoder.load(toy.write_toy_bundle(folder / "c.zip", version="toy-2"), 1))
         self.recalibrator = Recalibrator(self.plane, toy.fit_references)
         stack.callback(self.recalibrator.close)
         monitor, actions = Monitor(), Actions(self.plane, self.recalibrator)
-        state = ConsoleState(History(), self.plane.registry, monitor, "toy", actions, self.clock.now)
+        state = ConsoleState(LastPages(), self.plane.models, monitor, "toy", actions, self.clock.now)
         self.routes, authority = console_routes(state, self.plane.metrics.registry), Authority(folder)
         certificates = Certificates(authority.service())
         self.port = stack.enter_context(serving(self.routes, 0, certificates=certificates, names=["device.example"]))
@@ -319,7 +331,7 @@ class Asked:
 
     @property
     def version(self) -> str:
-        return self.plane.registry.current.version
+        return self.plane.models.current.version
 
     def shown(self, path: str, *roles: str) -> tuple[int, Any]:
         """Status and content of a page; of JSON, what it holds."""

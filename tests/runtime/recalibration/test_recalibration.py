@@ -23,7 +23,7 @@ from lightpage.errors import (
 from lightpage.page.symbols import random_symbols
 from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.reader import hash_frames
+from lightpage.recording.layout import hash_frames
 from lightpage.runtime.model.bundle.bundle import Bundle, npz
 from lightpage.runtime.model.bundle.manifest import TABLE
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path

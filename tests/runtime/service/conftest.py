@@ -16,8 +16,9 @@ from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 from lightpage.runtime.service.limits import Limits
 from lightpage.runtime.service.models.audit import AuditLog
-from lightpage.runtime.service.models.registry import ModelRegistry, TrackerFactory
-from lightpage.runtime.service.models.store import ModelStore
+from lightpage.runtime.service.models.loader import Loader, TrackerFactory
+from lightpage.runtime.service.models.models import Models
+from lightpage.runtime.service.models.store import Store
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.server.server import LightpageServer
 from tests.runtime import toy
@@ -34,14 +35,14 @@ def begun(
     tracker: TrackerFactory = NoTracker,
     source: Any = "toy",
     monitor: Monitor | None = None,
-    audit: AuditLog | None = None,
+    audit: Path | None = None,
     **server: Any,
 ) -> Running:
     """A service, as `lightpage serve` starts one; further arguments are of `LightpageServer`."""
     shown = toy.ToySource(toy.ToyDevice()) if source == "toy" else source
-    models = ModelStore(store, decoder.bundle) if store is not None else None
-    plane = DataPlane(ModelRegistry(decoder, tracker), shown, models, limits, monitor=monitor, audit=audit)
-    plane.models.resume()
+    kept = Store(store, decoder.bundle)
+    models = Models(decoder, kept, Loader(tracker), AuditLog(kept, audit))
+    plane = DataPlane(models, shown, limits, monitor=monitor)
     recalibrator = Recalibrator(plane, fit, recordings)
     running = LightpageServer(plane, recalibrator, **server).start()
     return Running(plane, recalibrator, running, shown, LightpageClient(running.target, timeout_s=20))

@@ -24,7 +24,8 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.tracking import NoTracker
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
-from lightpage.runtime.service.models.store import CURRENT, PROBE, ModelStore
+from lightpage.runtime.service.models.database import DATABASE
+from lightpage.runtime.service.models.folder import LOCK, PROBE, BundleFolder
 from lightpage.runtime.service.server.server import LightpageServer
 from tests.runtime import toy
 
@@ -49,18 +50,17 @@ class Running:
 
     @property
     def version(self) -> str:
-        return self.plane.registry.current.version
+        return self.plane.models.current.version
 
     @property
-    def store(self) -> ModelStore:
-        assert self.plane.store is not None
-        return self.plane.store
+    def store(self) -> BundleFolder:
+        return self.plane.models.store.folder
 
     @property
     def left_behind(self) -> list[str]:
-        """Names in the store beside its note, its bundles, and a probe that tries whether it can be written."""
-        names = [path.name for path in self.store.folder.iterdir() if not path.name.startswith(PROBE)]
-        return [name for name in names if name != CURRENT and (name[0] == "." or not name.endswith(".zip"))]
+        """Names in the store beside its database, its bundles, and a probe that tries whether it can be written."""
+        names = [path.name for path in self.store.path.iterdir() if not path.name.startswith((PROBE, LOCK, DATABASE))]
+        return [name for name in names if name[0] == "." or not name.endswith(".zip")]
 
     def count(self, name: str, **labels: str) -> float:
         """What the service's metrics say."""
@@ -90,6 +90,7 @@ class Running:
         for channel in self.channels:
             channel.close()
         self.server.stop(0.5)
+        self.plane.models.store.close()
 
 
 Start = Callable[..., Running]

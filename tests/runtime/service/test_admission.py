@@ -10,8 +10,7 @@ import pytest
 
 from lightpage.errors import CallerLeft, OverloadedError, SlotsTakenError
 from lightpage.runtime.service.admission import FORGET_S, Heart, Slots
-from lightpage.runtime.service.caller import Caller, named_session, own_name
-from lightpage.runtime.service.models.registry import Sessions
+from lightpage.runtime.service.caller import Caller, Sessions, named_session, own_name
 from tests.clock import HandClock
 from tests.waiting import eventually
 

@@ -76,6 +76,7 @@ def test_many_pages_of_the_source_in_one_call(start: Start) -> None:
         (lambda client: client.frames.decode(a_page()[1], pilots=KnownPilots(MASK, 256 * MASK, 0)), "pilots"),
         (lambda client: client.models.activate("\ud800"), "version"),
         (lambda client: client.jobs.recalibrate(pages=[-1]), "pages"),
+        (lambda client: client.jobs.start(pages=[1, 2], recording="known.h5"), "pages to recalibrate with"),
         (lambda client: list(client.pages.read_data(0, 2**40)), "pages"),
     ],
 )
@@ -123,7 +124,7 @@ def test_a_page_carries_its_bytes_when_asked(serve: Serve) -> None:
     client = service.client
     pair = toy.ToyDevice(noise=8.0).page(pages[1], 32, 0.3)
     size = client.describe().user_bytes_per_page
-    assert size == service.plane.registry.current.decoder.page_codec.user_bytes
+    assert size == service.plane.models.current.decoder.page_codec.user_bytes
     for page in (client.frames.decode(pair, 0, user_data=True), client.pages.read(1, user_data=True)):
         found = page.user_data
         assert found is not None
@@ -146,6 +147,7 @@ def test_what_cannot_be_asked_for_is_named(serve: Serve) -> None:
     client = serve()[0].client
     cases: list[tuple[Callable[[], object], type[LightpageError], str]] = [
         (lambda: client.pages.read(0, 16, user_data=True), InvalidInputError, "levels"),
+        (lambda: client.pages.read(0, 16, want_fase=True), InvalidInputError, "option of a page"),
         (lambda: list(client.pages.read_data(0, 0)), InvalidInputError, "pages"),
         (lambda: list(client.pages.read_data(0, 4097)), LimitError, "pages"),
         (lambda: list(client.pages.read_data((1 << 32) - 1, 2)), InvalidInputError, "first_page"),
@@ -183,12 +185,12 @@ def test_a_range_is_streamed_and_lost_pages_are_restored(serve: Serve) -> None:
 def test_files_whose_pages_take_turns_are_restored(serve: Serve) -> None:
     service, pages = serve()
     plane = service.plane
-    folder = plane.registry.current.decoder.bundle.path.parent / "other"
+    folder = plane.models.current.decoder.bundle.path.parent / "other"
     folder.mkdir()
     other = coded.pages(coded.bundle(folder / "toy.zip"), folder, b"y" * 400)
     mixed = [page for pair in zip(pages[:5], other[:5], strict=True) for page in pair]
     source = coded.ShownPages(mixed, {2: coded.half_lost, 3: coded.half_lost})
-    both = DataPlane(plane.registry, source)
+    both = DataPlane(plane.models, source)
     found = list(read_data(both, 0, 10, Caller()))
     restored = [(page.found.header.page, page.found.file.checksum) for page in found if page.source_page is None]
     assert len(restored) == 2

@@ -122,6 +122,12 @@ def test_all_wrong_settings_are_named_at_once_with_where_they_come_from(tmp_path
     assert re.search("receive_s.*age_s", str(refused(tmp_path, "[limits]\nstall_s = 31\nconnection_grace_s = 9").got))
 
 
+def test_a_variable_with_one_underscore_too_few_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    service_settings(environment={"LIGHTPAGE_LIMITS_CONCURRENT_DECODES": "1", "LIGHTPAGE_CLIENT_CA": "x"})
+    assert "LIGHTPAGE_LIMITS__CONCURRENT_DECODES" in caplog.text
+    assert "CLIENT" not in caplog.text
+
+
 def test_a_missing_file_and_missing_paths_are_named(tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError, match=re.escape(str(tmp_path / "none.toml"))):
         service_settings(tmp_path / "none.toml", {})

@@ -22,7 +22,8 @@ from lightpage.device.state import Device
 from lightpage.errors import CalibrationError, FrameError, LightpageError, RecordingError
 from lightpage.progress import reporting
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.reader import Recording, RecordingWriter
+from lightpage.recording.reader import Recording
+from lightpage.recording.writer import RecordingWriter
 from lightpage.simulator.true_optics import true_parameters
 from lightpage.train.commands.calibrate import calibrate
 from tests.told import Told

@@ -24,9 +24,9 @@ def opening_window(settings: ScreenSettings) -> HelperProcess:
     Raises:
         WorkerError: it cannot be started.
     """
-    process = HelperProcess(f"{__name__}:{ScreenWindow.__name__}", subject="window of the modulator")
     # of a table that wires a device, what else it says is not the window's
     plain = ScreenSettings.model_validate(settings.model_dump(include=set(ScreenSettings.model_fields)))
+    process = HelperProcess(f"{__name__}:{ScreenWindow.__name__}", subject="window of the modulator")
     process.send("open", plain)
     return process
 
@@ -62,7 +62,7 @@ class ScreenWindow(Helper):
             return self._window.shows
 
     def shows(self) -> bool:
-        """Whether the whole last picture is still on display."""
+        """Return whether the whole last picture is still on display."""
         assert self._window is not None  # it was opened
         self.idle()
         with _server():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.reader import hash_frames
+from lightpage.recording.layout import hash_frames
 from lightpage.runtime.archives.recordings.evaluation import was_seen
 from lightpage.runtime.archives.recordings.read_ahead import read_ahead
 from lightpage.runtime.model.decoding.decoder import Decoder

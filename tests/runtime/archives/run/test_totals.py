@@ -20,11 +20,10 @@ def test_pages_are_counted_by_what_became_of_them(tmp_path: Path) -> None:
     write(ledger.shard(1, 3), lost(3), lost(4, None, "no reason"), lost(5))
     asked = job(source("a"), source("b"), source("c", STAYS))
     found = totals(ledger, asked)
-    tally = found.tally
-    assert (tally.pages, tally.read, tally.left_out, tally.missing, tally.recalibration_due) == (2 * PAGES, 2, 1, 8, 1)
-    assert (tally.lost, tally.models) == ({"BlackFrameError": 2, "unknown": 1}, {"toy-1": 6})
-    assert (found.figures.value(AIR), found.figures.least(AIR), found.figures.value("none")) == (3.0, 2.0, None)
-    assert found.figures.value("confirmed_bits") == 2.0
+    assert (found.pages, found.read, found.left_out, found.missing, found.recalibration_due) == (2 * PAGES, 2, 1, 8, 1)
+    assert (found.lost, found.models) == ({"BlackFrameError": 2, "unknown": 1}, {"toy-1": 6})
+    assert (found.figures[AIR].value, found.figures[AIR].least, found.figures["none"].value) == (3.0, 2.0, None)
+    assert found.figures["confirmed_bits"].value == 2.0
     assert [row["pages_lost"] for row in found.recordings] == [0, 3, 0]
     assert found.recordings[1]["lost_pages"] == {"BlackFrameError": "3, 5", "unknown": "4"}
     assert found.recordings[2]["problem"] == str(STAYS)
@@ -41,7 +40,7 @@ def test_pages_are_counted_by_what_became_of_them(tmp_path: Path) -> None:
     told = found.to_json()
     assert (told["pages"], told["pages_read"], told["pages_lost"], told["pages_missing"]) == (14, 2, 3, 8)
     part = totals(Ledger(tmp_path, Part(index=1, count=3)), asked)
-    assert (part.tally.pages, part.tally.lost.total(), len(part.recordings)) == (PAGES, 3, 1)
+    assert (part.pages, part.lost.total(), len(part.recordings)) == (PAGES, 3, 1)
 
 
 def test_a_round_says_what_it_has_brought(tmp_path: Path) -> None:
@@ -60,7 +59,7 @@ def test_a_round_says_what_it_has_brought(tmp_path: Path) -> None:
         "air_before": 1.0,  # of a lost page nothing, and (0 + 1 + 2) / 3 of those whose AIR is known
         "air_after": pytest.approx(7 / 3),
     }
-    assert (found.tally.read, found.tally.models) == (3, {"toy-2": 2, "toy-1": 2})
+    assert (found.read, found.models) == (3, {"toy-2": 2, "toy-1": 2})
     assert [reading.pages for reading in found.readings] == [3, 3, 1, 1]
 
 
@@ -95,6 +94,6 @@ def test_devices_have_a_row_each_that_says_why(tmp_path: Path) -> None:
     assert rows["a"]["bundle"] == str(ledger.shard(0, 0).with_name("00000000.zip"))
     assert rows["a"]["recordings"] == ["/a1.h5", "/a2.h5"]
     assert (rows["b"]["reason"], rows["c"]["reason"], rows["e"]["reason"]) == ("no fit", str(STAYS), "")
-    assert found.lost == ["device b: recording /b.h5: no fit"]
-    assert (found.tally.pages, found.tally.read, found.tally.lost) == (4, 1, {"RecalibrationRefusedError": 1})
-    assert BUNDLE.version in found.tally.models
+    assert found.told == ["device b: recording /b.h5: no fit"]
+    assert (found.pages, found.read, found.lost) == (4, 1, {"RecalibrationRefusedError": 1})
+    assert BUNDLE.version in found.models

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -144,6 +144,20 @@ def test_the_command_works_with_the_usual_workers(job: Job, tmp_path: Path) -> N
     asked = f"decode {out} --recordings {tmp_path / 'a.h5'} --bundle {bundle} --workers 1 --threads 1"
     assert run_command(bulk, asked.split()) == 0
     assert sum(len(read) for read in pages(out).values()) == PAGES
+
+
+def test_a_run_that_ends_early_ends_workers_that_are_busy(job: Job, tmp_path: Path) -> None:
+    begun = tmp_path / f"a{BEGUN}"
+    begun.touch()
+
+    def tasks() -> Iterator[Task]:
+        yield next(Ledger(tmp_path / "out").missing(job))
+        eventually(begun.read_text)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        list(LocalEngine(2, 1, partial(started, target=WORKER)).run(tasks()))
+    assert not runs(int(begun.read_text()))
 
 
 DRIVER = """

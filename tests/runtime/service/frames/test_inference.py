@@ -333,8 +333,8 @@ def test_a_whole_pair_passes_where_no_message_of_ones_own_may_be_so_large(start:
 def test_the_largest_message_is_a_pair_with_pilots(shape: tuple[int, int], dtype: str, largest: int) -> None:
     profile = SimpleNamespace(frame_shape=shape, page_shape=(16, 24) if shape == (64, 96) else (500, 800))
     bundle = SimpleNamespace(profile=profile, manifest=SimpleNamespace(frame_dtype=dtype))
-    registry = SimpleNamespace(current=SimpleNamespace(decoder=SimpleNamespace(bundle=bundle)))
-    plane: Any = SimpleNamespace(registry=registry, limits=Limits())
+    models = SimpleNamespace(current=SimpleNamespace(decoder=SimpleNamespace(bundle=bundle)))
+    plane: Any = SimpleNamespace(models=models, limits=Limits())
     assert large_messages(plane) == {MODEL_INFER: largest}
 
 

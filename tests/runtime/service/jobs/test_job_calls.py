@@ -204,7 +204,7 @@ def test_frames_that_are_sent_give_what_the_same_pages_of_a_recording_give(start
     for name in ("model_version", "previous_version", "pages_used", "pages_held_back", "air_before", "air_after"):
         assert getattr(sent.result, name) == getattr(recorded.result, name)
     assert sent.result.air_after > sent.result.air_before + 0.5
-    bundles = [service.plane.registry.current.decoder.bundle for service in (one, other)]
+    bundles = [service.plane.models.current.decoder.bundle for service in (one, other)]
     assert bundles[0].files == bundles[1].files
     assert other.plane.received.used == 0
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import sqlite3
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,10 +27,11 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome, Refit, RefitReport
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
-from lightpage.runtime.service.jobs.jobs import DAMAGED, FILE, Jobs
+from lightpage.runtime.service.jobs.jobs import Jobs
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
-from lightpage.runtime.service.models.registry import ModelRegistry
-from lightpage.runtime.service.models.store import ModelStore
+from lightpage.runtime.service.models.database import write_job
+from lightpage.runtime.service.models.models import Models
+from lightpage.runtime.service.models.store import Store
 from tests.clock import HandClock
 from tests.lightpage.full_disk import full_disk
 from tests.runtime import toy
@@ -39,15 +42,38 @@ OUTCOME = RecalibrationOutcome(
 )
 
 
+Open = Callable[..., Jobs]
+
+
+@pytest.fixture
+def stores(decoder: Decoder, tmp_path: Path) -> Callable[[], Store]:
+    """Opens a store, the same one each time; the one before is closed."""
+    opened: list[Store] = []
+
+    def begin() -> Store:
+        for store in opened:
+            store.close()
+        opened[:] = [Store(tmp_path, decoder.bundle)]
+        return opened[0]
+
+    return begin
+
+
+@pytest.fixture
+def start(stores: Callable[[], Store]) -> Open:
+    """The jobs of a service as they are after a restart."""
+    return lambda **options: Jobs(stores(), **options)
+
+
 def ended(jobs: Jobs, end: RecalibrationOutcome | BaseException = OUTCOME) -> str:
     running = jobs.begin("source", Caller(), "mine")
     jobs.end(running, end)
     return running.id
 
 
-def test_one_runs_at_a_time_and_the_second_hears_which() -> None:
+def test_one_runs_at_a_time_and_the_second_hears_which(start: Open) -> None:
     clock = HandClock()
-    jobs = Jobs(clock=clock.now)
+    jobs = start(clock=clock.now)
     running = jobs.begin("source", Caller())
     with pytest.raises(BusyError, match=running.id) as caught:
         jobs.begin("frames", Caller())
@@ -59,7 +85,7 @@ def test_one_runs_at_a_time_and_the_second_hears_which() -> None:
     assert not running.caller.is_here
     with pytest.raises(JobCancelledError):
         running.check()
-    jobs.tell("fit", 0.5)
+    jobs.tell(running, "fit", 0.5)
     job = jobs.job(running.id)
     assert (job.state, job.progress.step, job.progress.fraction) == (pb.JOB_STATE_RUNNING, "fit", 0.5)
     clock.advance(5.0)
@@ -69,6 +95,20 @@ def test_one_runs_at_a_time_and_the_second_hears_which() -> None:
     assert jobs.wait_idle(0)
     jobs.check_free()
     assert jobs.begin("frames", Caller()).id != running.id
+
+
+def test_a_job_is_named_to_others_once_it_can_be_found(stores: Callable[[], Store]) -> None:
+    store = stores()
+    jobs, transaction = Jobs(store), store.transaction
+
+    @contextmanager
+    def slow() -> Iterator[sqlite3.Connection]:
+        jobs.check_free()
+        with transaction() as database:
+            yield database
+
+    store.transaction = slow  # type: ignore[method-assign,assignment]
+    jobs.begin("source", Caller())
 
 
 @pytest.mark.parametrize(
@@ -86,22 +126,22 @@ def test_one_runs_at_a_time_and_the_second_hears_which() -> None:
     ],
 )
 def test_each_end_is_told_and_kept_over_a_restart(
-    end: RecalibrationOutcome | BaseException, state: pb.JobState, tmp_path: Path
+    end: RecalibrationOutcome | BaseException, state: pb.JobState, start: Open, decoder: Decoder
 ) -> None:
-    jobs = Jobs(tmp_path)
+    jobs = start()
     found = jobs.job(ended(jobs, end))
     assert found.state == state
     assert found.HasField("result") == isinstance(end, RecalibrationOutcome) != found.HasField("refusal")
     assert (found.correlation_id, found.pages_of) == ("mine", "source")
-    assert Jobs(tmp_path).all() == [found]
-    assert Jobs(None).all() == []
+    assert start().all() == [found]
+    assert Jobs(Store(None, decoder.bundle)).all() == []
 
 
-def test_the_newest_come_first_and_the_oldest_are_forgotten(tmp_path: Path) -> None:
-    jobs = Jobs(tmp_path, kept=3)
+def test_the_newest_come_first_and_the_oldest_are_forgotten(start: Open) -> None:
+    jobs = start(kept=3)
     names = [ended(jobs) for _ in range(5)]
     assert [job.id for job in jobs.all()] == names[:1:-1]
-    assert [job.id for job in Jobs(tmp_path, kept=2).all()] == names[:2:-1]
+    assert [job.id for job in start(kept=2).all()] == names[:2:-1]
     for unknown in (names[0], "", "x"):
         with pytest.raises(NoSuchJobError):
             jobs.job(unknown)
@@ -109,71 +149,47 @@ def test_the_newest_come_first_and_the_oldest_are_forgotten(tmp_path: Path) -> N
             jobs.cancel(unknown)
 
 
-@pytest.mark.parametrize(
-    ("in_service", "foretold", "state"),
-    [("toy-1+r1", True, "DONE"), ("toy-1", True, "INTERRUPTED"), ("", False, "INTERRUPTED")],
-)
-def test_what_a_kill_interrupted_is_told_by_the_model_in_service(
-    in_service: str, foretold: bool, state: str, tmp_path: Path
+@pytest.mark.parametrize("written", [True, False])
+def test_a_job_that_a_kill_interrupted_is_done_where_its_model_is_written(
+    written: bool, start: Open, stores: Callable[[], Store]
 ) -> None:
-    before = Jobs(tmp_path)
-    first = ended(before)
-    running = before.begin("frames", Caller())
-    if foretold:
-        before.foretell(OUTCOME)
+    store = stores()
+    before = Jobs(store)
+    first, running = ended(before), before.begin("frames", Caller())
+    if written:
+        store.save(store.contents.state, before.done(running, OUTCOME))
     assert not before.job(running.id).HasField("result")  # nobody hears of it before it is so
-    after = Jobs(tmp_path, version=in_service, clock=lambda: 7.0)
+    after = start(clock=lambda: 7.0)
     job = after.job(running.id)
-    assert (job.state, job.ended_s) == (pb.JobState.Value(f"JOB_STATE_{state}"), 7.0)
-    assert job.HasField("result") == (state == "DONE")
-    assert job.refusal.detail.kind == ("" if state == "DONE" else "StoppingError")
+    assert job.state == (pb.JOB_STATE_DONE if written else pb.JOB_STATE_INTERRUPTED)
+    assert job.HasField("result") == written == (job.ended_s != 7.0)
+    assert job.refusal.detail.kind == ("" if written else "StoppingError")
     assert after.job(first).state == pb.JOB_STATE_DONE
     assert after.wait_idle(0)
-    assert [one.state for one in Jobs(tmp_path).all()] == [job.state, pb.JOB_STATE_DONE]
+    assert [one.state for one in start().all()] == [job.state, pb.JOB_STATE_DONE]
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"\xff\xfe",
-        b'{"format": "lightpage-jobs", "version": 2, "jobs": []}',
-        b'{"format": "lightpage-jobs", "version": 1, "jobs": [{"state": "JOB_STATE_DONE"}]}',
-        b'{"format": "lightpage-jobs", "version": 1, "jobs": [{"id": "x", "ended_s": "soon"}]}',
-        b"[" * 100_000,
-    ],
-)
-def test_a_damaged_record_is_set_aside_with_a_warning(
-    content: bytes, tmp_path: Path, caplog: pytest.LogCaptureFixture
+def test_a_damaged_record_is_forgotten_with_a_warning(
+    start: Open, stores: Callable[[], Store], caplog: pytest.LogCaptureFixture
 ) -> None:
-    (tmp_path / FILE).write_bytes(content)
-    jobs = Jobs(tmp_path)
+    with stores().transaction() as database:
+        write_job(database, "x", b"\xff", 9)
+    jobs = start()
     assert [record.levelname for record in caplog.records] == ["WARNING"]
     assert jobs.all() == []
-    assert (tmp_path / DAMAGED).read_bytes() == content
-    done = ended(jobs)
-    assert Jobs(tmp_path).job(done).state == pb.JOB_STATE_DONE
 
 
-def test_what_a_newer_program_has_added_is_passed_over(tmp_path: Path) -> None:
-    ended(Jobs(tmp_path))
-    text = (tmp_path / FILE).read_text()
-    (tmp_path / FILE).write_text(text.replace('"id"', '"colour": "green", "id"'))
-    assert Jobs(tmp_path).all()[0].state == pb.JOB_STATE_DONE
-    assert not (tmp_path / DAMAGED).exists()
-
-
-def test_a_full_disk_costs_the_record_and_not_the_job(tmp_path: Path) -> None:
-    jobs = Jobs(tmp_path)
+def test_a_full_disk_costs_the_record_and_not_the_job(start: Open) -> None:
+    jobs = start()
     kept = ended(jobs)
     with full_disk(10):
         lost = ended(jobs)
     assert jobs.job(lost).state == pb.JOB_STATE_DONE
-    assert [job.id for job in Jobs(tmp_path).all()] == [kept]
-    assert [path.name for path in tmp_path.iterdir()] == [FILE]
+    assert [job.id for job in start().all()] == [kept]
 
 
-def test_what_nobody_foresaw_is_logged_with_its_traceback(caplog: pytest.LogCaptureFixture) -> None:
-    jobs, caught = Jobs(), ZeroDivisionError("a bug")
+def test_what_nobody_foresaw_is_logged_with_its_traceback(start: Open, caplog: pytest.LogCaptureFixture) -> None:
+    jobs, caught = start(), ZeroDivisionError("a bug")
     with caplog.at_level(logging.INFO):
         ended(jobs, FrameError("frame", "black", "light"))
         ended(jobs, caught)
@@ -185,23 +201,22 @@ Make = Callable[..., Recalibrator]
 
 
 @pytest.fixture
-def make(decoder: Decoder) -> Make:
-    def begin(fit: Refit = toy.fit_references, store: Path | None = None) -> Recalibrator:
-        models = None if store is None else ModelStore(store, decoder.bundle)
-        return Recalibrator(DataPlane(ModelRegistry(decoder), toy.ToySource(toy.ToyDevice()), models), fit)
+def make(decoder: Decoder, stores: Callable[[], Store]) -> Make:
+    def begin(fit: Refit = toy.fit_references) -> Recalibrator:
+        return Recalibrator(DataPlane(Models(decoder, stores()), toy.ToySource(toy.ToyDevice())), fit)
 
     return begin
 
 
-def test_the_end_of_the_service_interrupts_the_job_and_the_next_start_knows(make: Make, tmp_path: Path) -> None:
+def test_the_end_of_the_service_interrupts_the_job_and_the_next_start_knows(make: Make) -> None:
     fit = SlowFit()
-    recalibrator = make(fit, tmp_path)
+    recalibrator = make(fit)
     job = recalibrator.start(recalibrator.source_pages(2), correlation_id="night")
     assert fit.entered.wait(60)
     recalibrator.close(60.0)
     with pytest.raises(StoppingError):
         recalibrator.start(recalibrator.source_pages(2))
-    found = make(store=tmp_path).jobs.job(job.id)
+    found = make().jobs.job(job.id)
     assert (found.state, found.correlation_id) == (pb.JOB_STATE_INTERRUPTED, "night")
     assert found.refusal.detail.kind == "StoppingError"
 

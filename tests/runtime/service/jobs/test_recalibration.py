@@ -29,8 +29,7 @@ from lightpage.metrics.measures import measure
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.device.acquisition.source import Shot, open_source
 from lightpage.runtime.recalibration.recalibration import RefitResult
-from lightpage.runtime.service.models.audit import AuditLog
-from lightpage.runtime.service.models.registry import KEPT_MODELS
+from lightpage.runtime.service.models.models import KEPT_MODELS
 from tests.runtime import toy
 from tests.runtime.service.stage import Running, Start, a_page, refused
 from tests.runtime.slow_fit import SlowFit
@@ -90,9 +89,9 @@ def test_without_a_store_it_goes_on_after_a_rollback_and_keeps_only_the_models_h
     assert service.client.models.roll_back() == ("toy-1", "toy-1+r1")
     versions = [service.client.jobs.recalibrate(count=2).model_version for _ in range(KEPT_MODELS + 1)]
     assert versions == [f"toy-1+r{number}" for number in range(2, KEPT_MODELS + 3)]
-    kept = [model.decoder.bundle.path for model in service.plane.registry.models]
+    kept = [model.decoder.bundle.path for model in service.plane.models.loaded]
     assert sorted(kept[0].parent.iterdir()) == sorted(kept)
-    service.recalibrator.close()
+    service.end()
     assert not kept[0].parent.exists()
 
 
@@ -186,7 +185,7 @@ def test_the_service_ends_beside_one_that_does_not_stop_and_it_changes_nothing_a
     assert service.count("lightpage_recalibrations_total", result="dropped") == 0  # it is still at work
     go.set()
     eventually(lambda: service.count("lightpage_recalibrations_total", result="dropped") == 1)
-    assert [model.version for model in service.plane.registry.models] == ["toy-1"]
+    assert [model.version for model in service.plane.models.loaded] == ["toy-1"]
 
 
 def test_a_caller_who_leaves_ends_it(start: Start) -> None:
@@ -199,6 +198,7 @@ def test_a_caller_who_leaves_ends_it(start: Start) -> None:
     assert fit.ended.wait(60)
     eventually(lambda: service.count("lightpage_recalibrations_total", result="dropped") == 1)
     assert service.version == "toy-1"
+    eventually(lambda: service.client.jobs.list()[0].state.name != "RUNNING")  # its end is noted after it is counted
     fit.go.set()
     assert service.client.jobs.recalibrate(count=2).model_version == "toy-1+r1"
 
@@ -233,5 +233,5 @@ def test_a_model_that_changes_meanwhile_makes_its_result_out_of_date(start: Star
 
 def test_who_asked_for_a_change_is_written_down(start: Start, tmp_path: Path) -> None:
     file = tmp_path / "audit.jsonl"
-    start(audit=AuditLog(file)).client.jobs.recalibrate(count=2)
+    start(audit=file).client.jobs.recalibrate(count=2)
     assert json.loads(file.read_text("utf-8"))["who"].startswith("ipv4:127.0.0.1:")

@@ -26,10 +26,9 @@ from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.frames.frames import decode
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 from lightpage.runtime.service.jobs.self_calibration import SelfCalibration, SelfCalibrationSettings
-from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
-from lightpage.runtime.service.monitoring.monitor import Monitor, MonitorSettings, PageFigures
-from lightpage.runtime.service.monitoring.monitors import Monitors
+from lightpage.runtime.service.monitoring.monitor import Monitor, Monitors, MonitorSettings, PageFigures
 from lightpage.runtime.service.monitoring.observation import Observation
 from lightpage.runtime.service.pages.reading import read_page
 from lightpage.runtime.service.settings import ServiceSettings
@@ -186,7 +185,7 @@ def own(seed: int) -> FramePair:
 
 def plane_of(decoder: Decoder, *device_sessions: str) -> DataPlane:
     monitor, source = Monitor(MonitorSettings(3)), toy.ToySource(toy.ToyDevice())
-    return DataPlane(ModelRegistry(decoder), source, monitor=monitor, device_sessions=device_sessions)
+    return DataPlane(Models(decoder), source, monitor=monitor, device_sessions=device_sessions)
 
 
 def send(plane: DataPlane, pair: FramePair, session: str, stateless: bool = False) -> bool:
@@ -319,7 +318,7 @@ class Loop:
 
     def __post_init__(self) -> None:
         self.monitor = Monitor(MonitorSettings(3))
-        self.plane = DataPlane(ModelRegistry(self.decoder), self.source, monitor=self.monitor)
+        self.plane = DataPlane(Models(self.decoder), self.source, monitor=self.monitor)
         self.recalibrator = Recalibrator(self.plane, self.fit)
         self.running = SelfCalibration(self.plane, self.monitor, self.recalibrator, self.settings, self.clock)
         self.read(8)
@@ -350,7 +349,7 @@ class Loop:
 
     @property
     def version(self) -> str:
-        return self.plane.registry.current.version
+        return self.plane.models.current.version
 
     def count(self, result: str) -> float:
         value = self.plane.metrics.registry.get_sample_value

@@ -34,7 +34,8 @@ from lightpage.runtime.model.bundle.manifest import DECODER
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.tracking import NoTracker
 from lightpage.runtime.service.limits import Limits
-from lightpage.runtime.service.models.registry import KEPT_MODELS, Model
+from lightpage.runtime.service.models.loader import Model
+from lightpage.runtime.service.models.models import KEPT_MODELS
 from tests.runtime import toy
 from tests.runtime.service.stage import Running, Start, refused, until_told
 from tests.waiting import eventually
@@ -69,7 +70,7 @@ def test_an_uploaded_model_is_kept_put_in_service_and_rolled_back(stored: Start,
     client = service.client
     model = client.models.upload(new)
     assert (model.version, model.origin, model.current, model.loaded) == ("toy-2", "uploaded", False, False)
-    assert service.store.path_of("toy-2").read_bytes() == new.read_bytes()
+    assert service.store.bundle("toy-2").read_bytes() == new.read_bytes()
     for bundle in (new, toy_zip):  # a version that is there is not taken again
         with pytest.raises(ModelExistsError):
             client.models.upload(bundle)
@@ -98,7 +99,7 @@ def test_an_uploaded_model_is_kept_put_in_service_and_rolled_back(stored: Start,
     for step in (client.models.roll_back, lambda: client.models.activate("toy-9"), lambda: client.models.pin("../new")):
         with pytest.raises(BundleError):
             step()
-    assert again.left_behind == ["jobs.json"]
+    assert again.left_behind == []
 
 
 def test_models_are_listed_with_what_is_known_of_them(stored: Start, new: Path) -> None:
@@ -106,7 +107,7 @@ def test_models_are_listed_with_what_is_known_of_them(stored: Start, new: Path) 
     service.client.models.upload(new)
     for number in range(1, KEPT_MODELS + 1):
         assert service.client.jobs.recalibrate(count=2).model_version == f"toy-1+r{number}"
-    (service.store.folder / "damaged.zip").write_bytes(b"no zip")
+    (service.store.path / "damaged.zip").write_bytes(b"no zip")
     listed = {model.version: model for model in service.client.models.list(stored=True)}
     assert list(listed) == ["toy-1", "toy-2", *(f"toy-1+r{number}" for number in range(1, KEPT_MODELS + 1))]
     assert [model.origin for model in listed.values()] == ["given", "uploaded"] + ["recalibrated"] * KEPT_MODELS
@@ -177,12 +178,12 @@ def test_a_caller_who_is_slow_leaves_nothing(stored: Start, new: Path) -> None:
 def test_a_caller_who_leaves_leaves_nothing_and_one_upload_is_taken_at_a_time(stored: Start, new: Path) -> None:
     service, data, more = stored(), new.read_bytes(), threading.Event()
     call = service.stub.UploadModel.future(until_told([header(data), chunk(data[:9])], more), timeout=60)
-    eventually(lambda: service.plane.models.uploads.busy == 1 and service.left_behind != [])
+    eventually(lambda: service.plane.uploads.busy == 1 and service.left_behind != [])
     with pytest.raises(SlotsTakenError):
         service.client.models.upload(new)
     call.cancel()
     more.set()
-    eventually(lambda: service.left_behind == [] and service.plane.models.uploads.busy == 0)
+    eventually(lambda: service.left_behind == [] and service.plane.uploads.busy == 0)
     assert service.client.models.upload(new).version == "toy-2"
 
 
@@ -190,14 +191,15 @@ def test_a_caller_who_leaves_while_the_bundle_is_checked_leaves_nothing(
     stored: Start, new: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     service, data = stored(), new.read_bytes()
-    as_it_was, checking = service.plane.registry.tracked, threading.Event()
+    loader, checking = service.plane.models.loader, threading.Event()
+    as_it_was = loader.tracked
 
-    def slow_check(decoder: Decoder) -> Model:
+    def slow_check(decoder: Decoder, current: Decoder) -> Model:
         checking.set()
-        eventually(lambda: service.plane.models.uploads.busy == 0)
-        return as_it_was(decoder)
+        eventually(lambda: service.plane.uploads.busy == 0)
+        return as_it_was(decoder, current)
 
-    monkeypatch.setattr(service.plane.registry, "tracked", slow_check)
+    monkeypatch.setattr(loader, "tracked", slow_check)
     call = service.stub.UploadModel.future(iter([header(data), chunk(data)]), timeout=60)
     assert checking.wait(60)
     call.cancel()
@@ -221,7 +223,7 @@ def test_a_disk_that_fails_during_an_upload_leaves_nothing(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("os.link", full)
+        patch.setattr("lightpage.runtime.service.models.uploads.give_new_name", full)
         with pytest.raises(StoreError):
             service.client.models.upload(new)
         eventually(lambda: service.left_behind == service.store.versions() == [])

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
+import signal
+import sqlite3
 from pathlib import Path
+from typing import Any
 
 import pytest
 from cryptography.hazmat.primitives import hashes, serialization
@@ -16,10 +18,15 @@ from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.signature import BundleKey
 from lightpage.runtime.model.bundle.signature_file import signature_path
 from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.service.caller import NOBODY
 from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.models.audit import AuditLog
+from lightpage.runtime.service.models.database import DATABASE
 from lightpage.runtime.service.models.incoming import Incoming
-from lightpage.runtime.service.models.registry import ModelRegistry
-from lightpage.runtime.service.models.store import ModelStore
+from lightpage.runtime.service.models.loader import Loader
+from lightpage.runtime.service.models.models import Models
+from lightpage.runtime.service.models.store import Store
+from lightpage.runtime.service.models.uploads import take_in
 from tests.clock import HandClock
 from tests.lightpage.full_disk import full_disk
 from tests.runtime import toy
@@ -28,9 +35,7 @@ from tests.waiting import eventually
 
 @pytest.fixture
 def plane(decoder: Decoder, tmp_path: Path) -> DataPlane:
-    made = DataPlane(ModelRegistry(decoder), store=ModelStore(tmp_path / "store", decoder.bundle))
-    made.models.resume()
-    return made
+    return DataPlane(Models(decoder, Store(tmp_path / "store", decoder.bundle)))
 
 
 @pytest.fixture
@@ -39,12 +44,16 @@ def folder(tmp_path: Path) -> Path:
     return made
 
 
+def incoming_of(plane: DataPlane, folder: Path, *options: Any) -> Incoming:
+    return Incoming(plane.models, plane.limits.model_bytes, plane.uploads, folder, *options)
+
+
 def versions(plane: DataPlane) -> list[str]:
     return [entry.manifest.version for entry in plane.models.entries(stored=True)]
 
 
 def test_a_bundle_is_moved_to_the_store_once_it_is_whole(plane: DataPlane, folder: Path) -> None:
-    incoming, path = Incoming(plane.models, folder), folder / "new.zip"
+    incoming, path = incoming_of(plane, folder), folder / "new.zip"
     whole = toy.write_toy_bundle(folder / "new.part", version="toy-2")
     data = toy.write_toy_bundle(folder.parent / "toy-2.zip", version="toy-2").read_bytes()
     path.write_bytes(data[:100])
@@ -55,13 +64,13 @@ def test_a_bundle_is_moved_to_the_store_once_it_is_whole(plane: DataPlane, folde
     incoming.look()
     assert versions(plane) == ["toy-2", "toy-1"]
     assert [file.name for file in folder.iterdir()] == [whole.name]
-    assert plane.registry.current.version == "toy-1"
+    assert plane.models.current.version == "toy-1"
 
 
 def test_what_is_refused_is_said_once_and_stays(
     plane: DataPlane, folder: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    incoming, path = Incoming(plane.models, folder), folder / "bad.zip"
+    incoming, path = incoming_of(plane, folder), folder / "bad.zip"
     path.write_bytes(b"no zip")
     (folder / "link.zip").symlink_to(toy.write_toy_bundle(folder.parent / "elsewhere.zip", version="toy-3"))
     for _ in range(4):
@@ -78,7 +87,7 @@ def test_what_is_refused_is_said_once_and_stays(
 def test_what_the_store_cannot_take_is_tried_again(
     plane: DataPlane, folder: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    incoming = Incoming(plane.models, folder)
+    incoming = incoming_of(plane, folder)
     toy.write_toy_bundle(folder / "new.zip", version="toy-2")
     incoming.look()
     with full_disk(10):
@@ -95,7 +104,7 @@ def test_the_folder_is_looked_at_while_the_service_runs(
     caplog.set_level(logging.INFO)
     clock = HandClock()
     toy.write_toy_bundle(folder / "new.zip", version="toy-2")
-    with Incoming(plane.models, folder, 5.0, clock):
+    with incoming_of(plane, folder, 5.0, clock):
         clock.until_somebody_waits()
         assert versions(plane) == ["toy-1"]
         eventually(lambda: clock.advance(5.0) or "as toy-2" in caplog.text)
@@ -118,18 +127,22 @@ class Signer:
         signature_path(bundle).write_bytes(self.signature(bundle))
 
 
-def begin(folder: Path, signer: Signer | None) -> DataPlane:
-    """A service as it is after a restart; without a signer it has no key."""
+running: list[Models] = []
+
+
+def begin(folder: Path, signer: Signer | None, **options: int) -> DataPlane:
+    """A service as it is after a restart, which ends the one before; without a signer it has no key."""
+    while running:
+        running.pop().store.close()
     base = folder / "base.zip"
     if not base.exists():
         toy.write_toy_bundle(base)
     if signer is not None:
         signer.sign(base)
     key = None if signer is None else BundleKey(signer.path)
-    registry = ModelRegistry(Decoder(Bundle.open(base, key=key), threads=1), key=key)
-    plane = DataPlane(registry, store=ModelStore(folder / "store", registry.current.decoder.bundle))
-    plane.models.resume()
-    return plane
+    decoder = Decoder(Bundle.open(base, key=key), threads=1)
+    running.append(Models(decoder, Store(folder / "store", decoder.bundle, **options), Loader(key=key)))
+    return DataPlane(running[0])
 
 
 class Signed:
@@ -146,10 +159,10 @@ class Signed:
 
     def take_in(self, version: str) -> None:
         path, signature = self.bundle(version)
-        self.models.take_in(path, signature=signature)
+        take_in(self.models, path, signature=signature)
 
     def looked(self) -> set[str]:
-        taking = Incoming(self.plane.models, self.incoming)
+        taking = incoming_of(self.plane, self.incoming)
         taking.look()
         taking.look()
         return set(self.models.versions())
@@ -164,8 +177,8 @@ def test_a_new_bundle_needs_a_signature(service: Signed) -> None:
     (good, signature), (bad, _) = service.bundle("toy-2"), service.bundle("toy-3")
     for wrong in (b"", signature):
         with pytest.raises(BundleError, match="new bundle: signature"):
-            service.models.take_in(bad, signature=wrong)
-    service.models.take_in(good, signature=signature)
+            take_in(service.models, bad, signature=wrong)
+    take_in(service.models, good, signature=signature)
     assert service.models.activate("toy-2")[0].version == "toy-2"
     assert signature_path(service.store / "toy-2.zip").read_bytes() == signature
     assert not list(service.store.glob("*toy-3*"))
@@ -208,7 +221,7 @@ def test_a_stored_bundle_without_its_own_signature_is_refused(service: Signed) -
 def recalibrated(plane: DataPlane, folder: Path, version: str) -> Path:
     """The bundle of a recalibration that the service has made and put in service."""
     path = toy.write_toy_bundle(folder / "store" / f"{version}.zip", version=version)
-    plane.models.adopt(plane.registry.current.decoder.of_another(Bundle.open(path)))
+    plane.models.adopt(plane.models.current.decoder.of_another(Bundle.open(path)))
     return path
 
 
@@ -217,53 +230,69 @@ def test_a_recalibration_under_no_key_or_another_one_needs_a_signature(tmp_path:
     signer, before = Signer(tmp_path), Signer(tmp_path, "before")
     own = recalibrated(begin(tmp_path, before if earlier == "another" else None), tmp_path, "toy-1+r1")
     plane = begin(tmp_path, signer)
-    assert plane.registry.current.version == "toy-1"
-    found = plane.models.trouble()
+    assert plane.models.current.version == "toy-1"
+    found = plane.models.store.trouble()
     assert found is not None
     assert f"under {earlier} bundle" in found.text
     with pytest.raises(BundleError, match=f"under {earlier} bundle"):
         plane.models.activate("toy-1+r1")
     recalibrated(plane, tmp_path, "toy-1+r2")
-    assert begin(tmp_path, signer).registry.current.version == "toy-1+r2"
+    assert begin(tmp_path, signer).models.current.version == "toy-1+r2"
     signer.sign(own)
     assert begin(tmp_path, signer).models.activate("toy-1+r1")[0].version == "toy-1+r1"
     for key in (signer, None):
-        assert begin(tmp_path, key).registry.current.version == "toy-1+r1"
+        assert begin(tmp_path, key).models.current.version == "toy-1+r1"
 
 
 def test_its_own_models_need_none_and_the_note_names_their_key(service: Signed) -> None:
     recalibrated(service.plane, service.folder, "toy-1+r1")
     service.take_in("toy-2")
-    assert begin(service.folder, service.signer).registry.current.version == "toy-1+r1"
-    assert json.loads((service.store / "current.json").read_text())["keys"].keys() == {"toy-1+r1"}
+    assert begin(service.folder, service.signer).models.current.version == "toy-1+r1"
+    found = begin(service.folder, service.signer).models.now.state.bundles
+    assert {version for version, known in found.items() if known.key} == {"toy-1+r1"}
 
 
 def test_without_a_key_no_signature_is_kept(tmp_path: Path) -> None:
-    begin(tmp_path, None).models.take_in(toy.write_toy_bundle(tmp_path / "new.zip", version="toy-2"), signature=b"some")
+    path = toy.write_toy_bundle(tmp_path / "new.zip", version="toy-2")
+    take_in(begin(tmp_path, None).models, path, signature=b"some")
     assert [path.name for path in (tmp_path / "store").glob("*toy*")] == ["toy-2.zip"]
 
 
 def test_pruning_takes_signatures_along(service: Signed) -> None:
-    store = ModelStore(service.store, service.plane.registry.current.decoder.bundle, kept=1)
     for version in ("toy-2", "toy-3"):
         service.take_in(version)
-    store.note = service.plane.store.note  # type: ignore[union-attr]
-    store.prune(())
+    begin(service.folder, service.signer, kept=1).models.prune()
     assert sorted(path.name for path in service.store.glob("toy-*")) == ["toy-3.zip", "toy-3.zip.sig"]
 
 
 def test_a_bundle_of_the_same_version_that_came_meanwhile_stays(service: Signed) -> None:
     path, signature = service.bundle("toy-2")
     with pytest.raises(ModelExistsError, match=r"^new bundle: version"):
-        service.models.take_in(path, (service.store / "toy-2.zip").touch, signature)
+        take_in(service.models, path, NOBODY, (service.store / "toy-2.zip").touch, signature)
     assert (service.store / "toy-2.zip").read_bytes() == b""
 
 
-def test_a_bundle_that_cannot_be_noted_is_not_taken(service: Signed, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object, **__: object) -> None:
-        raise StoreError("model store", "no room", "room")
+@pytest.mark.parametrize("end", ["save", "done"])
+def test_a_bundle_whose_taking_in_was_killed_is_there_with_all_that_belongs_to_it_or_not(
+    service: Signed, end: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, signature = service.bundle("toy-2")
+    hidden = path.rename(service.store / ".upload-x")
+    if not os.fork():
+        die = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)  # noqa: E731
+        monkeypatch.setattr(*{"save": (service.models.store, "save"), "done": (AuditLog, "done")}[end], die)
+        take_in(service.models, hidden, signature=signature)
+    os.wait()
+    assert signature_path(service.store / "toy-2.zip").read_bytes() == signature
+    after = begin(service.folder, service.signer).models
+    assert not hidden.exists()
+    assert sorted(path.name for path in service.store.glob("toy*")) == ["toy-2.zip", "toy-2.zip.sig"] * (end == "done")
+    assert (after.now.state.known("toy-2").origin == "uploaded") == (end == "done")
 
-    monkeypatch.setattr(service.plane.store, "change", full)
+
+def test_a_bundle_that_cannot_be_noted_is_not_taken(service: Signed) -> None:
+    with sqlite3.connect(service.store / DATABASE) as database:
+        database.execute("DROP TABLE audit")
     with pytest.raises(StoreError, match="model store"):
         service.take_in("toy-2")
     assert not list(service.store.glob("toy-2*"))

@@ -17,7 +17,7 @@ from lightpage.recording.reader import Recording
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
-from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.monitoring.flight_recorder import FileRing, FlightRecorder, FlightSettings
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import Monitor
@@ -30,8 +30,8 @@ LOST = (230.0, 20.0)
 
 
 @pytest.fixture
-def registry(decoder: Decoder) -> ModelRegistry:
-    return ModelRegistry(decoder)
+def registry(decoder: Decoder) -> Models:
+    return Models(decoder)
 
 
 def kept(folder: Path) -> list[Path]:
@@ -48,7 +48,7 @@ def read_lost(plane: DataPlane, pages: int) -> None:
             read_page(plane, None, None, Caller())
 
 
-def test_a_lost_page_is_kept_with_why(registry: ModelRegistry, tmp_path: Path) -> None:
+def test_a_lost_page_is_kept_with_why(registry: Models, tmp_path: Path) -> None:
     source = toy.ToySource(toy.ToyDevice())
     with FlightRecorder(tmp_path / "flight", registry) as recorder:
         plane = DataPlane(registry, source, observers=[recorder])
@@ -69,13 +69,13 @@ def test_a_lost_page_is_kept_with_why(registry: ModelRegistry, tmp_path: Path) -
 
 
 @pytest.fixture
-def seen(registry: ModelRegistry) -> Observation:
+def seen(registry: Models) -> Observation:
     pair = toy.ToyDevice().page(toy.symbols_of(16, 1)[0], 16, 0.5)
     page = registry.current.decoder.decode(pair, 16)
     return Observation("page 1 of toy", 1, "toy-1", 1e9, 0.1, pair=pair, page=page)
 
 
-def test_what_is_kept_and_what_not(registry: ModelRegistry, seen: Observation, tmp_path: Path) -> None:
+def test_what_is_kept_and_what_not(registry: Models, seen: Observation, tmp_path: Path) -> None:
     monitor, metrics = Monitor(), ServiceMetrics()
 
     def at(step: float, loss: Loss | None = None, margin: float = 1.0) -> Observation:
@@ -101,7 +101,7 @@ def test_what_is_kept_and_what_not(registry: ModelRegistry, seen: Observation, t
         assert file["flight"].attrs["margin_bits"] == 0.049
 
 
-def test_the_ring_is_bounded_and_goes_on_after_a_restart(registry: ModelRegistry, tmp_path: Path) -> None:
+def test_the_ring_is_bounded_and_goes_on_after_a_restart(registry: Models, tmp_path: Path) -> None:
     source = toy.ToySource(toy.ToyDevice(LOST))
     (tmp_path / "mine.txt").write_text("stays")
     (tmp_path / "page-x.h5.partial").write_text("cut off")
@@ -130,7 +130,7 @@ def test_the_ring_is_bounded_in_bytes(tmp_path: Path) -> None:
     assert len(ring.files()) == 2
 
 
-def test_a_disk_that_takes_nothing_hurts_no_read(registry: ModelRegistry, tmp_path: Path) -> None:
+def test_a_disk_that_takes_nothing_hurts_no_read(registry: Models, tmp_path: Path) -> None:
     metrics, source = ServiceMetrics(), toy.ToySource(toy.ToyDevice(LOST))
     folder = tmp_path / "flight"
     with FlightRecorder(folder, registry, metrics=metrics) as recorder:
@@ -144,7 +144,7 @@ def test_a_disk_that_takes_nothing_hurts_no_read(registry: ModelRegistry, tmp_pa
 
 
 def test_pages_are_dropped_where_the_disk_is_behind(
-    registry: ModelRegistry, seen: Observation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    registry: Models, seen: Observation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go, metrics = threading.Event(), ServiceMetrics()
     monkeypatch.setattr(FileRing, "add", lambda *_: go.wait())
@@ -156,7 +156,7 @@ def test_pages_are_dropped_where_the_disk_is_behind(
     assert count(metrics, "dropped") + count(metrics, "kept") == 20
 
 
-def test_a_folder_that_cannot_be_made_is_refused(registry: ModelRegistry, tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_refused(registry: Models, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InvalidInputError, match="folder"):
         FlightRecorder(tmp_path / "file" / "folder", registry)

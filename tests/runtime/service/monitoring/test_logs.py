@@ -22,9 +22,9 @@ from lightpage.runtime.service.caller import Actor
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 from lightpage.runtime.service.jobs.self_calibration import SelfCalibration
-from lightpage.runtime.service.models.audit import AuditLog
-from lightpage.runtime.service.models.registry import ModelRegistry
-from lightpage.runtime.service.models.store import ModelStore
+from lightpage.runtime.service.models.audit import AuditLog, Entry
+from lightpage.runtime.service.models.models import Models
+from lightpage.runtime.service.models.store import Store
 from lightpage.runtime.service.monitoring import logs
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.monitoring.observation import Observation
@@ -154,10 +154,9 @@ def test_lost_pages_are_logged_and_others_are_not() -> None:
 
 def test_every_change_of_models_is_written_down_with_who_made_it(decoder: Decoder, tmp_path: Path) -> None:
     file, monitor = tmp_path / "audit.jsonl", Monitor()
-    store = ModelStore(tmp_path / "store", decoder.bundle)
-    plane = DataPlane(
-        ModelRegistry(decoder), toy.ToySource(toy.ToyDevice()), store, monitor=monitor, audit=AuditLog(file)
-    )
+    store = Store(tmp_path / "store", decoder.bundle)
+    models = Models(decoder, store, audit=AuditLog(store, file))
+    plane = DataPlane(models, toy.ToySource(toy.ToyDevice()), monitor=monitor)
     for _ in range(8):
         monitor.follow("toy-1", {"unread": 1.0})
     SelfCalibration(plane, monitor, Recalibrator(plane, toy.fit_references)).look()
@@ -183,27 +182,66 @@ def test_every_change_of_models_is_written_down_with_who_made_it(decoder: Decode
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}\+00:00", entries[0]["time"])
 
 
-def test_the_record_is_put_aside_when_it_is_large_and_only_so_many_stay(tmp_path: Path) -> None:
+def test_the_record_is_put_aside_when_it_is_large_and_only_so_many_stay(decoder: Decoder, tmp_path: Path) -> None:
     file = tmp_path / "deep" / "audit.jsonl"
-    for number in range(40):
-        AuditLog(file, 1000, 3).record("activate", f"a{number}", "b", actor=Actor("ipv4:1", f"é{number}"))
+    with Store(None, decoder.bundle) as store:
+        for number in range(40):
+            AuditLog(store, file, 1000, 3).failed(Entry("activate", Actor("ipv4:1", f"é{number}"), f"a{number}", "b"))
     newest_last = [file.with_name(f"audit.jsonl{number}") for number in (".3", ".2", ".1", "")]
     assert set(file.parent.iterdir()) == set(newest_last)
     assert all(path.stat().st_size <= 1000 for path in newest_last)
     entries = [json.loads(line) for path in newest_last for line in path.read_text("utf-8").splitlines()]
     assert [entry["correlation_id"] for entry in entries] == [f"é{number}" for number in range(40)][-len(entries) :]
+    assert "é39" in file.read_text("utf-8")
 
 
-def test_a_change_that_cannot_be_written_down_is_logged_and_leaves_whole_lines(tmp_path: Path) -> None:
+def test_lines_that_the_service_before_could_not_write_are_written_once(decoder: Decoder, tmp_path: Path) -> None:
+    file, folder = tmp_path / "audit.jsonl", tmp_path / "store"
+    for start in range(4):
+        with Store(folder, decoder.bundle) as store:
+            models = Models(decoder, store, audit=AuditLog(store, file))
+            models.pin("toy-1", start == 1, Actor(f"{start}"))
+            with pytest.raises(BundleError):
+                models.rollback(actor=Actor("failed"))
+            with store.transaction() as database:  # as if it had been killed before it noted what the file has
+                database.execute(f"UPDATE audit SET exported = 0 WHERE number > {2 * start}")
+            if start == 1:  # before that
+                file.write_text("\n".join(file.read_text().splitlines()[:2]) + "\n")
+            if start == 2:
+                file.rename(f"{file}.1")
+    lines = [*Path(f"{file}.1").read_text().splitlines(), *file.read_text().splitlines()]
+    assert [json.loads(line)["who"] for line in lines] == ["0", "failed", "1", "failed", "2", "failed", "3", "failed"]
+
+
+def test_a_line_that_somebody_has_moved_away_is_not_written_again(decoder: Decoder, tmp_path: Path) -> None:
+    file = tmp_path / "audit.jsonl"
+    for _ in range(2):
+        with Store(tmp_path / "store", decoder.bundle) as store:
+            models = Models(decoder, store, audit=AuditLog(store, file))
+            assert not file.stat().st_size
+            models.pin("toy-1", True)
+        file.rename(tmp_path / "yesterday")
+
+
+def test_a_change_that_cannot_be_written_down_is_logged_waits_and_leaves_whole_lines(
+    decoder: Decoder, tmp_path: Path
+) -> None:
     """A folder that has gone is not made again: it may be the place where a disk was mounted."""
-    audit, file = AuditLog(tmp_path / "store" / "audit.jsonl"), tmp_path / "store" / "audit.jsonl"
-    audit.record("activate", "a", "b")
-    with json_lines() as lines, full_disk(file.stat().st_size + 20):
-        audit.record("activate", "b", "c")
-    audit.record("activate", "c", "d")
-    assert [json.loads(line)["from"] for line in file.read_text().splitlines()] == ["a", "c"]
-    file.parent.rename(tmp_path / "away")
-    with json_lines() as more:
-        audit.record("activate", "d", "e")
-    assert [line["level"] for line in (*lines, *more)] == ["INFO", "WARNING"] * 2
-    assert not file.parent.exists()
+    file = tmp_path / "elsewhere" / "audit.jsonl"
+    with Store(tmp_path / "store", decoder.bundle) as store:
+        audit, entries = AuditLog(store, file), [Entry("activate", Actor("one"), each, "z") for each in "abcde"]
+        audit.failed(entries[0])
+        with json_lines() as lines, full_disk(10):  # neither the database nor the file
+            audit.failed(entries[1])
+        audit.failed(entries[2])
+        file.parent.rename(tmp_path / "away")
+        with json_lines() as more:
+            audit.failed(entries[3])
+        assert not file.parent.exists()
+    (tmp_path / "away").rename(file.parent)
+    with Store(tmp_path / "store", decoder.bundle) as store:
+        AuditLog(store, file).failed(entries[4])
+        with store.transaction() as database:
+            kept = [json.loads(line)["from"] for (line,) in database.execute("SELECT line FROM audit ORDER BY number")]
+    assert [json.loads(line)["from"] for line in file.read_text().splitlines()] == [*"abcde"] == kept
+    assert [line["level"] for line in (*lines, *more)] == ["WARNING", "INFO", "INFO", "WARNING"]

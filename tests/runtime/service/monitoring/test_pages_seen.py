@@ -14,7 +14,7 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane, Seen
 from lightpage.runtime.service.frames.frames import decode
-from lightpage.runtime.service.models.registry import ModelRegistry
+from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.monitoring.metrics import VERSIONS, ServiceMetrics
 from lightpage.runtime.service.monitoring.monitor import PageFigures
 from lightpage.runtime.service.monitoring.observation import Observation
@@ -45,7 +45,7 @@ class LosingSource(toy.ToySource):
 
 def test_pages_given_out_and_lost_are_observed(decoder: Decoder) -> None:
     broken, notebook = Notebook(broken=True), Notebook()
-    registry = ModelRegistry(decoder)
+    registry = Models(decoder)
     plane = DataPlane(registry, LosingSource(toy.ToyDevice()), observers=[broken, notebook])
     read_page(plane, 0, None, Caller())
     with pytest.raises(LostShotError):
@@ -71,7 +71,7 @@ def test_pages_given_out_and_lost_are_observed(decoder: Decoder) -> None:
 
 def test_pages_of_the_source_whose_frames_contradict_each_other_are_observed_as_lost(decoder: Decoder) -> None:
     notebook, source = Notebook(), toy.ToySource(toy.ToyDevice((180.0, 30.0)))
-    plane = DataPlane(ModelRegistry(decoder), source, observers=[notebook])
+    plane = DataPlane(Models(decoder), source, observers=[notebook])
     with pytest.raises(SourceError, match="contradict"):
         read_page(plane, 0, None, Caller())
     with pytest.raises(FrameError, match="contradict"):  # a caller's frames may be swapped

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 
 import grpc
 import pytest
@@ -37,14 +38,21 @@ def test_the_process_says_what_it_hears_and_that_silence_is_no_service() -> None
     answers.close()
 
 
-def test_one_that_fails_to_say_does_not_serve_and_a_killed_process_is_started_again() -> None:
+def test_one_that_fails_to_say_does_not_serve_and_a_killed_process_is_started_again(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     said: list[dict[str, bool]] = [{"": True, "other": False}]
     with HealthServer("127.0.0.1:0", lambda: said[0]) as health:  # fails where nothing is said
         eventually(lambda: is_serving(health.target)[0])
         assert not is_serving(health.target, service="other")[0]
         before = health.pid
         assert before is not None
-        os.kill(before, signal.SIGKILL)
+        with monkeypatch.context() as none_left:
+            none_left.setattr(sys, "executable", "/nowhere/python")
+            for pause in ("_AGAIN_S", "_BEAT_S"):
+                none_left.setattr(f"lightpage.runtime.service.server.health_server.{pause}", 0.0)
+            os.kill(before, signal.SIGKILL)
+            eventually(lambda: len(caplog.records) > 6)  # it fails to start time and again
         eventually(lambda: health.pid != before and is_serving(health.target)[0])
         with pytest.raises(InvalidInputError) as error, HealthServer(health.target, dict):
             pass

@@ -25,7 +25,6 @@ from lightpage.runtime.client.wire.channel import TlsFiles, open_channel
 from lightpage.runtime.commands.service.healthcheck import is_serving
 from lightpage.runtime.service.caller import Role
 from lightpage.runtime.service.frames.inference_calls import INFERENCE, PREFIX
-from lightpage.runtime.service.models.audit import AuditLog
 from lightpage.runtime.service.server.certificates import Certificates
 from lightpage.runtime.service.server.dispatcher import SERVICE
 from lightpage.runtime.service.server.health_server import HealthServer
@@ -43,7 +42,7 @@ def authority(tmp_path: Path) -> Authority:
 @pytest.fixture
 def secured(start: Start, authority: Authority, tmp_path: Path) -> Iterator[Running]:
     """A service that asks for certificates, but for its client, who talks to another server of it."""
-    service = start(tracker=Remembering, audit=AuditLog(tmp_path / "audit.jsonl"))
+    service = start(tracker=Remembering, audit=tmp_path / "audit.jsonl")
     certificates = Certificates(authority.service())
     with LightpageServer(service.plane, service.recalibrator, certificates=certificates) as server:
         yield replace(service, server=server)

@@ -56,7 +56,7 @@ class PageRow:
     recalibration_due: bool
 
     def to_json(self) -> dict[str, Any]:
-        """The figures by name; None for what is not a number."""
+        """Return the figures by name; None for what is not a number."""
         return {name: _number(value) if isinstance(value, float) else value for name, value in vars(self).items()}
 
 
@@ -70,7 +70,7 @@ class Losses:
     time_s: float
 
 
-class History:
+class LastPages:
     """Takes note of pages, an `Observer`. Its methods may be called from many threads."""
 
     def __init__(self, pages: int = PAGES) -> None:
@@ -105,7 +105,7 @@ class History:
             return self._pages
 
     def rows(self) -> list[PageRow]:
-        """The last pages, the oldest first."""
+        """Return the last pages, the oldest first."""
         with self._lock:
             return list(self._rows)
 
@@ -115,7 +115,7 @@ class History:
             return sorted(self._losses.values(), key=lambda one: -one.count)
 
     def pictures(self) -> tuple[int, FramePair | None, NDArray[np.float32] | None]:
-        """Number of the last page with frames, its frames, and its confidence [ny, nx] if it was decoded."""
+        """Return the number of the last page with frames, its frames, and its confidence [ny, nx] if it was decoded."""
         with self._lock:
             return self._shown, self._pair, self._confidence
 

@@ -1,0 +1,160 @@
+"""Recordings that are not complete yet: where they lie, and whether the pages in them may be gone on with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.device.profile import Profile
+from lightpage.errors import NoSuchPageError, RecordingError
+from lightpage.failures import error_number, hdf5_failure, os_failure, short_resource
+from lightpage.files import lock
+from lightpage.recording.hdf5 import retried
+from lightpage.recording.layout import FORMAT, FRAMES, SHOT_DATA, VERSION
+from lightpage.words import counted
+
+Symbols = Callable[[int], NDArray[np.uint8]]
+"""Of a page by its number; `NoSuchPageError` where there is none."""
+
+CUT_OFF = (OSError, KeyError, RuntimeError, TypeError, ValueError)
+"""What HDF5 raises of a file that was cut off while it was written; it is begun anew."""
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What a recording's pages are of, by which an unfinished one is known again.
+
+    Attributes:
+        profile: nominal profile.
+        levels: M.
+        bit_depth: bits of a camera count.
+        code: what the pages hold, JSON text, where they were made by an encoder.
+        symbols: of the pages, where they are known before they are recorded.
+    """
+
+    profile: Profile
+    levels: int
+    bit_depth: int
+    code: str | None = None
+    symbols: Symbols | None = None
+
+    def attributes(self) -> dict[str, object]:
+        """The root attributes that say so."""
+        told = {"format": FORMAT, "version": VERSION, "camera_bit_depth": self.bit_depth, "levels": self.levels}
+        return told | {"profile": self.profile.to_toml()} | ({} if self.code is None else {"code": self.code})
+
+    def difference(self, file: h5py.File, pages: int) -> str:
+        """Of what else the pages of a file are; empty if they are the same."""
+        own = self.attributes()
+        for names, what in (
+            (("profile",), "another profile"),
+            (("camera_bit_depth",), "another bit depth"),
+            (("levels", "code"), "other symbols"),
+            (("format", "version"), "another format"),
+        ):
+            if any(file.attrs.get(name) != own.get(name) for name in names):
+                return what
+        if self.symbols is None or not pages:
+            return ""
+        if "symbols" not in file:
+            return "unknown symbols"
+        try:
+            same = all(np.array_equal(file["symbols"][page], self.symbols(page)) for page in range(pages))
+        except NoSuchPageError:
+            same = False
+        return "" if same else "other symbols"
+
+
+def partial_path(path: Path) -> Path:
+    """Where a recording lies until it is complete and gets its name `path`."""
+    return path.with_name(path.name + ".partial")
+
+
+def pages_there(path: Path, identity: Identity, *, overwrite: bool = False) -> int:
+    """Pages of the unfinished recording `path` that `RecordingWriter` would go on from.
+
+    Raises:
+        RecordingError: another process is writing them; or they are others, and `overwrite` is not asked for.
+    """
+    partial = partial_path(path)
+    if not taken(partial, remove=False):
+        return 0
+    try:
+        with retried(lambda: h5py.File(str(partial), "r", locking=False)) as file:
+            pages = pages_of(file)
+            other = identity.difference(file, pages)
+    except CUT_OFF as error:
+        check_damage(partial, error)
+        return 0
+    if pages and other and not overwrite:
+        raise other_pages(partial, pages, other)
+    return 0 if other else pages
+
+
+def discard_partial(path: Path) -> None:
+    """Remove the unfinished pages of the recording `path`, if there are any.
+
+    Raises:
+        RecordingError: another process is writing them, or they cannot be removed.
+    """
+    taken(partial_path(path), remove=True)
+
+
+def taken(partial: Path, *, remove: bool) -> bool:
+    """Whether `partial` is there, writable and written by nobody else; `remove` unlinks it while that is certain.
+
+    HDF5 holds this same lock on a file as long as it is open for writing.
+
+    Raises:
+        RecordingError: another process is writing it, or it cannot be read and written.
+        StorageError, SurroundingsError: storage fails, or a resource is short.
+    """
+    subject = f"recording {partial}"
+    try:
+        with partial.open("rb+") as file:
+            lock(file.fileno(), subject)
+            if remove:
+                partial.unlink()
+    except FileNotFoundError:
+        return False
+    except BlockingIOError:
+        got = "pages that another process is writing now"
+        raise RecordingError(subject, got, "another name, or to wait for its end") from None
+    except OSError as error:
+        raise os_failure(subject, error, "a file that can be read and written", RecordingError) from None
+    return True
+
+
+def check_damage(partial: Path, error: Exception) -> None:
+    """Check that an error says something of an unfinished file, and not that it cannot be read now.
+
+    Raises:
+        StorageError, SurroundingsError, RecordingError: it cannot be read.
+    """
+    if error_number(error) is not None or short_resource("", error):
+        expected = "a file that can be read: its pages are not begun anew"
+        raise hdf5_failure(f"recording {partial}", error, expected, RecordingError) from None
+
+
+def pages_of(file: h5py.File) -> int:
+    """Pages that are complete; without its count a file was interrupted while it was completed: all of them are."""
+    return int(file.attrs.get("pages_complete", file[FRAMES[0]].shape[0]))
+
+
+def growing(file: h5py.File) -> list[str]:
+    """Names of the arrays that grow by one with each page."""
+    truth = file.get("truth")
+    names = [f"truth/{name}" for name in truth] if isinstance(truth, h5py.Group) else []
+    return [name for name in (*FRAMES, "symbols", *SHOT_DATA) if name in file] + names
+
+
+def other_pages(partial: Path, pages: int, other: str) -> RecordingError:
+    """The error of pages that are of something else, and may not be lost."""
+    same = "--symbols" if other.endswith("symbols") else other.removeprefix("another ").removeprefix("other ")
+    expected = f"the same {same}, another name, or --force"
+    return RecordingError(f"recording {partial}", f"{counted(pages, 'page')} of {other}", expected)
