@@ -178,13 +178,12 @@ class RayTwin(nn.Module):
 
     def _pixels(self, value: dict[str, Tensor], places: Tensor) -> Tensor:
         radius2 = (places * places).sum(-1, keepdim=True) / self.corner**2
-        seen = places * (1 + value["distortion_relative"] * radius2) / self.camera_pitch
+        across, up = places[:, :1] / self.half_width, places[:, 1:] / self.half_height
         cameras = []
         for camera in ("in_phase", "quadrature"):
-            across = seen[:, 0] * self.camera_pitch / self.half_width
-            up = seen[:, 1] * self.camera_pitch / self.half_height
             keystone = value[f"{camera}_keystone_x_relative"] * across + value[f"{camera}_keystone_y_relative"] * up
-            x, y = seen[:, 0] * (1 + keystone), seen[:, 1] * (1 + keystone)
+            seen = places * (1 + value["distortion_relative"] * radius2 + keystone) / self.camera_pitch
+            x, y = seen[:, 0], seen[:, 1]
             column = (1 + value[f"{camera}_scale_x_relative"]) * x + value[f"{camera}_turn_xy_slope"] * y
             row = value[f"{camera}_turn_yx_slope"] * x + (1 + value[f"{camera}_scale_y_relative"]) * y
             column = column + value[f"{camera}_shift_x_px"] + self.camera_centre[0]

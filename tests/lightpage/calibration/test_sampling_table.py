@@ -58,6 +58,7 @@ def test_its_maps_have_the_names_and_shapes_that_a_decoder_takes_and_no_digits_t
     assert {name: array.shape for name, array in table.items()} == {
         "registration": (2, 2, 10),
         "homodyne": (2,),
+        "apart": (2, 25),
         "parameters": (len(NAMES),),
         "places": (branches, 2, *page),
         "place_gradients": (branches, 4, *page),
