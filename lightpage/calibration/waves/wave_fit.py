@@ -8,7 +8,7 @@ the arms is, and what pipe and lenses are: more than patches of symbols do, sinc
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal, NamedTuple
 
@@ -32,14 +32,16 @@ Complex = NDArray[np.complexfloating]
 READ_NOISE = 0.3
 """Variance of an equation that does not grow with the light, over the shot noise of the reference alone."""
 ROUNDS = 9
-_CHORD = 4
-"""Rounds that share one derivative of the light, which costs as much as several rounds."""
 _CHORD_ACCURACY = 3 / 8
 """Share of the splitting steps for that derivative: an error of a percent in it costs no round."""
-_NEARLY = 0.02
-"""Relative fall of the residual, by a whole step, below which the derivative at hand serves to the end."""
-_CONVERGED = 3e-3
+_STALE = 0.03
+"""Relative fall of the residual, since the derivative of the light was taken, beyond which it is taken anew. That costs
+as much as several rounds, but one from further off leaves axial places twenty deviations from the best."""
+_CONVERGED = 1e-3
 """Relative fall of the residual below which another round does not pay."""
+_LEAST_OFF = 2.0
+"""Mean square of the modulation's coefficients over their deviations from which on levels are uneven: a nominal device
+has 1 or less, and more than 2 in one of seventy fits."""
 _LARGEST_MOVE_PX = 1.5
 """A round's largest step: the model is linear in the displacement over about a speckle."""
 _EQUATIONS = 100_000
@@ -55,7 +57,7 @@ _AT_CAMERA = frozenset(indices("camera_phase"))
 """Parameters whose change of the light needs no propagation."""
 _OF_REAL_LENSES = (NAMES.index("lens_path_relative"),)
 """Parameters that do nothing where the profile's lenses are ideal."""
-_SEEN = frozenset(indices(*_CAMERAS, "distortion"))
+_SEEN = frozenset(indices(*_CAMERAS, "distortion", "keystone"))
 """Parameters that say where the cameras see a place; all others change the light itself."""
 
 
@@ -70,7 +72,7 @@ class WaveFitted:
         quadrature_phase: angle between the homodyne arms, radians.
         residual: root mean square of what is left of the equations, in standard deviations of the reference's noise
             times an unknown factor: it says which of two fits is better.
-        modulation: what the modulator makes of its levels.
+        modulation: what the modulator makes of its levels; nominal where the page does not tell it from that.
         modulation_deviations: standard deviations of its coefficients, zero where held.
     """
 
@@ -182,18 +184,18 @@ class WaveFit:
         centre = np.zeros(len(PARAMETERS)) if centre is None else centre
         state = self._start(start, quadrature_phase, modulation)
         best = WaveFitted(start, np.zeros(len(PARAMETERS)), quadrature_phase, np.inf, modulation)
-        fall, whole, slopes = 1.0, False, None
+        slopes, taken_at = None, np.inf
         for number in range(ROUNDS):
             progress(number / ROUNDS)
-            if slopes is None or (number % _CHORD == 0 and not (whole and fall < _NEARLY)):
-                told = partial(_within_round, progress, number)
+            fields, left = self._left(state)
+            residual = float(np.sqrt(np.mean(left**2)))
+            if not residual < (1 - _CONVERGED) * best.residual:
+                break
+            if slopes is None or residual < (1 - _STALE) * taken_at:
+                told, taken_at = partial(_within_round, progress, number), residual
                 slopes = self._slopes(state, of_light, of_cameras, told, levels=levels)
             directions = _directions(state.light, bends="launch" not in groups)
-            columns, left = self._equations(state, slopes, directions)
-            residual = float(np.sqrt(np.mean(left**2)))
-            fall = 1 - residual / best.residual
-            if not fall > _CONVERGED:
-                break
+            columns = self._columns(state, fields, slopes, directions)
             # What is unexplained differs from symbol to symbol, so equations tell no more than symbols do.
             variance = residual**2 * max(1.0, len(left) / (2 * self._symbols))
             others = columns.shape[1] - len(free)
@@ -218,8 +220,8 @@ class WaveFit:
                 Modulation(tuple(state.levels.tolist())),
                 tuple(known[fitted_levels].tolist()) if levels else best.modulation_deviations,
             )
-            state, whole = self._moved(state, covariance @ pull, directions, fitted_levels, free)
-        return best
+            state = self._moved(state, covariance @ pull, directions, fitted_levels, free)
+        return _told_apart(best)
 
     def _waves(self, parameters: Real) -> FittedWaves:
         return FittedWaves(self._profile, parameters, self._samples, filled=True)
@@ -298,39 +300,47 @@ class WaveFit:
         amplitude = np.sqrt(_at(self._levels[0], pixels[0][chosen], order=1))
         return chosen, np.stack(counts), amplitude / amplitude.mean()
 
-    def _equations(self, state: _State, slopes: _Slopes, directions: Complex) -> tuple[Real, Real]:
-        """Columns [2 N, K] and what is left [2 N], over the noise of each equation's light.
+    def _left(self, state: _State) -> tuple[Complex, Real]:
+        """The light of both cameras [2, Gy, Gx], and what is left of the equations, [2 N], over each one's noise.
 
-        A count says Re(e exp(-i arm)) + |e|^2 / 2 of the field e over the reference. Columns are those of the
-        illumination's `directions`, the turn, the modulation's coefficients, and the parameters of `slopes`.
+        A count says Re(e exp(-i arm)) + |e|^2 / 2 of the field e over the reference.
         """
-        chosen, counts, amplitude = self._look(state.parameters)
+        fields, (chosen, counts, amplitude) = self._light(state), self._look(state.parameters)
+        left = []
+        for camera, arm in enumerate((0.0, state.quadrature_phase)):
+            phasor, here = np.exp(-1j * arm), fields[camera][self._every][chosen] / amplitude
+            left.append((counts[camera] - (here * phasor).real - np.abs(here) ** 2 / 2) * _weight(here, phasor))
+        return fields, np.concatenate(left)
+
+    def _columns(self, state: _State, fields: Complex, slopes: _Slopes, directions: Complex) -> Real:
+        """Derivatives of the equations of `_left`, [2 N, K].
+
+        Columns are those of the illumination's `directions`, the turn, the modulation's coefficients, and the
+        parameters of `slopes`.
+        """
+        chosen, _, amplitude = self._look(state.parameters)
 
         def seen(field: Complex) -> Complex:
             return np.asarray(field[chosen] / amplitude)
 
-        fields = self._light(state)
         of_phase, of_amplitude = [1j * each for each in slopes.by_level], slopes.by_level[1:]
         changes = [*np.tensordot(directions, slopes.by_term, 1), *of_phase, *of_amplitude, *slopes.of_light]
         moves = [pixels[:, chosen] for pixels in slopes.of_cameras]
-        columns, left = [], []
+        columns = []
         for camera, arm in enumerate((0.0, state.quadrature_phase)):
             phasor, field = np.exp(-1j * arm), fields[camera]
             here, down, across = (seen(part[self._every]) for part in (field, *np.gradient(field)))
-            weight = 1 / np.sqrt(np.abs(1 / phasor + here) ** 2 + READ_NOISE)
+            weight = _weight(here, phasor)
             along = (phasor + here.conj()) * weight  # derivative of the count by e
-            left.append((counts[camera] - (here * phasor).real - np.abs(here) ** 2 / 2) * weight)
             mine = [(along * seen(change[camera])).real for change in changes]
             mine.insert(len(directions), (here * phasor * -1j).real * weight * camera)
             slope = np.stack([(along * part).real for part in (across, down)]) / self._pitch_px
             mine += [-(slope * move[camera].T).sum(axis=0) for move in moves]
             columns.append(np.stack(mine, axis=1))
-        return np.concatenate(columns), np.concatenate(left)
+        return np.concatenate(columns)
 
-    def _moved(
-        self, state: _State, step: Real, directions: Complex, levels: slice, free: list[int]
-    ) -> tuple[_State, bool]:
-        """The state after a step, shortened where it would move a camera too far, and whether it was whole."""
+    def _moved(self, state: _State, step: Real, directions: Complex, levels: slice, free: list[int]) -> _State:
+        """The state after a step, shortened where it would move a camera too far."""
         change = np.zeros(len(PARAMETERS))
         change[free] = step[levels.stop :]
         by_level = step[levels] if levels.start < levels.stop else 0.0
@@ -338,13 +348,12 @@ class WaveFit:
         seen = [self._twin.pixels(at, few) for at in (state.parameters, state.parameters + change)]
         furthest = float(np.sqrt(np.mean(np.sum((seen[1] - seen[0]) ** 2, axis=-1), axis=-1)).max())
         share = min(1.0, _LARGEST_MOVE_PX / max(furthest, 1e-9))
-        moved = _State(
+        return _State(
             state.parameters + share * change,
             state.quadrature_phase + share * float(step[len(directions)]),
             state.light + share * step[: len(directions)] @ directions,
             state.levels + share * by_level,
         )
-        return moved, share == 1
 
 
 def _within_round(progress: Callable[[float], None], number: int, share: float) -> None:
@@ -358,6 +367,20 @@ def _directions(light: Complex, *, bends: bool) -> Complex:
     if bends:
         return np.concatenate([terms, 1j * terms])
     return np.concatenate([light[0] / abs(light[0]) * terms, 1j * light[None]])
+
+
+def _told_apart(found: WaveFitted) -> WaveFitted:
+    """A fit whose modulation is nominal unless its coefficients differ from zero by more than their deviations."""
+    known = np.array(found.modulation_deviations)
+    if not known.any():
+        return found
+    off = np.sum((np.array(found.modulation.coefficients) / known) ** 2)
+    return replace(found, modulation=NOMINAL) if off < _LEAST_OFF * len(known) else found
+
+
+def _weight(here: Complex, phasor: complex) -> Real:
+    """One over the noise of equations of the light `here`."""
+    return np.asarray(1 / np.sqrt(np.abs(1 / phasor + here) ** 2 + READ_NOISE))
 
 
 def _inverse(information: Real) -> Real:
