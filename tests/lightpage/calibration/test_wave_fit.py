@@ -20,6 +20,7 @@ from lightpage.device.state import (
     SlmDefects,
     draw_device,
 )
+from lightpage.page.modulation import NOMINAL
 from lightpage.page.symbols import symbol_phases
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_modulation, true_parameters
@@ -127,6 +128,20 @@ def test_held_parameters_keep_their_values_and_priors_hold_the_others() -> None:
     assert abs(free.parameters[angle] - truth[angle]) < 1e-4
     assert abs(held.parameters[angle] - start[angle]) < 1e-5
     assert free.residual < held.residual
+
+
+def test_a_nominal_modulator_stays_nominal_and_axial_places_are_found_from_far_away() -> None:
+    pose, other = CameraPose(axial_rad=0.2), CameraPose(axial_rad=-0.1)
+    device = Device(in_phase_camera=pose, quadrature_camera=other, drift=Drift(shift_px=0))
+    truth = true_parameters(PROFILE, device)
+    start, axial = truth.copy(), indices("axial")
+    start[axial] += [0.4, -0.2, 0.1]
+    found = seen_by(device, 5).fit(start, device.homodyne.turn_rad, EVERY, levels=True)
+    assert found.modulation is NOMINAL
+    assert all(found.modulation_deviations)
+    off = ((found.parameters - truth) / np.maximum(found.deviations, 1e-12))[axial]
+    assert np.sqrt(np.mean(off**2)) < 2
+    assert np.rad2deg(abs(found.quadrature_phase - device.homodyne.turn_rad)) < 0.3
 
 
 def test_what_the_modulator_makes_of_its_levels_comes_back_with_calibrated_deviations() -> None:
