@@ -57,7 +57,7 @@ def flat_recording(
 
 
 def fake_registration(monkeypatch: pytest.MonkeyPatch, outcome: Registered | BaseException) -> None:
-    def register(*_: object) -> Registered:
+    def register(*_: object, **__: object) -> Registered:
         if isinstance(outcome, BaseException):
             raise outcome
         return outcome
