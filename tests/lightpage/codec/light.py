@@ -23,11 +23,7 @@ def codec_of(
     levels: int, coded: int, rate: int, corrections: int = 0, shape: tuple[int, int] = SHAPE, needed: float = 1.0
 ) -> PageCodec:
     code = Code(
-        levels=levels,
-        coded_bits=coded,
-        rate_per_mille=rate,
-        corrections=corrections,
-        needed_information=needed,
+        levels=levels, coded_bits=coded, rate_per_mille=rate, corrections=corrections, needed_information=needed
     )
     return PageCodec(code, pilot_mask(shape))
 

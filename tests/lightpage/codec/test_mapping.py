@@ -8,15 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from lightpage.codec.mapping import (
-    MOST_LLR,
-    bit_information,
-    bit_llrs,
-    decide_in_coset,
-    labels,
-    level_bits,
-    to_levels,
-)
+from lightpage.codec.mapping import MOST_LLR, bit_information, bit_llrs, decide_in_coset, labels, level_bits, to_levels
 from lightpage.errors import PageError
 from lightpage.page.levels import Levels
 from tests.lightpage.refused import refused

@@ -16,11 +16,7 @@ from lightpage.waves.lens import FourierLens
 from lightpage.waves.pipe import PipePropagator
 
 DEVICE = WaveGeometry(
-    wavelength_m=532e-9,
-    focal_length_m=10e-3,
-    pipe_length_m=9.375e-3,
-    pipe_width_m=0.444815e-3,
-    refractive_index=1.461,
+    wavelength_m=532e-9, focal_length_m=10e-3, pipe_length_m=9.375e-3, pipe_width_m=0.444815e-3, refractive_index=1.461
 )
 GLASS = DEVICE.refractive_index * DEVICE.wave_number
 CELLS = (46, 61)
@@ -49,14 +45,6 @@ def axis(count: int, pitch_m: float) -> np.ndarray:
 def facet() -> np.ndarray:
     """A field on the entrance facet that fills every mode."""
     return noise(CELLS[0] - 1, CELLS[1] - 1)
-
-
-@pytest.fixture(scope="module")
-def page_at_entrance() -> np.ndarray:
-    """The light of a page of random symbols on the entrance facet: pages leave the top of the band dark."""
-    page = np.exp(2j * np.pi * np.kron(np.random.default_rng(1).random((12, 16)), np.ones((4, 4))))
-    pitch = 2.2 * 9.2e-6 / 4
-    return FourierLens(DEVICE, axis(64, pitch), axis(48, pitch), CELLS).to_facet(page)
 
 
 class TestPipe:

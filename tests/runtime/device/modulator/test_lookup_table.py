@@ -93,8 +93,7 @@ def test_an_offset_moves_the_page_right_and_down_and_a_flip_mirrors_it_where_it_
 
 
 @pytest.mark.parametrize(
-    ("settings", "ends"),
-    [({"columns_px": 5}, "-1"), ({"offset_y_px": 3}, "5"), ({"offset_x_px": -3}, "-1")],
+    ("settings", "ends"), [({"columns_px": 5}, "-1"), ({"offset_y_px": 3}, "5"), ({"offset_x_px": -3}, "-1")]
 )
 def test_a_page_that_leaves_the_modulator_is_refused(settings: dict[str, int], ends: str) -> None:
     with pytest.raises(InvalidInputError, match=f"pixels {ends} to"):
