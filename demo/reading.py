@@ -15,6 +15,7 @@ from lightpage.demo.pages import pgm
 from lightpage.demo.result import Phase
 from lightpage.errors import InvalidInputError, LostPageError
 from lightpage.metrics.information import achievable_rate
+from lightpage.page.levels import Levels
 from lightpage.runtime.archives.recordings.coded_pages import AIR_LEVELS
 from lightpage.runtime.client.answers import RemotePage
 from lightpage.runtime.client.client import LightpageClient
@@ -82,8 +83,8 @@ def summarise(name: str, pages: Sequence[RemotePage]) -> Phase:
     for page in pages:
         if page.phase is None or page.concentration is None or page.written is None or page.pilot_mask is None:
             raise InvalidInputError(f"page {page.page}", "symbols alone", "phase, concentration and what was written")
-        fine = page.written.astype(np.int64) * (AIR_LEVELS // page.levels)
-        rate = achievable_rate(page.phase, page.concentration, fine, AIR_LEVELS)
+        error = page.phase - Levels(page.levels, page.level_phases).phases[page.written]
+        rate = achievable_rate(error, page.concentration, np.zeros_like(page.written), AIR_LEVELS)
         rates.append(np.where(page.pilot_mask, np.nan, rate))
         errors.append((page.symbols != page.written)[~page.pilot_mask])
     return Phase(

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from lightpage.errors import BundleError, InvalidInputError
-from lightpage.export.graph import FRAME_INPUTS, DecoderGraph, FieldGraph
+from lightpage.export.graph import APART, FRAME_INPUTS, DecoderGraph, FieldGraph
 from lightpage.export.half import LARGEST_DEVIATION, check_deviation, in_half, rounded
 from lightpage.export.onnx_files import decoder_onnx, field_onnx, twin_onnx
 from lightpage.export.parity import check_parity
@@ -125,7 +125,11 @@ def export_run(
     files = {
         DECODER: decoder,
         TWIN: twin_onnx(twin),
-        **({FIELD: field_onnx(FieldGraph(profile), frame_dtype, defaults)} if isinstance(graph, DecoderGraph) else {}),
+        **(
+            {FIELD: field_onnx(FieldGraph(profile, apart=APART in defaults), frame_dtype, defaults)}
+            if isinstance(graph, DecoderGraph)
+            else {}
+        ),
         GOLDEN: npz(in_phase=pair.in_phase, quadrature=pair.quadrature, p=expected["p"]),
         PILOTS: npz(**{name: kept[key] for name, key in PILOT_ARRAYS.items() if key in kept}),
     }

@@ -21,7 +21,8 @@ ANSWERS = ("p", "phase", "concentration")
 """What every decoder says."""
 TABLE_INPUTS = ("reference_in_phase", "reference_quadrature", "registration", "homodyne")
 """Inputs of every decoder at symbol pitch that carry the calibrated table as their default and may be fed instead;
-behind them come those of `SymbolDecoder.table_inputs`."""
+behind them come `APART`, where cameras stand apart, and those of `SymbolDecoder.table_inputs`."""
+APART = "apart"
 PUBLISHED_TABLE_INPUTS = ("grid", "levels")
 """The same of a published decoder: where it samples the frames, and the references there."""
 _SERIES = 15
@@ -40,11 +41,12 @@ class DecoderGraph(nn.Module):
         profile: the nominal device.
         decoder: trained; the weights of its parts in `HALVED` are rounded to float16.
         kappa_scale: factor on p that makes its length a calibrated concentration.
+        apart: whether the cameras stand apart, see `CalibratedDevice.stands_apart`.
     """
 
     outputs = OUTPUTS
 
-    def __init__(self, profile: Profile, decoder: SymbolDecoder, kappa_scale: float) -> None:
+    def __init__(self, profile: Profile, decoder: SymbolDecoder, kappa_scale: float, *, apart: bool = False) -> None:
         super().__init__()
         self.recovery = decoder.choices.field_recovery(profile)
         self.decoder = decoder
@@ -52,11 +54,12 @@ class DecoderGraph(nn.Module):
         with torch.no_grad():
             for parameter in itertools.chain(*(getattr(decoder, part).parameters() for part in HALVED)):
                 parameter.copy_(parameter.half())
-        self.table_inputs = (*TABLE_INPUTS, *decoder.table_inputs)
+        self.measured_by = (*TABLE_INPUTS, *((APART,) if apart else ()))
+        self.table_inputs = (*self.measured_by, *decoder.table_inputs)
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
         """Decode one pair: frames and `table_inputs` to `OUTPUTS`; see `lightpage.calibration.sampling_table`."""
-        seen = len(FRAME_INPUTS) + len(TABLE_INPUTS)
+        seen = len(FRAME_INPUTS) + len(self.measured_by)
         measured = self.recovery.measure(*tensors[:seen])
         table = dict(zip(self.decoder.table_inputs, tensors[seen:], strict=True))
         p, field, left = self.decoder(self.recovery, measured, table)
@@ -68,16 +71,18 @@ class FieldGraph(nn.Module):
 
     Args:
         profile: the nominal device.
+        apart: whether the cameras stand apart.
     """
 
     outputs = ("field", "unexplained")
 
-    def __init__(self, profile: Profile) -> None:
+    def __init__(self, profile: Profile, *, apart: bool = False) -> None:
         super().__init__()
         self.recovery = FieldRecovery(profile)
+        self.table_inputs = (*TABLE_INPUTS, *((APART,) if apart else ()))
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
-        """Frames and `TABLE_INPUTS` to field and what is left, see `FieldRecovery`."""
+        """Frames and `table_inputs` to field and what is left, see `FieldRecovery`."""
         return tuple(self.recovery(*tensors))
 
 

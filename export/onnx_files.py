@@ -18,7 +18,7 @@ from onnxscript import optimizer
 from torch import nn
 
 from lightpage.calibration.parameters import nominal
-from lightpage.export.graph import FRAME_INPUTS, HALVED, TABLE_INPUTS, FieldGraph, Graph
+from lightpage.export.graph import FRAME_INPUTS, HALVED, FieldGraph, Graph
 from lightpage.train.models.twin import RayTwin
 
 OPSET = 20
@@ -55,10 +55,11 @@ def decoder_onnx(
 
 
 def field_onnx(graph: FieldGraph, frame_dtype: str, tensors: dict[str, NDArray[np.generic]]) -> bytes:
-    """The field recovery as ONNX; `tensors` are examples of `TABLE_INPUTS`."""
+    """The field recovery as ONNX; `tensors` are examples of its `table_inputs`."""
     frame = torch.from_numpy(np.zeros(tensors["reference_in_phase"].shape, dtype=frame_dtype))
-    chosen = [torch.from_numpy(np.ascontiguousarray(tensors[name])) for name in TABLE_INPUTS]
-    model = _export(graph, (frame, frame.clone(), *chosen), (*FRAME_INPUTS, *TABLE_INPUTS), graph.outputs, None)
+    names = graph.table_inputs
+    chosen = [torch.from_numpy(np.ascontiguousarray(tensors[name])) for name in names]
+    model = _export(graph, (frame, frame.clone(), *chosen), (*FRAME_INPUTS, *names), graph.outputs, None)
     onnx.checker.check_model(model)
     return bytes(model.SerializeToString())
 

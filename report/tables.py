@@ -22,6 +22,8 @@ GROUPS = {
     "distortion": "Distortion, at the corner",
     "in_phase": "In-phase camera",
     "quadrature": "Quadrature camera",
+    "axial": "Axial places, as phases at the pipe's wall",
+    "keystone": "Keystone, at the page's edges",
 }
 """Headings of the groups of `lightpage.calibration.parameters`."""
 

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile
 from lightpage.device.state import Device
-from lightpage.page.levels import MAX_LEVELS
-from lightpage.page.symbols import check_levels
+from lightpage.page.levels import MAX_LEVELS, check_levels
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import frame_type
 from lightpage.simulator.simulator import Simulator

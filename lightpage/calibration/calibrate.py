@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.coherence import COHERENT_BRANCHES, page_coherence
 from lightpage.calibration.interfaces import FieldSolver, Twin
-from lightpage.calibration.parameters import PARAMETERS, indices, nominal
+from lightpage.calibration.parameters import NAMES, PARAMETERS, indices, nominal
 from lightpage.calibration.patch_fit import PatchFit, fit_parameters
 from lightpage.calibration.patches import (
     Measurement,
@@ -23,10 +23,11 @@ from lightpage.calibration.patches import (
     search_window,
 )
 from lightpage.calibration.samplers import FieldSampler, FrameSampler
-from lightpage.calibration.sampling_table import registration_coefficients
+from lightpage.calibration.sampling_table import cameras_apart, registration_coefficients, stand_apart
 from lightpage.calibration.waves.wave_fit import WaveFit
 from lightpage.device.profile import Profile
 from lightpage.errors import CalibrationError
+from lightpage.page.modulation import NOMINAL, Modulation
 from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
 from lightpage.waves.grid import field_grid, symbol_samples
@@ -37,7 +38,7 @@ SIGNIFICANT = 16.0
 _FEWEST = 5
 """Patches that must be looked for, and measurements that must be found, to fit anything."""
 _CAMERA_GROUPS = ("in_phase", "quadrature", "centre", "camera_phase")
-_SHAPE_GROUPS = (*_CAMERA_GROUPS, "lengths", "distortion", "launch")
+_SHAPE_GROUPS = (*_CAMERA_GROUPS, "lengths", "distortion", "keystone", "launch")
 _ALL_GROUPS = tuple(dict.fromkeys(p.group for p in PARAMETERS))
 _LEAST_OVER_CHANCE = 8.0
 """Coherence that a calibration must reach, in units of 1/sqrt(symbols of a page), what chance gives. Measured on the
@@ -63,13 +64,21 @@ _LARGEST_QUADRATURE_ERROR_DEG = 20.0
 a device in the capture range is within 6."""
 _ALONE = 0.2
 """Share of the patches that one camera has found below which the other one does not see the same image."""
-_FLIPS = {
-    "mirrored left to right": (slice(None), slice(None, None, -1)),
-    "mirrored top to bottom": (slice(None, None, -1), slice(None)),
-    "turned by 180 degrees": (slice(None, None, -1), slice(None, None, -1)),
+AS_IT_IS = "as it is"
+ORIENTATIONS: Mapping[str, tuple[tuple[int, int], tuple[int, int]]] = {
+    AS_IT_IS: ((1, 0), (0, 1)),
+    "mirrored left to right": ((-1, 0), (0, 1)),
+    "mirrored top to bottom": ((1, 0), (0, -1)),
+    "turned by 180 degrees": ((-1, 0), (0, -1)),
+    "turned by 90 degrees to the right": ((0, -1), (1, 0)),
+    "turned by 90 degrees to the left": ((0, 1), (-1, 0)),
+    "mirrored along the falling diagonal": ((0, 1), (1, 0)),
+    "mirrored along the rising diagonal": ((0, -1), (-1, 0)),
 }
-"""How a camera may show an image otherwise than the profile has it, and the index that undoes it."""
-_AS_IT_IS = (slice(None), slice(None))
+"""How a camera may show an image, by name, and the matrix from (x, y) to (column, row) that does so."""
+_SHOWS = 0.5
+"""Share of the patches in the middle that a camera finds which shows the image as it is looked for; another way of
+showing it is looked for where fewer are found."""
 _CAMERAS = ("in-phase camera", "quadrature camera")
 
 
@@ -92,6 +101,8 @@ class Registered:
         coherence_before, coherence_after: mean over the pages, at the start's geometry and at the fitted one.
         cost: mean squared normalised residual of the last fit of patches.
         significant: share of the measured patches that were found, in the last stage.
+        modulation: what the modulator makes of its levels.
+        modulation_deviations: standard deviations of its coefficients.
     """
 
     parameters: Real
@@ -101,6 +112,8 @@ class Registered:
     coherence_after: float
     cost: float
     significant: float
+    modulation: Modulation = NOMINAL
+    modulation_deviations: tuple[float, ...] = NOMINAL.coefficients
 
 
 @dataclass(frozen=True)
@@ -146,6 +159,8 @@ def calibrate(
     references: FramePair,
     pages: Sequence[KnownPage],
     progress: Progress = lambda what, share: None,
+    *,
+    any_orientation: bool = False,
 ) -> Registered:
     """Register known pages from nominal geometry.
 
@@ -156,12 +171,14 @@ def calibrate(
         references: reference-only frames.
         pages: one to a few known pages; the first is fitted, all are judged by.
         progress: told of every stage, and within it of every patch or derivative, so that it may stop the work soon.
+        any_orientation: whether cameras that show the image mirrored or turned are taken.
 
     Raises:
         CalibrationError: nothing within the capture range explains the frames, or the page is too small to tell.
     """
     work = _Registration(twin, solve_field, profile, references, list(pages), progress)
     work.total = len(_SINGLE_CAMERA) + len(_COMPLEX) + len(_PHASES) + 5
+    work.any_orientation = any_orientation
     for stage in _SINGLE_CAMERA:
         work.single_camera(stage)
     work.estimate_turn()
@@ -172,7 +189,7 @@ def calibrate(
     for stage in _PHASES:
         work.complex_field(stage)
     work.waves("waves", _ALL_GROUPS)
-    return work.result(nominal())
+    return work.result(work.centre)
 
 
 def refine(
@@ -184,23 +201,26 @@ def refine(
     start: Real,
     quadrature_phase: float,
     progress: Progress = lambda what, share: None,
+    modulation: Modulation = NOMINAL,
 ) -> Registered:
     """Register known pages from an earlier calibration that has drifted: the reflections need no search from nominal.
 
     Args:
         start: [P] earlier parameters.
         quadrature_phase: earlier angle between the homodyne arms.
+        modulation: earlier one, which is fitted again: a stroke changes with temperature.
         twin, solve_field, profile, references, pages, progress: as for `calibrate`.
 
     Raises:
         CalibrationError: the pages do not fit near the earlier calibration.
     """
     work = _Registration(twin, solve_field, profile, references, list(pages), progress)
-    work.parameters, work.quadrature_phase = start.copy(), quadrature_phase
+    work.parameters, work.centre, work.quadrature_phase = start.copy(), start, quadrature_phase
+    work.modulation = modulation
     work.total = len(_DRIFTED) + 2
     for stage in _DRIFTED:
-        work.complex_field(stage, start, _DRIFT_SCALE)
-    work.waves("waves", _ALL_GROUPS, start, _DRIFT_SCALE)
+        work.complex_field(stage, _DRIFT_SCALE)
+    work.waves("waves", _ALL_GROUPS, _DRIFT_SCALE)
     return work.result(start)
 
 
@@ -268,9 +288,11 @@ class _Registration:
                 f"at least {_FEWEST} patches of about {patch_edge(profile)} x {patch_edge(profile)} symbols",
             )
         self.grid = field_grid(profile)
-        self.parameters = nominal()
+        self.parameters, self.centre = nominal(), nominal()
+        self.any_orientation, self.orientations = False, tuple[str, ...]()
         self.deviations = np.zeros_like(self.parameters)
         self.quadrature_phase = np.pi / 2
+        self.modulation, self.modulation_deviations = NOMINAL, NOMINAL.coefficients
         self.fit: PatchFit | None = None
         self.total = 1
         self._stage, self._done = "", 0
@@ -287,46 +309,67 @@ class _Registration:
         """Tell what share of the present stage is behind."""
         self.progress(self._stage, (self._done - 1 + share) / self.total)
 
-    def single_camera(self, stage: _Stage, centre: Real | None = None) -> None:
+    def single_camera(self, stage: _Stage) -> None:
         """Measure the direct branch on each camera by itself and fit places and slopes."""
         self._begin(stage.name)
-        in_phase, quadrature = self._on_each_camera(stage)
+        found = self._on_each_camera(stage)
         if stage.middle_only:
-            self._check_orientation(stage, [_significant(in_phase), _significant(quadrature)])
-        self._fit(stage, in_phase + quadrature, centre)
+            found = self._orient(stage, found)
+        self._fit(stage, found[0] + found[1])
 
-    def _check_orientation(self, stage: _Stage, found: list[int]) -> None:
-        """Look for the image of a camera that has not found it among its mirror images.
+    def _orient(self, stage: _Stage, found: list[list[Measurement]]) -> list[list[Measurement]]:
+        """Look for the image of a camera that has not found it as it may show it otherwise.
 
         Args:
             stage: of the search.
-            found: patches that either camera has found.
+            found: measurements of either camera.
+
+        Returns:
+            Measurements of either camera as it shows the image.
 
         Raises:
-            CalibrationError: a camera shows the image mirrored or turned, or it alone does not show it.
+            CalibrationError: a camera shows the image otherwise and that is not to be taken, or it alone does not
+                show it.
         """
-        wanted = "frames as the profile has them: set the camera, or turn its frames in the recording"
         told = []
-        for camera, (own, other) in enumerate(zip(found, found[::-1], strict=True)):
-            if own >= _FEWEST or own > _ALONE * other:
+        for camera, own in enumerate(found):
+            if _significant(own) >= _SHOWS * len(own):
                 continue
-            for how, index in _FLIPS.items():
-                sampler = self._frame_samplers(self.pages[0], index)[camera]
-                if _significant(self._measure(sampler, stage, (camera,), camera / 2)) >= _FEWEST:
-                    told.append(f"{_CAMERAS[camera]} {how}")
-                    break
-        if told:
+            best, most = AS_IT_IS, max(_FEWEST - 1, 2 * _significant(own))
+            for how in list(ORIENTATIONS)[1:]:
+                self._set_orientation(camera, how)
+                sampler = self._frame_samplers(self.pages[0])[camera]
+                seen = self._measure(sampler, stage, (camera,), camera / 2)
+                if _significant(seen) > most:
+                    best, most, found[camera] = how, _significant(seen), seen
+            self._set_orientation(camera, best)
+            if best != AS_IT_IS:
+                told.append(f"{_CAMERAS[camera]} {best}")
+        self.orientations = tuple(told)
+        if told and not self.any_orientation:
+            wanted = "frames as the profile has them, or --orientation any: set the camera, or turn its frames"
             raise CalibrationError("calibration, cameras", " and ".join(told), wanted)
-        for camera, (own, other) in enumerate(zip(found, found[::-1], strict=True)):
-            if other >= _FEWEST and own < _ALONE * other:
-                got = f"{own} patches of known symbols where the {_CAMERAS[1 - camera]} has found {other}"
+        counts = [_significant(own) for own in found]
+        for camera, (mine, other) in enumerate(zip(counts, counts[::-1], strict=True)):
+            if other >= _FEWEST and mine < _ALONE * other:
+                got = f"{mine} patches of known symbols where the {_CAMERAS[1 - camera]} has found {other}"
                 raise CalibrationError(f"calibration, {_CAMERAS[camera]}", got, "the same image on both cameras")
+        return found
 
-    def complex_field(self, stage: _Stage, centre: Real | None = None, prior_scale: float | Real = 1.0) -> None:
+    def _set_orientation(self, camera: int, how: str) -> None:
+        """Begin anew with a camera that shows the image so."""
+        (xx, xy), (yx, yy) = ORIENTATIONS[how]
+        name = ("in_phase", "quadrature")[camera]
+        values = {"scale_x_relative": xx - 1, "turn_xy_slope": xy, "turn_yx_slope": yx, "scale_y_relative": yy - 1}
+        for parameter, value in values.items():
+            self.parameters[NAMES.index(f"{name}_{parameter}")] = value
+            self.centre[NAMES.index(f"{name}_{parameter}")] = value
+
+    def complex_field(self, stage: _Stage, prior_scale: float | Real = 1.0) -> None:
         """Measure branches on the recovered field and fit."""
         self._begin(stage.name)
         sampler = FieldSampler(self._field(self.pages[0])[0], self.grid)
-        self._fit(stage, self._measure(sampler, stage, (0, 1)), centre, prior_scale)
+        self._fit(stage, self._measure(sampler, stage, (0, 1)), prior_scale)
 
     def estimate_turn(self) -> None:
         """The angle between the arms, from the phases that the same known symbols show on either camera."""
@@ -345,19 +388,24 @@ class _Registration:
                 "about +90 or -90 degrees",
             )
 
-    def waves(
-        self, what: str, groups: tuple[str, ...], centre: Real | None = None, prior_scale: float | Real = 1.0
-    ) -> None:
+    def waves(self, what: str, groups: tuple[str, ...], prior_scale: float | Real = 1.0) -> None:
         """Fit `groups` and the angle between the arms to the waves of the first page."""
         self._begin(what)
         page = self.pages[0]
         fit = WaveFit(self.twin, self.profile, page.pair, self.references, page.symbols)
-        found = fit.fit(self.parameters, self.quadrature_phase, groups, centre, prior_scale, self._tell)
-        self.parameters, self.deviations, self.quadrature_phase = (
-            found.parameters,
-            found.deviations,
-            found.quadrature_phase,
+        found = fit.fit(
+            self.parameters,
+            self.quadrature_phase,
+            groups,
+            self.centre,
+            prior_scale,
+            self._tell,
+            self.modulation,
+            levels=True,
         )
+        self.parameters, self.deviations = found.parameters, found.deviations
+        self.quadrature_phase = found.quadrature_phase
+        self.modulation, self.modulation_deviations = found.modulation, found.modulation_deviations
 
     def result(self, before: Real) -> Registered:
         """Judge the outcome; `before` is the geometry that it is compared with."""
@@ -383,6 +431,8 @@ class _Registration:
             coherence_after=after,
             cost=self.fit.cost,
             significant=significant,
+            modulation=self.modulation,
+            modulation_deviations=self.modulation_deviations,
         )
 
     def _share(self, branch: str) -> float:
@@ -402,18 +452,18 @@ class _Registration:
     def _field(
         self, page: KnownPage, parameters: Real | None = None, quadrature_phase: float | None = None
     ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
-        registration = registration_coefficients(
-            self.twin, self.parameters if parameters is None else parameters, self.profile
-        )
+        parameters = self.parameters if parameters is None else parameters
+        registration = registration_coefficients(self.twin, parameters, self.profile)
         quadrature_phase = self.quadrature_phase if quadrature_phase is None else quadrature_phase
         homodyne = np.array([np.cos(quadrature_phase), np.sin(quadrature_phase)], dtype=np.float32)
-        return self.solve_field(page.pair, self.references, registration, homodyne)
+        kernel = cameras_apart(parameters, self.profile) if stand_apart(parameters) else None
+        return self.solve_field(page.pair, self.references, registration, homodyne, kernel)
 
-    def _frame_samplers(self, page: KnownPage, index: tuple[slice, slice] = _AS_IT_IS) -> list[FrameSampler]:
+    def _frame_samplers(self, page: KnownPage) -> list[FrameSampler]:
         frames = (page.pair.in_phase, page.pair.quadrature)
         references = (self.references.in_phase, self.references.quadrature)
         return [
-            FrameSampler(frame[index], reference[index], camera, self.twin, self.parameters)
+            FrameSampler(frame, reference, camera, self.twin, self.parameters)
             for camera, (frame, reference) in enumerate(zip(frames, references, strict=True))
         ]
 
@@ -458,9 +508,7 @@ class _Registration:
             )
         return found
 
-    def _fit(
-        self, stage: _Stage, found: list[Measurement], centre: Real | None, prior_scale: float | Real = 1.0
-    ) -> None:
+    def _fit(self, stage: _Stage, found: list[Measurement], prior_scale: float | Real = 1.0) -> None:
         good = [m for m in found if m.significance > SIGNIFICANT]
         self._looked, self._found = found, good
         if len(good) < _FEWEST:
@@ -477,7 +525,7 @@ class _Registration:
             self.parameters,
             indices(*stage.groups),
             use_phase=stage.use_phase,
-            centre=centre,
+            centre=self.centre,
             prior_scale=prior_scale,
         )
         self.parameters = self.fit.parameters

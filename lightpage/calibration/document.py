@@ -12,32 +12,42 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, field_serializer
 
 from lightpage.calibration.calibrate import Registered
-from lightpage.calibration.parameters import NAMES, as_dict, as_vector
+from lightpage.calibration.parameters import KNOWN, NAMES, as_dict, as_vector
 from lightpage.device.profile import Count, Finite, Profile, TomlTable, to_toml, validate
 from lightpage.errors import ProfileError
 from lightpage.files import read_text, replace_text
+from lightpage.page import modulation as modulations
+from lightpage.page.modulation import NOMINAL, Modulation
 
 Real = NDArray[np.float64]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 PageHash = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
-_ADDED = {"parameters": {"lens_path_relative": -1.0}, "deviations": {"lens_path_relative": 0.0}}
-"""What documents lack that were written before it: they took lenses for ideal."""
+_LATER = NAMES[KNOWN[0] :]
+_ADDED = {
+    "parameters": {"lens_path_relative": -1.0, **dict.fromkeys(_LATER, 0.0)},
+    "deviations": dict.fromkeys(("lens_path_relative", *_LATER), 0.0),
+}
+"""What documents lack that were written before it: they took lenses for ideal, and planes for those of the profile."""
 
 
-def _names_problem(values: dict[str, Any]) -> str:
-    """Which names are missing or unknown, in words; empty when they are just those of the twin's parameters."""
-    missing = [name for name in NAMES if name not in values]
-    unknown = sorted(set(values) - set(NAMES))
+def _names_problem(values: dict[str, Any], names: tuple[str, ...] = NAMES) -> str:
+    """Which names are missing or unknown, in words; empty when they are just those wanted."""
+    missing = [name for name in names if name not in values]
+    unknown = sorted(set(values) - set(names))
     parts = [("no " + ", ".join(missing)) if missing else "", ("unknown " + ", ".join(unknown)) if unknown else ""]
     return "; ".join(part for part in parts if part)
 
 
-def _just_the_names(values: dict[str, float]) -> dict[str, float]:
-    problem = _names_problem(values)
-    if problem:
-        raise ValueError(problem)
-    return {name: values[name] for name in NAMES}
+def _just(names: tuple[str, ...]) -> AfterValidator:
+    """Check that a table has these names, and put it into their order."""
+
+    def ordered(values: dict[str, float]) -> dict[str, float]:
+        if problem := _names_problem(values, names):
+            raise ValueError(problem)
+        return {name: values[name] for name in names}
+
+    return AfterValidator(ordered)
 
 
 class Calibration(TomlTable):
@@ -55,6 +65,9 @@ class Calibration(TomlTable):
         calibrated_pages: their SHA-256 (`hash_frames`), so that no figure counts them as held out.
         parameters: fitted value of every parameter of `lightpage.calibration.parameters`, in the unit of its name.
         deviations: their standard deviations, same names and units.
+        modulation: what the modulator makes of its levels, by the names of `lightpage.page.modulation`; nominal in
+            documents that do not tell it.
+        modulation_deviations: standard deviations of that, same names.
     """
 
     schema_version: Literal[1] = 1
@@ -67,8 +80,10 @@ class Calibration(TomlTable):
     significant: Share
     pages_used: Count
     calibrated_pages: tuple[PageHash, ...]
-    parameters: Annotated[dict[str, Finite], AfterValidator(_just_the_names)]
-    deviations: Annotated[dict[str, NonNegative], AfterValidator(_just_the_names)]
+    parameters: Annotated[dict[str, Finite], _just(NAMES)]
+    deviations: Annotated[dict[str, NonNegative], _just(NAMES)]
+    modulation: Annotated[dict[str, Finite], _just(modulations.NAMES)] = NOMINAL.as_dict()
+    modulation_deviations: Annotated[dict[str, NonNegative], _just(modulations.NAMES)] = NOMINAL.as_dict()
 
     @field_serializer("calibrated_pages")
     def _as_list(self, pages: tuple[str, ...]) -> list[str]:
@@ -94,6 +109,8 @@ class Calibration(TomlTable):
             calibrated_pages=tuple(hashes),
             parameters=as_dict(registered.parameters),
             deviations=as_dict(registered.deviations),
+            modulation=registered.modulation.as_dict(),
+            modulation_deviations=Modulation(registered.modulation_deviations).as_dict(),
         )
 
     def followed_by(self, fitted: Self) -> Self:
@@ -123,6 +140,11 @@ class Calibration(TomlTable):
     def vector(self) -> Real:
         """The fitted parameters as a ray twin takes them, [P]."""
         return as_vector(self.parameters)
+
+    @property
+    def modulator(self) -> Modulation:
+        """What the modulator makes of its levels."""
+        return Modulation(tuple(self.modulation.values()))
 
     def angle_deg(self, profile: Profile) -> float:
         """Angle of the pipe, degrees: the profile's and what was fitted on top."""

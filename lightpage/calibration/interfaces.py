@@ -56,7 +56,12 @@ class FieldSolver(Protocol):
     """Turns a frame pair into the signal field on the common grid of `lightpage.waves.grid`."""
 
     def __call__(
-        self, pair: FramePair, references: FramePair, registration: NDArray[np.float32], homodyne: NDArray[np.float32]
+        self,
+        pair: FramePair,
+        references: FramePair,
+        registration: NDArray[np.float32],
+        homodyne: NDArray[np.float32],
+        apart: NDArray[np.float32] | None = None,
     ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
         """Field [ny, nx] over the mean reference amplitude, and what is left of the homodyne equations, [2, ny, nx].
 
@@ -64,5 +69,7 @@ class FieldSolver(Protocol):
             pair, references: frames [H, W].
             registration: [2, 2, 10], see `lightpage.calibration.sampling_table`.
             homodyne: [2], cosine and sine of the turn between the arms.
+            apart: [2, taps], see `lightpage.calibration.sampling_table.cameras_apart`; None where both cameras see the
+                same plane.
         """
         ...

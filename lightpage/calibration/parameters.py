@@ -62,9 +62,21 @@ PARAMETERS: tuple[Parameter, ...] = (
             ("turn_yx_slope", 0.005),
         )
     ),
+    # defocus: phase on the facet that a plane off its focal plane makes, radians at the middle of the facet's wall
+    Parameter("modulator_axial_rad", 0.5, "axial"),
+    Parameter("in_phase_axial_rad", 0.5, "axial"),
+    Parameter("quadrature_axial_rad", 0.5, "axial"),
+    # change of a camera's scale from the page's centre to its edge, as a tilted sensor has
+    *(
+        Parameter(f"{camera}_keystone_{axis}_relative", 0.001, "keystone")
+        for camera in ("in_phase", "quadrature")
+        for axis in "xy"
+    ),
 )
 
 NAMES: tuple[str, ...] = tuple(p.name for p in PARAMETERS)
+KNOWN = (NAMES.index("modulator_axial_rad"), len(NAMES))
+"""Counts of parameters that twins know: those of bundles of before, which took planes for those of the profile; all."""
 PRIORS: Real = np.array([p.prior for p in PARAMETERS])
 
 

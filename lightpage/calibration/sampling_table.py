@@ -12,7 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.calibration.interfaces import Twin
+from lightpage.calibration.parameters import as_dict
+from lightpage.calibration.waves.wave_model import axial_of_cameras, defocus, fitted_geometry
 from lightpage.device.profile import Profile
+from lightpage.waves.defocus import defocus_taps
 from lightpage.waves.grid import field_grid
 
 Real = NDArray[np.float64]
@@ -20,6 +23,9 @@ SamplingTable = dict[str, NDArray[Any]]
 """Tensors by their names as inputs of an exported decoder, float32 where `sampling_table` makes them."""
 
 _FIT_POINTS = 9
+_LEAST_APART_RAD = 0.03
+"""Half of the distance of the cameras' axial places, as a phase at the facet's wall, from which on it is dealt with:
+that takes time, and less of it leaves the field as exact as noise does."""
 _PLACE_BITS = 14
 """Fractional bits of places and gradients, grid samples. A float32 of thousands of samples has 12."""
 _PHASE_BITS = 16
@@ -52,6 +58,19 @@ def registration_coefficients(twin: Twin, parameters: Real, profile: Profile) ->
     return np.stack(coefficients).astype(np.float32)
 
 
+def stand_apart(parameters: Real) -> bool:
+    """Whether the cameras of a device stand so far apart that the field of each is to be seen through its defocus."""
+    return bool(abs(axial_of_cameras(as_dict(parameters))[1]) >= _LEAST_APART_RAD)
+
+
+def cameras_apart(parameters: Real, profile: Profile) -> NDArray[np.float32]:
+    """Kernel of the in-phase camera's defocus beyond the mean of both, along either axis of the grid, [2, taps]."""
+    value = as_dict(parameters)
+    geometry = fitted_geometry(profile, value)
+    beyond = defocus(axial_of_cameras(value)[1], geometry.pipe_width_m)
+    return defocus_taps(geometry, beyond, field_grid(profile).pitch_m)
+
+
 def shifted(registration: NDArray[np.float32], shift_px: Real) -> NDArray[np.float32]:
     """The registration [2, 2, 10] of an image that lies (x, y) camera pixels from where calibration saw it."""
     moved = registration.copy()
@@ -69,7 +88,8 @@ def sampling_table(twin: Twin, parameters: Real, quadrature_phase: float, profil
         profile: the nominal device.
 
     Returns:
-        registration [2, 2, 10]; homodyne [2] (cosine and sine of the turn); parameters [P] themselves; with one symbol
+        registration [2, 2, 10]; homodyne [2] (cosine and sine of the turn); apart [2, taps], see `cameras_apart`;
+        parameters [P] themselves; with one symbol
         pitch as the unit of offset: places [B, 2, ny, nx] in grid samples (column, row), place_gradients [B, 4, ny, nx]
         as (dx/dx, dx/dy, dy/dx, dy/dy), phases [B, 6, ny, nx] as (value, d/dx, d/dy, d2/dx2, d2/dxdy, d2/dy2), the
         value within +-pi; positions [2, ny, nx], exit centroid over the pipe's width.
@@ -108,6 +128,7 @@ def sampling_table(twin: Twin, parameters: Real, quadrature_phase: float, profil
     return {
         "registration": registration_coefficients(twin, parameters, profile),
         "homodyne": np.array([np.cos(quadrature_phase), np.sin(quadrature_phase)], dtype=np.float32),
+        "apart": cameras_apart(parameters, profile),
         "parameters": parameters.astype(np.float32),
         "places": as_maps(middle, _PLACE_BITS),
         "place_gradients": as_maps(gradients, _PLACE_BITS),

@@ -78,6 +78,7 @@ SUMMARIES = {
     "evaluate": "Measure a bundle on a recording with known symbols.",
     "export": "Turn a training run into a bundle.",
     "jobs": "Show, follow or cancel the recalibrations of a running service.",
+    "lookup-table": "Correct a modulator's lookup table by a calibration.",
     "models": "List, add and change the models of a running service.",
     "recalibrate": "Re-fit a drifted device's geometry and write a new bundle.",
     "record": "Record pages of cameras, or of any other source.",

@@ -20,7 +20,7 @@ from lightpage.codec.ldpc.decoder import decode
 from lightpage.codec.mapping import bit_information, bit_llrs, decide_in_coset, labels, level_bits
 from lightpage.codec.page_codec import PageCodec
 from lightpage.errors import InvalidInputError
-from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
+from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS, Levels
 
 FEWEST_PAGES = 3
 """Fewer say nothing of how pages differ."""
@@ -61,11 +61,13 @@ class DrawnPage:
         phase: decoded, radians, of the data symbols, [symbols].
         concentration: kappa, [symbols].
         symbols: what was drawn.
+        levels: that they were drawn from.
     """
 
     phase: NDArray[np.float64]
     concentration: NDArray[np.float64]
     symbols: NDArray[np.uint8]
+    levels: Levels
 
 
 Draw = Callable[[int, np.random.Generator], Sequence[DrawnPage]]
@@ -153,7 +155,7 @@ def _best_of(
     """The best code of a level count that leaves `kept_bits` of a symbol, None where none carries the pages."""
     bits = level_bits(levels)
     for coded in range(min(_CODED_BITS, bits), bits + 1):
-        seen = [_information(page, levels, coded) for page in pages]
+        seen = [_information(page, coded) for page in pages]
         information, wrong = np.array([each[0] for each in seen]), np.array([each[1] for each in seen])
         corrections = _corrections(wrong)
         if corrections is not None:
@@ -169,7 +171,7 @@ def _best_of(
         if rate < lowest or tried > _MOST_TRIED:
             return None
         code = Code(levels=levels, coded_bits=coded, rate_per_mille=rate, corrections=corrections)
-        needed = needed_information(PageCodec(code, pilots).ldpc, pages, levels, coded, rng)
+        needed = needed_information(PageCodec(code, pilots).ldpc, pages, coded, rng)
         if needed > weakest:
             rate = min(rate - _RATE_STEP, _stepped(weakest - (needed - rate / 1000)))
             continue
@@ -200,11 +202,11 @@ def _label_bits(symbols: NDArray[np.uint8], coded: int) -> NDArray[np.uint8]:
     return np.asarray(labels(coded)[symbols % (1 << coded)][:, None] >> np.arange(coded) & 1, np.uint8)
 
 
-def _information(page: DrawnPage, levels: int, coded: int) -> tuple[float, int]:
+def _information(page: DrawnPage, coded: int) -> tuple[float, int]:
     """Information of a coded bit of a page, and how many of its symbols' upper numbers are decided wrongly."""
     label = _label_bits(page.symbols, coded)
-    llrs = bit_llrs(page.phase, page.concentration, levels, coded)
-    wrong = decide_in_coset(page.phase, label, levels) != page.symbols >> coded
+    llrs = bit_llrs(page.phase, page.concentration, page.levels, coded)
+    wrong = decide_in_coset(page.phase, label, page.levels) != page.symbols >> coded
     return bit_information(llrs, label), int(np.count_nonzero(wrong))
 
 
@@ -216,7 +218,7 @@ def _corrections(wrong: NDArray[np.int64]) -> int | None:
 
 
 def _blocks(
-    pages: Sequence[DrawnPage], code: LdpcCode, levels: int, coded: int, noise: float, rng: np.random.Generator
+    pages: Sequence[DrawnPage], code: LdpcCode, coded: int, noise: float, rng: np.random.Generator
 ) -> tuple[NDArray[np.float32], float]:
     """LLRs of the zero word in the light of pages with more noise, [blocks, n], and their information.
 
@@ -228,7 +230,7 @@ def _blocks(
             np.maximum(page.concentration, 1.0)
         )
         label = _label_bits(page.symbols, coded)
-        llrs = bit_llrs(worse, page.concentration / (1 + noise**2), levels, coded)
+        llrs = bit_llrs(worse, page.concentration / (1 + noise**2), page.levels, coded)
         right = np.where(label == 0, llrs, -llrs).ravel()
         whole = len(right) // code.sent_bits * code.sent_bits
         ratios.append(rng.permutation(right)[:whole].reshape(-1, code.sent_bits))
@@ -236,15 +238,12 @@ def _blocks(
     return blocks, bit_information(blocks, np.zeros(blocks.shape, np.uint8))
 
 
-def needed_information(
-    code: LdpcCode, pages: Sequence[DrawnPage], levels: int, coded: int, rng: np.random.Generator
-) -> float:
+def needed_information(code: LdpcCode, pages: Sequence[DrawnPage], coded: int, rng: np.random.Generator) -> float:
     """Information per bit from which nearly all blocks decode: the pages' light is made noisier until 2% of them fail.
 
     Args:
         code: of the blocks.
         pages: with their light.
-        levels: M.
         coded: b.
         rng: of noise.
     """
@@ -252,7 +251,7 @@ def needed_information(
     needed = 1.0
     for _ in range(_BISECTIONS):
         noise = (low + high) / 2
-        blocks, information = _blocks(pages, code, levels, coded, noise, rng)
+        blocks, information = _blocks(pages, code, coded, noise, rng)
         if np.mean(~decode(code, blocks).converged) <= 0.02:
             low, needed = noise, information
         else:
@@ -264,6 +263,6 @@ def _all_decode(draw: Draw, code: Code, pilots: NDArray[np.bool_], rng: np.rando
     """Whether every page decodes, drawn some times."""
     ldpc = PageCodec(code, pilots).ldpc
     return all(
-        decode(ldpc, _blocks(draw(code.levels, rng), ldpc, code.levels, code.coded_bits, 0.0, rng)[0]).converged.all()
+        decode(ldpc, _blocks(draw(code.levels, rng), ldpc, code.coded_bits, 0.0, rng)[0]).converged.all()
         for _ in range(_DRAWS)
     )

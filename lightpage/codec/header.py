@@ -19,6 +19,7 @@ from lightpage.codec.mapping import bit_llrs, level_bits, to_levels
 from lightpage.codec.page_bytes import VERSION, Header
 from lightpage.codec.random_bits import random_bytes
 from lightpage.errors import InvalidInputError
+from lightpage.page.levels import Levels
 
 MOST_PAGES = 1 << 24
 MOST_BYTES = (1 << 40) - 1
@@ -97,10 +98,13 @@ def encode_headers(headers: list[Header], levels: int) -> NDArray[np.uint8]:
     return symbols.astype(np.uint8).reshape(len(headers), -1)
 
 
-def decode_header(phase: NDArray[np.floating], concentration: NDArray[np.floating], levels: int) -> Header | None:
+def decode_header(
+    phase: NDArray[np.floating], concentration: NDArray[np.floating], levels: int | Levels
+) -> Header | None:
     """The header in its symbols' phases (radians) and concentrations; None where it cannot be read."""
-    llrs = bit_llrs(phase, concentration, header_levels(levels)).reshape(1, -1)[:, : sent_bits(levels)]
-    found = decode(_code(sent_bits(levels)), llrs)
+    levels = Levels.of(levels)
+    coarse, sent = levels.every(levels.count // header_levels(levels.count)), sent_bits(levels.count)
+    found = decode(_code(sent), bit_llrs(phase, concentration, coarse).reshape(1, -1)[:, :sent])
     if not found.converged[0]:
         return None
     text = np.packbits(found.information[0]) ^ random_bytes(_SCRAMBLER_SEED, HEADER_BYTES)

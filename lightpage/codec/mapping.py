@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lightpage.codec.ldpc.decoder import MOST_LLR
 from lightpage.errors import PageError
-from lightpage.page.symbols import check_levels
+from lightpage.page.levels import Levels, check_levels
 
 _CHUNK = 1 << 18
 """Probabilities at once: few enough for the cache."""
@@ -42,7 +42,10 @@ def labels(label_bits: int) -> NDArray[np.uint8]:
 
 
 def bit_llrs(
-    phase: NDArray[np.floating], concentration: NDArray[np.floating], levels: int, label_bits: int | None = None
+    phase: NDArray[np.floating],
+    concentration: NDArray[np.floating],
+    levels: int | Levels,
+    label_bits: int | None = None,
 ) -> NDArray[np.float32]:
     """Log-likelihood ratios ln P(0) / P(1) of the label bits of symbols whose levels are equally likely.
 
@@ -52,7 +55,7 @@ def bit_llrs(
     Args:
         phase: decoded phases mu, radians, any shape; piston removed.
         concentration: kappa, the same shape.
-        levels: M, a power of two.
+        levels: M, a power of two, or uneven levels of that number.
         label_bits: b, 1 to log2 M; all bits, in Gray code, if left out.
 
     Returns:
@@ -61,33 +64,58 @@ def bit_llrs(
     Raises:
         PageError: shapes differ, a value that is not finite, a negative concentration, levels that carry no bits.
     """
-    bits = level_bits(levels) if label_bits is None else label_bits
-    _check_label(levels, bits)
+    levels = Levels.of(levels)
+    bits = level_bits(levels.count) if label_bits is None else label_bits
+    _check_label(levels.count, bits)
     mu, kappa = np.asarray(phase, np.float64).ravel(), np.asarray(concentration, np.float64).ravel()
     if np.shape(phase) != np.shape(concentration):
         raise PageError("phase, concentration", (np.shape(phase), np.shape(concentration)), "two equal shapes")
     if not (np.isfinite(mu).all() and np.isfinite(kappa).all() and (kappa >= 0).all()):
         raise PageError("phase, concentration", "NaN, infinity or a negative concentration", "finite numbers")
     ratios = np.empty((mu.size, bits), np.float32)
-    step = 2 * np.pi / levels
-    offsets = np.arange(levels) * step
-    # kappa (cos(offset - away) - cos(away)) as a product
-    waves = np.stack([np.cos(offsets) - 1, np.sin(offsets)])
+    weights = _CosetWeights(levels, bits)
     ones = labels(bits)[:, None] >> np.arange(bits) & 1
-    rows = max(1, _CHUNK // levels)
+    rows = max(1, _CHUNK // levels.count)
     for start in range(0, mu.size, rows):
         some = slice(start, start + rows)
-        nearest = np.rint(mu[some] / step)
-        # about the nearest level: float32 then keeps what a large concentration makes of small differences
-        away = mu[some] - nearest * step
-        drop = (kappa[some] * np.stack([np.cos(away), np.sin(away)])).T @ waves
-        weight = np.exp(drop.astype(np.float32)).reshape(len(away), -1, 1 << bits).sum(axis=1)
-        first = nearest.astype(np.int64) % (1 << bits)
-        by_coset = np.take_along_axis(weight, (np.arange(1 << bits) - first[:, None]) % (1 << bits), axis=1)
+        by_coset = weights(mu[some], kappa[some])
         one, zero = by_coset @ ones.astype(np.float32), by_coset @ (1 - ones).astype(np.float32)
         tiny = np.float32(np.finfo(np.float32).tiny)
         ratios[some] = np.log(np.maximum(zero, tiny)) - np.log(np.maximum(one, tiny))
     return np.clip(ratios, -MOST_LLR, MOST_LLR).reshape(*np.shape(phase), bits)
+
+
+class _CosetWeights:
+    """Posterior of the cosets, but for a factor, so that no sum underflows.
+
+    Args:
+        levels: of the page.
+        bits: b.
+    """
+
+    def __init__(self, levels: Levels, bits: int) -> None:
+        self._levels, self._cosets = levels, 1 << bits
+        first = 1.0 if levels.is_nominal else 0.0
+        self._waves = np.stack([np.cos(levels.phases) - first, np.sin(levels.phases)])
+
+    def __call__(self, mu: NDArray[np.float64], kappa: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Weights of symbols' cosets, float32 [symbols, 2^b]."""
+        if not self._levels.is_nominal:
+            drop = (kappa * np.stack([np.cos(mu), np.sin(mu)])).T @ self._waves
+            return self._summed(drop - drop.max(axis=1, keepdims=True))
+        step = 2 * np.pi / self._levels.count
+        nearest = np.rint(mu / step)
+        # about the nearest level: float32 then keeps what a large concentration makes of small differences;
+        # kappa (cos(offset - away) - cos(away)) as a product
+        away = mu - nearest * step
+        weight = self._summed((kappa * np.stack([np.cos(away), np.sin(away)])).T @ self._waves)
+        first = nearest.astype(np.int64) % self._cosets
+        places = (np.arange(self._cosets) - first[:, None]) % self._cosets
+        return np.take_along_axis(weight, places, axis=1)
+
+    def _summed(self, logits: NDArray[np.float64]) -> NDArray[np.float32]:
+        weights = np.exp(logits.astype(np.float32)).reshape(len(logits), -1, self._cosets)
+        return np.asarray(weights.sum(axis=1))
 
 
 def to_levels(label: NDArray[np.uint8], upper: NDArray[np.integer], levels: int) -> NDArray[np.uint8]:
@@ -104,20 +132,26 @@ def to_levels(label: NDArray[np.uint8], upper: NDArray[np.integer], levels: int)
     return np.asarray(number + (upper.astype(np.int64) << bits), np.uint8)
 
 
-def decide_in_coset(phase: NDArray[np.floating], label: NDArray[np.uint8], levels: int) -> NDArray[np.int64]:
+def decide_in_coset(phase: NDArray[np.floating], label: NDArray[np.uint8], levels: int | Levels) -> NDArray[np.int64]:
     """Number within its coset of the level that lies nearest to each phase, its label being known.
 
     Args:
         phase: decoded phases, radians, [symbols].
         label: bits of each symbol, [symbols, b].
-        levels: M, a power of two.
+        levels: M, a power of two, or uneven levels of that number.
     """
-    bits = label.shape[1]
-    _check_label(levels, bits)
-    number = np.argsort(labels(bits))[label @ (1 << np.arange(bits))]
-    step = 2 * np.pi / levels
-    nearest = np.rint((np.asarray(phase, np.float64) - number * step) / (step * (1 << bits))).astype(np.int64)
-    return np.asarray(nearest % (levels >> bits))
+    levels, bits = Levels.of(levels), label.shape[1]
+    _check_label(levels.count, bits)
+    mu, number = np.asarray(phase, np.float64), np.argsort(labels(bits))[label @ (1 << np.arange(bits))]
+    if levels.is_nominal:
+        step = 2 * np.pi / levels.count
+        nearest = np.rint((mu - number * step) / (step * (1 << bits))).astype(np.int64)
+        return np.asarray(nearest % (levels.count >> bits))
+    found = np.zeros(mu.shape, np.int64)
+    if levels.count >> bits > 1:
+        for coset in range(1 << bits):
+            found[number == coset] = levels.every(1 << bits, coset).nearest(mu[number == coset])
+    return found
 
 
 def bit_information(llrs: NDArray[np.floating], bits: NDArray[np.uint8] | None = None) -> float:

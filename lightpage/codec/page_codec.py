@@ -21,6 +21,7 @@ from lightpage.codec.page_bytes import FILE_BYTES, FileFacts, Header, Loss, Page
 from lightpage.codec.random_bits import random_bytes, random_order
 from lightpage.codec.reed_solomon import LONGEST_WORD, SYMBOL_BITS, parity, repair
 from lightpage.errors import InvalidInputError, PageError
+from lightpage.page.levels import Levels
 
 _INTERLEAVER_SEED = 0x4C50_494C
 _FILLING_SEED = 0x4C50_464C
@@ -32,13 +33,14 @@ class PageCodec:
     Args:
         code: its parameters.
         pilots: where the pilots are, bool [ny, nx].
+        levels: of the pages that are read, where they are uneven; as many as the code has.
 
     Raises:
         InvalidInputError: the page is too small for this code.
     """
 
-    def __init__(self, code: Code, pilots: NDArray[np.bool_]) -> None:
-        self.code, self.pilots = code, pilots
+    def __init__(self, code: Code, pilots: NDArray[np.bool_], levels: Levels | None = None) -> None:
+        self.code, self.pilots, self._levels = code, pilots, levels or Levels(code.levels)
         data = int(np.count_nonzero(~pilots))
         count = header_symbols(code.levels)
         if count >= data:
@@ -139,16 +141,16 @@ class PageCodec:
             shapes = phase.shape, concentration.shape
             raise PageError("phase, concentration", shapes, f"{self.pilots.shape} twice, as the pilots have")
         mu, kappa = phase.ravel(), concentration.ravel()
-        header = decode_header(mu[self._header], kappa[self._header], self.code.levels)
+        header = decode_header(mu[self._header], kappa[self._header], self._levels)
         other = header is not None and header.code_id != self.code.id and expected is None
-        llrs = bit_llrs(mu[self._body], kappa[self._body], self.code.levels, self.code.coded_bits).ravel()
+        llrs = bit_llrs(mu[self._body], kappa[self._body], self._levels, self.code.coded_bits).ravel()
         blocks = llrs[self._order[: self.blocks * self.ldpc.sent_bits]].reshape(self.blocks, -1)
         if other:
             return self._lost(header, Loss.CODE, blocks, 0, 0.0)
         found = decode(self.ldpc, blocks)
         failed, iterations = int(np.count_nonzero(~found.converged)), float(found.iterations.mean())
         label = self._interleaved(found.sent[None])
-        upper = decide_in_coset(mu[self._body], label, self.code.levels)
+        upper = decide_in_coset(mu[self._body], label, self._levels)
         high = (upper[:, None] >> np.arange(self._upper_bits)[::-1] & 1).astype(np.uint8)
         bits = np.concatenate([found.information.ravel(), high.ravel()])
         for candidate in (header, expected):

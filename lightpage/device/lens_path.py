@@ -27,6 +27,8 @@ class SeidelTerms(NamedTuple):
     """Of R^2 (x X + y Y)."""
     spherical: Any = 0.0
     """Of R^4."""
+    defocus: Any = 0.0
+    """Of R^2, rad/m^2: the outer plane does not stand in the focal plane, see `defocus`."""
 
     def mirrored(self) -> SeidelTerms:
         """Of the same lens met from the facet, as a lens from camera plane to facet whose adjoint is used.
@@ -39,7 +41,13 @@ class SeidelTerms(NamedTuple):
             astigmatism=-self.astigmatism,
             field_curvature=-self.field_curvature,
             spherical=-self.spherical,
+            defocus=-self.defocus,
         )
+
+    @property
+    def couples(self) -> bool:
+        """Whether any term depends on the field; defocus does not."""
+        return not all(isinstance(term, float) and term == 0.0 for term in self[:-1])
 
     def of_field(self, x: Any, y: Any) -> Any:
         """The part of W that depends on the field alone, radians."""
@@ -51,13 +59,14 @@ class SeidelTerms(NamedTuple):
         r2, aperture2, product = x * x + y * y, across * across + up * up, x * across + y * up
         odd = self.distortion * r2 + self.coma * aperture2
         even = self.astigmatism * product * product + self.field_curvature * r2 * aperture2
-        return odd * product + even + self.spherical * aperture2 * aperture2
+        return odd * product + even + (self.spherical * aperture2 + self.defocus) * aperture2
 
     def slope(self, x: Any, y: Any, across: Any, up: Any) -> tuple[Any, Any]:
         """Derivatives of W by the aperture's two coordinates, rad/m."""
         r2, aperture2, product = x * x + y * y, across * across + up * up, x * across + y * up
         by_field = self.distortion * r2 + self.coma * aperture2 + 2 * self.astigmatism * product
-        by_aperture = 2 * self.coma * product + 2 * self.field_curvature * r2 + 4 * self.spherical * aperture2
+        even = self.coma * product + self.field_curvature * r2 + self.defocus
+        by_aperture = 2 * even + 4 * self.spherical * aperture2
         return by_field * x + by_aperture * across, by_field * y + by_aperture * up
 
     def slope_on_field(self, x: Any, y: Any, across: Any, up: Any) -> tuple[Any, Any]:
@@ -75,7 +84,7 @@ class SeidelTerms(NamedTuple):
     def bend(self, x: Any, y: Any, across: Any, up: Any) -> tuple[Any, Any]:
         """Second derivatives of W by either of the aperture's coordinates, rad/m^2."""
         r2, aperture2, product = x * x + y * y, across * across + up * up, x * across + y * up
-        alike = 2 * self.coma * product + 2 * self.field_curvature * r2 + 4 * self.spherical * aperture2
+        alike = 2 * (self.coma * product + self.field_curvature * r2 + self.defocus) + 4 * self.spherical * aperture2
 
         def along(field: Any, aperture: Any) -> Any:
             by_field = 2 * self.astigmatism * field + 4 * self.coma * aperture

@@ -34,6 +34,8 @@ class Geometry(TomlTable):
     """Centre of the page off the optical axis, SLM pixels."""
     page_shift_y_px: Pixels = 2.0
     pipe_roll_deg: Angle = 0.1
+    modulator_axial_rad: Phase = 0.0
+    """Axial place of the modulator off its focal plane: phase at the middle of the facet's wall."""
 
 
 class CameraPose(TomlTable):
@@ -43,6 +45,12 @@ class CameraPose(TomlTable):
     rotation_deg: Angle = 0.0
     shift_x_px: Pixels = 0.0
     shift_y_px: Pixels = 0.0
+    axial_rad: Phase = 0.0
+    """Axial place off the focal plane: phase at the middle of the facet's wall."""
+    keystone_x_relative: Annotated[float, Field(ge=-0.1, le=0.1, allow_inf_nan=False)] = 0.0
+    """Change of the scale from the centre to the right edge of the page's image, as a tilted sensor has."""
+    keystone_y_relative: Annotated[float, Field(ge=-0.1, le=0.1, allow_inf_nan=False)] = 0.0
+    """The same to the bottom edge."""
 
 
 class Aberration(TomlTable):
@@ -92,6 +100,18 @@ class SlmDefects(TomlTable):
     blur_px: Few = 0.3
     falloff_relative: Annotated[float, Field(ge=0, lt=1)] = 0.15
     """Loss of illumination amplitude at the page's corner."""
+    stroke_relative_error: Annotated[float, Field(ge=-0.5, le=0.5, allow_inf_nan=False)] = 0.0
+    """Of the phase between the first level and one beyond the last, which is nominally 2 pi."""
+    level_sine_rad: Annotated[float, Field(ge=-3, le=3, allow_inf_nan=False)] = 0.0
+    """Smooth error over the levels: times the sine of the nominal phase."""
+    level_cosine_rad: Annotated[float, Field(ge=-3, le=3, allow_inf_nan=False)] = 0.0
+    level_sine_twice_rad: Annotated[float, Field(ge=-3, le=3, allow_inf_nan=False)] = 0.0
+    """Times the sine of twice the nominal phase."""
+    unmodulated_relative: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """Amplitude of the light that is not modulated, over that of the light that is."""
+    unmodulated_phase_rad: Phase = 0.0
+    level_amplitude_relative: Annotated[float, Field(ge=-0.9, le=0.9, allow_inf_nan=False)] = 0.0
+    """Change of amplitude that goes with the phase: times the cosine of the nominal phase."""
 
 
 class Sensor(TomlTable):

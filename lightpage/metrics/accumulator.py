@@ -9,6 +9,7 @@ from lightpage.errors import PageError
 from lightpage.metrics.information import CONCENTRATION_CAP, decide_with_confidence
 from lightpage.metrics.measures import PageMeasures, SymbolMaps, measure, symbol_maps
 from lightpage.metrics.reliability import ECE_BINS, ConcentrationBin, ConfidenceBin, calibration_error, reliability
+from lightpage.page.levels import Levels
 from lightpage.von_mises import mean_resultant
 
 _INDEX_BITS = 33
@@ -20,13 +21,13 @@ class Accumulator:
     """What `lightpage.metrics.information` says of all pages together, in twelve bytes a symbol.
 
     Args:
-        levels: M.
+        levels: M, or uneven levels.
         data: where the data symbols are, bool [ny, nx].
         pages: the most that are added.
     """
 
-    def __init__(self, levels: int, data: NDArray[np.bool_], pages: int) -> None:
-        self._levels, self._data = levels, data
+    def __init__(self, levels: int | Levels, data: NDArray[np.bool_], pages: int) -> None:
+        self._levels, self._data = Levels.of(levels), data
         self._measures: list[PageMeasures] = []
         self._maps = np.zeros((3, *data.shape))
         self._reliability = np.zeros((3, ECE_BINS))
@@ -69,7 +70,7 @@ class Accumulator:
         gmi = [page.gmi_bits_per_symbol for page in pages if page.gmi_bits_per_symbol is not None]
         return PageMeasures(
             count=sum(page.count for page in pages),
-            levels=self._levels,
+            levels=self._levels.count,
             air_bits_per_symbol=float(np.mean([page.air_bits_per_symbol for page in pages])),
             own_mi_bits_per_symbol=float(np.mean([page.own_mi_bits_per_symbol for page in pages])),
             gmi_bits_per_symbol=float(np.mean(gmi)) if gmi else None,
@@ -105,7 +106,7 @@ class Accumulator:
         added = slice(self._count, self._count + symbols.size)
         bits = np.minimum(kappa, CONCENTRATION_CAP).astype(np.float32).view(np.uint32).astype(np.uint64)
         self._keys[added] = bits << _INDEX_BITS | np.arange(added.start, added.stop, dtype=np.uint64)
-        self._cosines[added] = np.cos(symbols * (2 * np.pi / self._levels) - np.asarray(mu, np.float64))
+        self._cosines[added] = np.cos(self._levels.phases[symbols] - np.asarray(mu, np.float64))
         self._count = added.stop
 
     def _concentration_bin(self, keys: NDArray[np.uint64]) -> ConcentrationBin:

@@ -17,6 +17,7 @@ from lightpage.metrics.information import (
     own_information,
 )
 from lightpage.metrics.reliability import expected_calibration_error
+from lightpage.page.levels import Levels
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class PageMeasures:
 
 
 def measure(
-    mu: NDArray[np.floating], kappa: NDArray[np.floating], symbols: NDArray[np.integer], levels: int
+    mu: NDArray[np.floating], kappa: NDArray[np.floating], symbols: NDArray[np.integer], levels: int | Levels
 ) -> PageMeasures:
     """All figures of the symbols given, which should be data symbols only (pilots carry nothing).
 
@@ -47,19 +48,19 @@ def measure(
         mu: decoded phase, radians, piston already removed; any shape.
         kappa: concentration, same shape.
         symbols: the true symbols, same shape.
-        levels: M.
+        levels: M, or uneven levels.
     """
-    truth = np.asarray(symbols)
+    truth, levels = np.asarray(symbols), Levels.of(levels)
     if truth.size == 0:
         raise PageError("symbols to measure", "none", "at least one")
     decided, confidence = decide_with_confidence(mu, kappa, levels)
     correct = decided == truth
     return PageMeasures(
         count=int(truth.size),
-        levels=levels,
+        levels=levels.count,
         air_bits_per_symbol=float(achievable_rate(mu, kappa, truth, levels).mean()),
         own_mi_bits_per_symbol=float(own_information(mu, kappa, levels).mean()),
-        gmi_bits_per_symbol=None if levels & (levels - 1) else float(gray_rate(mu, kappa, truth, levels).mean()),
+        gmi_bits_per_symbol=float(gray_rate(mu, kappa, truth, levels).mean()) if levels.carry_bits else None,
         symbol_error_rate=float(1 - correct.mean()),
         ece=expected_calibration_error(confidence, correct),
     )
@@ -84,14 +85,14 @@ def symbol_maps(
     mu: NDArray[np.floating],
     kappa: NDArray[np.floating],
     symbols: NDArray[np.integer],
-    levels: int,
+    levels: int | Levels,
     data: NDArray[np.bool_],
 ) -> SymbolMaps:
     """What `measure` averages over the page, place by place.
 
     Args:
         mu, kappa, symbols: of the data symbols, [pages, number of Trues in data] in row order.
-        levels: M.
+        levels: M, or uneven levels.
         data: where the data symbols are, bool [ny, nx].
 
     Raises:
@@ -106,6 +107,6 @@ def symbol_maps(
         page[data] = values.mean(axis=0)
         return page
 
-    turned = s * (2 * np.pi / m) - phase
+    turned = m.phases[s] - phase
     error = np.abs(turned - 2 * np.pi * np.rint(turned / (2 * np.pi)))
     return SymbolMaps(spread(achievable_rate(phase, k, s, m)), spread(own_information(phase, k, m)), spread(error))

@@ -10,6 +10,7 @@ from scipy.special import i0e
 
 from lightpage.device.profile import Profile
 from lightpage.errors import PageError
+from lightpage.page.levels import Levels
 from lightpage.page.symbols import pilot_mask, pilot_symbols, symbol_phases
 from lightpage.von_mises import information, mean_resultant
 
@@ -64,13 +65,13 @@ class Pilots:
             raise PageError("pilots", f"{count} positions and phases of shape {self.phases.shape}", "one phase each")
 
     @classmethod
-    def of_profile(cls, profile: Profile, levels: int, mask: NDArray[np.bool_] | None = None) -> Pilots:
+    def of_profile(cls, profile: Profile, levels: int | Levels, mask: NDArray[np.bool_] | None = None) -> Pilots:
         """The seeded pattern of `profile` for pages of `levels` levels, at `mask` or at its default positions."""
         where = pilot_mask(profile) if mask is None else mask
-        return cls.of_symbols(where, pilot_symbols(profile, levels), levels)
+        return cls.of_symbols(where, pilot_symbols(profile, Levels.of(levels).count), levels)
 
     @classmethod
-    def of_symbols(cls, mask: NDArray[np.bool_], symbols: NDArray[np.uint8], levels: int) -> Pilots:
+    def of_symbols(cls, mask: NDArray[np.bool_], symbols: NDArray[np.uint8], levels: int | Levels) -> Pilots:
         """Pilots whose values stand in a page of known symbols [ny, nx].
 
         Raises:

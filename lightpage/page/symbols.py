@@ -7,24 +7,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from lightpage.device.profile import Profile
 from lightpage.errors import PageError
-from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
+from lightpage.page.levels import Levels, check_levels
 
 MIN_PILOTS = 4
 """Fewer cannot tell a page's piston from its shift."""
 
 _POSITIONS, _VALUES = 0, 1
 """Independent random streams drawn from one pilot seed."""
-
-
-def check_levels(levels: int, subject: str = "levels") -> None:
-    """Check a level count.
-
-    Raises:
-        PageError: not a whole number from 2 to 256.
-    """
-    whole = isinstance(levels, (int, np.integer)) and not isinstance(levels, bool)
-    if not whole or not MIN_LEVELS <= levels <= MAX_LEVELS:
-        raise PageError(subject, repr(levels), f"a whole number from {MIN_LEVELS} to {MAX_LEVELS}")
 
 
 def check_symbols(symbols: ArrayLike, page_shape: tuple[int, int], levels: int, subject: str) -> NDArray[np.uint8]:
@@ -50,14 +39,16 @@ def check_symbols(symbols: ArrayLike, page_shape: tuple[int, int], levels: int, 
     return array.astype(np.uint8, copy=False)
 
 
-def symbol_phases(symbols: ArrayLike, levels: int) -> NDArray[np.float64]:
-    """Phase 2 pi s / M of each symbol, radians, in the shape of `symbols`.
+def symbol_phases(symbols: ArrayLike, levels: int | Levels) -> NDArray[np.float64]:
+    """Phase of each symbol, radians, in the shape of `symbols`: 2 pi s / M, or that of uneven levels.
 
     Raises:
         PageError: a level count outside 2..256.
     """
-    check_levels(levels)
-    return np.asarray(symbols, dtype=np.float64) * (2 * np.pi / levels)
+    levels = Levels.of(levels)
+    if levels.is_nominal:
+        return np.asarray(symbols, dtype=np.float64) * (2 * np.pi / levels.count)
+    return np.asarray(levels.phases[np.asarray(symbols)])
 
 
 def pilot_mask(profile: Profile) -> NDArray[np.bool_]:

@@ -20,7 +20,8 @@ from lightpage.device.profile import Profile
 from lightpage.errors import RecordingError
 from lightpage.failures import os_failure
 from lightpage.files import move_into_place
-from lightpage.page.symbols import check_levels, check_symbols
+from lightpage.page.levels import check_levels
+from lightpage.page.symbols import check_symbols
 from lightpage.recording.hdf5 import open_hdf5
 from lightpage.recording.hdf_file import open_to_write
 from lightpage.recording.stored import ArrayFile

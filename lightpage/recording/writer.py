@@ -18,7 +18,8 @@ from lightpage.device.profile import Profile
 from lightpage.errors import LightpageError, PageError, RecordingError
 from lightpage.failures import os_failure
 from lightpage.files import move_into_place, move_to_new_name
-from lightpage.page.symbols import check_levels, check_symbols
+from lightpage.page.levels import check_levels
+from lightpage.page.symbols import check_symbols
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.hdf_file import open_to_write
 from lightpage.recording.layout import (

@@ -41,12 +41,14 @@ class CameraView:
         pose: similarity transform of the sensor.
         distortion_relative: relative radial displacement of the image at `distortion_radius_m`.
         distortion_radius_m: normalising radius.
+        edges_m: half width and half height of the page's image, where the keystone is stated.
     """
 
     camera: Camera
     pose: CameraPose
     distortion_relative: float
     distortion_radius_m: float
+    edges_m: tuple[float, float]
 
     def positions_m(self) -> tuple[Real, Real]:
         """Points (x, y) of the camera plane that land on the pixels, two arrays [rows, columns], metres."""
@@ -56,7 +58,10 @@ class CameraView:
         per_px = self.camera.pitch_m / (1 + self.pose.scale_relative_error)
         x = per_px * (np.cos(rotation) * column[None, :] + np.sin(rotation) * row[:, None])
         y = per_px * (-np.sin(rotation) * column[None, :] + np.cos(rotation) * row[:, None])
-        shrink = 1 - self.distortion_relative * (x**2 + y**2) / self.distortion_radius_m**2
+        keystone = (
+            self.pose.keystone_x_relative * x / self.edges_m[0] + self.pose.keystone_y_relative * y / self.edges_m[1]
+        )
+        shrink = 1 - self.distortion_relative * (x**2 + y**2) / self.distortion_radius_m**2 - keystone
         return x * shrink, y * shrink
 
 

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile
 from lightpage.device.state import CameraPose, Device
-from lightpage.page.symbols import check_levels, check_symbols, symbol_phases
+from lightpage.page.levels import check_levels
+from lightpage.page.symbols import check_symbols, symbol_phases
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import frame_type
 from lightpage.simulator.cameras import (
@@ -125,15 +126,13 @@ class Simulator:
         shift = (float(self._shift[0]), float(self._shift[1]))
         size = self.profile.page.symbol_size_px
         phase = np.kron(symbol_phases(symbols, self.levels), np.ones((size, size)))
-        phase = phase + device.slm.phase_noise_rad * rng.standard_normal(phase.shape)
-        exit_field = self.optics.exit_field(phase)
-        field = self.optics.camera_field(exit_field) * np.complex64(np.exp(1j * self._piston))
-        frames = self._frames(field, shift, rng)
+        exit_field = self.optics.exit_field(phase, device.slm.phase_noise_rad * rng.standard_normal(phase.shape))
+        frames = self._frames(exit_field, shift, rng)
         return SimulatedPage(frames, exit_field, self._piston, shift)
 
     def references(self) -> FramePair:
         """Reference-only frames, the mean of so many exposures that only quantisation is left."""
-        return self._frames(np.zeros_like(self.optics.reference_in_place), (0.0, 0.0), None)
+        return self._frames(None, (0.0, 0.0), None)
 
     def _drift(self) -> None:
         """Walk on by one page; its noise has a stream of its own, so that pages can pass without being computed."""
@@ -142,13 +141,21 @@ class Simulator:
         self._shift = self._shift + drift.shift_px * self._walk.standard_normal(2)
         self._page += 1
 
-    def _frames(self, field: Complex, shift: tuple[float, float], noise: np.random.Generator | None) -> FramePair:
+    def _frames(
+        self, exit_field: Complex | None, shift: tuple[float, float], noise: np.random.Generator | None
+    ) -> FramePair:
         device = self.device
         homodyne = device.homodyne
         error, sign = np.deg2rad(homodyne.quadrature_error_deg), homodyne.quadrature_sign
-        frames = []
+        piston, frames = np.complex64(np.exp(1j * self._piston)), []
+        together = device.in_phase_camera.axial_rad == device.quadrature_camera.axial_rad
+        field: Complex = np.zeros(1, np.complex64)
+        if exit_field is not None and together:
+            field = self.optics.camera_field(exit_field) * piston
         for pose, quadrature in ((device.in_phase_camera, False), (device.quadrature_camera, True)):
             reference = self._reference_behind(pose, shift)
+            if exit_field is not None and not together:
+                field = self.optics.camera_field(exit_field, pose) * piston
             if quadrature:
                 intensity = homodyne.quadrature_gain * quadrature_intensity(field, reference, error, sign)
             else:

@@ -9,9 +9,12 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.parameters import NAMES, as_dict, as_vector
-from lightpage.calibration.waves.wave_model import fitted_geometry
+from lightpage.calibration.waves.wave_model import defocus, fitted_geometry
 from lightpage.device.profile import Profile
-from lightpage.device.state import CameraPose, Device
+from lightpage.device.state import CameraPose, Device, SlmDefects
+from lightpage.page.levels import MAX_LEVELS
+from lightpage.page.modulation import NOMINAL, Modulation, basis
+from lightpage.page.symbols import symbol_phases
 from lightpage.recording.frame_pair import FramePair
 from lightpage.simulator.cameras import CameraView
 from lightpage.waves.channel import WaveChannel
@@ -110,13 +113,24 @@ class TrueOptics:
         samples = self.profile.page_width_m * self.profile.page_height_m / self.profile.camera.pitch_m**2
         return float(np.sqrt(samples) / np.linalg.norm(field))
 
-    def exit_field(self, page_phase: Real) -> Complex:
-        """Phase written on the SLM [ny, nx], radians, to the field on the exit facet."""
-        return self.signal_scale * self.channel.exit_field(self.slm_factor * np.exp(1j * page_phase))
+    def exit_field(self, page_phase: Real, noise_rad: Real | float = 0.0) -> Complex:
+        """Nominal phase written on the SLM [ny, nx], radians, to the field on the exit facet.
 
-    def camera_field(self, exit_field: Complex) -> Complex:
-        """Field on the exit facet to the computed camera plane."""
-        return self.channel.camera_field(exit_field)
+        Args:
+            page_phase: of the levels, as their numbers say.
+            noise_rad: phase that is added to what the SLM makes of them.
+        """
+        shown = modulated(self.device.slm, page_phase) * np.exp(1j * np.asarray(noise_rad))
+        return self.signal_scale * self.channel.exit_field(self.slm_factor * shown)
+
+    def camera_field(self, exit_field: Complex, camera: CameraPose | None = None) -> Complex:
+        """Field on the exit facet to the computed camera plane, of one camera, or of where both stand on average."""
+        return self.channel.camera_field(exit_field, 0.0 if camera is None else self._beyond_mean(camera))
+
+    def _beyond_mean(self, camera: CameraPose) -> float:
+        """Defocus of a camera beyond that of both on average, rad/m^2 of the facet."""
+        mean = (self.device.in_phase_camera.axial_rad + self.device.quadrature_camera.axial_rad) / 2
+        return float(defocus(camera.axial_rad - mean, self.geometry.pipe_width_m))
 
     @cached_property
     def reference_in_place(self) -> Complex:
@@ -148,7 +162,8 @@ class TrueOptics:
             update={"shift_x_px": pose.shift_x_px + shift_px[0], "shift_y_px": pose.shift_y_px + shift_px[1]}
         )
         distortion = self.device.aberration.distortion_relative
-        return CameraView(self.profile.camera, moved, distortion, self.profile.corner_m).positions_m()
+        edges = self.profile.page_width_m / 2, self.profile.page_height_m / 2
+        return CameraView(self.profile.camera, moved, distortion, self.profile.corner_m, edges).positions_m()
 
     @property
     def electrons_per_unit(self) -> float:
@@ -159,9 +174,32 @@ class TrueOptics:
         return full / brightest / max(1.0, self.device.homodyne.quadrature_gain)
 
 
+def modulated(slm: SlmDefects, phase: Real) -> Complex:
+    """Light that a modulator makes of levels of so much nominal phase, radians; of unit amplitude on average nearly."""
+    turn = phase + slm.stroke_relative_error * phase
+    turn = turn + slm.level_sine_rad * np.sin(phase) + slm.level_cosine_rad * np.cos(phase)
+    turn = turn + slm.level_sine_twice_rad * np.sin(2 * phase)
+    amplitude = 1 + slm.level_amplitude_relative * np.cos(phase)
+    return np.asarray(amplitude * np.exp(1j * turn) + slm.unmodulated_relative * np.exp(1j * slm.unmodulated_phase_rad))
+
+
 def perfectly_calibrated(profile: Profile, device: Device, references: FramePair) -> CalibratedDevice:
     """A device as a calibration without any error would find it."""
-    return CalibratedDevice(profile, true_parameters(profile, device), device.homodyne.turn_rad, references)
+    parameters, modulation = true_parameters(profile, device), true_modulation(device.slm)
+    return CalibratedDevice(profile, parameters, device.homodyne.turn_rad, references, modulation)
+
+
+def true_modulation(slm: SlmDefects) -> Modulation:
+    """The truth as a calibration without any error would tell it: what its few coefficients can."""
+    phases = symbol_phases(np.arange(MAX_LEVELS), MAX_LEVELS)
+    shown, (stroke, *series) = modulated(slm, phases), basis(phases)
+    if np.allclose(shown, np.exp(1j * phases), rtol=0, atol=1e-12):
+        return NOMINAL
+    even = np.ones(len(phases))
+    off = np.unwrap(np.angle(shown * np.exp(-1j * phases)))
+    phase = np.linalg.lstsq(np.stack([stroke, *series, even], axis=1), off, rcond=None)[0]
+    amplitude = np.linalg.lstsq(np.stack([*series, even], axis=1), np.log(np.abs(shown)), rcond=None)[0]
+    return Modulation((*phase[:-1].tolist(), *amplitude[:-1].tolist()))
 
 
 def true_parameters(profile: Profile, device: Device) -> NDArray[np.float64]:
@@ -176,6 +214,7 @@ def true_parameters(profile: Profile, device: Device) -> NDArray[np.float64]:
         "page_centre_x_m": g.page_shift_x_px * pitch,
         "page_centre_y_m": g.page_shift_y_px * pitch,
         "pipe_roll_rad": np.deg2rad(g.pipe_roll_deg),
+        "modulator_axial_rad": g.modulator_axial_rad,
         "launch_defocus_rad": device.aberration.defocus_rad,
         "launch_astigmatism_0_rad": device.aberration.astigmatism_rad,
         "launch_coma_x_rad": device.aberration.coma_rad,
@@ -195,5 +234,8 @@ def true_parameters(profile: Profile, device: Device) -> NDArray[np.float64]:
             f"{camera}_scale_y_relative": scale * np.cos(rotation) - 1,
             f"{camera}_turn_xy_slope": -scale * np.sin(rotation),
             f"{camera}_turn_yx_slope": scale * np.sin(rotation),
+            f"{camera}_axial_rad": pose.axial_rad,
+            f"{camera}_keystone_x_relative": pose.keystone_x_relative,
+            f"{camera}_keystone_y_relative": pose.keystone_y_relative,
         }
     return as_vector(values)

@@ -11,7 +11,15 @@ from functools import cached_property
 
 import numpy as np
 
-from lightpage.waves.geometry import Complex, Real, WaveGeometry, facet_axis, highest_frequencies
+from lightpage.waves.geometry import (
+    Complex,
+    Real,
+    WaveGeometry,
+    couplings,
+    facet_axis,
+    highest_frequencies,
+    on_facet,
+)
 from lightpage.waves.lens import FourierLens, entrance_window
 from lightpage.waves.pipe import PipePropagator, real_products
 from lightpage.waves.sinc_interpolation import interpolation, sparse_axis
@@ -58,7 +66,7 @@ class WaveChannel:
     def sparse_axes_m(self) -> tuple[Real, Real]:
         """Axes (x, y) of the samples on which light at the camera plane is computed."""
         axes = self.camera_x_m, self.camera_y_m
-        highest = highest_frequencies(self.geometry, self.geometry.lens_path.mirrored(), *axes)
+        highest = highest_frequencies(self.geometry, self.geometry.camera_path, *axes)
         x, y = (sparse_axis(axis, frequency) for axis, frequency in zip(axes, highest, strict=True))
         return x, y
 
@@ -84,6 +92,13 @@ class WaveChannel:
         window = entrance_window(self.geometry, facet_x, facet_y, self.envelope_m, self.blur_m)
         return np.asarray(window, dtype=np.float32)
 
+    @cached_property
+    def facet_radius2_m2(self) -> Real:
+        """R^2 of the facets' samples, [cells_y - 1, cells_x - 1]."""
+        facet_y, facet_x = (facet_axis(count, self.geometry.pipe_width_m) for count in self.cells)
+        along, upward = on_facet(couplings(self.geometry), facet_x, facet_y[:, None])
+        return np.asarray(along**2 + upward**2)
+
     def forward(self, field: Complex) -> Complex:
         """Field on the SLM [ny, nx] to the field on the camera plane."""
         return self.camera_field(self.exit_field(field))
@@ -92,8 +107,15 @@ class WaveChannel:
         """Field on the SLM [ny, nx] to the field on the exit facet's grid."""
         return self.pipe.forward(self.launch_lens.to_facet(field) * self.entrance_window)
 
-    def camera_field(self, exit_field: Complex) -> Complex:
-        """Field on the exit facet's grid to the field on the camera plane."""
+    def camera_field(self, exit_field: Complex, defocus: float = 0.0) -> Complex:
+        """Field on the exit facet's grid to the field on the camera plane, or on a plane of further `defocus`.
+
+        Args:
+            exit_field: [cells_y - 1, cells_x - 1].
+            defocus: factor of R^2 on the facet, rad/m^2.
+        """
+        if defocus:
+            exit_field = exit_field * np.exp(1j * defocus * self.facet_radius2_m2).astype(np.complex64)
         sparse = self.delaunch_lens.to_plane(exit_field)
         if self._between is None:
             return sparse

@@ -36,7 +36,9 @@ class WaveGeometry:
     pipe_roll: float = 0.0
     """Rotation of the pipe about the optical axis, from x towards y, against page and cameras."""
     lens_path: SeidelTerms = IDEAL
-    """Of the first lens; the second one is its mirror image."""
+    """Of the first lens, the modulator's axial place included."""
+    camera_path: SeidelTerms = IDEAL
+    """Of the second lens, the cameras' axial place included, as a lens from camera plane to facet (`mirrored`)."""
 
     @property
     def wave_number(self) -> float:

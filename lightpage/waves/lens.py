@@ -73,7 +73,7 @@ class LensPath:
 
     def beyond(self, x: Any, y: Any, across: Any, up: Any, a: Any = 0.0, b: Any = 0.0) -> Any:
         """By how much the path at (x, y) differs from that at (a, b)."""
-        if self.path is IDEAL:
+        if not self.path.couples:
             return 0.0 * (a + b + x + y + across + up)
         there = on_facet(self.factors, across, up)
         return self.path.of_both(a + x, b + y, *there) - self.path.of_both(a, b, *there)
@@ -117,8 +117,7 @@ class FourierLens:
         w = geometry.pipe_width_m
         facet_y, facet_x = (facet_axis(count, w) for count in cells)
         factors = couplings(geometry)
-        path = geometry.lens_path.mirrored() if second else geometry.lens_path
-        path = IDEAL if path == IDEAL else path
+        path = geometry.camera_path if second else geometry.lens_path
 
         def kernel(factor: float, rows: Real, columns: Real) -> Complex:
             return lens_kernel(geometry, factor * rows, columns)
@@ -128,17 +127,18 @@ class FourierLens:
         self.x_to_x = (unitary * kernel(factors.x_to_x, x_m, facet_x)).astype(np.complex64)
         self.y_and_x = kernel(factors.y_to_x, y_m, facet_x).astype(np.complex64)
         self.y_to_y = kernel(factors.y_to_y, facet_y, y_m).astype(np.complex64)
-        tolerance = _TOLERANCE if path is IDEAL else TOLERANCE_WITH_PATH
+        tolerance = TOLERANCE_WITH_PATH if path.couples else _TOLERANCE
         parts = LensPath(geometry, path, factors)
         beyond = parts.beyond
         self.terms = Expansion.of(parts.rest, (x_m, y_m), (facet_x, facet_y), tolerance)
         self.on_plane: Complex = np.ones((1, 1), np.complex64)
         self.on_facet: Complex = self.on_plane
-        if path is not IDEAL:
+        if path.couples:
             self.x_to_x *= _phasor(beyond(x_m[:, None], 0.0, facet_x, 0.0))
             self.y_and_x *= _phasor(beyond(0.0, y_m[:, None], facet_x, 0.0))
             self.y_to_y *= _phasor(beyond(0.0, y_m, 0.0, facet_y[:, None]))
             self.on_plane = _phasor(path.of_field(x_m, y_m[:, None]))
+        if path != IDEAL:
             self.on_facet = _phasor(parts.on_facet(facet_x, facet_y[:, None]))
 
     def to_facet(self, field: Complex) -> Complex:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from lightpage.errors import InvalidInputError
 from lightpage.metrics.accumulator import Accumulator
 from lightpage.metrics.information import decide
-from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
+from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS, Levels
+from lightpage.page.modulation import NOMINAL, Modulation
 from lightpage.recording.frame_pair import FramePair
 from lightpage.report.contents.data import Golden, Rays, ReportData
 from lightpage.report.contents.run_pages import decodable, passes_of
@@ -45,7 +46,7 @@ def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportDat
     with decodable(folder, run, kept, recording_path) as decoded:
         module = decoded.module
         outputs, phases = decode_pages(module.eval(), decoded.pages)
-    levels = levels_of(phases)
+    levels = levels_of(phases, run.calibration.modulator)
     p = np.stack([without_piston(run.kappa_scale * o, t, mask) for o, t in zip(outputs, phases, strict=True)])
     symbols = decide(phases[:, ~mask], levels)
     phase, kappa = np.arctan2(p[:, 1], p[:, 0]), np.hypot(p[:, 0], p[:, 1])[:, ~mask]
@@ -77,17 +78,22 @@ def _curves(folder: Path, run: Run) -> list[dict[str, Curve]]:
     return found if all(found) else []
 
 
-def levels_of(phases: NDArray[np.floating]) -> int:
+def levels_of(phases: NDArray[np.floating], modulation: Modulation = NOMINAL) -> Levels:
     """The fewest levels that hold all of these phases, radians: M where thousands of symbols were drawn from M.
+
+    Args:
+        phases: of light.
+        modulation: of the modulator that showed them.
 
     Raises:
         InvalidInputError: no level count up to 256 does.
     """
-    turns = np.unique(phases).astype(np.float64) / (2 * np.pi)
-    for levels in range(MIN_LEVELS, MAX_LEVELS + 1):
-        if np.abs(turns * levels - np.rint(turns * levels)).max() < _PHASE_TOLERANCE:
+    seen = np.unique(phases).astype(np.float64)
+    for count in range(MIN_LEVELS, MAX_LEVELS + 1):
+        levels = modulation.page_levels(count)
+        if np.abs(levels.nearest_phases(seen) - seen).max() < _PHASE_TOLERANCE * 2 * np.pi / count:
             return levels
-    raise InvalidInputError("phases of the validation pages", "no equal steps", f"at most {MAX_LEVELS} levels")
+    raise InvalidInputError("phases of the validation pages", "no levels", f"at most {MAX_LEVELS} levels")
 
 
 def _rays(run: Run, module: DecoderTraining[Any]) -> Rays:

@@ -54,8 +54,9 @@ def decodable(
             return
         references = FramePair(kept["in_phase"], kept["quadrature"])
         decoder = published_decoder(run.localizer, choices, run.profile, references, run.calibration.turn_rad)
-        module = PublishedTraining(load_weights(folder, decoder), choices, kept["pilots"], recording.levels)
-        yield Decodable(module, FramePages(recording, validation, _states(folder, run)), _size(decoder))
+        pages = FramePages(recording, validation, _states(folder, run), run.calibration.modulator)
+        module = PublishedTraining(load_weights(folder, decoder), choices, kept["pilots"], pages.levels)
+        yield Decodable(module, pages, _size(decoder))
 
 
 def _at_symbol_pitch(folder: Path, run: Run, kept: dict[str, NDArray[Any]]) -> Decodable:

@@ -53,6 +53,8 @@ class RemotePage:
         concentration: float32 [ny, nx], or None where not asked for.
         phase: float32 [ny, nx], radians, piston removed, or None where not asked for.
         levels: M.
+        level_phases: phase that stands for each level, radians; None where level s is 2 pi s / M, or no phase was asked
+            for.
         piston_rad: what was removed.
         pilot_coherence: agreement of the pilots, 0..1.
         pilot_trust: share of the claimed concentration that they bear out, 0..1; in the fields above already.
@@ -95,6 +97,7 @@ class RemotePage:
     correlation_id: str = ""
     frames: tuple[RemoteFrame, ...] = ()
     replayed: bool = False
+    level_phases: tuple[float, ...] | None = None
 
 
 def remote_page(reply: pb.DecodeReply, read: pb.ReadPageReply | None = None) -> RemotePage:

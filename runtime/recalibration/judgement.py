@@ -78,18 +78,18 @@ def judged_pages(
 ) -> list[JudgedPage]:
     """The pages, as a service reads them with this tracker."""
     mask = bundle.pilot_mask if pages.pilot_mask is None else pages.pilot_mask
-    data, judged = ~mask, list[JudgedPage]()
+    data, judged, levels = ~mask, list[JudgedPage](), bundle.levels(pages.levels)
     for pair, symbols in zip(pages.pairs, pages.symbols, strict=True):
         progress(len(judged) / len(pages.pairs))
         lost = None
         try:
-            page = tracker.decode(pair, pages.levels, Pilots.of_symbols(mask, symbols, pages.levels))
+            page = tracker.decode(pair, pages.levels, Pilots.of_symbols(mask, symbols, levels))
         except FrameError as error:
             judged.append(JudgedPage(np.zeros(np.count_nonzero(data)), error))
             continue
         except UnconfirmedPageError as error:
             page, lost = unconfirmed_page(error), error
-        information = achievable_rate(page.phase[data], page.concentration[data], symbols[data], pages.levels)
+        information = achievable_rate(page.phase[data], page.concentration[data], symbols[data], levels)
         judged.append(JudgedPage(information, lost, _drifted(page)))
     return judged
 

@@ -151,7 +151,7 @@ def recalibrate(
         judging = partial(within, judged_count + FIT_WORTH, whole - WRITING_WORTH, "judge by the held-back pages")
         judging(0.0)
         refitted = decoder.of_bundle(_refitted(decoder.bundle, result))
-        after = judged_pages(tracker.refitted(refitted), decoder.bundle, held_back, judging)
+        after = judged_pages(tracker.refitted(refitted), refitted.bundle, held_back, judging)
     verdict = judge(before, after, pages.levels)
     within(whole - WRITING_WORTH, whole, "write the new bundle", 0.0)
     bundle = refitted.bundle

@@ -84,6 +84,7 @@ def refit(
             start=start,
             quadrature_phase=earlier.turn_rad,
             progress=progress,
+            modulation=earlier.modulator,
         )
     except CalibrationError as error:
         if image is None:
@@ -105,6 +106,8 @@ def refit(
         "reference_quadrature": references.quadrature,
         **sampling_table(twin, registered.parameters, registered.quadrature_phase, profile),
     }
+    if "parameters" in decoder.graph.ports:
+        table["parameters"] = table["parameters"][: decoder.graph.ports["parameters"].shape[0]]
     return RefitResult(
         table={name: value for name, value in table.items() if name in decoder.graph.ports},
         calibration_toml=fitted.to_toml(),
@@ -126,7 +129,7 @@ def _find(decoder: Decoder, twin: Twin, pages: KnownPages, references: FramePair
     """
     symbols, mask = pages.symbols[0], np.zeros(pages.symbols[0].size, bool)
     mask[:: max(1, mask.size // _SEARCHED_SYMBOLS)] = True
-    pilots = Pilots.of_symbols(mask.reshape(symbols.shape), symbols, pages.levels)
+    pilots = Pilots.of_symbols(mask.reshape(symbols.shape), symbols, decoder.bundle.levels(pages.levels))
     around = np.array([(0.0, 0.0), pages.image_px])
     found = BundleSearch(decoder, twin).find(pages.pairs[0], pilots, around, references)
     x, y = map(float, found.shift_px)

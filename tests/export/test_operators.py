@@ -59,11 +59,7 @@ def test_no_node_of_a_decoder_leaves_the_provider(decoder: str, fast: bytes, sma
 
 @pytest.mark.parametrize(
     ("left", "right", "repeated"),
-    [
-        ("2, 1, 3, 4", "1, 2, 4, 5", True),
-        ("2, 1, 3, 4", "2, 2, 4, 5", False),
-        ("3, 4", "2, 2, 4, 5", False),
-    ],
+    [("2, 1, 3, 4", "1, 2, 4, 5", True), ("2, 1, 3, 4", "2, 2, 4, 5", False), ("3, 4", "2, 2, 4, 5", False)],
 )
 def test_a_product_that_repeats_both_of_its_factors_is_found(left: str, right: str, repeated: bool) -> None:
     model = small("y = MatMul (a, b)", f"agraph (float[{left}] a, float[{right}] b) => (float[N] y)")

@@ -121,12 +121,7 @@ def test_what_a_file_system_lacks_is_gone_without(
 
 
 @pytest.mark.parametrize(
-    ("number", "kind"),
-    [
-        (errno.EIO, StorageError),
-        (errno.EDQUOT, SurroundingsError),
-        (errno.EROFS, InvalidInputError),
-    ],
+    ("number", "kind"), [(errno.EIO, StorageError), (errno.EDQUOT, SurroundingsError), (errno.EROFS, InvalidInputError)]
 )
 def test_what_is_needed_is_named(
     number: int, kind: type[Exception], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

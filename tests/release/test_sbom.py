@@ -163,18 +163,12 @@ DEBIAN = "pkg:deb/debian/libgood1@1%3A2.0%2Bdeb12u{}?arch=amd64&distro=debian-12
 OTHER_CONFIGURATION = b"home = /state\ninclude-system-site-packages = true\n"
 PLANTED: dict[str, tuple[Callable[[Path], object], list[str]]] = {
     "a changed module": (lambda root: write(root / SITE / CLICK, b"import socket\n"), [f"Click: {CLICK}"]),
-    "a module of nobody": (
-        lambda root: write(root / SITE / "usercustomize.py", b""),
-        [f"{OWN}/usercustomize.py"],
-    ),
+    "a module of nobody": (lambda root: write(root / SITE / "usercustomize.py", b""), [f"{OWN}/usercustomize.py"]),
     "byte code of nobody that needs no source": (
         lambda root: write(root / SITE / "socket.pyc", b""),
         [f"{OWN}/socket.pyc"],
     ),
-    "a linked package": (
-        lambda root: (root / SITE / "extra").symlink_to("../../../../../usr/lib"),
-        [f"{OWN}/extra"],
-    ),
+    "a linked package": (lambda root: (root / SITE / "extra").symlink_to("../../../../../usr/lib"), [f"{OWN}/extra"]),
     "a package that has become a link": (
         lambda root: moved_and_linked(root / SITE / "lightpage", root / "usr/lib/own"),
         [f"{OWN}/lightpage", "lightpage: lightpage/__init__.py"],

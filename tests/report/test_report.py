@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from lightpage.errors import InvalidInputError, RecordingError
+from lightpage.page.levels import Levels
 from lightpage.page.symbols import pilot_mask
 from lightpage.report.command import report
 from lightpage.report.contents.data import exit_centroids
@@ -26,6 +27,7 @@ from lightpage.runtime.model.bundle.bundle import in_few_counts
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.train.runs import load_run
 from tests.lightpage.small import small_profile
+from tests.lightpage.uneven import UNEVEN, uneven
 from tests.report.pages import check_whole, page_of, run
 
 SECTIONS = ["figures", "geometry", "maps", "zones", "reliability", "training", "page", "rays"]
@@ -132,7 +134,9 @@ def test_a_golden_page_comes_from_the_bundle_that_was_evaluated_or_not_at_all(
 def test_levels_are_read_off_phases() -> None:
     for levels in (2, 16, 100, 256):
         drawn = np.random.default_rng(levels).integers(levels, size=2000)
-        assert levels_of((drawn * (2 * np.pi / levels)).astype(np.float32)) == levels
+        assert levels_of((drawn * (2 * np.pi / levels)).astype(np.float32)) == Levels(levels)
+        shown = uneven(levels)
+        assert levels_of(shown.phases[drawn].astype(np.float32), UNEVEN) == shown
     with pytest.raises(InvalidInputError, match="256"):
         levels_of(np.random.default_rng(0).uniform(0, 6, 100).astype(np.float32))
 

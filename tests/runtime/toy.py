@@ -18,6 +18,7 @@ from onnx import numpy_helper
 
 from lightpage.device.profile import Camera, PageLayout, Profile, load_profile
 from lightpage.errors import CalibrationError
+from lightpage.page.levels import Levels
 from lightpage.page.symbols import random_symbols, symbol_phases
 from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
@@ -56,7 +57,7 @@ class ToyDevice:
     def __post_init__(self) -> None:
         self.rng = np.random.default_rng(self.seed)
 
-    def page(self, symbols: np.ndarray, levels: int, piston: float = 0.0) -> FramePair:
+    def page(self, symbols: np.ndarray, levels: int | Levels, piston: float = 0.0) -> FramePair:
         phase = np.kron(symbol_phases(symbols, levels) + piston, np.ones((4, 4)))
         frames = []
         for offset, wave in zip(self.offsets, (np.cos(phase), np.sin(phase)), strict=True):

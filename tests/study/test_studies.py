@@ -14,13 +14,7 @@ from PIL import Image
 
 from lightpage.device.profile import Profile, load_profile
 from lightpage.errors import InvalidInputError, ProfileError
-from lightpage.study import (
-    STUDIES,
-    angle,
-    cross_section,
-    pipe_length,
-    scaling,
-)
+from lightpage.study import STUDIES, angle, cross_section, pipe_length, scaling
 from lightpage.study.command import study
 from lightpage.study.study import Settings, measured
 from lightpage.study.trained import chosen

@@ -141,9 +141,7 @@ def test_settings_of_pip_are_lent_to_the_build_of_an_image(tmp_path: Path) -> No
 # ---- an environment without torch ---------------------------------------------------------------------------------
 
 
-NEED_AN_EXTRA = {
-    "lightpage.runtime.device.modulator.screen.x_window": "xcffib",
-}
+NEED_AN_EXTRA = {"lightpage.runtime.device.modulator.screen.x_window": "xcffib"}
 """Modules that the process of a modulator's window alone loads, and what they lack without the extra `screen`."""
 
 WITH_TORCH = ("lightpage.train", "lightpage.export", "lightpage.study", "lightpage.report")

@@ -34,14 +34,24 @@ MAX_PAGES = 4
 @click.option(
     "--pages", default=DEFAULT_PAGES, show_default=True, type=click.IntRange(1, MAX_PAGES), help="Pages used."
 )
+@click.option(
+    "--orientation",
+    default="profile",
+    show_default=True,
+    type=click.Choice(["profile", "any"]),
+    help="any: take frames of a camera that shows the image mirrored or turned, each camera by itself.",
+)
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
-def calibrate(profile_name: str, recording: Path, out: Path, pages: int, json_path: Path | None) -> None:
+def calibrate(
+    profile_name: str, recording: Path, out: Path, pages: int, orientation: str, json_path: Path | None
+) -> None:
     """Find this device's geometry, from nominal, with the first pages of a recording that show light."""
     profile = load_profile(profile_name)
     start = time.perf_counter()
     with Recording.open(recording) as file, percent_bar() as progress:
         file.header.check_against(profile)
-        calibration = calibrate_recording(file, profile, first_lit_pages(file, pages, warn), progress)
+        chosen = first_lit_pages(file, pages, warn)
+        calibration = calibrate_recording(file, profile, chosen, progress, any_orientation=orientation == "any")
     seconds = time.perf_counter() - start
     calibration.save(out)
     lost = int(np.sum(seen_share(TorchTwin(RayTwin(profile)), calibration.vector, profile) < 0.5))
@@ -59,7 +69,12 @@ def calibrate(profile_name: str, recording: Path, out: Path, pages: int, json_pa
 
 
 def calibrate_recording(
-    recording: Recording, profile: Profile, pages: Sequence[int], progress: Progress
+    recording: Recording,
+    profile: Profile,
+    pages: Sequence[int],
+    progress: Progress,
+    *,
+    any_orientation: bool = False,
 ) -> Calibration:
     """Calibrate from nominal with some pages of a recording.
 
@@ -78,6 +93,7 @@ def calibrate_recording(
         recording.references(),
         known,
         progress,
+        any_orientation=any_orientation,
     )
     return Calibration.from_registered(registered, profile, [recording.page_hash(page) for page in pages])
 
@@ -92,6 +108,7 @@ def figures(calibration: Calibration, profile: Profile, seconds: float, lost: in
         "coherence_after": calibration.coherence_after,
         "turn_deg": float(np.rad2deg(calibration.turn_rad)),
         "parameters": calibration.parameters,
+        "modulation": calibration.modulation,
         "symbols_beside_cameras": lost,
     }
 
@@ -112,6 +129,8 @@ def table(calibration: Calibration, profile: Profile) -> str:
         factor = nominal if unit is None else unit
         fitted, deviation = nominal + factor * value, factor * calibration.deviations[name]
         lines.append(f"{label:<32}{fitted:>12.6g}   {deviation:<10.2g}{nominal:>10.6g}")
+    for name, value in calibration.modulation.items():
+        lines.append(f"{name:<32}{value:>12.6g}   {calibration.modulation_deviations[name]:<10.2g}{0:>10.6g}")
     quadrature_phase = np.rad2deg(calibration.turn_rad)
     lines.append(f"{'between the arms, degree':<32}{quadrature_phase:>12.6g}   {'':<10}{'+90 or -90':>10}")
     return "\n".join(lines)

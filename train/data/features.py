@@ -90,6 +90,7 @@ class FeatureExtractor:
         self.device = device
         self._twin = TorchTwin(RayTwin(profile))
         self.table: SamplingTable = sampling_table(self._twin, parameters, device.quadrature_phase_rad, profile)
+        self._apart = self.table["apart"] if device.stands_apart else None
         self.recovery = choices.field_recovery(profile, with_signal_power=with_signal_power)
         self._solve = TorchFieldSolver(self.recovery)
         self._coherent = choices.coherent_localizer(profile)
@@ -105,13 +106,15 @@ class FeatureExtractor:
 
     def field(self, pair: FramePair) -> NDArray[np.complex64]:
         """Recovered field on the common grid."""
-        return self._solve(pair, self.device.references, self.table["registration"], self.table["homodyne"])[0]
+        at = self.table["registration"], self.table["homodyne"], self._apart
+        return self._solve(pair, self.device.references, *at)[0]
 
     def measure(self, pair: FramePair, shift_px: tuple[float, float]) -> tuple[Measured, Tensor]:
         """What was measured on the calibrated grid of a page whose image has moved by (x, y), and its field there."""
         registration = shifted(self.table["registration"], np.array(shift_px))
         seen = (pair.in_phase, pair.quadrature, self.device.references.in_phase, self.device.references.quadrature)
         tensors = [*(frame.astype(np.float32) for frame in seen), registration, self.table["homodyne"]]
+        tensors += [] if self._apart is None else [self._apart]
         measured = self.recovery.measure(*map(torch.from_numpy, tensors))
         return measured, self.recovery.solve(measured)[0]
 
@@ -125,7 +128,7 @@ class FeatureExtractor:
         Raises:
             CalibrationError: it shows hardly more of them than chance does, or clearly less than those pages.
         """
-        field = self.known_field(page.pair, np.angle(page.symbols))
+        field = self.known_field(page.pair, self.device.modulation.phase(np.angle(page.symbols)))
         sampler = FieldSampler(field, self.grid)
         found = page_coherence(sampler, self._twin, self.device.parameters, self.device.profile, page.symbols)
         least = max(least_coherence(page.symbols.size), LEAST_KEPT * calibrated)
@@ -149,7 +152,7 @@ class FeatureExtractor:
         for index in indices:
             symbols = recording.symbols(index)
             assert symbols is not None
-            phases = symbol_phases(symbols, recording.levels)
+            phases = self.device.modulation.phase(symbol_phases(symbols, recording.levels))
             page, shift = self.page(self.field(recording.frames(index)), phases, shift)
             yield page
 

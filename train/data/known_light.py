@@ -57,7 +57,7 @@ def explained(extractor: FeatureExtractor, pages: Sequence[KnownPage]) -> list[E
         pages: of the device.
     """
     profile, parameters = extractor.device.profile, extractor.device.parameters
-    samples = symbol_samples(profile)
+    modulation, samples = extractor.device.modulation, symbol_samples(profile)
     grid = extractor.grid
     waves = FittedWaves(profile, parameters, samples, filled=True, accuracy=ACCURACY, grid=grid)
     terms = np.stack(illumination_terms(waves.x, waves.y))
@@ -65,12 +65,12 @@ def explained(extractor: FeatureExtractor, pages: Sequence[KnownPage]) -> list[E
     at_few = FittedWaves(profile, parameters, samples, filled=True, stride=stride, accuracy=ACCURACY, grid=grid)
     found = []
     for page in track(pages, "light of known pages"):
-        phases = np.angle(page.symbols)
-        state = extractor.state(extractor.field(page.pair), phases, np.zeros(2))
+        nominal = np.angle(page.symbols)
+        state = extractor.state(extractor.field(page.pair), modulation.phase(nominal), np.zeros(2))
         with torch.no_grad():
             measured, solved = extractor.measure(page.pair, state.shift_px)
         field, seen = solved[0].numpy() + 1j * solved[1].numpy(), measured.lit.numpy().astype(bool)
-        written = on_modulator(phases, samples)
+        written = on_modulator(modulation.light(nominal), samples)
         few = seen[::stride, ::stride]
         shown = np.stack([at_few.to_camera(written * term)[few] for term in terms], axis=-1)
         factors = np.linalg.lstsq(shown, field[::stride, ::stride][few], rcond=None)[0]

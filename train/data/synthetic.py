@@ -129,15 +129,15 @@ class SyntheticPages:
         table = sampling_table(self._twin, parameters, np.pi / 2, profile)
         light_on = np.tensordot(self._like.illumination, np.stack(illumination_terms(waves.x, waves.y)), 1)
         for symbols in random_symbols(profile, MAX_LEVELS, self._per_state, rng):
-            phases = symbol_phases(symbols, MAX_LEVELS)
-            field = waves.to_camera(on_modulator(phases, symbol_samples(profile)) * light_on)
+            nominal, modulation = symbol_phases(symbols, MAX_LEVELS), self._device.modulation
+            field = waves.to_camera(on_modulator(modulation.light(nominal), symbol_samples(profile)) * light_on)
             field = (self._like.seen * (field + self._noise(field, rng))).astype(np.complex64)
             if waves_back is not None:
                 light = localized(waves_back, field)
             else:
                 assert self._coherent is not None
                 light = demodulate(self._coherent, field, table)
-            written, still = phases.astype(np.float32), PageState((0.0, 0.0), 0.0)
+            written, still = modulation.phase(nominal).astype(np.float32), PageState((0.0, 0.0), 0.0)
             yield PageFeatures(light.astype(np.float16), table["positions"], written, still)
 
     def _noise(self, field: Complex, rng: np.random.Generator) -> Complex:

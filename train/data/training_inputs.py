@@ -11,6 +11,7 @@ from torch import Tensor
 
 from lightpage.calibration.document import Calibration
 from lightpage.device.profile import Profile
+from lightpage.page.levels import Levels
 from lightpage.recording.reader import Recording
 from lightpage.train.data.features import FeatureExtractor
 from lightpage.train.processes import Processes
@@ -42,6 +43,11 @@ class TrainingInputs:
     pilot_mask: NDArray[np.bool_]
     key: str
     processes: Processes
+
+    @property
+    def levels(self) -> Levels:
+        """Of the recording's pages, as the device shows them."""
+        return self.calibration.modulator.page_levels(self.recording.levels)
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from torch import nn
 from torch.utils.data import DataLoader, Dataset, RandomSampler
 
 from lightpage.errors import LightpageError
+from lightpage.page.levels import Levels
 from lightpage.progress import track
 from lightpage.train.data.pages import Page
 from lightpage.train.fitting.curves import TENSORBOARD, curves_of, thinned
@@ -47,7 +48,7 @@ def fit_network(
     run: Path,
     hyperparameters: Hyperparameters,
     pilot_mask: NDArray[np.bool_],
-    levels: int,
+    levels: int | Levels,
     training: Dataset[Page],
     validation: Dataset[Page],
     *,
@@ -62,7 +63,7 @@ def fit_network(
         training: pages whose phases are NaN where nothing is asked (`lightpage.train.data.patches.training_pages`).
         hyperparameters: the run's choices.
         pilot_mask: bool [ny, nx].
-        levels: M of the pages.
+        levels: of the pages.
         kind: of the network.
         start: network of the same kind and size whose weights a new run begins with; random ones if left out.
     """

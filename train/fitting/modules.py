@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from lightpage.page.levels import Levels
 from lightpage.train.data.pages import Page
 from lightpage.train.fitting.loss import training_rate, von_mises_nll
 from lightpage.train.fitting.validation import held_out_air
@@ -35,13 +36,13 @@ class DecoderTraining(L.LightningModule, Generic[N]):
     Args:
         network: pages without their phases to p [N, 2, ny, nx].
         pilot_mask: bool [ny, nx]; pilots are no data: no figure counts them.
-        levels: M of the pages, which bounds their AIR.
+        levels: of the pages, whose number bounds their AIR.
     """
 
-    def __init__(self, network: N, pilot_mask: NDArray[np.bool_], levels: int) -> None:
+    def __init__(self, network: N, pilot_mask: NDArray[np.bool_], levels: int | Levels) -> None:
         super().__init__()
         self.network = network
-        self.pilot_mask, self.levels = pilot_mask, levels
+        self.pilot_mask, self.levels = pilot_mask, Levels.of(levels)
         self._rates: list[float] = []
 
     def forward(self, *page: Tensor) -> Tensor:
@@ -53,7 +54,7 @@ class DecoderTraining(L.LightningModule, Generic[N]):
         asked = torch.isfinite(phases)
         loss = von_mises_nll(p, torch.where(asked, phases, 0.0))[asked].mean()
         self.log("train_nll", loss, prog_bar=True)
-        rate = training_rate(p.movedim(1, 0)[:, asked], phases[asked], self.levels)
+        rate = training_rate(p.movedim(1, 0)[:, asked], phases[asked], self.levels.count)
         self.log("train_air", rate, prog_bar=True)
         return loss
 
@@ -86,7 +87,11 @@ class SymbolTraining(DecoderTraining[SymbolNetwork]):
     """
 
     def __init__(
-        self, network: SymbolNetwork, hyperparameters: Hyperparameters, pilot_mask: NDArray[np.bool_], levels: int
+        self,
+        network: SymbolNetwork,
+        hyperparameters: Hyperparameters,
+        pilot_mask: NDArray[np.bool_],
+        levels: int | Levels,
     ) -> None:
         super().__init__(network, pilot_mask, levels)
         self.choices = hyperparameters

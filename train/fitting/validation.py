@@ -7,18 +7,19 @@ import torch
 from numpy.typing import NDArray
 
 from lightpage.metrics.information import achievable_rate, decide
+from lightpage.page.levels import Levels
 from lightpage.page.pilots import Pilots, estimate_piston
 from lightpage.train.models.parts import turned
 
 
-def held_out_air(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.bool_], levels: int) -> float:
+def held_out_air(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.bool_], levels: Levels) -> float:
     """AIR in bits per data symbol of decoded pages.
 
     Args:
         p: [pages, 2, ny, nx].
         phases: true phases [pages, ny, nx].
         mask: pilots, bool [ny, nx].
-        levels: M of the pages.
+        levels: of the pages.
     """
     rates = []
     for page, truth in zip(p, phases, strict=True):

@@ -28,6 +28,8 @@ from lightpage.waves.grid import FieldGrid, field_grid
 
 ROUNDS = 6
 """Of descent; beyond these the band filter's ripple adds up."""
+APART_ROUNDS = 18
+"""The same where cameras stand apart: what the one misses of a frequency, the other must make up for."""
 _STEP = 0.9
 """Along the weighted gradient: the weights bound the curvature by 2, and step times curvature must stay below 2."""
 _MOMENTUM = 0.5
@@ -48,6 +50,8 @@ class Measured(NamedTuple):
         cos, sin: of the turn between the arms.
         amplitude: the reference's over its mean, by which e becomes E.
         lit: one where both cameras have a reference, else zero.
+        apart: kernel of the defocus of the in-phase camera against the mean of both, real and imaginary part
+            [2, taps]; None where both see the same plane. The quadrature camera's is its conjugate.
     """
 
     a: Tensor
@@ -56,10 +60,11 @@ class Measured(NamedTuple):
     sin: Tensor
     amplitude: Tensor
     lit: Tensor
+    apart: Tensor | None = None
 
     def left(self, e: Tensor) -> Tensor:
         """What is left of the two equations at e, [2, ny, nx] real and imaginary part."""
-        in_phase, turned = self._brightness(e, 0.0)
+        in_phase, turned = self._brightness(*self._seen(e), 0.0)
         return torch.stack([self.a + (1 - in_phase) / 2, self.b + (1 - turned) / 2])
 
     def pull(self, e: Tensor, floor: Tensor | float, share: float = 1.0) -> Tensor:
@@ -69,18 +74,30 @@ class Measured(NamedTuple):
         electronics, the `floor`. The first is also the squared length of its gradient, so a step along the sum needs
         no matrix. What is left of an equation is half of what its brightness lacks, see `left`.
         """
-        in_phase, turned = self._brightness(e, floor)
+        seen = self._seen(e)
+        in_phase, turned = self._brightness(*seen, floor)
         pull_a = share * (self.a + (1 + floor) / 2) / in_phase - share / 2
         pull_b = share * (self.b + (1 + floor) / 2) / turned - share / 2
+        if self.apart is not None:
+            (real_a, imaginary_a), (real_b, imaginary_b) = (each.unbind() for each in seen)
+            by_b = pull_b * (real_b + self.cos), pull_b * (imaginary_b + self.sin)
+            return _together(torch.stack([pull_a * (real_a + 1), pull_a * imaginary_a, *by_b]), self.apart)
         total, (real, imaginary) = pull_a + pull_b, e.unbind()
         return torch.stack([total * real + pull_a + self.cos * pull_b, total * imaginary + self.sin * pull_b])
 
-    def _brightness(self, e: Tensor, floor: Tensor | float) -> tuple[Tensor, Tensor]:
-        """|1 + e|^2 and |exp(i turn) + e|^2, each with the floor on it, [ny, nx]."""
+    def _seen(self, e: Tensor) -> tuple[Tensor, Tensor]:
+        """The field as either camera sees it, [2, ny, nx] each."""
+        return (e, e) if self.apart is None else _apart(e, self.apart)
+
+    def _brightness(self, e: Tensor, other: Tensor, floor: Tensor | float) -> tuple[Tensor, Tensor]:
+        """|1 + e|^2 and |exp(i turn) + other|^2, each with the floor on it, [ny, nx]."""
         real, imaginary = e.unbind()
         real_plus_one = real + 1
         in_phase = real_plus_one * real_plus_one + imaginary * imaginary + floor
-        return in_phase, in_phase + (2 * (self.cos - 1) * real + 2 * self.sin * imaginary)
+        if other is e:
+            return in_phase, in_phase + (2 * (self.cos - 1) * real + 2 * self.sin * imaginary)
+        real, imaginary = other.unbind()
+        return in_phase, (real + self.cos) ** 2 + (imaginary + self.sin) ** 2 + floor
 
     def in_blocks(self, side: int) -> Measured:
         """The same on whole blocks of so many samples a side, zeros at the right and below where there are none."""
@@ -146,6 +163,7 @@ class FieldRecovery(nn.Module):
         reference_quadrature: Tensor,
         registration: Tensor,
         homodyne: Tensor,
+        apart: Tensor | None = None,
     ) -> Measured:
         """Both cameras' measurements on the common grid.
 
@@ -155,6 +173,7 @@ class FieldRecovery(nn.Module):
             registration: [2, 2, 10], pixel (column, row) of each camera as a cubic in the grid's (x, y), each over
                 the page's corner radius.
             homodyne: [2], cosine and sine of the turn between the two arms.
+            apart: see `Measured`.
         """
         frames = _block_means(_stacked(in_phase, quadrature), self.binning)
         references = _block_means(_stacked(reference_in_phase, reference_quadrature), self.binning)
@@ -170,7 +189,7 @@ class FieldRecovery(nn.Module):
         reference = torch.maximum(reference, floor)
         a, b = lit * gained / (2 * reference)
         amplitude = torch.sqrt(reference[0])
-        return Measured(a, b, homodyne[0], homodyne[1], amplitude / amplitude.mean(), lit)
+        return Measured(a, b, homodyne[0], homodyne[1], amplitude / amplitude.mean(), lit, apart)
 
     def solve(self, measured: Measured) -> tuple[Tensor, Tensor]:
         """Solve what was measured.
@@ -209,7 +228,7 @@ class FieldRecovery(nn.Module):
         closed root nearer to the linear estimate, then descent with momentum towards the most likely field in the
         pipe's band.
         """
-        a, b, cos, sin, amplitude, _ = measured
+        a, b, cos, sin, amplitude, *_ = measured
         start = self.band(torch.stack([a, (b - cos * a) / sin]) * amplitude) * inverse_amplitude
         if not self.with_signal_power:
             return torch.as_tensor(start)
@@ -222,7 +241,7 @@ class FieldRecovery(nn.Module):
         root = torch.sqrt(torch.clamp(discriminant, min=0)) / quadratic
         real = middle + torch.where(start[0] < middle, -root, root)
         before = estimate = self.band(torch.stack([real, slope * real - offset]) * amplitude) * inverse_amplitude
-        for _ in range(self.rounds):
+        for _ in range(self.rounds if measured.apart is None else APART_ROUNDS):
             ahead = estimate + _MOMENTUM * (estimate - before)
             step = measured.pull(ahead, READ_NOISE, _STEP)
             before, estimate = estimate, self.band((ahead + step) * amplitude) * inverse_amplitude
@@ -255,6 +274,25 @@ class FieldRecovery(nn.Module):
         ny, nx = self.grid.shape
         rows = _interpolated(seen.transpose(1, 2), ny).transpose(1, 2)
         return _interpolated(rows, nx)
+
+
+def _apart(field: Tensor, taps: Tensor) -> tuple[Tensor, Tensor]:
+    """A field [2, ny, nx] through the defocus of one camera, and of the other one."""
+    real, imaginary = taps
+    weights = torch.stack([real, -imaginary, imaginary, real, real, imaginary, -imaginary, real])
+    along = functional.conv2d(field[None], weights.reshape(4, 2, 1, -1), padding=(0, taps.shape[1] // 2))
+    both = functional.conv2d(along, weights.reshape(4, 2, -1, 1), padding=(taps.shape[1] // 2, 0), groups=2)[0]
+    return both[:2], both[2:]
+
+
+def _together(both: Tensor, taps: Tensor) -> Tensor:
+    """The adjoint of `_apart`: [4, ny, nx] to [2, ny, nx]."""
+    real, imaginary = taps
+    back = torch.stack([real, imaginary, -imaginary, real, real, -imaginary, imaginary, real])
+    added = torch.stack([real, imaginary, real, -imaginary, -imaginary, real, imaginary, real])
+    reach = taps.shape[1] // 2
+    along = functional.conv2d(both[None], back.reshape(4, 2, -1, 1), padding=(reach, 0), groups=2)
+    return functional.conv2d(along, added.reshape(2, 4, 1, -1), padding=(0, reach))[0]
 
 
 def _stacked(in_phase: Tensor, quadrature: Tensor) -> Tensor:
@@ -303,7 +341,12 @@ class TorchFieldSolver:
         self._recovery = recovery
 
     def __call__(
-        self, pair: FramePair, references: FramePair, registration: NDArray[np.float32], homodyne: NDArray[np.float32]
+        self,
+        pair: FramePair,
+        references: FramePair,
+        registration: NDArray[np.float32],
+        homodyne: NDArray[np.float32],
+        apart: NDArray[np.float32] | None = None,
     ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
         """See `lightpage.calibration.interfaces.FieldSolver`."""
         frames = (pair.in_phase, pair.quadrature, references.in_phase, references.quadrature)
@@ -312,6 +355,7 @@ class TorchFieldSolver:
                 *(torch.from_numpy(frame.astype(np.float32)) for frame in frames),
                 torch.from_numpy(registration),
                 torch.from_numpy(homodyne),
+                None if apart is None else torch.from_numpy(apart),
             )
         real, imaginary = field.numpy()
         return np.asarray(real + 1j * imaginary, dtype=np.complex64), residual.numpy()

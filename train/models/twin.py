@@ -116,7 +116,6 @@ class RayTwin(nn.Module):
             return torch.stack([slope_x, slope_y], dim=-1), mean - slope_x * x - slope_y * y
 
         per_metre = self.wave_number / focal
-        path = geometry.lens_path
         starts = in_pipe(points)
         straight = -per_metre * starts
         positions = exit_centroid(straight)
@@ -129,22 +128,19 @@ class RayTwin(nn.Module):
         for branch in BRANCHES:
             crossed = {"x": (odd if "x" in branch else even)[:, 0], "y": (odd if "y" in branch else even)[:, 1]}
             k, phase = straight, at_launch
-            leaves = spread = more = torch.zeros_like(straight)
             met = torch.stack([crossed["x"], crossed["y"]], dim=-1)
-            if not self.ideal_lenses:
-                entrance, leaves, spread = self._filled(met, positions, width, focal)
-                tilt, more = bent_by(path, starts, entrance, spread)
-                k, phase = k + tilt, phase + more
+            entrance, leaves, spread = self._filled(met, positions, width, focal)
+            tilt, more = bent_by(geometry.lens_path, starts, entrance, spread)
+            k, phase = k + tilt, phase + more
             squared = (k * k).sum(-1)
             phase = phase - squared / (torch.sqrt(nk**2 - squared) + nk) * length
             for name in "yx" if branch == "yx" else "xy":
                 k, phase = self._reflect(k, phase, normals[name], crossed[name], width, wall_offset["xy".index(name)])
             landing = -k / per_metre
-            if not self.ideal_lenses:
-                for _ in range(_LANDINGS):
-                    tilt, more = bent_by(path.mirrored(), landing, leaves, spread)
-                    landing = (tilt - k) / per_metre
-                phase = phase - more
+            for _ in range(1 if self.ideal_lenses else _LANDINGS):
+                tilt, more = bent_by(geometry.camera_path, landing, leaves, spread)
+                landing = (tilt - k) / per_metre
+            phase = phase - more
             landing = _turn(landing, roll)
             landings.append(landing)
             x, y = landing[:, 0] / self.corner, landing[:, 1] / self.corner
@@ -182,10 +178,12 @@ class RayTwin(nn.Module):
 
     def _pixels(self, value: dict[str, Tensor], places: Tensor) -> Tensor:
         radius2 = (places * places).sum(-1, keepdim=True) / self.corner**2
-        seen = places * (1 + value["distortion_relative"] * radius2) / self.camera_pitch
-        x, y = seen[:, 0], seen[:, 1]
+        across, up = places[:, :1] / self.half_width, places[:, 1:] / self.half_height
         cameras = []
         for camera in ("in_phase", "quadrature"):
+            keystone = value[f"{camera}_keystone_x_relative"] * across + value[f"{camera}_keystone_y_relative"] * up
+            seen = places * (1 + value["distortion_relative"] * radius2 + keystone) / self.camera_pitch
+            x, y = seen[:, 0], seen[:, 1]
             column = (1 + value[f"{camera}_scale_x_relative"]) * x + value[f"{camera}_turn_xy_slope"] * y
             row = value[f"{camera}_turn_yx_slope"] * x + (1 + value[f"{camera}_scale_y_relative"]) * y
             column = column + value[f"{camera}_shift_x_px"] + self.camera_centre[0]

@@ -20,7 +20,6 @@ from lightpage.calibration.waves.wave_model import (
     fitted_launch_phase,
     modulator_axes,
 )
-from lightpage.device.lens_path import IDEAL
 from lightpage.device.profile import Profile
 from lightpage.train.models.parts import Parts, conjugate, multiply, parts, phasor
 from lightpage.train.models.wave_lens import OVERSAMPLING, LensMatrices, TiledLens
@@ -96,16 +95,14 @@ class Waves(nn.Module):
         finest_x, finest_y = modulator_axes(profile, symbol_samples(profile))
         seen = float(grid.x_m[-1]), float(grid.y_m[-1])
         cells = cells_for(geometry, finest_x + centre[0], finest_y + centre[1], *seen)
-        highest = highest_frequencies(geometry, geometry.lens_path.mirrored(), grid.x_m, grid.y_m)
+        highest = highest_frequencies(geometry, geometry.camera_path, grid.x_m, grid.y_m)
         sparse = [
             sparse_axis(axis, frequency, OVERSAMPLING)
             for axis, frequency in zip((grid.x_m, grid.y_m), highest, strict=True)
         ]
-        path = IDEAL if profile.ideal_lenses else geometry.lens_path
-        mirrored = IDEAL if profile.ideal_lenses else path.mirrored()
         common = cells, _ROLL_MARGIN, fidelity.lenses
-        self._launch = TiledLens(geometry, path, (x + centre[0], y + centre[1]), *common)
-        self._delaunch = TiledLens(geometry, mirrored, (sparse[0], sparse[1]), *common)
+        self._launch = TiledLens(geometry, geometry.lens_path, (x + centre[0], y + centre[1]), *common)
+        self._delaunch = TiledLens(geometry, geometry.camera_path, (sparse[0], sparse[1]), *common)
         self._pipe = TiledPipe(geometry, cells, fidelity.pipe)
         self._profile, self._envelope_m = profile, profile.symbol_pitch_m / samples if filled else 0.0
         self.x_m: Tensor
@@ -116,7 +113,6 @@ class Waves(nn.Module):
         self.sparse_y_m: Tensor
         self.facet_x: Tensor
         self.facet_y: Tensor
-        self._ideal = profile.ideal_lenses
         for name, buffer in {
             "x_m": x,
             "y_m": y,
@@ -146,12 +142,9 @@ class Waves(nn.Module):
         window = entrance_window(geometry, *facet, self._envelope_m, xp=torch)
         at_launch = fitted_launch_phase(self._profile, value, geometry, self.x_m[None, :], self.y_m[:, None])
         at_camera = fitted_camera_phase(self._profile, value, geometry, grid[0][None, :], grid[1][:, None])
-        path, mirrored = geometry.lens_path, geometry.lens_path.mirrored()
-        if self._ideal:
-            path = mirrored = IDEAL
-        else:
-            at_launch = at_launch + path.of_field(x[0][None, :], x[1][:, None])
-            at_camera = at_camera - mirrored.of_field(grid[0][None, :], grid[1][:, None])
+        path, mirrored = geometry.lens_path, geometry.camera_path
+        at_launch = at_launch + path.of_field(x[0][None, :], x[1][:, None])
+        at_camera = at_camera - mirrored.of_field(grid[0][None, :], grid[1][:, None])
         start = x[0][0], x[1][0]
         sparse = self.sparse_x_m[0], self.sparse_y_m[0]
         return WaveMatrices(

@@ -40,7 +40,7 @@ def page_states(
         symbols = recording.symbols(page)
         assert symbols is not None
         shift = np.array(states[-1].shift_px) if states else np.zeros(2)
-        phases = symbol_phases(symbols, recording.levels)
+        phases = extractor.device.modulation.phase(symbol_phases(symbols, recording.levels))
         states.append(extractor.state(extractor.field(recording.frames(page)), phases, shift))
         if len(states) % _AT_ONCE == 0 or len(states) == len(pages):
             seconds = time.monotonic() - start

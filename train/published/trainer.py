@@ -68,8 +68,9 @@ class PublishedTrainer:
         path = inputs.out / "states.json"
         states, preparing = page_states(path, inputs.key, inputs.recording, inputs.extractor, known)
         count = len(inputs.training)
-        training = FramePages(inputs.recording, known[:count], states[:count])
-        validation = FramePages(inputs.recording, known[count:], states[count:])
+        modulation = inputs.calibration.modulator
+        training = FramePages(inputs.recording, known[:count], states[:count], modulation)
+        validation = FramePages(inputs.recording, known[count:], states[count:], modulation)
         fitted = train_published(
             inputs.out,
             self.localizer,
@@ -114,7 +115,7 @@ def train_published(
     seed_stretch(run, choices.seed)
     recording = training.recording
     decoder = published_decoder(localizer, choices, profile, recording.references(), quadrature_phase)
-    module = PublishedTraining(decoder, choices, mask, recording.levels)
+    module = PublishedTraining(decoder, choices, mask, training.levels)
     return fit(
         run,
         module,

@@ -14,6 +14,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils.data import Dataset
 
+from lightpage.page.levels import Levels
+from lightpage.page.modulation import NOMINAL, Modulation
 from lightpage.page.symbols import symbol_phases
 from lightpage.recording.reader import Recording
 from lightpage.train.data.features import PageState
@@ -70,10 +72,18 @@ class FramePages(Dataset[Page]):
         recording: with symbols; stays open.
         pages: which of its pages.
         states: of those pages.
+        modulation: what the modulator makes of its levels.
     """
 
-    def __init__(self, recording: Recording, pages: Sequence[int], states: Sequence[PageState]) -> None:
+    def __init__(
+        self,
+        recording: Recording,
+        pages: Sequence[int],
+        states: Sequence[PageState],
+        modulation: Modulation = NOMINAL,
+    ) -> None:
         self.recording, self._pages, self.states = recording, pages, states
+        self.levels = modulation.page_levels(recording.levels)
 
     def __len__(self) -> int:
         """Pages."""
@@ -84,7 +94,7 @@ class FramePages(Dataset[Page]):
         page, state = self._pages[index], self.states[index]
         pair, symbols = self.recording.frames(page), self.recording.symbols(page)
         assert symbols is not None
-        phases = symbol_phases(symbols, self.recording.levels).astype(np.float32)
+        phases = symbol_phases(symbols, self.levels).astype(np.float32)
         return (
             torch.from_numpy(np.stack([pair.in_phase, pair.quadrature]).astype(np.float32)),
             torch.tensor([*state.shift_px, state.piston_rad], dtype=torch.float32),
@@ -125,7 +135,11 @@ class PublishedTraining(DecoderTraining[PublishedDecoder]):
     """
 
     def __init__(
-        self, network: PublishedDecoder, choices: PublishedChoices, pilot_mask: NDArray[np.bool_], levels: int
+        self,
+        network: PublishedDecoder,
+        choices: PublishedChoices,
+        pilot_mask: NDArray[np.bool_],
+        levels: int | Levels,
     ) -> None:
         super().__init__(network, pilot_mask, levels)
         self.choices = choices

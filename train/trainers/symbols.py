@@ -91,7 +91,7 @@ class SymbolTrainer:
             inputs.out,
             self.choices,
             inputs.pilot_mask,
-            inputs.recording.levels,
+            inputs.levels,
             training,
             validation,
             start=None if before is None else before.network,

@@ -8,7 +8,7 @@ the arms is, and what pipe and lenses are: more than patches of symbols do, sinc
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal, NamedTuple
 
@@ -21,6 +21,8 @@ from lightpage.calibration.parameters import NAMES, PARAMETERS, PRIORS, indices
 from lightpage.calibration.samplers import smooth_reference
 from lightpage.calibration.waves.wave_model import FittedWaves, illumination_terms, on_modulator
 from lightpage.device.profile import Profile
+from lightpage.page import modulation as modulations
+from lightpage.page.modulation import NOMINAL, Modulation
 from lightpage.recording.frame_pair import FramePair
 from lightpage.waves.grid import field_grid, symbol_samples
 
@@ -30,14 +32,16 @@ Complex = NDArray[np.complexfloating]
 READ_NOISE = 0.3
 """Variance of an equation that does not grow with the light, over the shot noise of the reference alone."""
 ROUNDS = 9
-_CHORD = 4
-"""Rounds that share one derivative of the light, which costs as much as several rounds."""
 _CHORD_ACCURACY = 3 / 8
 """Share of the splitting steps for that derivative: an error of a percent in it costs no round."""
-_NEARLY = 0.02
-"""Relative fall of the residual, by a whole step, below which the derivative at hand serves to the end."""
-_CONVERGED = 3e-3
+_STALE = 0.03
+"""Relative fall of the residual, since the derivative of the light was taken, beyond which it is taken anew. That costs
+as much as several rounds, but one from further off leaves axial places twenty deviations from the best."""
+_CONVERGED = 1e-3
 """Relative fall of the residual below which another round does not pay."""
+_LEAST_OFF = 2.0
+"""Mean square of the modulation's coefficients over their deviations from which on levels are uneven: a nominal device
+has 1 or less, and more than 2 in one of seventy fits."""
 _LARGEST_MOVE_PX = 1.5
 """A round's largest step: the model is linear in the displacement over about a speckle."""
 _EQUATIONS = 100_000
@@ -53,7 +57,7 @@ _AT_CAMERA = frozenset(indices("camera_phase"))
 """Parameters whose change of the light needs no propagation."""
 _OF_REAL_LENSES = (NAMES.index("lens_path_relative"),)
 """Parameters that do nothing where the profile's lenses are ideal."""
-_SEEN = frozenset(indices(*_CAMERAS, "distortion"))
+_SEEN = frozenset(indices(*_CAMERAS, "distortion", "keystone"))
 """Parameters that say where the cameras see a place; all others change the light itself."""
 
 
@@ -68,32 +72,46 @@ class WaveFitted:
         quadrature_phase: angle between the homodyne arms, radians.
         residual: root mean square of what is left of the equations, in standard deviations of the reference's noise
             times an unknown factor: it says which of two fits is better.
+        modulation: what the modulator makes of its levels; nominal where the page does not tell it from that.
+        modulation_deviations: standard deviations of its coefficients, zero where held.
     """
 
     parameters: Real
     deviations: Real
     quadrature_phase: float
     residual: float
+    modulation: Modulation = NOMINAL
+    modulation_deviations: tuple[float, ...] = (0.0,) * len(modulations.NAMES)
 
 
 class _State(NamedTuple):
-    """What is fitted: parameters [P], the angle between the arms, coefficients [T] of the illumination's terms."""
+    """What is fitted.
+
+    Attributes:
+        parameters: [P].
+        quadrature_phase: angle between the arms, radians.
+        light: coefficients [T] of the illumination's terms.
+        levels: coefficients of the modulation.
+    """
 
     parameters: Real
     quadrature_phase: float
     light: Complex
+    levels: Real
 
 
 class _Slopes(NamedTuple):
-    """Derivatives at the places of the equations [...].
+    """Derivatives at the places of the equations [...], of the light that each of both cameras sees.
 
     Attributes:
-        by_term: of the light by the illumination's terms, [T, ...].
-        of_light: of the light by parameters that change it, [...] each.
+        by_term: of the light by the illumination's terms, [T, 2, ...].
+        by_level: of the light by what the logarithm of the modulation is made of, [K, 2, ...]; none where it is held.
+        of_light: of the light by parameters that change it, [2, ...] each.
         of_cameras: of the places' pixels by parameters that move them, [2, ..., 2] each.
     """
 
     by_term: Complex
+    by_level: list[Complex]
     of_light: list[Complex]
     of_cameras: list[Real]
 
@@ -116,9 +134,9 @@ class WaveFit:
     ) -> None:
         self._twin, self._profile, self._symbols = twin, profile, symbols.size
         self._samples = symbol_samples(profile)
-        page = on_modulator(np.angle(symbols), self._samples)
+        self._phases = np.mod(np.angle(symbols), 2 * np.pi)
         waves = self._waves(np.zeros(len(PARAMETERS)))
-        self._pages = np.stack([page * term for term in illumination_terms(waves.x, waves.y)])
+        self._terms = np.stack(illumination_terms(waves.x, waves.y))
         grid = field_grid(profile)
         self._pitch_px = grid.pitch_m / profile.camera.pitch_m
         self._stride = max(_LEAST_STRIDE, int(np.sqrt(np.prod(grid.shape) / _EQUATIONS)))
@@ -140,6 +158,9 @@ class WaveFit:
         centre: Real | None = None,
         prior_scale: float | Real = 1.0,
         progress: Callable[[float], None] = lambda share: None,
+        modulation: Modulation = NOMINAL,
+        *,
+        levels: bool = False,
     ) -> WaveFitted:
         """Fit the parameters of `groups` and the angle between the arms.
 
@@ -152,6 +173,8 @@ class WaveFit:
             prior_scale: factor on the priors' standard deviations, one for all or [P].
             progress: told of every round and of every derivative, with the share of the most rounds that is behind,
                 0 to 1. It may raise to stop the work.
+            modulation: what the modulator makes of its levels, to start from.
+            levels: whether that is fitted too.
         """
         without_effect = _OF_REAL_LENSES if self._profile.ideal_lenses else ()
         of_light = [index for index in indices(*groups) if index not in (*_SEEN, *without_effect)]
@@ -159,50 +182,78 @@ class WaveFit:
         free = of_light + of_cameras
         precision = 1 / (PRIORS * prior_scale)[free] ** 2
         centre = np.zeros(len(PARAMETERS)) if centre is None else centre
-        state = self._start(start, quadrature_phase)
-        best = WaveFitted(start, np.zeros(len(PARAMETERS)), quadrature_phase, np.inf)
-        fall, whole, slopes = 1.0, False, None
+        state = self._start(start, quadrature_phase, modulation)
+        best = WaveFitted(start, np.zeros(len(PARAMETERS)), quadrature_phase, np.inf, modulation)
+        slopes, taken_at = None, np.inf
         for number in range(ROUNDS):
             progress(number / ROUNDS)
-            if slopes is None or (number % _CHORD == 0 and not (whole and fall < _NEARLY)):
-                slopes = self._slopes(state, of_light, of_cameras, partial(_within_round, progress, number))
-            directions = _directions(state.light, bends="launch" not in groups)
-            columns, left = self._equations(state, slopes, directions)
+            fields, left = self._left(state)
             residual = float(np.sqrt(np.mean(left**2)))
-            fall = 1 - residual / best.residual
-            if not fall > _CONVERGED:
+            if not residual < (1 - _CONVERGED) * best.residual:
                 break
+            if slopes is None or residual < (1 - _STALE) * taken_at:
+                told, taken_at = partial(_within_round, progress, number), residual
+                slopes = self._slopes(state, of_light, of_cameras, told, levels=levels)
+            directions = _directions(state.light, bends="launch" not in groups)
+            columns = self._columns(state, fields, slopes, directions)
             # What is unexplained differs from symbol to symbol, so equations tell no more than symbols do.
             variance = residual**2 * max(1.0, len(left) / (2 * self._symbols))
             others = columns.shape[1] - len(free)
-            information = columns.T @ columns / variance + np.diag(np.r_[np.zeros(others), precision])
+            fitted_levels = slice(others - (len(modulations.NAMES) if levels else 0), others)
+            prior = np.zeros(columns.shape[1])
+            prior[others:] = precision
+            prior[fitted_levels] = 1 / modulations.PRIORS[: others - fitted_levels.start] ** 2
+            information = columns.T @ columns / variance + np.diag(prior)
             pull = columns.T @ left / variance
             pull[others:] -= precision * (state.parameters[free] - centre[free])
+            if levels:
+                pull[fitted_levels] -= prior[fitted_levels] * state.levels
             covariance = _inverse(information)
+            known = np.sqrt(np.diag(covariance))
             deviations = np.zeros(len(PARAMETERS))
-            deviations[free] = np.sqrt(np.diag(covariance)[others:])
-            best = WaveFitted(state.parameters, deviations, state.quadrature_phase, residual)
-            state, whole = self._moved(state, covariance @ pull, directions, free)
-        return best
+            deviations[free] = known[others:]
+            best = WaveFitted(
+                state.parameters,
+                deviations,
+                state.quadrature_phase,
+                residual,
+                Modulation(tuple(state.levels.tolist())),
+                tuple(known[fitted_levels].tolist()) if levels else best.modulation_deviations,
+            )
+            state = self._moved(state, covariance @ pull, directions, fitted_levels, free)
+        return _told_apart(best)
 
     def _waves(self, parameters: Real) -> FittedWaves:
         return FittedWaves(self._profile, parameters, self._samples, filled=True)
 
-    def _light(self, parameters: Real, light: Complex) -> Complex:
-        """The page's light on the common grid, [Gy, Gx]."""
-        return self._waves(parameters).to_camera(np.tensordot(light, self._pages, 1))
+    def _page(self, levels: Real) -> Complex:
+        """What the modulator makes of the page, evenly lit, [ny samples, nx samples]."""
+        return on_modulator(Modulation(tuple(levels.tolist())).light(self._phases), self._samples)
 
-    def _start(self, parameters: Real, quadrature_phase: float) -> _State:
+    def _light(self, state: _State) -> Complex:
+        """The page's light on the common grid, as either camera sees it, [2, Gy, Gx]."""
+        lit = self._page(state.levels) * np.tensordot(state.light, self._terms, 1)
+        return self._waves(state.parameters).to_cameras(lit)
+
+    def _start(self, parameters: Real, quadrature_phase: float, modulation: Modulation) -> _State:
         """With the even illumination that fits best."""
         chosen, counts, amplitude = self._look(parameters)
-        even = np.eye(1, len(self._pages), dtype=np.complex128)[0]
-        here = self._light(parameters, even)[self._every][chosen] / amplitude
-        columns = np.concatenate([here * np.exp(-1j * arm) for arm in (0.0, quadrature_phase)])
+        even = np.eye(1, len(self._terms), dtype=np.complex128)[0]
+        state = _State(parameters, quadrature_phase, even, np.array(modulation.coefficients))
+        here = [field[self._every][chosen] / amplitude for field in self._light(state)]
+        arms = (0.0, quadrature_phase)
+        columns = np.concatenate([field * np.exp(-1j * arm) for field, arm in zip(here, arms, strict=True)])
         found = np.linalg.lstsq(np.stack([columns.real, -columns.imag], axis=1), counts.ravel(), rcond=None)[0]
-        return _State(parameters, quadrature_phase, even * complex(*found))
+        return state._replace(light=even * complex(*found))
 
     def _slopes(
-        self, state: _State, of_light: list[int], of_cameras: list[int], progress: Callable[[float], None]
+        self,
+        state: _State,
+        of_light: list[int],
+        of_cameras: list[int],
+        progress: Callable[[float], None],
+        *,
+        levels: bool,
     ) -> _Slopes:
         def waves(parameters: Real, like: FittedWaves | None = None) -> FittedWaves:
             stride, accuracy = self._stride, _CHORD_ACCURACY
@@ -216,8 +267,11 @@ class WaveFit:
             return there, step
 
         here = waves(state.parameters)
-        by_term = np.stack([here.to_camera(page) for page in self._pages])
-        page, field = np.tensordot(state.light, self._pages, 1), np.tensordot(state.light, by_term, 1)
+        even = self._page(state.levels)
+        by_term = np.stack([here.to_cameras(even * term) for term in self._terms])
+        page, field = even * np.tensordot(state.light, self._terms, 1), np.tensordot(state.light, by_term, 1)
+        functions = [on_modulator(one, self._samples) for one in modulations.basis(self._phases)] if levels else []
+        by_level = [here.to_cameras(page * one) for one in functions]
         light, pixels = list[Complex](), list[Real]()
         for number, index in enumerate(of_light):
             progress(number / len(of_light))
@@ -225,10 +279,10 @@ class WaveFit:
             moved = waves(there, here)
             at_camera = index in _AT_CAMERA
             ratio = moved.against_reference / here.against_reference
-            light.append(((field * ratio if at_camera else moved.to_camera(page)) - field) / step)
+            light.append(((field * ratio if at_camera else moved.to_cameras(page)) - field) / step)
         for there, step in map(stepped, of_cameras):
             pixels.append((self._pixels(there) - self._pixels(state.parameters)) / step)
-        return _Slopes(by_term, light, pixels)
+        return _Slopes(by_term, by_level, light, pixels)
 
     def _pixels(self, parameters: Real) -> Real:
         """Where both cameras see the places [...], [2, ..., 2]."""
@@ -246,48 +300,60 @@ class WaveFit:
         amplitude = np.sqrt(_at(self._levels[0], pixels[0][chosen], order=1))
         return chosen, np.stack(counts), amplitude / amplitude.mean()
 
-    def _equations(self, state: _State, slopes: _Slopes, directions: Complex) -> tuple[Real, Real]:
-        """Columns [2 N, K] and what is left [2 N], over the noise of each equation's light.
+    def _left(self, state: _State) -> tuple[Complex, Real]:
+        """The light of both cameras [2, Gy, Gx], and what is left of the equations, [2 N], over each one's noise.
 
-        A count says Re(e exp(-i arm)) + |e|^2 / 2 of the field e over the reference. Columns are those of the
-        illumination's `directions`, the turn, and the parameters of `slopes`.
+        A count says Re(e exp(-i arm)) + |e|^2 / 2 of the field e over the reference.
         """
-        chosen, counts, amplitude = self._look(state.parameters)
+        fields, (chosen, counts, amplitude) = self._light(state), self._look(state.parameters)
+        left = []
+        for camera, arm in enumerate((0.0, state.quadrature_phase)):
+            phasor, here = np.exp(-1j * arm), fields[camera][self._every][chosen] / amplitude
+            left.append((counts[camera] - (here * phasor).real - np.abs(here) ** 2 / 2) * _weight(here, phasor))
+        return fields, np.concatenate(left)
+
+    def _columns(self, state: _State, fields: Complex, slopes: _Slopes, directions: Complex) -> Real:
+        """Derivatives of the equations of `_left`, [2 N, K].
+
+        Columns are those of the illumination's `directions`, the turn, the modulation's coefficients, and the
+        parameters of `slopes`.
+        """
+        chosen, _, amplitude = self._look(state.parameters)
 
         def seen(field: Complex) -> Complex:
             return np.asarray(field[chosen] / amplitude)
 
-        field = self._light(state.parameters, state.light)
-        here, down, across = (seen(part[self._every]) for part in (field, *np.gradient(field)))
-        changes = [seen(part) for part in (*np.tensordot(directions, slopes.by_term, 1), *slopes.of_light)]
+        of_phase, of_amplitude = [1j * each for each in slopes.by_level], slopes.by_level[1:]
+        changes = [*np.tensordot(directions, slopes.by_term, 1), *of_phase, *of_amplitude, *slopes.of_light]
         moves = [pixels[:, chosen] for pixels in slopes.of_cameras]
-        columns, left = [], []
+        columns = []
         for camera, arm in enumerate((0.0, state.quadrature_phase)):
-            phasor = np.exp(-1j * arm)
-            weight = 1 / np.sqrt(np.abs(1 / phasor + here) ** 2 + READ_NOISE)
+            phasor, field = np.exp(-1j * arm), fields[camera]
+            here, down, across = (seen(part[self._every]) for part in (field, *np.gradient(field)))
+            weight = _weight(here, phasor)
             along = (phasor + here.conj()) * weight  # derivative of the count by e
-            left.append((counts[camera] - (here * phasor).real - np.abs(here) ** 2 / 2) * weight)
-            mine = [(along * change).real for change in changes]
+            mine = [(along * seen(change[camera])).real for change in changes]
             mine.insert(len(directions), (here * phasor * -1j).real * weight * camera)
             slope = np.stack([(along * part).real for part in (across, down)]) / self._pitch_px
             mine += [-(slope * move[camera].T).sum(axis=0) for move in moves]
             columns.append(np.stack(mine, axis=1))
-        return np.concatenate(columns), np.concatenate(left)
+        return np.concatenate(columns)
 
-    def _moved(self, state: _State, step: Real, directions: Complex, free: list[int]) -> tuple[_State, bool]:
-        """The state after a step, shortened where it would move a camera too far, and whether it was whole."""
+    def _moved(self, state: _State, step: Real, directions: Complex, levels: slice, free: list[int]) -> _State:
+        """The state after a step, shortened where it would move a camera too far."""
         change = np.zeros(len(PARAMETERS))
-        change[free] = step[len(directions) + 1 :]
+        change[free] = step[levels.stop :]
+        by_level = step[levels] if levels.start < levels.stop else 0.0
         few = self._places[self._inside][:: 1 + len(self._places)]
         seen = [self._twin.pixels(at, few) for at in (state.parameters, state.parameters + change)]
         furthest = float(np.sqrt(np.mean(np.sum((seen[1] - seen[0]) ** 2, axis=-1), axis=-1)).max())
         share = min(1.0, _LARGEST_MOVE_PX / max(furthest, 1e-9))
-        moved = _State(
+        return _State(
             state.parameters + share * change,
             state.quadrature_phase + share * float(step[len(directions)]),
             state.light + share * step[: len(directions)] @ directions,
+            state.levels + share * by_level,
         )
-        return moved, share == 1
 
 
 def _within_round(progress: Callable[[float], None], number: int, share: float) -> None:
@@ -301,6 +367,20 @@ def _directions(light: Complex, *, bends: bool) -> Complex:
     if bends:
         return np.concatenate([terms, 1j * terms])
     return np.concatenate([light[0] / abs(light[0]) * terms, 1j * light[None]])
+
+
+def _told_apart(found: WaveFitted) -> WaveFitted:
+    """A fit whose modulation is nominal unless its coefficients differ from zero by more than their deviations."""
+    known = np.array(found.modulation_deviations)
+    if not known.any():
+        return found
+    off = np.sum((np.array(found.modulation.coefficients) / known) ** 2)
+    return replace(found, modulation=NOMINAL) if off < _LEAST_OFF * len(known) else found
+
+
+def _weight(here: Complex, phasor: complex) -> Real:
+    """One over the noise of equations of the light `here`."""
+    return np.asarray(1 / np.sqrt(np.abs(1 / phasor + here) ** 2 + READ_NOISE))
 
 
 def _inverse(information: Real) -> Real:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.parameters import as_dict
 from lightpage.calibration.phases import camera_phase, launch_phase
+from lightpage.device.lens_path import IDEAL
 from lightpage.device.profile import Profile
 from lightpage.waves.channel import WaveChannel
 from lightpage.waves.geometry import WaveGeometry, cells_for
@@ -23,17 +24,33 @@ _ILLUMINATION = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 
 
 def fitted_geometry(profile: Profile, value: Mapping[str, Any]) -> WaveGeometry:
-    """The geometry of fitted parameters by name, numbers or tensors."""
+    """The geometry of fitted parameters by name, numbers or tensors; its cameras stand where they do on average."""
+    width = profile.pipe.width_m * (1 + value["pipe_width_relative"])
+    glass, cameras = profile.seidel_terms(1 + value["lens_path_relative"]), axial_of_cameras(value)[0]
+    if profile.ideal_lenses:
+        glass = IDEAL
     return WaveGeometry(
         wavelength_m=profile.light.wavelength_m,
         focal_length_m=profile.lens.focal_length_m * (1 + value["focal_length_relative"]),
         pipe_length_m=profile.pipe.length_m * (1 + value["pipe_length_relative"]),
-        pipe_width_m=profile.pipe.width_m * (1 + value["pipe_width_relative"]),
+        pipe_width_m=width,
         refractive_index=profile.pipe.refractive_index,
         pipe_angle=np.deg2rad(profile.pipe.angle_deg) + value["pipe_angle_rad"],
         pipe_roll=value["pipe_roll_rad"],
-        lens_path=profile.seidel_terms(1 + value["lens_path_relative"]),
+        lens_path=glass._replace(defocus=defocus(value["modulator_axial_rad"], width)),
+        camera_path=glass.mirrored()._replace(defocus=-defocus(cameras, width)),
     )
+
+
+def defocus(axial_rad: Any, width_m: Any) -> Any:
+    """The factor of R^2 on a facet, rad/m^2, of a plane whose axial place is stated as a phase at the facet's wall."""
+    return axial_rad * (2 / width_m) ** 2
+
+
+def axial_of_cameras(value: Mapping[str, Any]) -> tuple[Any, Any]:
+    """Axial place of both cameras on average, and half of what in-phase lies beyond quadrature; radians at the wall."""
+    one, other = value["in_phase_axial_rad"], value["quadrature_axial_rad"]
+    return (one + other) / 2, (one - other) / 2
 
 
 def modulator_axes(profile: Profile, samples: int) -> tuple[Real, Real]:
@@ -131,20 +148,29 @@ class FittedWaves:
         at_camera = fitted_camera_phase(profile, value, geometry, grid_x[None, :], grid_y[:, None])
         self.launch: Complex = np.exp(1j * at_launch)
         self.against_reference: Complex = np.exp(1j * at_camera)
+        self._apart = defocus(axial_of_cameras(value)[1], geometry.pipe_width_m)
+        """Defocus of the in-phase camera beyond that of both on average, rad/m^2."""
         self._camera = self.against_reference / stride  # samples that stand for more area are larger
 
     def to_camera(self, field: Complex) -> Complex:
         """Field on the modulator [ny samples, nx samples] to the common grid [Gy, Gx], against the reference."""
         return np.asarray(self.channel.forward(field * self.launch) * self._camera)
 
+    def to_cameras(self, field: Complex) -> Complex:
+        """The same as either camera sees it from where it stands, in-phase and quadrature, [2, Gy, Gx]."""
+        leaving = self.channel.exit_field(field * self.launch)
+        beyond = (self._apart, -self._apart) if self._apart else (0.0,)
+        seen = [self.channel.camera_field(leaving, each) * self._camera for each in beyond]
+        return np.stack([seen[0], seen[-1]])
+
     def to_page(self, field: Complex) -> Complex:
         """Field on the common grid [Gy, Gx] back to the modulator, by the adjoint."""
         return np.asarray(self.channel.adjoint(field * self._camera.conj()) * self.launch.conj())
 
 
-def on_modulator(phases: Real, samples: int) -> Complex:
-    """A page's phases [ny, nx] as a field on the modulator, [ny samples, nx samples]."""
-    return np.asarray(np.exp(1j * np.kron(phases, np.ones((samples, samples)))))
+def on_modulator(page: NDArray[Any], samples: int) -> NDArray[Any]:
+    """A page of light, [ny, nx], on the modulator, [ny samples, nx samples]."""
+    return np.kron(page, np.ones((samples, samples)))
 
 
 def illumination_terms(x: Any, y: Any) -> list[Any]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lightpage.codec.choose import HEADROOM, Choice, DrawnPage, choose
 from lightpage.metrics.information import achievable_rate
+from lightpage.page.levels import Levels
 from lightpage.page.pilots import Pilots, remove_piston
 from lightpage.page.symbols import symbol_phases
 from lightpage.progress import warn
@@ -23,12 +24,12 @@ AIR_LEVELS = 256
 """Level count of the AIR: fine enough that it does not bound what a phase carries."""
 
 
-def phase_errors(page: DecodedPage, symbols: NDArray[np.uint8], levels: int) -> NDArray[np.float32]:
+def phase_errors(page: DecodedPage, symbols: NDArray[np.uint8], levels: int | Levels) -> NDArray[np.float32]:
     """Phase error of each symbol of a page, its smooth part still in it, radians [ny, nx]."""
     return remove_piston(page.phase + page.phase_error - symbol_phases(symbols, levels), 0.0)
 
 
-def air_bits(page: DecodedPage, symbols: NDArray[np.uint8], data: NDArray[np.bool_], levels: int) -> float:
+def air_bits(page: DecodedPage, symbols: NDArray[np.uint8], data: NDArray[np.bool_], levels: int | Levels) -> float:
     """AIR of a page as delivered, over 256 levels whatever its own count is, bits per data symbol."""
     error = (page.phase - symbol_phases(symbols, levels))[data]
     rates = achievable_rate(error, page.concentration[data], np.zeros(error.shape, np.int64), AIR_LEVELS)
@@ -52,7 +53,7 @@ def choose_code(
     """
     check_recording(decoder, recording)
     check_symbols(recording, "choose a code by")
-    levels, mask = recording.levels, pilots_of(decoder, recording)
+    levels, mask = decoder.bundle.levels(recording.levels), pilots_of(decoder, recording)
     errors: list[NDArray[np.float32]] = []
     concentrations: list[NDArray[np.float32]] = []
     refused: list[RefusedPage] = []
@@ -71,11 +72,12 @@ def choose_code(
     def draw(levels: int, rng: np.random.Generator) -> Sequence[DrawnPage]:
         pages = []
         for error, kappa in zip(errors, concentrations, strict=True):
+            shown = decoder.bundle.levels(levels)
             symbols = rng.integers(0, levels, mask.shape, dtype=np.int64).astype(np.uint8)
-            phase = symbol_phases(symbols, levels) + error
-            pilots = Pilots.of_symbols(mask, symbols, levels)
-            phase = phase - decoder.phase_refit.error(phase, kappa, levels, pilots)
-            pages.append(DrawnPage(phase[data], kappa[data].astype(np.float64), symbols[data]))
+            phase = symbol_phases(symbols, shown) + error
+            pilots = Pilots.of_symbols(mask, symbols, shown)
+            phase = phase - decoder.phase_refit.error(phase, kappa, shown, pilots)
+            pages.append(DrawnPage(phase[data], kappa[data].astype(np.float64), symbols[data], shown))
         return pages
 
     return choose(draw, float(np.mean(rates)) if rates else 1.0, mask, headroom)

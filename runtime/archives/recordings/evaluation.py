@@ -14,6 +14,7 @@ from lightpage.metrics.accumulator import Accumulator
 from lightpage.metrics.information import achievable_rate, page_kilobytes
 from lightpage.metrics.measures import PageMeasures, SymbolMaps
 from lightpage.metrics.reliability import ConcentrationBin, ConfidenceBin
+from lightpage.page.levels import Levels
 from lightpage.page.pilots import Pilots, estimate_piston
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
@@ -156,7 +157,7 @@ def decode_unseen(
     """
     if symbols is None or was_seen(decoder, frames):
         return None
-    pilots = Pilots.of_symbols(mask, symbols, recording.levels)
+    pilots = Pilots.of_symbols(mask, symbols, decoder.bundle.levels(recording.levels))
     return tracker.decode(narrow(frames, recording.bit_depth), recording.levels, pilots)
 
 
@@ -204,7 +205,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
     """
     check_recording(decoder, recording)
     check_symbols(recording)
-    levels = recording.levels
+    levels = decoder.bundle.levels(recording.levels)
     data = ~pilots_of(decoder, recording)
     accumulator = Accumulator(levels, data, recording.pages)
     timings: list[Timings] = []
@@ -249,7 +250,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
     )
 
 
-def _describe(decoder: Decoder, levels: int) -> dict[str, Any]:
+def _describe(decoder: Decoder, levels: Levels) -> dict[str, Any]:
     """The bundle's device and origin, the hash of its golden page, and the piston in the answer to that, radians."""
     bundle, manifest = decoder.bundle, decoder.bundle.manifest
     return {
@@ -257,5 +258,5 @@ def _describe(decoder: Decoder, levels: int) -> dict[str, Any]:
         "provider": str(decoder.graph.provider),
         **manifest.model_dump(include={"name", "precision", "profile", "calibration", "metrics", "provenance"}),
         "golden_sha256": manifest.files[GOLDEN],
-        "golden_piston_rad": estimate_piston(bundle.golden.p, decoder.pilots(levels)).angle_rad,
+        "golden_piston_rad": estimate_piston(bundle.golden.p, decoder.pilots(levels.count)).angle_rad,
     }

@@ -257,7 +257,8 @@ class PageReader:
             raise RecordingError(f"{subject}: levels", recording.levels, f"{code.levels}, as the code has")
         if not np.array_equal(pilots_of(decoder, recording), mask):
             raise RecordingError(f"{subject}: pilots", "other places", "those of the bundle")
-        self.codec = PageCodec(code, mask)
+        self._levels = decoder.bundle.levels(code.levels)
+        self.codec = PageCodec(code, mask, self._levels)
         self._bit_depth, self._tracker, self._give_up = recording.bit_depth, tracker, give_up
         self._pilots = decoder.written_pilots(code.levels)
         self._next = Successor()
@@ -278,11 +279,11 @@ class PageReader:
         Raises:
             StorageError: the frames could not be read, which says nothing of the page, and it is not given up.
         """
-        expected, levels = self._next.header, self.codec.code.levels
+        expected = self._next.header
         try:
             frames, symbols = shown.result()
             start = time.perf_counter()
-            page = self._tracker.decode(narrow(frames, self._bit_depth), levels, self._pilots)
+            page = self._tracker.decode(narrow(frames, self._bit_depth), self._levels.count, self._pilots)
             decoded = time.perf_counter()
             found = self.codec.decode(page.phase, page.concentration, expected)
             read = time.perf_counter()
@@ -306,7 +307,7 @@ class PageReader:
             found.corrected,
             found.failed_blocks,
             found.iterations,
-            None if symbols is None else air_bits(page, symbols, ~self.codec.pilots, levels),
+            None if symbols is None else air_bits(page, symbols, ~self.codec.pilots, self._levels),
             decoded - start,
             read - decoded,
         )

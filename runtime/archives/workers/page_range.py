@@ -65,10 +65,11 @@ class PageRange:
     def _decoded(self) -> Findings:
         """Symbols, confidences, and figures where the symbols are known."""
         levels, mask = self.recording.levels, pilots_of(self.decoder, self.recording)
+        shown = self.decoder.bundle.levels(levels)
         records: list[PageRecord] = []
 
         def decode(frames: FramePair, symbols: Symbols | None) -> DecodedPage:
-            pilots = self.decoder.pilots(levels, mask) if symbols is None else Pilots.of_symbols(mask, symbols, levels)
+            pilots = self.decoder.pilots(levels, mask) if symbols is None else Pilots.of_symbols(mask, symbols, shown)
             return self.tracker.decode(narrow(frames, self.recording.bit_depth), levels, pilots)
 
         with ExitStack() as stack:
@@ -80,7 +81,7 @@ class PageRange:
                     writer.append(found.symbols, found.confidence, self.decoder.version, page)
                 measures = None
                 if symbols is not None and not mask.all():
-                    measures = measure(found.phase[~mask], found.concentration[~mask], symbols[~mask], levels)
+                    measures = measure(found.phase[~mask], found.concentration[~mask], symbols[~mask], shown)
                 records.append(_read_record(page, found, measures))
         return Findings(pages=tuple(records))
 
@@ -92,7 +93,7 @@ class PageRange:
         """
         check_symbols(self.recording)
         mask = pilots_of(self.decoder, self.recording)
-        accumulator = Accumulator(self.recording.levels, ~mask, len(self.task.pages))
+        accumulator = Accumulator(self.decoder.bundle.levels(self.recording.levels), ~mask, len(self.task.pages))
         records: list[PageRecord] = []
 
         def decode(frames: FramePair, symbols: Symbols | None) -> DecodedPage | None:

@@ -18,6 +18,7 @@ from lightpage.device.profile import parse_profile
 from lightpage.errors import InvalidInputError, LightpageError, LostPageError, RecordingError, SourceError, StorageError
 from lightpage.files import write_json
 from lightpage.metrics.measures import PageMeasures, measure
+from lightpage.page.levels import Levels
 from lightpage.page.symbols import pilot_symbols
 from lightpage.progress import track, warn
 from lightpage.recording.decoded_file import DecodedWriter
@@ -169,7 +170,9 @@ def _measured(page: RemotePage) -> PageMeasures | None:
     if page.pilot_mask.all():
         return None
     data = ~page.pilot_mask
-    return measure(page.phase[data], page.concentration[data], page.written[data], page.levels)
+    return measure(
+        page.phase[data], page.concentration[data], page.written[data], Levels(page.levels, page.level_phases)
+    )
 
 
 def _read(client: LightpageClient, count: int, levels: int) -> Iterator[RemotePage | RefusedPage]:

@@ -101,6 +101,11 @@ def _of_calibration(lines: list[Line], levels: int, subject: str) -> NDArray[np.
         if grey in points:
             raise InvalidInputError(where, f"grey value {grey} once more", "one phase per grey value")
         points[grey] = _number(words[0], where)
+    return _of_curve(points, levels, subject)
+
+
+def _of_curve(points: dict[int, float], levels: int, subject: str) -> NDArray[np.uint8]:
+    """Grey values interpolated between those whose phases, radians, are known."""
     if len(points) < 2:
         raise InvalidInputError(subject, f"a calibration of {len(points)} grey values", "at least 2")
     greys = np.array(sorted(points))
@@ -117,6 +122,22 @@ def _of_calibration(lines: list[Line], levels: int, subject: str) -> NDArray[np.
         raise InvalidInputError(subject, f"phases over {span:.4g} rad", f"{wanted[-1]:.4g} rad for {levels} levels")
     found: NDArray[np.float64] = np.interp(phase[0] + wanted, phase, greys)
     return found.round().astype(np.uint8)
+
+
+def calibration_text(curve: dict[int, float]) -> str:
+    """A file with the phase, radians, of grey values."""
+    lines = [f"{phase:.5f} {grey}" for grey, phase in sorted(curve.items())]
+    return "\n".join([" ".join(CALIBRATION_HEADER), *lines]) + "\n"
+
+
+def levels_text(curve: dict[int, float], levels: int, subject: str) -> str:
+    """A file with the grey values of so many levels, by the phases, radians, of some.
+
+    Raises:
+        InvalidInputError: see `read_table`; it is about `subject`.
+    """
+    greys = _different(_of_curve(curve, levels, subject), subject)
+    return "\n".join([*LEVELS_HEADER, *map(str, greys.tolist())]) + "\n"
 
 
 def _different(greys: NDArray[np.uint8], subject: str) -> NDArray[np.uint8]:

@@ -23,7 +23,9 @@ from lightpage.errors import BundleError, CalibrationError, InvalidInputError, P
 from lightpage.failures import os_errors, os_failure
 from lightpage.files import move_to_new_name, sync_folder, synchronise
 from lightpage.metrics.information import decide
-from lightpage.page.symbols import check_levels, pilot_mask, pilot_symbols
+from lightpage.page.levels import Levels, check_levels
+from lightpage.page.modulation import NOMINAL, Modulation
+from lightpage.page.symbols import pilot_mask, pilot_symbols
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.archive import MAX_BYTES, MAX_FILES, check_name, read_files
 from lightpage.runtime.model.bundle.manifest import (
@@ -155,6 +157,25 @@ class Bundle:
         return calibration
 
     @cached_property
+    def modulation(self) -> Modulation:
+        """What the modulator makes of its levels; nominal where the calibration does not tell.
+
+        Raises:
+            CalibrationError: see `calibration`.
+        """
+        # a document that tells nothing of it need not be read, which takes modules that decoding does without
+        return self.calibration.modulator if "\n[modulation]" in self.manifest.calibration else NOMINAL
+
+    def levels(self, count: int) -> Levels:
+        """So many levels of a page, as this device shows them.
+
+        Raises:
+            CalibrationError: see `calibration`.
+            PageError: a level count outside 2..256.
+        """
+        return self.modulation.page_levels(count)
+
+    @cached_property
     def table(self) -> SamplingTable:
         """Re-traced tensors that replace the graph's defaults, by input name; empty where there are none.
 
@@ -195,7 +216,7 @@ class Bundle:
 
     @cached_property
     def pilot_phases(self) -> NDArray[np.float32] | None:
-        """The device's own fixed pilot phases, radians, one a True of `pilot_mask` in row order.
+        """The device's own fixed pilots as nominal phases, radians, one a True of `pilot_mask` in row order.
 
         None where the pilots follow the profile's seeded pattern.
 

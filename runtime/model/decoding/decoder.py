@@ -24,9 +24,8 @@ from lightpage.errors import (
 )
 from lightpage.failures import short_resource
 from lightpage.metrics.information import decide_with_confidence
-from lightpage.page.levels import MAX_LEVELS
+from lightpage.page.levels import MAX_LEVELS, check_levels
 from lightpage.page.pilots import Pilots, read_pilots, remove_piston
-from lightpage.page.symbols import check_levels, symbol_phases
 from lightpage.recording.exposure import check_light
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.bundle import Bundle
@@ -148,14 +147,14 @@ class Decoder:
             mask: where a page's pilots are, bool [ny, nx], if not where the bundle has them: then the pattern holds.
         """
         if mask is not None and not np.array_equal(mask, self.bundle.pilot_mask):
-            return Pilots.of_profile(self.bundle.profile, levels, mask)
+            return Pilots.of_profile(self.bundle.profile, self.bundle.levels(levels), mask)
         if levels not in self._pilots:
             # Two threads may both do this; the results are equal and either may stay.
             own, phases = self.bundle.pilot_mask, self.bundle.pilot_phases
             self._pilots[levels] = (
-                Pilots.of_profile(self.bundle.profile, levels, own)
+                Pilots.of_profile(self.bundle.profile, self.bundle.levels(levels), own)
                 if phases is None
-                else Pilots(own, phases.astype(np.float64))
+                else Pilots(own, self.bundle.modulation.phase(phases.astype(np.float64)))
             )
         return self._pilots[levels]
 
@@ -231,7 +230,8 @@ class Decoder:
         if self.bundle.code is None:
             raise NoCodeError(f"{self.bundle.subject}: code", "none", "one, as `lightpage code --out-bundle` adds it")
         with raised_as(BundleError, InvalidInputError, about=f"{self.bundle.subject}: "):
-            return PageCodec(self.bundle.code, self.bundle.pilot_mask)
+            code = self.bundle.code
+            return PageCodec(code, self.bundle.pilot_mask, self.bundle.levels(code.levels))
 
     def written_pilots(self, levels: int) -> Pilots:
         """The pilots of pages that were written at `levels` levels, each on one of them.
@@ -239,7 +239,8 @@ class Decoder:
         Raises:
             PageError: a level count outside 2..256.
         """
-        return Pilots(self.bundle.pilot_mask, symbol_phases(self.bundle.written_pilots(levels), levels))
+        written, shown = self.bundle.written_pilots(levels), self.bundle.levels(levels)
+        return Pilots(self.bundle.pilot_mask, shown.phases[written])
 
     def decode(self, pair: FramePair, levels: int = 256, pilots: Pilots | None = None) -> DecodedPage:
         """Decode a frame pair into symbols of `levels` levels.
@@ -263,13 +264,13 @@ class Decoder:
 
     def post_process(self, inference: Inference, levels: int, pilots: Pilots | None = None) -> DecodedPage:
         """Piston, smooth phase error, trust and decision: all that is behind the graph, timings left at zero."""
-        known = pilots or self.pilots(levels)
+        known, shown = pilots or self.pilots(levels), self.bundle.levels(levels)
         reading = read_pilots(inference.p, known)
         phase = remove_piston(inference.phase, reading.piston.angle_rad)
-        error = self.phase_refit.error(phase, inference.concentration, levels, known)
+        error = self.phase_refit.error(phase, inference.concentration, shown, known)
         phase = remove_piston(phase, error)
         concentration = inference.concentration * np.float32(reading.trust)
-        symbols, confidence = decide_with_confidence(phase, concentration, levels)
+        symbols, confidence = decide_with_confidence(phase, concentration, shown)
         return DecodedPage(
             symbols=symbols,
             confidence=confidence,
@@ -282,6 +283,7 @@ class Decoder:
             check=reading.check,
             timings=Timings(0.0, 0.0, 0.0),
             phase_error=error,
+            level_phases=shown.uneven,
         )
 
     def _check_graph(self) -> None:
@@ -343,7 +345,12 @@ class BundleFieldSolver:
             raise BundleError(f"{self._subject}: outputs", f"no {', '.join(sorted(missing))}", "a graph with its field")
 
     def __call__(
-        self, pair: FramePair, references: FramePair, registration: NDArray[np.float32], homodyne: NDArray[np.float32]
+        self,
+        pair: FramePair,
+        references: FramePair,
+        registration: NDArray[np.float32],
+        homodyne: NDArray[np.float32],
+        apart: NDArray[np.float32] | None = None,
     ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
         """Field and what is left of the equations, see `FieldSolver`; whatever the page's residual is.
 
@@ -357,6 +364,8 @@ class BundleFieldSolver:
             "registration": registration,
             "homodyne": homodyne,
         }
+        if "apart" in self._graph.ports:
+            table["apart"] = _together(self._graph.value("apart")) if apart is None else apart
         self._graph.check(table)
         feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **table}
         if not self._alone:
@@ -367,3 +376,10 @@ class BundleFieldSolver:
             expected = f"{wanted}, or a {FIELD} beside it"
             raise BundleError(f"{self._subject}: output field", f"shape {real.shape}", expected)
         return np.asarray(real + 1j * imaginary, np.complex64), left
+
+
+def _together(apart: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The kernel of cameras that see the same plane, in the shape of another one."""
+    kernel = np.zeros_like(apart)
+    kernel[0, apart.shape[1] // 2] = 1
+    return kernel

@@ -24,6 +24,7 @@ from lightpage.calibration.phases import tilt_of_shift
 from lightpage.calibration.sampling_table import SamplingTable, sampling_table, shifted, symbol_centres
 from lightpage.device.profile import Profile
 from lightpage.errors import BundleError, FrameError
+from lightpage.page.levels import Levels
 from lightpage.page.pilots import Pilots, read_pilots
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.decoding.decoder import Decoder
@@ -124,18 +125,18 @@ class DriftModel:
         """What `drift` [4] adds to decoded phases [ny, nx], radians, first order."""
         return np.asarray(np.tensordot(drift, self.slopes, 1))
 
-    def estimate(self, inference: Inference, levels: int, pilots: Pilots, prior: Real) -> Estimate | None:
+    def estimate(self, inference: Inference, levels: int | Levels, pilots: Pilots, prior: Real) -> Estimate | None:
         """Drift that a page still shows, from its pilots and then from safe decisions too; None where pilots disagree.
 
         The 54 pilots of a bench page show shift to 0.01 px per axis; with the safe decisions of 16 levels it is 0.005.
 
         Args:
             inference: what the graph says of the page.
-            levels: M.
+            levels: M, or uneven levels.
             pilots: its known symbols.
             prior: covariance [4, 4] of the drift about zero before the page was seen.
         """
-        concentration = inference.concentration.astype(np.float64)
+        levels, concentration = Levels.of(levels), inference.concentration.astype(np.float64)
         phase = inference.phase - read_pilots(inference.p, pilots).piston.angle_rad
         at = pilots.mask
         residual, weight = wrapped(phase[at] - pilots.phases), np.minimum(concentration[at], _CAP)
@@ -146,9 +147,8 @@ class DriftModel:
             return None
         concentration /= coarse.over_claim
         freed = phase - coarse.constant_rad - self.phase_change(coarse.drift)
-        step = 2 * np.pi / levels
-        safe = SAFE_DEVIATIONS / np.sqrt(np.maximum(concentration, 1e-9)) < np.pi / levels
-        decided = np.rint(freed / step) * step
+        safe = SAFE_DEVIATIONS / np.sqrt(np.maximum(concentration, 1e-9)) < levels.half_way(freed)
+        decided = levels.nearest_phases(freed)
         decided[at] = pilots.phases
         chosen = safe | at
         weight = np.minimum(concentration[chosen], _CAP)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.image_search import FEWEST_SEARCHED, FoundImage
 from lightpage.calibration.sampling_table import SamplingTable
+from lightpage.page.levels import Levels
 from lightpage.page.pilots import PilotCheck, Pilots, read_pilots
-from lightpage.page.symbols import check_levels
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.manifest import FIELD
 from lightpage.runtime.model.decoding.decoder import Decoder
@@ -229,7 +229,7 @@ class ImageTracker:
         """
         _ = self._model.slopes  # of a new tracker still being measured; two inferences at once may not fit the memory
         begun, clock = self.state, _Clock()
-        check_levels(levels)
+        shown = self._decoder.bundle.levels(levels)
         self._decoder.check(pair)
         pilots = pilots or self._decoder.pilots(levels)
         clock.add("check_s")
@@ -238,14 +238,14 @@ class ImageTracker:
             found = self._search.find(pair, pilots, self._around(begun))
             state = self._moved_to(found, begun)
             clock.add("search_s")
-        best = self._attempts(pair, state, levels, pilots, found, clock)
+        best = self._attempts(pair, state, shown, pilots, found, clock)
         step = best.step if found is None else None
         if found is None and self._search is not None and _search_may_pay(best.check, begun):
             found = self._search.find(pair, pilots, self._around(begun))
             moved = self._moved_to(found, best.after)
             clock.add("search_s")
             if moved is not best.after:
-                there = self._attempts(pair, moved, levels, pilots, found, clock)
+                there = self._attempts(pair, moved, shown, pilots, found, clock)
                 if not _worse(there, best):
                     best, step = there, None
         page = self._decoder.post_process(best.inference, levels, pilots)
@@ -255,7 +255,13 @@ class ImageTracker:
         return confirmed(page, found)
 
     def _attempts(
-        self, pair: FramePair, state: ImageState, levels: int, pilots: Pilots, found: FoundImage | None, clock: _Clock
+        self,
+        pair: FramePair,
+        state: ImageState,
+        levels: Levels,
+        pilots: Pilots,
+        found: FoundImage | None,
+        clock: _Clock,
     ) -> _Attempt:
         """Decode at a place, and again where the page shows that its image lies: the best one, with the first step."""
         enough = SEARCHED_PX if found is not None and found.found else np.inf
@@ -275,7 +281,7 @@ class ImageTracker:
         assert best is not None  # at least one attempt
         return best
 
-    def _read(self, inference: Inference, state: ImageState, levels: int, pilots: Pilots) -> _Attempt:
+    def _read(self, inference: Inference, state: ImageState, levels: Levels, pilots: Pilots) -> _Attempt:
         """Take in what a decoded page shows of drift beyond what its state knows."""
         known = inference.turned(-self._model.phase_change(state.untraced))
         many = len(pilots.phases) >= FEWEST_PILOTS
@@ -298,7 +304,7 @@ class ImageTracker:
         return _Attempt(state, after, freed, check, prior, jumped or after.decoder is not state.decoder, step)
 
     def _freed(
-        self, known: Inference, tilt: Real, levels: int, pilots: Pilots, prior: Real
+        self, known: Inference, tilt: Real, levels: Levels, pilots: Pilots, prior: Real
     ) -> tuple[Inference, Real, Real, PilotCheck]:
         """A page freed from a tilt and from what drift it shows then; all of that drift, its covariance, the check."""
         guess = np.concatenate([np.zeros(2), tilt])

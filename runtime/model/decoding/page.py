@@ -74,6 +74,7 @@ class DecodedPage:
         check: information that is claimed of the pilots, and what of it they confirm.
         timings: seconds.
         phase_error: float32 [ny, nx], smooth error that was taken off `phase`, radians.
+        level_phases: phase that stands for each level, radians; None where level s is 2 pi s / M.
         image: where the image lies as this page shows it, None where it is not followed.
     """
 
@@ -88,6 +89,7 @@ class DecodedPage:
     check: PilotCheck
     timings: Timings
     phase_error: NDArray[np.float32]
+    level_phases: tuple[float, ...] | None = None
     image: ImagePosition | None = None
 
     @cached_property

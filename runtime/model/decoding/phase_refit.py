@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.page.levels import Levels
 from lightpage.page.pilots import Pilots
 
 _Floats = NDArray[np.floating]
@@ -58,14 +59,14 @@ class PhaseRefit:
         self._filled, self._sizes = own[self._starts], np.diff(self._starts, append=len(own))
 
     def error(
-        self, phase: _Floats, concentration: _Floats, levels: int, pilots: Pilots, rounds: int = ROUNDS
+        self, phase: _Floats, concentration: _Floats, levels: int | Levels, pilots: Pilots, rounds: int = ROUNDS
     ) -> NDArray[np.float32]:
         """The smooth error of a page's phases, radians [ny, nx]: to be taken off.
 
         Args:
             phase: radians, piston removed, [ny, nx].
             concentration: von Mises kappa, [ny, nx].
-            levels: M.
+            levels: M, or uneven levels.
             pilots: the known symbols of this page.
             rounds: of expectation maximisation.
         """
@@ -78,10 +79,10 @@ class PhaseRefit:
         planes = self._planes[:, self._taken]
         # sums and no matrix products: those wake threads, which go on looking for work on cores that others need
         normal = np.moveaxis(self._sums(self._products * kappa), -1, 0) + np.eye(len(planes)) / _PRIOR_RAD**2
-        step, coefficients = 2 * np.pi / levels, np.zeros((len(self._filled), len(planes)))
+        levels, coefficients = Levels.of(levels), np.zeros((len(self._filled), len(planes)))
         for _ in range(rounds):
             left = mu - _at(planes, np.repeat(coefficients.T, self._sizes, axis=1))
-            distance = _mean_distance(left, kappa, step)
+            distance = _mean_distance(left, kappa, levels)
             distance[is_known] = wrapped(left[is_known] - truth[is_known])
             gradient = self._sums(planes * (kappa * distance)).T - coefficients / _PRIOR_RAD**2
             coefficients = coefficients + np.linalg.solve(normal, gradient[..., None])[..., 0]
@@ -100,11 +101,16 @@ def _at(planes: NDArray[np.float64], coefficients: NDArray[np.float64]) -> NDArr
     return np.asarray(sum(others, first))
 
 
-def _mean_distance(mu: NDArray[np.float64], kappa: NDArray[np.float64], step: float) -> NDArray[np.float64]:
+def _mean_distance(mu: NDArray[np.float64], kappa: NDArray[np.float64], levels: Levels) -> NDArray[np.float64]:
     """Distance of each phase to the levels about it, the mean over their posterior, radians [symbols]."""
-    few = min(_NEIGHBOURS, max(0, round(2 * np.pi / step) - 1) // 2)
-    offsets = np.float32(step) * np.arange(-few, few + 1, dtype=np.float32)[:, None]  # in rows: sums take whole arrays
-    away = (mu - np.rint(mu / step) * step).astype(np.float32)
+    few = min(_NEIGHBOURS, (levels.count - 1) // 2)
+    neighbours = np.arange(-few, few + 1)  # in rows: sums take whole arrays
+    places, nearest = levels.around(mu)
+    if levels.is_nominal:
+        offsets = np.float32(2 * np.pi / levels.count) * neighbours.astype(np.float32)[:, None]
+    else:
+        offsets = levels.gaps(neighbours).astype(np.float32)[:, places]
+    away = (mu - nearest).astype(np.float32)
     near, k = np.cos(away), kappa.astype(np.float32)
     # cos(away - offset) - cos(away), without a cosine each
     weight = np.exp(np.sin(offsets) * (k * np.sin(away)) - 2 * np.sin(0.5 * offsets) ** 2 * (k * near))

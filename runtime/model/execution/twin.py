@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.calibration.interfaces import Rays
-from lightpage.calibration.parameters import NAMES
+from lightpage.calibration.parameters import KNOWN, NAMES
 from lightpage.errors import BundleError
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import TWIN
@@ -27,6 +27,9 @@ class OnnxTwin:
     Args:
         bundle: an opened bundle.
 
+    Attributes:
+        known: how many of the parameters it knows, the first ones; see `KNOWN`.
+
     Raises:
         BundleError: the graph is no twin with the parameters of `lightpage.calibration.parameters`.
     """
@@ -39,8 +42,9 @@ class OnnxTwin:
         if found != (expected := {name: ("tensor(double)", axes) for name, axes in INPUTS.items()}):
             raise BundleError(f"{subject}: inputs", found, expected)
         size = next(node.shape for node in inputs if node.name == "parameters")[0]
-        if isinstance(size, int) and size != len(NAMES):
+        if isinstance(size, int) and size not in KNOWN:
             raise BundleError(f"{subject}: parameters", size, f"{len(NAMES)}: {', '.join(NAMES)}")
+        self.known = size if isinstance(size, int) else len(NAMES)
         if missing := set(OUTPUTS) - {node.name for node in self._session.get_outputs()}:
             raise BundleError(f"{subject}: outputs", f"no {', '.join(sorted(missing))}", ", ".join(OUTPUTS))
 
@@ -50,7 +54,7 @@ class OnnxTwin:
             rays = [self.trace(one, points, anchors) for one in parameters]
             return Rays(*(np.stack(part) for part in zip(*rays, strict=True)))
         feeds = {
-            "parameters": _doubles(parameters),
+            "parameters": _doubles(parameters[: self.known]),
             "points": _doubles(points),
             "anchors": _doubles(points if anchors is None else anchors),
             "camera_places": _doubles(points[:1]),
@@ -63,7 +67,8 @@ class OnnxTwin:
         if parameters.ndim == 2:
             return np.stack([self.pixels(one, places) for one in parameters])
         one = _doubles(places[:1])
-        feeds = {"parameters": _doubles(parameters), "points": one, "anchors": one, "camera_places": _doubles(places)}
+        known = _doubles(parameters[: self.known])
+        feeds = {"parameters": known, "points": one, "anchors": one, "camera_places": _doubles(places)}
         with running(self._subject):
             pixels: Real = self._session.run(OUTPUTS[3:], feeds)[0]
         return pixels

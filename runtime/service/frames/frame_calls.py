@@ -231,7 +231,7 @@ class FrameCalls:
         levels = levels_for(decoder, options.levels or None, self._plane.default_levels, options.want_user_data)
         if not header.HasField("pilots"):
             return None
-        return pilots_of(header.pilots, decoder.bundle.profile.page_shape, levels)
+        return pilots_of(header.pilots, decoder.bundle, levels)
 
     def _decode(self, receiver: PairReceiver, header: pb.DecodeHeader, call: Call, stages: Stages) -> pb.DecodeReply:
         """Decode a pair that was received, and let go of it."""

@@ -9,11 +9,12 @@ import numpy as np
 
 from lightpage.codec.page_bytes import FileFacts, PageBytes
 from lightpage.errors import CallerLeft, FrameError, InvalidInputError, LimitError, PageError
+from lightpage.page.levels import check_levels
 from lightpage.page.pilots import Pilots
-from lightpage.page.symbols import check_levels, symbol_phases
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import PIXEL_TYPES, message_of
+from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.service.admission import Bytes, ReceiveBudget
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import Answer, DataPlane, Seen, levels_for, observed
@@ -24,25 +25,23 @@ SESSION_CHARACTERS = 1024
 """Of the name of a session, at most: the service remembers it."""
 
 
-def pilots_of(message: pb.Pilots, page_shape: tuple[int, int], levels: int) -> Pilots:
-    """Pilots that a caller sent.
+def pilots_of(message: pb.Pilots, bundle: Bundle, levels: int) -> Pilots:
+    """Pilots that a caller sent, as the bundle's device shows them.
 
     Raises:
         PageError: sizes that do not fit the page, or levels out of range.
     """
-    flags = np.frombuffer(message.mask, np.uint8)
+    page_shape, flags = bundle.profile.page_shape, np.frombuffer(message.mask, np.uint8)
     values = np.frombuffer(message.values, np.uint8)
     if flags.size and int(flags.max()) > 1:
         raise PageError("pilots", f"a flag of {flags.max()}", "flags of 0 or 1")
     if flags.size != page_shape[0] * page_shape[1] or np.count_nonzero(flags) != values.size:
         got = f"{flags.size} flags, {np.count_nonzero(flags)} of them set, and {values.size} values"
         raise PageError("pilots", got, f"{page_shape[0] * page_shape[1]} flags and one value a set flag")
-    if message.levels:
-        check_levels(message.levels)
-    levels = message.levels or levels
-    if values.size and int(values.max()) >= levels:
-        raise PageError("pilots", f"level {values.max()}", f"0..{levels - 1}")
-    return Pilots(flags.reshape(page_shape) != 0, symbol_phases(values, levels))
+    shown = bundle.levels(message.levels or levels)
+    if values.size and int(values.max()) >= shown.count:
+        raise PageError("pilots", f"level {values.max()}", f"0..{shown.count - 1}")
+    return Pilots(flags.reshape(page_shape) != 0, shown.phases[values])
 
 
 def check_options(options: pb.DecodeOptions) -> None:
@@ -241,6 +240,7 @@ def decode_reply(
         confidence_format=options.confidence_format or pb.CONFIDENCE_FORMAT_FLOAT32,
         concentration=page.concentration if options.want_concentration else None,
         phase=page.phase if options.want_phase else None,
+        level_phases=page.level_phases if options.want_phase else None,
         recalibration_reasons=_recalibration_reasons(answer),
         user_data=None if answer.user_data is None else user_data_message(answer.user_data),
         timings=message_of(pb.Timings, answer, decode_s=page.timings.total_s, inference_s=page.timings.inference_s),

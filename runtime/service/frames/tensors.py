@@ -184,8 +184,8 @@ def outputs_of(request: Request, known: Collection[str], usual: Sequence[str]) -
 def parameters_message(message: Any, left_out: Collection[str] = (), prefix: str = "") -> dict[str, oip.InferParameter]:
     """All that a message says as parameters: `name`, or `outer.name` of a message in it.
 
-    Bytes are left out, and so are messages that are not set. A name of an enum is without its prefix; names in a list
-    are separated by commas.
+    Bytes are left out, and so are messages that are not set. A name of an enum is without its prefix; names or
+    numbers in a list are separated by commas.
     """
     found: dict[str, oip.InferParameter] = {}
     for field in message.DESCRIPTOR.fields:
@@ -198,6 +198,8 @@ def parameters_message(message: Any, left_out: Collection[str] = (), prefix: str
         elif field.enum_type is not None:
             names = [_enum_name(field.enum_type, each) for each in (value if field.is_repeated else [value])]
             found[name] = oip.InferParameter(string_param=",".join(names))
+        elif field.is_repeated:
+            found[name] = oip.InferParameter(string_param=",".join(map(str, value)))
         else:
             found[name] = oip.InferParameter(**{_PARAMETERS[type(value)]: value})
     return found

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.errors import CallerLeft, InvalidInputError, LimitError, MalformedError, PageError, StalledError
-from lightpage.page.symbols import check_levels, check_symbols
+from lightpage.page.levels import check_levels
+from lightpage.page.symbols import check_symbols
 from lightpage.recording.black_level import without_black
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import frame_type

@@ -117,7 +117,7 @@ def read_page(
                 raise SourceError(f"{source.name}: pilots", "other places", "those of the model in service")
             # Pilots are what was written, whatever level count the caller wants to see.
             if found.symbols is not None:
-                pilots = Pilots.of_symbols(mask, found.symbols, source.levels)
+                pilots = Pilots.of_symbols(mask, found.symbols, model.decoder.bundle.levels(source.levels))
             else:
                 own = model.decoder
                 pilots = own.written_pilots(levels) if user_data else own.pilots(source.levels, mask)

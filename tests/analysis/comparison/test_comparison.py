@@ -10,15 +10,13 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from analysis.comparison import calibration, decoders, kept_figures
-from analysis.comparison.calibration_bench import Bench, Outcome
+from analysis.comparison import decoders, kept_figures
 from analysis.comparison.kept_figures import FOURTH_DIGIT
 from analysis.comparison.outcome import symbols_by_walls
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.document import Calibration
 from lightpage.calibration.parameters import NAMES
 from lightpage.device.state import Device, ideal_device
-from lightpage.errors import InvalidInputError
 from lightpage.page.symbols import pilot_mask
 from lightpage.simulator.true_optics import true_parameters
 from lightpage.train.fitting.fitted import FITTED_WEIGHTS
@@ -78,30 +76,3 @@ def test_the_command_compares_methods_and_says_what_the_device_is(tmp_path: Path
     assert float(line[1]) == pytest.approx(float(line[2]), abs=FOURTH_DIGIT)
     trained, kept = sorted((tmp_path / "figures").rglob(FITTED_WEIGHTS))
     assert trained.read_bytes() != kept.read_bytes()
-
-
-def test_calibrations_that_are_done_are_not_done_again_and_what_failed_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    drawn = list[int]()
-
-    def outcome(bench: Bench, seed: int) -> Outcome:
-        drawn.append(seed)
-        failure = "not found" if drawn.count(6) == 1 and seed == 6 else None
-        error = None if failure else 0.001 * seed
-        return Outcome(seed, -0.6, angle_error_deg=error, seconds=2.0, failure=failure)
-
-    def run(*words: str) -> None:
-        CliRunner().invoke(calibration.main, words, standalone_mode=False, catch_exceptions=False)
-
-    monkeypatch.setattr(Bench, "own", outcome)
-    path = tmp_path / "F.json"
-    for devices, calibrated in (("2", 1), ("3", 3)):
-        run("--symbol-size", "2", "--first-seed", "5", "--json", str(path), "--devices", devices)
-        found = json.loads(path.read_text())["summary"]
-        assert (found["devices"], found["calibrated"]) == (int(devices), calibrated)
-    assert drawn == [5, 6, 6, 7]
-    assert found["angle_error_deg_worst"] == pytest.approx(0.007)
-    assert found["angle_error_deg_median"] == pytest.approx(0.006)
-    with pytest.raises(InvalidInputError, match="a new name"):
-        run("--first-seed", "5", "--json", str(path))

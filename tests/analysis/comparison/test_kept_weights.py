@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from analysis.comparison.kept_weights import LARGE, MOST_MOVED_BITS, moved_bits, read_weights, steps, write_weights
-from lightpage.errors import InvalidInputError
 from lightpage.train.data.pages import Page
 from lightpage.train.fitting.concentration_scale import decode_pages
 from lightpage.train.fitting.modules import SymbolTraining
@@ -77,19 +76,3 @@ def test_what_is_said_moves_by_the_relative_entropy() -> None:
     before, after = log_density(said), log_density(now)
     assert moved_bits(said, now) == pytest.approx(np.sum(np.exp(before) * (before - after)) / np.log(2), rel=1e-6)
     assert moved_bits(said, said) == 0
-
-
-def test_the_largest_numbers_of_the_finest_step_keep_their_sign(tmp_path: Path) -> None:
-    most = 127 * 256 + 127
-    weights = {"weight": torch.linspace(-1, 1, 2001)}
-    write_weights(tmp_path / "kept", weights, {"weight": 1 / most})
-    torch.testing.assert_close(read_weights(tmp_path / "kept")["weight"], weights["weight"], rtol=0, atol=0.51 / most)
-
-
-def test_damaged_weights_are_refused(tmp_path: Path) -> None:
-    write_weights(tmp_path / "kept", {"weight": torch.ones(3)}, {})
-    whole = (tmp_path / "kept").read_bytes()
-    for damaged in (whole[:-20], b"", b"weights"):
-        (tmp_path / "kept").write_bytes(damaged)
-        with pytest.raises(InvalidInputError, match="kept weights"):
-            read_weights(tmp_path / "kept")

@@ -11,14 +11,8 @@ import pytest
 from click.testing import CliRunner
 
 from analysis.hardware import cameras, latency, pairs, plugs, scpi
-from analysis.hardware.drifting import DriftingSource, TrueTable, direction, moved
-from analysis.hardware.drifts import alarms, judged
-from analysis.hardware.rows import append_row, kept_rows
 from analysis.hardware.week import figures_of
 from analysis.hardware.week_figure import draw
-from lightpage.device.state import Device
-from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
-from lightpage.runtime.model.decoding.decoder import Decoder
 
 
 def measured(command: click.Command, arguments: str, folder: Path) -> Any:
@@ -70,31 +64,6 @@ def test_scpi(tmp_path: Path) -> None:
     assert found["right"] + sum(found["lost"].values()) == found["queries"] >= 20
 
 
-def test_a_row_that_was_cut_off_is_measured_again(tmp_path: Path) -> None:
-    path = tmp_path / "rows.jsonl"
-    assert kept_rows(path) == []
-    for page in range(3):
-        append_row(path, {"page": page})
-    path.write_text(path.read_text() + '{"page": 3, "a')
-    assert [row["page"] for row in kept_rows(path)] == [0, 1, 2]
-    append_row(path, {"page": 3})
-    assert [json.loads(line)["page"] for line in path.read_text().splitlines()] == [0, 1, 2, 3]
-
-
-def test_the_alarm_is_held_against_the_first_page_whose_margin_is_gone() -> None:
-    margins = {page: 0.12 - 0.002 * max(0, page) for page in range(-25, 70)}
-    rows: list[dict[str, object]] = [
-        {"page": page, "lost": "body" if left <= 0 else "", "figures": {"margin_bits": left, "unread": 0.0}}
-        for page, left in margins.items()
-    ]
-    told = judged(1, rows)
-    assert told["gone"] == 60
-    assert told["alarm"] == pytest.approx(34, abs=2)
-    assert told["pages_ahead"] == 60 - told["alarm"]
-    assert alarms(rows[:30]) == []
-    assert judged(1, rows[:30])["pages_ahead"] is None
-
-
 def row(page: int, **changes: object) -> dict[str, object]:
     plain = {"page": page, "air": 6.6, "true_air": 6.6, "lost": "", "failed": False, "due": False, "during": False}
     return {**plain, "ended": [], "restarted": False, "shift_px": [0.0, 0.1], **changes}
@@ -114,16 +83,3 @@ def test_the_week_is_summed_up_and_drawn(tmp_path: Path) -> None:
     assert [told[name] for name in (*counts, "false_alarms", "restarts")] == [1, 1, 2, 0, 2, 1, 0]
     draw(rows, tmp_path / "week.png", 50, 300.0)
     assert (tmp_path / "week.png").stat().st_size > 10_000
-
-
-# Simulates full pages of the bench device.
-@pytest.mark.long
-def test_with_the_true_table_a_drifted_device_is_read_as_well_as_before() -> None:
-    decoder = Decoder.load(bundle_path(DEFAULT), threads=1)
-    source = DriftingSource(decoder, lambda moment: moved(Device(), moment * direction(1)), seed=1)
-    true_table, found = TrueTable(decoder), list[float]()
-    for moment in (0.0, 3.0):
-        source.moment = moment
-        found.append(true_table.air(source.truth(source.shot().page_index), source.levels))
-    assert found[1] > 0.98 * found[0]
-    assert source.shots == 2

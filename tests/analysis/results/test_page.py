@@ -5,12 +5,10 @@ import os
 from pathlib import Path
 from typing import Any
 
-import pytest
 from click.testing import CliRunner, Result
 
-from analysis.results.measurements import Measurement, collected, kept_measurements
+from analysis.results.measurements import Measurement, kept_measurements
 from analysis.results.page import PAGE, ROOT, Results, main, render
-from lightpage.errors import InvalidInputError
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.shipped import bundle_path
 
@@ -109,9 +107,3 @@ def test_figures_are_collected_without_their_curves_and_what_lacks_is_left_out(t
     written(path, toy(outcome("ray", 3.0)))
     command(tmp_path, "--from", tmp_path / "runs", "--commit", "0123456")
     assert kept_measurements(tmp_path / "kept")["sheared"].figures == figures
-
-
-@pytest.mark.parametrize(("name", "figures"), [("dim", {"pages": 3}), ("demo", {}), ("speed-bench", {}), ("dim", [])])
-def test_figures_of_another_benchmark_are_refused(name: str, figures: object, tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError):
-        collected(name, written(tmp_path / "F.json", figures), "0123456")

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from analysis.scaling import cost
-from analysis.scaling.cluster_model import Cluster, Driver, Work, nodes_that_saturate, simulated
 from analysis.scaling.cost import fitted_driver, main
 from analysis.scaling.node_figures import DriverFigures, NodeFigures, RunFigures
 from lightpage.cli.main import run
@@ -57,31 +55,3 @@ def test_what_a_range_costs_the_driver_is_a_line_through_what_was_measured() -> 
     found = fitted_driver(FIGURES.ray, 2)
     assert (found.base_s, found.in_flight_s) == (pytest.approx(0.000998), pytest.approx(1e-6))
     assert found.range_s(500) == pytest.approx(0.001998)
-
-
-# ---- queues ---------------------------------------------------------------------------------------------------------
-
-
-WORK = Work(page_seconds=(0.5,), read_bytes=1e6, written_bytes=1e4, range_s=0.02, range_pages=8)
-IDLE = Driver(base_s=1e-6, in_flight_s=0.0, ahead=2)
-WIDE = Cluster(nodes=4, workers=2, storage_bytes_per_s=1e15, link_bytes_per_s=1e15)
-
-
-def test_workers_that_wait_for_nothing_read_as_fast_as_they_decode() -> None:
-    rate = simulated(WIDE, WORK, IDLE)
-    assert rate.pages_per_s == pytest.approx(8 / (0.5 + 0.02 / 8), rel=1e-3)
-    assert (rate.efficiency, rate.bound, rate.lost_ranges) == (pytest.approx(1, rel=1e-3), "workers", 0)
-
-
-@pytest.mark.parametrize("part", ["driver", "storage"])
-def test_the_nodes_that_saturate_a_part_by_arithmetic_do_so_in_the_queues(part: str) -> None:
-    driver = Driver(base_s=0.02, in_flight_s=0.001, ahead=2) if part == "driver" else IDLE
-    cluster = replace(WIDE, storage_bytes_per_s=1e15 if part == "driver" else 40e6)
-    nodes = nodes_that_saturate(cluster, WORK, driver)[part]
-    asked = nodes * cluster.workers / WORK.mean_s  # pages a second
-    busy = asked / WORK.range_pages * (driver.base_s + driver.in_flight_s * driver.ahead * nodes * cluster.workers)
-    assert (busy if part == "driver" else asked * 1.01e6 / 40e6) == pytest.approx(1)
-    below, above = (simulated(replace(cluster, nodes=round(share * nodes)), WORK, driver) for share in (0.5, 2.0))
-    assert (below.bound, above.bound) == ("workers", part)
-    assert below.efficiency > 0.95
-    assert getattr(above, part) == pytest.approx(1, abs=0.05)

@@ -7,13 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import click
-import pytest
 from click.testing import CliRunner
 
 from analysis.speed import provider
-from analysis.speed.fidelity import FORMS, HALF, measured, name_of
-from lightpage.recording.reader import Recording
-from lightpage.runtime.model.decoding.decoder import Decoder
 from tests.runtime import toy
 
 
@@ -32,15 +28,3 @@ def test_a_provider_is_compared_with_the_cpu(tmp_path: Path) -> None:
     assert (made["precision"], made["deviation"], made["symbols_changed"]) == ("float32", 0, 0)
     assert made["air"] > 4
     assert set(made["nodes"]) == {"CPUExecutionProvider"}
-
-
-def test_forms_of_a_decoder_are_compared_with_the_usual_one(tmp_path: Path) -> None:
-    toy.write_toy_recording(tmp_path / "r.h5", toy.ToyDevice(), 256, 3)
-    usual, doubtful = toy.decoder_onnx(), toy.decoder_onnx(kappa=100.0)
-    decoder = Decoder.load(toy.write_toy_bundle(tmp_path / "toy.zip"))
-    with Recording.open(tmp_path / "r.h5") as recording:
-        models = {"usual": usual, "doubtful": doubtful}
-        forms = {form.name: form for form in measured(decoder, models, doubtful, recording, 2, "usual")}
-    assert forms["usual"].air > forms["doubtful"].air == forms[HALF].air > 4
-    assert (forms["usual"].deviation, forms["doubtful"].deviation) == (0, pytest.approx(0.75, abs=1e-3))
-    assert len({name_of(form) for form in FORMS}) == len(FORMS)

@@ -13,11 +13,14 @@ from lightpage.calibration.known_pages import known_pages
 from lightpage.calibration.parameters import NAMES, PRIORS
 from lightpage.device.profile import load_profile
 from lightpage.errors import CalibrationError, ProfileError, RecordingError
+from lightpage.page.modulation import NOMINAL
+from lightpage.page.modulation import PRIORS as PRIORS_OF_LEVELS
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
 from lightpage.recording.writer import RecordingWriter
 from tests.lightpage.calibration.flat_twin import FlatTwin
 from tests.lightpage.refused import refused
+from tests.lightpage.uneven import UNEVEN
 
 PROFILE = load_profile("bench")
 HASHES = ("0123456789abcdef" * 4, "f" * 64)
@@ -34,6 +37,8 @@ def calibration() -> Calibration:
         coherence_after=0.8,
         cost=1.3,
         significant=0.7,
+        modulation=UNEVEN,
+        modulation_deviations=tuple(PRIORS_OF_LEVELS / 20),
     )
     return Calibration.from_registered(registered, PROFILE, HASHES)
 
@@ -43,6 +48,7 @@ def test_a_calibration_is_read_back_as_it_was_written(calibration: Calibration, 
     path.write_text("an older one")
     calibration.save(path)
     assert load_calibration(path) == calibration
+    assert load_calibration(path).modulator == UNEVEN
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
 
 
@@ -50,6 +56,12 @@ def test_one_from_before_real_lenses_took_them_for_ideal(calibration: Calibratio
     lines = calibration.to_toml().splitlines()
     old = parse_calibration("\n".join(line for line in lines if not line.startswith("lens_path_relative")))
     assert (old.parameters["lens_path_relative"], old.deviations["lens_path_relative"]) == (-1, 0)
+
+
+def test_one_from_before_modulators_were_fitted_took_their_levels_for_even(calibration: Calibration) -> None:
+    old = parse_calibration(calibration.to_toml().partition("[modulation]")[0])
+    assert old.modulator == NOMINAL
+    assert old == parse_calibration(old.to_toml())
 
 
 def test_the_angle_is_the_profiles_and_the_fitted_one(calibration: Calibration) -> None:
@@ -75,6 +87,8 @@ def test_a_calibration_of_another_profile_is_refused(calibration: Calibration) -
         (HASHES[1], "../../etc/passwd", "calibrated_pages.1 = "),
         ("schema_version = 1", "schema_version = ", "TOML"),
         ("[deviations]", "[variances]", "variances"),
+        ("stroke_relative = -0.1", "stroke = -0.1", "modulation"),
+        ("stroke_relative = -0.1", "stroke_relative = inf", "stroke_relative"),
     ],
 )
 def test_a_wrong_document_is_refused_by_the_name_of_its_key(

@@ -48,10 +48,9 @@ class TestFrameSampler:
         simulator = Simulator(PROFILE, device, seed=1, steps=1)
         symbols = np.random.default_rng(0).integers(256, size=PROFILE.page_shape).astype(np.uint8)
         page, references, optics = simulator.simulate(symbols), simulator.references(), simulator.optics
-        frame, reference = (
-            (page.pair.in_phase, references.in_phase),
-            (page.pair.quadrature, references.quadrature),
-        )[camera]
+        frame, reference = ((page.pair.in_phase, references.in_phase), (page.pair.quadrature, references.quadrature))[
+            camera
+        ]
         sampler = FrameSampler(frame, reference, camera, TWIN, true_parameters(PROFILE, device))
         half = 0.9 * np.array([PROFILE.page_width_m, PROFILE.page_height_m]) / 2
         places = np.random.default_rng(2).uniform(-half, half, (2000, 2))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lightpage.calibration.interfaces import BRANCHES
-from lightpage.calibration.parameters import NAMES, PRIORS
+from lightpage.calibration.parameters import NAMES, PRIORS, indices
 from lightpage.calibration.sampling_table import (
     monomial_powers,
     registration_coefficients,
@@ -29,9 +29,15 @@ def some_device() -> np.ndarray:
     return vector
 
 
+@pytest.mark.parametrize("right", [True, False])
 @pytest.mark.parametrize("profile", [small_profile(), load_profile("bench")], ids=lambda p: p.name)
-def test_four_by_four_samples_rebuilt_from_it_are_those_that_the_twin_traces(profile: Profile) -> None:
+def test_four_by_four_samples_rebuilt_from_it_are_those_that_the_twin_traces(profile: Profile, right: bool) -> None:
     twin, parameters, grid = TorchTwin(RayTwin(profile)), some_device(), field_grid(profile)
+    # a plane off its focal plane moves a landing place by where its branch's light crosses the facet, and the middle of
+    # that light is not linear over a symbol; drawn axial places of some 0.25 rad leave 5e-3
+    off = 1e-3 if right else 5e-3
+    if right:
+        parameters[indices("axial")] = 0
     table = sampling_table(twin, parameters, TURN, profile)
     centres = symbol_centres(profile)
     shape = (len(BRANCHES), *profile.page_shape)
@@ -42,8 +48,8 @@ def test_four_by_four_samples_rebuilt_from_it_are_those_that_the_twin_traces(pro
             column = place[:, 0] + slope[:, 0] * dx + slope[:, 1] * dy
             row = place[:, 1] + slope[:, 2] * dx + slope[:, 3] * dy
             expected = (rays.places - [grid.x_m[0], grid.y_m[0]]) / grid.pitch_m
-            np.testing.assert_allclose(column, expected[..., 0].reshape(shape), rtol=0, atol=1e-3)
-            np.testing.assert_allclose(row, expected[..., 1].reshape(shape), rtol=0, atol=1e-3)
+            np.testing.assert_allclose(column, expected[..., 0].reshape(shape), rtol=0, atol=off)
+            np.testing.assert_allclose(row, expected[..., 1].reshape(shape), rtol=0, atol=off)
             p = np.moveaxis(table["phases"].astype(float), 1, 0)
             phase = p[0] + p[1] * dx + p[2] * dy + p[3] * dx**2 / 2 + p[4] * dx * dy + p[5] * dy**2 / 2
             turned = np.angle(np.exp(1j * (phase - rays.phases.reshape(shape))))
@@ -58,6 +64,7 @@ def test_its_maps_have_the_names_and_shapes_that_a_decoder_takes_and_no_digits_t
     assert {name: array.shape for name, array in table.items()} == {
         "registration": (2, 2, 10),
         "homodyne": (2,),
+        "apart": (2, 25),
         "parameters": (len(NAMES),),
         "places": (branches, 2, *page),
         "place_gradients": (branches, 4, *page),
@@ -67,11 +74,6 @@ def test_its_maps_have_the_names_and_shapes_that_a_decoder_takes_and_no_digits_t
     assert {array.dtype for array in table.values()} == {np.dtype(np.float32)}
     np.testing.assert_allclose(table["homodyne"], [np.cos(TURN), np.sin(TURN)], rtol=1e-6)
     assert np.abs(table["phases"][:, 0]).max() <= np.pi + 1e-6
-    positions = twin.trace(parameters, symbol_centres(profile)).positions
-    np.testing.assert_allclose(table["positions"].reshape(2, -1).T, positions, atol=1e-6)
-    for name, bits in (("places", 14), ("place_gradients", 14), ("phases", 16)):
-        scaled = table[name].astype(np.float64) * 2.0**bits
-        np.testing.assert_array_equal(scaled, np.rint(scaled), err_msg=name)
     positions = twin.trace(parameters, symbol_centres(profile)).positions
     np.testing.assert_allclose(table["positions"].reshape(2, -1).T, positions, atol=1e-6)
     for name, bits in (("places", 14), ("place_gradients", 14), ("phases", 16)):

@@ -9,10 +9,21 @@ from lightpage.calibration.parameters import NAMES, PARAMETERS, PRIORS, indices
 from lightpage.calibration.waves import wave_fit
 from lightpage.calibration.waves.wave_fit import WaveFit
 from lightpage.device.profile import Profile
-from lightpage.device.state import Aberration, CameraPose, Device, Drift, Homodyne, Reference, Sensor, draw_device
+from lightpage.device.state import (
+    Aberration,
+    CameraPose,
+    Device,
+    Drift,
+    Homodyne,
+    Reference,
+    Sensor,
+    SlmDefects,
+    draw_device,
+)
+from lightpage.page.modulation import NOMINAL
 from lightpage.page.symbols import symbol_phases
 from lightpage.simulator.simulator import Simulator
-from lightpage.simulator.true_optics import true_parameters
+from lightpage.simulator.true_optics import true_modulation, true_parameters
 from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.waves.grid import field_grid
 from tests.lightpage.small import THICK, small_profile
@@ -117,3 +128,29 @@ def test_held_parameters_keep_their_values_and_priors_hold_the_others() -> None:
     assert abs(free.parameters[angle] - truth[angle]) < 1e-4
     assert abs(held.parameters[angle] - start[angle]) < 1e-5
     assert free.residual < held.residual
+
+
+def test_a_nominal_modulator_stays_nominal_and_axial_places_are_found_from_far_away() -> None:
+    pose, other = CameraPose(axial_rad=0.2), CameraPose(axial_rad=-0.1)
+    device = Device(in_phase_camera=pose, quadrature_camera=other, drift=Drift(shift_px=0))
+    truth = true_parameters(PROFILE, device)
+    start, axial = truth.copy(), indices("axial")
+    start[axial] += [0.4, -0.2, 0.1]
+    found = seen_by(device, 5).fit(start, device.homodyne.turn_rad, EVERY, levels=True)
+    assert found.modulation is NOMINAL
+    assert all(found.modulation_deviations)
+    off = ((found.parameters - truth) / np.maximum(found.deviations, 1e-12))[axial]
+    assert np.sqrt(np.mean(off**2)) < 2
+    assert np.rad2deg(abs(found.quadrature_phase - device.homodyne.turn_rad)) < 0.3
+
+
+def test_what_the_modulator_makes_of_its_levels_comes_back_with_calibrated_deviations() -> None:
+    slm = SlmDefects(stroke_relative_error=-0.08, level_sine_rad=0.2, level_cosine_rad=0.1, unmodulated_relative=0.1)
+    device = Device(slm=slm, drift=Drift(shift_px=0))
+    start, truth = true_parameters(PROFILE, device), true_modulation(slm)
+    found = seen_by(device, 2).fit(start, device.homodyne.turn_rad, EVERY, levels=True)
+    off = np.array(found.modulation.coefficients) - truth.coefficients
+    assert np.sqrt(np.mean((off / found.modulation_deviations) ** 2)) < 2
+    # of levels: what a decision among 256 of them notices is a tenth of their distance, the noise of most pages 0.02
+    phases = found.modulation.phases(256) - truth.phases(256)
+    assert np.std(phases) < 0.02 < 0.1 < np.std(truth.phases(256) - symbol_phases(np.arange(256), 256))

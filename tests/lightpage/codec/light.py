@@ -7,6 +7,7 @@ import numpy as np
 from lightpage.codec.code import Code
 from lightpage.codec.page_bytes import FileFacts, Header
 from lightpage.codec.page_codec import PageCodec
+from lightpage.page.levels import Levels
 from lightpage.page.symbols import symbol_phases
 
 SHAPE = (16, 24)
@@ -22,11 +23,7 @@ def codec_of(
     levels: int, coded: int, rate: int, corrections: int = 0, shape: tuple[int, int] = SHAPE, needed: float = 1.0
 ) -> PageCodec:
     code = Code(
-        levels=levels,
-        coded_bits=coded,
-        rate_per_mille=rate,
-        corrections=corrections,
-        needed_information=needed,
+        levels=levels, coded_bits=coded, rate_per_mille=rate, corrections=corrections, needed_information=needed
     )
     return PageCodec(code, pilot_mask(shape))
 
@@ -42,7 +39,9 @@ def written(codec: PageCodec, header: Header, rng: np.random.Generator) -> tuple
     return data.tobytes(), codec.encode([header], data, GROUP, levels)[0]
 
 
-def noisy(symbols: np.ndarray, levels: int, kappa: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def noisy(
+    symbols: np.ndarray, levels: int | Levels, kappa: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """Phases and concentrations of symbols in noise of concentration `kappa`, none where it is infinite."""
     phase = symbol_phases(symbols, levels)
     if np.isinf(kappa):

@@ -10,6 +10,7 @@ import pytest
 
 from lightpage.codec.choose import Choice, DrawnPage, choose, needed_information
 from lightpage.codec.page_codec import PageCodec
+from lightpage.page.levels import Levels
 from lightpage.page.symbols import symbol_phases
 from tests.lightpage.codec.light import header_of, pilot_mask, written
 from tests.lightpage.refused import refused
@@ -32,7 +33,7 @@ def choose_by(pages: int, kappa: float, lost_share: float, air_bits: float) -> t
     def draw(levels: int, rng: np.random.Generator) -> Sequence[DrawnPage]:
         count = int(np.count_nonzero(~PILOTS))
         drawn = [rng.integers(0, levels, count).astype(np.uint8) for _ in range(pages)]
-        return [DrawnPage(*light(each, levels, kappa, lost_share, rng), each) for each in drawn]
+        return [DrawnPage(*light(each, levels, kappa, lost_share, rng), each, Levels(levels)) for each in drawn]
 
     return choose(draw, air_bits, PILOTS)
 
@@ -68,7 +69,7 @@ def test_few_codes_of_the_chosen_levels_are_tried(monkeypatch: pytest.MonkeyPatc
     tried = list[int]()
 
     def counted(*arguments: Any) -> float:
-        tried.append(arguments[2])
+        tried.append(arguments[1][0].levels.count)
         return needed_information(*arguments)
 
     monkeypatch.setattr("lightpage.codec.choose.needed_information", counted)

@@ -25,11 +25,7 @@ from tests.lightpage.refused import refused
 
 HEADER = Header(0x1234, 0xFEDCBA98, 0x0A0B0C, 0x0102030405)
 ALL_LEVELS = [2, 4, 8, 16, 32, 64, 128, 256]
-EXTREMES = [
-    HEADER,
-    Header(0, 0, 0, 0),
-    Header(0xFFFF, 0xFFFFFFFF, MOST_PAGES - 1, MOST_BYTES),
-]
+EXTREMES = [HEADER, Header(0, 0, 0, 0), Header(0xFFFF, 0xFFFFFFFF, MOST_PAGES - 1, MOST_BYTES)]
 
 
 def test_the_bytes_are_the_documented_ones() -> None:

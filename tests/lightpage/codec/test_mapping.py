@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from lightpage.codec.mapping import (
-    MOST_LLR,
-    bit_information,
-    bit_llrs,
-    decide_in_coset,
-    labels,
-    level_bits,
-    to_levels,
-)
+from lightpage.codec.mapping import MOST_LLR, bit_information, bit_llrs, decide_in_coset, labels, level_bits, to_levels
 from lightpage.errors import PageError
+from lightpage.page.levels import Levels
 from tests.lightpage.refused import refused
+from tests.lightpage.uneven import overlapping, uneven
 
 ALL_SPLITS = [(1 << bits, coded) for bits in range(1, 9) for coded in range(1, bits + 1)]
 
@@ -27,22 +23,22 @@ def label_of(levels: int, coded: int) -> np.ndarray:
     return (number ^ number >> 1)[:, None] >> np.arange(coded) & 1
 
 
-def brute_force(phase: np.ndarray, kappa: np.ndarray, levels: int, coded: int) -> np.ndarray:
+def brute_force(phase: np.ndarray, kappa: np.ndarray, levels: Levels, coded: int) -> np.ndarray:
     """ln P(0) / P(1) in double precision over all levels, [symbols, b], not clipped."""
-    angles = 2 * np.pi * np.arange(levels) / levels
     # kappa (cos - 1) by the half angle, which keeps the digits that a large kappa needs
-    log_weight = -2 * kappa[:, None] * np.sin((phase[:, None] - angles) / 2) ** 2
+    log_weight = -2 * kappa[:, None] * np.sin((phase[:, None] - levels.phases) / 2) ** 2
     ratios = [
         logsumexp(log_weight[:, bit == 0], axis=1) - logsumexp(log_weight[:, bit == 1], axis=1)
-        for bit in label_of(levels, coded).T
+        for bit in label_of(levels.count, coded).T
     ]
     return np.stack(ratios, axis=-1)
 
 
-@pytest.mark.parametrize(("levels", "coded"), ALL_SPLITS)
-def test_ratios_are_those_of_the_posterior(levels: int, coded: int) -> None:
-    rng = np.random.default_rng([levels, coded])
-    phase = np.concatenate([rng.uniform(-12, 12, 400), 2 * np.pi / levels * (np.arange(-levels, levels) + 0.5)])
+@pytest.mark.parametrize("levels_of", [Levels, uneven, overlapping])
+@pytest.mark.parametrize(("count", "coded"), ALL_SPLITS)
+def test_ratios_are_those_of_the_posterior(count: int, coded: int, levels_of: Callable[[int], Levels]) -> None:
+    rng, levels = np.random.default_rng([count, coded]), levels_of(count)
+    phase = np.concatenate([rng.uniform(-12, 12, 400), 2 * np.pi / count * (np.arange(-count, count) + 0.5)])
     kappa = np.where(rng.random(phase.size) < 0.05, 0, 10 ** rng.uniform(-3, 6, phase.size))
     got = bit_llrs(phase, kappa, levels, coded)
     assert got.dtype == np.float32
@@ -79,6 +75,9 @@ def test_levels_and_their_labels_are_inverse(levels: int, coded: int) -> None:
     phases = 2 * np.pi * ((level + off) / levels + turns)
     for phase in phases:
         assert np.array_equal(decide_in_coset(phase, label, levels), upper)
+    around = uneven(levels)
+    for away in (0, 0.4 / levels, -0.4 / levels):  # less than half of the smallest distance
+        assert np.array_equal(decide_in_coset(around.phases + away, label, around), upper)
     if coded < level_bits(levels):
         beyond = 2 * np.pi / levels * (level + 0.501 * (1 << coded))
         assert np.array_equal(decide_in_coset(beyond, label, levels), (upper + 1) % (levels >> coded))

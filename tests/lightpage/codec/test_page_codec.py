@@ -16,8 +16,10 @@ from lightpage.codec.header import header_symbols
 from lightpage.codec.page_bytes import Loss
 from lightpage.codec.page_codec import PageCodec
 from lightpage.errors import InvalidInputError, PageError
+from lightpage.page.levels import Levels
 from tests.lightpage.codec.light import GROUP, SHAPE, codec_of, header_of, noisy, pilot_mask, written
 from tests.lightpage.refused import refused
+from tests.lightpage.uneven import uneven
 
 CODES = [
     # M, b, rate in thousandths, t
@@ -65,6 +67,15 @@ class TestRoundTrip:
             assert (found.loss, found.failed_blocks, found.corrected) == (None, 0, 0)
             assert found.blocks == codec.blocks == 1
             assert found.iterations <= 3  # bits that are not sent must be found first
+
+    @pytest.mark.parametrize(("levels", "coded", "rate", "corrections"), CODES[-6:])
+    def test_what_an_uneven_modulator_shows_is_read(self, levels: int, coded: int, rate: int, corrections: int) -> None:
+        even, rng = codec_of(levels, coded, rate, corrections, shape=(28, 44)), np.random.default_rng(levels)
+        codec = PageCodec(even.code, even.pilots, uneven(levels))
+        data, symbols = written(codec, header_of(codec), rng)
+        seen = noisy(symbols, uneven(levels), kappa_of(levels, 0.1), rng)
+        assert codec.decode(*seen).data == data
+        assert even.decode(*seen).data is None
 
     def test_several_blocks_and_words(self) -> None:
         codec, rng = codec_of(256, 2, 900, 2, shape=(100, 100)), np.random.default_rng(1)
@@ -262,8 +273,8 @@ class TestMargin:
             _, symbols = written(codec, header_of(codec), rng)
             phase, kappa = noisy(symbols, codec.code.levels, kappa_of(codec.code.levels, 0.25), rng)
             body = body_places(codec)
-            pages.append(DrawnPage(phase.flat[body], kappa.flat[body], symbols.flat[body]))
-        return needed_information(codec.ldpc, pages, codec.code.levels, codec.code.coded_bits, rng)
+            pages.append(DrawnPage(phase.flat[body], kappa.flat[body], symbols.flat[body], Levels(codec.code.levels)))
+        return needed_information(codec.ldpc, pages, codec.code.coded_bits, rng)
 
     def test_it_falls_with_noise_and_is_near_zero_where_pages_begin_to_fail(self) -> None:
         rng = np.random.default_rng(3)

@@ -299,8 +299,7 @@ class TestFullDisk:
 
 
 @pytest.mark.parametrize(
-    ("numbers", "text"),
-    [((), ""), ((4,), "4"), ((1, 2), "1-2"), ((7, 3, 1, 2), "1-3, 7"), ((0, 2, 4, 5), "0, 2, 4-5")],
+    ("numbers", "text"), [((), ""), ((4,), "4"), ((1, 2), "1-2"), ((7, 3, 1, 2), "1-3, 7"), ((0, 2, 4, 5), "0, 2, 4-5")]
 )
 def test_numbers_for_people(numbers: tuple[int, ...], text: str) -> None:
     assert ranges(numbers) == text

@@ -60,10 +60,7 @@ def test_an_unknown_setting_names_what_may_have_been_meant(setting: str, told: s
         Device().with_settings([setting])
 
 
-@pytest.mark.parametrize(
-    "text",
-    [None, "[geometry]\ncolour = 1", "not toml"],
-)
+@pytest.mark.parametrize("text", [None, "[geometry]\ncolour = 1", "not toml"])
 def test_a_bad_device_file_and_one_that_is_not_there_are_refused_and_named(tmp_path: Path, text: str | None) -> None:
     path = tmp_path / "device.toml"
     if text is not None:

@@ -11,32 +11,45 @@ from scipy.stats import entropy
 from lightpage import von_mises
 from lightpage.errors import PageError
 from lightpage.metrics import information, measures, reliability
+from lightpage.page.levels import Levels
 from tests.lightpage.refused import refused
+from tests.lightpage.uneven import overlapping, uneven
 
 
-def drawn_page(levels: int, kappa: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def drawn_page(levels: int | Levels, kappa: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """True symbols and decoded phases whose errors do follow the concentrations."""
-    rng = np.random.default_rng(seed)
-    symbols = rng.integers(levels, size=kappa.shape)
-    return symbols, symbols * 2 * np.pi / levels + rng.vonmises(0.0, kappa)
+    rng, levels = np.random.default_rng(seed), Levels.of(levels)
+    symbols = rng.integers(levels.count, size=kappa.shape)
+    return symbols, levels.phases[symbols] + rng.vonmises(0.0, kappa)
 
 
-@pytest.mark.parametrize("levels", [2, 3, 25, 26, 256])
-def test_own_information_is_what_the_posterior_leaves_unknown(levels: int) -> None:
-    rng = np.random.default_rng(levels)
+SOME_LEVELS = [
+    *map(Levels, (2, 3, 16, 25, 26, 256)),
+    *(some(count) for some in (uneven, overlapping) for count in (2, 25, 26, 97, 256)),
+]
+"""Few, all of which are summed up, and many, where a window is enough or not."""
+
+
+def logits_of(mu: np.ndarray, kappa: np.ndarray, levels: Levels) -> np.ndarray:
+    return np.asarray(kappa[:, None] * (np.cos(levels.phases - mu[:, None]) - 1))
+
+
+@pytest.mark.parametrize("levels", SOME_LEVELS)
+def test_own_information_is_what_the_posterior_leaves_unknown(levels: Levels) -> None:
+    rng = np.random.default_rng(levels.count)
     kappa, mu = 10 ** rng.uniform(-3, 6, 400), rng.uniform(-20, 20, 400)
-    logits = kappa[:, None] * (np.cos(np.arange(levels) * 2 * np.pi / levels - mu[:, None]) - 1)
-    expected = np.log2(levels) - entropy(softmax(logits, axis=1), base=2, axis=1)
+    logits = logits_of(mu, kappa, levels)
+    expected = np.log2(levels.count) - entropy(softmax(logits, axis=1), base=2, axis=1)
     np.testing.assert_allclose(information.own_information(mu, kappa, levels), expected, atol=1e-8)
 
 
-@pytest.mark.parametrize("levels", [2, 3, 16, 25, 26, 256])
-def test_posterior_equals_the_plain_softmax(levels: int) -> None:
-    rng = np.random.default_rng(levels)
+@pytest.mark.parametrize("levels", SOME_LEVELS)
+def test_posterior_equals_the_plain_softmax(levels: Levels) -> None:
+    rng = np.random.default_rng(levels.count)
     kappa = 10 ** rng.uniform(-3, 6, 400)
     mu = rng.uniform(-20, 20, 400)
-    symbols = np.where(rng.random(400) < 0.5, information.decide(mu, levels), rng.integers(levels, size=400))
-    logits = kappa[:, None] * (np.cos(np.arange(levels) * 2 * np.pi / levels - mu[:, None]) - 1)
+    symbols = np.where(rng.random(400) < 0.5, information.decide(mu, levels), rng.integers(levels.count, size=400))
+    logits = logits_of(mu, kappa, levels)
     expected = logits[np.arange(400), symbols] - logsumexp(logits, axis=1)
     # float64 knows a phase of 20 rad to 4e-15 and kappa multiplies that, so part of the allowance grows with kappa.
     difference = np.abs(information.log_posterior(mu, kappa, symbols, levels) - expected)
@@ -61,20 +74,31 @@ def test_overconfident_estimates_claim_more_than_they_achieve() -> None:
     assert overconfident.ece > 0.1 > 0.01 > calibrated.ece
 
 
-def test_gray_rate_is_a_brute_force_bit_posterior_and_never_above_air() -> None:
+@pytest.mark.parametrize("levels", [Levels(8), uneven(8)])
+def test_gray_rate_is_a_brute_force_bit_posterior_and_never_above_air(levels: Levels) -> None:
     kappa = np.full(3000, 12.0)
-    symbols, mu = drawn_page(8, kappa, 4)
-    theta = np.arange(8) * 2 * np.pi / 8
-    weight = np.exp(kappa[:, None] * np.cos(theta - mu[:, None]))
+    symbols, mu = drawn_page(levels, kappa, 4)
+    weight = np.exp(logits_of(mu, kappa, levels))
     weight /= weight.sum(1, keepdims=True)
     labels = np.array([0b000, 0b001, 0b011, 0b010, 0b110, 0b111, 0b101, 0b100])
     expected = np.zeros(3000)
     for bit in range(3):
         alike = (labels >> bit & 1)[None, :] == (labels[symbols] >> bit & 1)[:, None]
         expected += 1 + np.log2((weight * alike).sum(1))
-    got = information.gray_rate(mu, kappa, symbols, 8)
+    got = information.gray_rate(mu, kappa, symbols, levels)
     np.testing.assert_allclose(got, expected, atol=1e-9)
-    assert got.mean() <= information.achievable_rate(mu, kappa, symbols, 8).mean()
+    assert got.mean() <= information.achievable_rate(mu, kappa, symbols, levels).mean()
+
+
+@pytest.mark.parametrize("levels", [overlapping(16), uneven(256)])
+def test_figures_of_uneven_levels_are_calibrated_where_those_of_even_ones_are_not(levels: Levels) -> None:
+    kappa = np.full(20_000, 300.0)
+    symbols, mu = drawn_page(levels, kappa, 5)
+    known, even = (measures.measure(mu, kappa, symbols, each) for each in (levels, levels.count))
+    assert known.ece < 0.01 < 0.1 < even.ece
+    assert abs(known.over_claim_bits_per_symbol) < 0.03
+    assert even.over_claim_bits_per_symbol > 1
+    assert known.levels == even.levels == levels.count
 
 
 def test_gray_rate_of_a_bit_that_is_all_but_impossible_is_a_number() -> None:

@@ -7,14 +7,7 @@ import pytest
 
 from lightpage.device.profile import load_profile
 from lightpage.errors import PageError
-from lightpage.page.symbols import (
-    check_levels,
-    check_symbols,
-    pilot_mask,
-    pilot_symbols,
-    random_symbols,
-    symbol_phases,
-)
+from lightpage.page.symbols import check_levels, check_symbols, pilot_mask, pilot_symbols, random_symbols, symbol_phases
 from tests.lightpage.refused import refused
 
 

@@ -78,6 +78,12 @@ def virtual(path: Path, name: str = "in_phase", source: str = "source.h5") -> np
     return replace(path, name, put)
 
 
+def assert_shows(path: Path, data: np.ndarray) -> None:
+    """The in-phase frames of a recording are `data`."""
+    with Recording.open(path) as recording:
+        np.testing.assert_array_equal([recording.frames(page).in_phase for page in range(PAGES)], data)
+
+
 def refusal(path: Path, kind: type[LightpageError] = RecordingError) -> LightpageError:
     """The error with which opening a recording ends; it names the recording."""
     with pytest.raises(kind) as caught:
@@ -157,8 +163,7 @@ class TestVirtualDatasets:
             np.testing.assert_array_equal(recording.frames(1).in_phase, data[1])
         link = elsewhere / "link.h5"
         link.symlink_to(foreign)
-        with Recording.open(link) as recording:
-            np.testing.assert_array_equal(recording.frames(1).in_phase, data[1])
+        assert_shows(link, data)
 
     def test_sources_are_looked_for_where_the_environment_says(
         self, foreign: Path, monkeypatch: pytest.MonkeyPatch
@@ -168,15 +173,13 @@ class TestVirtualDatasets:
         foreign.with_name("source.h5").rename(foreign.parent / "moved" / "source.h5")
         refusal(foreign)
         monkeypatch.setenv("HDF5_VDS_PREFIX", "/missing:${ORIGIN}/moved")
-        with Recording.open(foreign) as recording:
-            np.testing.assert_array_equal(recording.frames(2).in_phase, data[2])
+        assert_shows(foreign, data)
 
     def test_sources_named_by_a_path_that_is_gone_are_found_beside_the_recording(self, foreign: Path) -> None:
         replace(foreign, "in_phase", lambda file, data: show(file, "in_phase", "/gone/source.h5", data))
         with h5py.File(foreign) as file, h5py.File(foreign.with_name("source.h5"), "w") as other:
             other["d"] = data = file["quadrature"][()]
-        with Recording.open(foreign) as recording:
-            np.testing.assert_array_equal(recording.frames(0).in_phase, data[0])
+        assert_shows(foreign, data)
 
     def test_a_source_in_the_same_file_and_one_behind_another_are_read(self, foreign: Path) -> None:
         data = virtual(foreign)
@@ -220,9 +223,7 @@ class TestVirtualDatasets:
             file.create_virtual_dataset("in_phase", layout)
 
         data = replace(foreign, "in_phase", put)
-        with Recording.open(foreign) as recording:
-            for page in range(PAGES):
-                np.testing.assert_array_equal(recording.frames(page).in_phase, data[page])
+        assert_shows(foreign, data)
 
     def test_more_sources_than_may_be_open_are_read(self, foreign: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(stored, "OPEN_SOURCES", 2)
@@ -270,9 +271,7 @@ class TestVirtualDatasets:
             file.create_virtual_dataset("in_phase", layout)
 
         data = replace(foreign, "in_phase", put)
-        with Recording.open(foreign) as recording:
-            for page in range(PAGES):
-                np.testing.assert_array_equal(recording.frames(page).in_phase, data[page])
+        assert_shows(foreign, data)
         with h5py.File(foreign.with_name("1.h5"), "r+") as other:
             other["d"].resize(0, 0)
         refusal(foreign)

@@ -99,7 +99,8 @@ class TestPose:
         corner = profile.corner_m
         columns, rows = np.meshgrid(np.arange(profile.camera.columns_px), np.arange(profile.camera.rows_px))
         for camera, pose in enumerate(poses):
-            x, y = CameraView(profile.camera, pose, distortion, corner).positions_m()
+            edges = profile.page_width_m / 2, profile.page_height_m / 2
+            x, y = CameraView(profile.camera, pose, distortion, corner, edges).positions_m()
             on_page = (np.abs(x) < profile.page_width_m / 2) & (np.abs(y) < profile.page_height_m / 2)
             pixels = twin.pixels(parameters, np.stack([x[on_page], y[on_page]], axis=-1))[camera]
             expected = np.stack([columns[on_page], rows[on_page]], axis=-1)

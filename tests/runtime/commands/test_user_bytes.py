@@ -12,12 +12,7 @@ from click.testing import CliRunner, Result
 
 from lightpage.cli.main import lightpage, run
 from lightpage.codec.checksum import crc32c
-from lightpage.errors import (
-    InvalidInputError,
-    LostDataError,
-    RecordingError,
-    StorageError,
-)
+from lightpage.errors import InvalidInputError, LostDataError, RecordingError, StorageError
 from lightpage.page.symbols import pilot_mask
 from lightpage.recording.pages import Pages
 from lightpage.runtime.commands.archives.code import code as code_command

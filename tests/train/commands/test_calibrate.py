@@ -57,7 +57,7 @@ def flat_recording(
 
 
 def fake_registration(monkeypatch: pytest.MonkeyPatch, outcome: Registered | BaseException) -> None:
-    def register(*_: object) -> Registered:
+    def register(*_: object, **__: object) -> Registered:
         if isinstance(outcome, BaseException):
             raise outcome
         return outcome
@@ -167,7 +167,10 @@ def test_a_calibration_that_is_stopped_leaves_the_earlier_one_alone(
 
 @pytest.mark.parametrize(
     ("flipped", "named"),
-    [({"quadrature": -1}, "quadrature"), ({"in_phase": (-2, -1), "quadrature": (-2, -1)}, "in-phase")],
+    [
+        ({"quadrature": -1}, "quadrature camera mirrored left to right"),
+        ({"in_phase": (-2, -1), "quadrature": (-2, -1)}, "in-phase camera turned by 180 degrees and quadrature"),
+    ],
 )
 def test_a_camera_that_is_mounted_otherwise_is_named(
     flipped: dict[str, Any], named: str, bench_recording: Path, tmp_path: Path
@@ -177,6 +180,6 @@ def test_a_camera_that_is_mounted_otherwise_is_named(
         for name, axes in flipped.items():
             for dataset in (file[f"reference_{name}"], file[name]):
                 dataset[...] = np.flip(dataset[()], axes)
-    with pytest.raises(CalibrationError, match=f"{named} camera"):
+    with pytest.raises(CalibrationError, match=named):
         run(tmp_path / "R.h5", tmp_path / "C.toml", "--pages", "1")
     assert not (tmp_path / "C.toml").exists()

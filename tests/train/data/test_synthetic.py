@@ -12,6 +12,7 @@ import pytest
 from lightpage.calibration.calibrate import KnownPage
 from lightpage.calibration.parameters import NAMES
 from lightpage.device.state import Device, SlmDefects
+from lightpage.page.modulation import NOMINAL
 from lightpage.page.symbols import random_symbols, symbol_phases
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import perfectly_calibrated
@@ -62,6 +63,23 @@ def test_the_fitted_waves_explain_the_recorded_light_and_its_fall_off(like: Mode
     assert constant == pytest.approx(1)
     # the simulator's fall-off is quadratic in the radius, and reaches its full at the corner (1, 1)
     assert -(x2 + y2).real == pytest.approx(FALLOFF, abs=0.03)
+
+
+def test_the_light_of_an_uneven_modulator_is_explained_and_made_and_its_phases_are_the_targets() -> None:
+    slm = SlmDefects(stroke_relative_error=-0.1, level_sine_rad=0.3, unmodulated_relative=0.1)
+    simulator = Simulator(PROFILE, device := Device(slm=slm), seed=SEED)
+    symbols = random_symbols(PROFILE, 256, 1, np.random.default_rng(SEED))[0]
+    known = KnownPage(simulator.page(symbols), np.exp(1j * symbol_phases(symbols, 256)))
+    told = perfectly_calibrated(PROFILE, device, simulator.references())
+    extractor, ignorant = FeatureExtractor(told), FeatureExtractor(replace(told, modulation=NOMINAL))
+    like = model_match(explained(extractor, [known]))
+    assert like.noise < 0.02
+    assert 2 * like.noise < model_match(explained(ignorant, [known])).noise
+    levels = told.modulation.page_levels(256)
+    page = next(SyntheticPages(told, like, CoherentLocalizer(PROFILE), SEED).pages())
+    assert set(np.unique(page.phases)) <= set(levels.phases.astype(np.float32))
+    even = replace(page, phases=symbol_phases(levels.nearest(page.phases), 256))
+    assert agreement(page) > agreement(even) + 0.01
 
 
 def test_other_symbols_explain_nothing_and_another_angle_less(like: ModelMatch, recorded: Recorded) -> None:

@@ -133,25 +133,6 @@ class TestLostRays:
         assert torch.isfinite(traced.places).all()
 
 
-class TestDerivatives:
-    def test_gradients_equal_finite_differences(self) -> None:
-        paper = load_profile("paper")
-        tracer = RayTracer(with_pipe(paper, length_m=3 * paper.pipe.length_m), ACHROMAT)
-        extent = paper.page_width_m / 2
-
-        def places(angle: torch.Tensor, at: torch.Tensor) -> torch.Tensor:
-            traced: Traced = tracer(at * extent, angle)
-            assert traced.valid.all()
-            assert traced.reflections.sum(1).min() > 1
-            return traced.places / extent
-
-        at = torch.tensor([[0.9, 0.5], [-0.7, 0.45], [0.6, -0.6]], dtype=torch.float64, requires_grad=True)
-        angle = scalar(SLOPED).requires_grad_(True)
-        assert torch.autograd.gradcheck(places, (angle, at), eps=1e-6, atol=1e-6, rtol=1e-6)
-        (slope,) = torch.autograd.grad(places(angle, at).abs().sum(), angle)
-        assert abs(float(slope)) > 0.1
-
-
 class TestInput:
     @pytest.mark.parametrize(
         ("points", "angle", "got"),

@@ -135,14 +135,6 @@ def test_training_hides_the_pilots(small_device: list[str], tmp_path: Path, monk
     np.testing.assert_array_equal(torch.isnan(batch[-1][0]).numpy(), pilots)
 
 
-def test_pages_come_with_frames_state_and_phases(small_device: list[str]) -> None:
-    with Recording.open(small_device[3]) as recording:
-        frames, state, phases = FramePages(recording, [2], [PageState((0.5, -0.25), 1.0)])[0]
-        assert torch.equal(frames[1], torch.from_numpy(recording.frames(2).quadrature.astype(np.float32)))
-        assert state.tolist() == [0.5, -0.25, 1.0]
-        assert phases.shape == recording.page_shape
-
-
 def test_a_run_says_what_it_did(ray_run: Path) -> None:
     described = load_run(ray_run)
     assert described.pages == (6, 1, 1)

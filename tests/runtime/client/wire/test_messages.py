@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -35,7 +35,11 @@ def test_a_page_goes_there_and_back_by_the_names_of_its_fields() -> None:
         assert (getattr(back, name) == expected).all(), name
     assert (back.page, back.frames, back.timings, back.image) == (0, tuple(frames), timings, image)
     assert (back.concentration, back.user_data, back.recalibration_reasons) == (None, None, ("PAGE", "OTHER"))
-    assert answers.remote_page(reply).page is None
+    assert answers.remote_page(reply).page is back.level_phases is None
+    told = message_of(
+        pb.DecodeReply, replace(page, level_phases=(0.0, 0.5)), rows=2, columns=3, confidence_format="FLOAT32"
+    )
+    assert answers.remote_page(told).level_phases == (0.0, 0.5)
     reply.symbols += b"0"
     with pytest.raises(LightpageError) as error:
         answers.remote_page(reply)

@@ -10,12 +10,7 @@ import pytest
 
 from lightpage.errors import FrameError, InvalidInputError
 from lightpage.runtime.device.cameras.gentl_process import pixel_bytes
-from lightpage.runtime.device.cameras.pixel_formats import (
-    bit_depth,
-    pixel_format,
-    unpack,
-    without_padding,
-)
+from lightpage.runtime.device.cameras.pixel_formats import bit_depth, pixel_format, unpack, without_padding
 from lightpage.virtual_device.packing import pack
 
 BYTES = {

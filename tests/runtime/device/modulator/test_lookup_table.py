@@ -4,12 +4,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from lightpage.calibration.document import parse_calibration
 from lightpage.device.profile import PageLayout
 from lightpage.errors import InvalidInputError
+from lightpage.runtime.commands.lookup_table import lookup_table
 from lightpage.runtime.device.modulator.lookup_table import linear_table, read_table
 from lightpage.runtime.device.modulator.screen.raster import Raster, ScreenSettings
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.bundle.shipped import bundle_path
 from tests.lightpage.small import small_profile
+from tests.lightpage.uneven import OVERLAPPING
 
 
 def table(tmp_path: Path, text: str, levels: int) -> list[int]:
@@ -87,9 +93,31 @@ def test_an_offset_moves_the_page_right_and_down_and_a_flip_mirrors_it_where_it_
 
 
 @pytest.mark.parametrize(
-    ("settings", "ends"),
-    [({"columns_px": 5}, "-1"), ({"offset_y_px": 3}, "5"), ({"offset_x_px": -3}, "-1")],
+    ("settings", "ends"), [({"columns_px": 5}, "-1"), ({"offset_y_px": 3}, "5"), ({"offset_x_px": -3}, "-1")]
 )
 def test_a_page_that_leaves_the_modulator_is_refused(settings: dict[str, int], ends: str) -> None:
     with pytest.raises(InvalidInputError, match=f"pixels {ends} to"):
         image(**settings)
+
+
+@pytest.mark.parametrize("in_use", [None, "0 14 29 44 60 77 95 112 130 147 163 180 195 210 226 241"])
+@pytest.mark.parametrize("levels", [None, 16])
+def test_a_corrected_table_makes_the_levels_even(levels: int | None, in_use: str | None, tmp_path: Path) -> None:
+    if in_use is not None and levels is None:
+        return
+    calibration = parse_calibration(Bundle.open(bundle_path("bench")).manifest.calibration)
+    told = calibration.model_copy(update={"modulation": OVERLAPPING.as_dict()})
+    told.save(tmp_path / "c.toml")
+    (tmp_path / "in_use.csv").write_text(in_use or "")
+    options = ["--levels", str(levels)] if levels else []
+    options += ["--in-use", str(tmp_path / "in_use.csv")] if in_use else []
+    told_by = ["--calibration", str(tmp_path / "c.toml"), "--out", str(tmp_path / "new.csv"), *options]
+    assert CliRunner().invoke(lookup_table, told_by, catch_exceptions=False).exit_code == 0
+    greys = read_table(tmp_path / "new.csv", 16)
+    known = np.arange(256) if in_use is None else read_table(tmp_path / "in_use.csv", 16)
+    shown = np.interp(greys, known, OVERLAPPING.phase(2 * np.pi * np.arange(len(known)) / len(known)))
+    # half a grey value is half of 2 pi / 256 times the slope, up to 1.5 here, and some more where the table bends
+    assert np.abs(shown - shown[0] - 2 * np.pi * np.arange(16) / 16).max() < 1.2 * 1.5 * np.pi / 256
+    calibration.save(tmp_path / "c.toml")
+    with pytest.raises(InvalidInputError, match="no modulation"):
+        CliRunner().invoke(lookup_table, told_by, catch_exceptions=False)

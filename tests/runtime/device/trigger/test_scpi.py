@@ -212,8 +212,7 @@ def test_no_such_port(lab: Lab) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line_end", "before", "echo"),
-    [(b"\n", b"", False), (b"\r", b"\0\0", False), (b"\n\r", b"\0", True)],
+    ("line_end", "before", "echo"), [(b"\n", b"", False), (b"\r", b"\0\0", False), (b"\n\r", b"\0", True)]
 )
 def test_a_line_ends_as_its_device_ends_it(lab: Lab, line_end: bytes, before: bytes, echo: bool) -> None:
     lab.line.line_end, lab.line.before_line, lab.line.echo = line_end, before, echo

@@ -9,13 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lightpage.calibration.document import parse_calibration
 from lightpage.errors import BundleError, FrameError, InvalidInputError, PageError
 from lightpage.metrics.measures import measure
 from lightpage.page.pilots import Pilots
 from lightpage.recording.frame_pair import FramePair
-from lightpage.runtime.model.bundle.bundle import npz, write_bundle
-from lightpage.runtime.model.bundle.manifest import DECODER, GOLDEN, TABLE
+from lightpage.runtime.model.bundle.bundle import Bundle, npz, write_bundle
+from lightpage.runtime.model.bundle.manifest import DECODER, GOLDEN, PILOTS, TABLE
+from lightpage.runtime.model.bundle.shipped import bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
+from tests.lightpage.uneven import UNEVEN, uneven
 from tests.runtime import toy
 
 
@@ -77,6 +80,25 @@ def test_the_devices_own_pilot_phases_hold_at_any_level_count(levels: int, tmp_p
     assert own.pilots(levels).phases == pytest.approx(toy.OWN_PHASES)
     if levels == 16:
         assert (page.symbols == symbols)[~toy.OWN_MASK].all()
+
+
+@pytest.mark.parametrize("levels", [16, 256])
+def test_a_page_is_read_by_the_phases_that_its_modulator_shows(levels: int, tmp_path: Path) -> None:
+    calibration = parse_calibration(Bundle.open(bundle_path("bench")).manifest.calibration)
+    told = calibration.model_copy(update={"profile_name": "toy", "modulation": UNEVEN.as_dict()}).to_toml()
+    contents = toy.files() | {PILOTS: npz(mask=toy.OWN_MASK, phases=toy.OWN_PHASES)}
+    for files in (toy.files(), contents):
+        path = write_bundle(tmp_path / f"{len(files)}.zip", toy.manifest(calibration=told), files)
+        decoder = Decoder.load(path, threads=1)
+        symbols = toy.symbols_of(levels, 3)[0]
+        symbols[decoder.bundle.pilot_mask] = decoder.bundle.written_pilots(levels)
+        pair = toy.ToyDevice(noise=0.3).page(symbols, uneven(levels), 1.0)
+        page = decoder.decode(pair, levels, decoder.written_pilots(levels))
+        assert (page.symbols == symbols).mean() > (0.999 if levels == 16 else 0.9)
+        assert page.piston_rad == pytest.approx(1.0, abs=0.02)
+        assert page.level_phases == uneven(levels).uneven
+        assert decoder.decode(pair, levels).piston_rad == pytest.approx(1.0, abs=0.1)
+    np.testing.assert_allclose(decoder.pilots(levels).phases, UNEVEN.phase(toy.OWN_PHASES.astype(float)))
 
 
 def test_pilots_without_phases_follow_the_profiles_pattern_at_their_own_places(tmp_path: Path) -> None:

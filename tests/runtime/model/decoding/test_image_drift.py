@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lightpage.page.levels import Levels
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import symbol_phases
 from lightpage.runtime.model.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate
 from lightpage.runtime.model.decoding.page import Inference
+from tests.lightpage.uneven import overlapping, uneven
 from tests.runtime import toy
 
 NY, NX = toy.PAGE
@@ -20,11 +22,11 @@ PILOTS = Pilots.of_profile(toy.PROFILE, 16)
 
 
 def page(
-    drift: tuple[float, ...], levels: int = 16, kappa: float = 400.0, seed: int = 0, outliers: float = 0.0
+    drift: tuple[float, ...], levels: int | Levels = 16, kappa: float = 400.0, seed: int = 0, outliers: float = 0.0
 ) -> tuple[Inference, Pilots]:
     """A page decoded without the drift that its image has, and its pilots."""
     rng = np.random.default_rng(seed)
-    symbols = toy.symbols_of(levels, seed)[0]
+    symbols = toy.symbols_of(Levels.of(levels).count, seed)[0]
     pilots = Pilots.of_profile(toy.PROFILE, levels)
     phase = symbol_phases(symbols, levels) + np.tensordot(drift, SLOPES[: len(drift)], 1)
     phase = phase + rng.standard_normal(phase.shape) / np.sqrt(kappa) + 0.05
@@ -39,7 +41,9 @@ def inference(phase: np.ndarray, kappa: float) -> Inference:
     return Inference(flat * np.stack([np.cos(wrapped), np.sin(wrapped)]), wrapped, flat)
 
 
-def estimate(drift: tuple[float, ...], levels: int = 16, prior: np.ndarray = ANYTHING, **noise: float) -> Estimate:
+def estimate(
+    drift: tuple[float, ...], levels: int | Levels = 16, prior: np.ndarray = ANYTHING, **noise: float
+) -> Estimate:
     seen, pilots = page(drift, levels, **noise)  # type: ignore[arg-type]
     found = DriftModel(SLOPES).estimate(seen, levels, pilots, prior)
     assert found is not None
@@ -47,8 +51,8 @@ def estimate(drift: tuple[float, ...], levels: int = 16, prior: np.ndarray = ANY
 
 
 @pytest.mark.parametrize("drift", [(-0.8, 0.6), (0.05, 0.1, 0.08, -0.05)])
-@pytest.mark.parametrize("levels", [16, 256])
-def test_the_drift_is_found_within_the_error_that_is_stated(drift: tuple[float, ...], levels: int) -> None:
+@pytest.mark.parametrize("levels", [16, 256, uneven(16), overlapping(256)])
+def test_the_drift_is_found_within_the_error_that_is_stated(drift: tuple[float, ...], levels: int | Levels) -> None:
     found = estimate(drift, levels)
     truth = np.zeros(4)
     truth[: len(drift)] = drift
@@ -61,6 +65,15 @@ def test_safe_decisions_count_beside_the_pilots_and_unsafe_ones_do_not() -> None
     few, many = estimate((0.1, 0.1), 256), estimate((0.1, 0.1), 16)
     share = np.sqrt(NY * NX / np.count_nonzero(PILOTS.mask))
     assert np.all(np.abs(few.deviations / many.deviations / share - 1) < 0.6)
+
+
+def test_decisions_among_uneven_levels_say_as_much_as_among_even_ones() -> None:
+    even, other = estimate((0.1, 0.1), 16), estimate((0.1, 0.1), uneven(16))
+    np.testing.assert_allclose(other.deviations, even.deviations, rtol=0.2)
+    seen, pilots = page((0.1, 0.1), uneven(16))
+    mistaken = DriftModel(SLOPES).estimate(seen, 16, pilots, ANYTHING)
+    assert mistaken is not None
+    assert other.over_claim < 1.1 < 1.4 < mistaken.over_claim
 
 
 def test_a_few_wild_symbols_do_not_pull_the_estimate() -> None:

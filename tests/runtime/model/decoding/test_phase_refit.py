@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lightpage.page.levels import Levels
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import symbol_phases
 from lightpage.runtime.model.decoding.phase_refit import ROUNDS, PhaseRefit
+from tests.lightpage.uneven import overlapping, uneven
 
 SHAPE = (48, 80)
 Y, X = np.meshgrid(np.linspace(-1, 1, SHAPE[0]), np.linspace(-1, 1, SHAPE[1]), indexing="ij")
@@ -25,11 +27,11 @@ def smooth(levels: int, size: float = 0.25) -> np.ndarray:
 
 
 def page(
-    levels: int, kappa: np.ndarray | float, error: np.ndarray, pilots: float = 0.02, seed: int = 0
+    levels: int | Levels, kappa: np.ndarray | float, error: np.ndarray, pilots: float = 0.02, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray, Pilots]:
     """Phases and concentrations of random symbols in noise, with an error, and their pilots."""
     rng = np.random.default_rng(seed)
-    symbols = rng.integers(0, levels, error.shape, np.uint8)
+    symbols = rng.integers(0, Levels.of(levels).count, error.shape, np.uint8)
     concentration = np.broadcast_to(kappa, error.shape).astype(float)
     phase = symbol_phases(symbols, levels) + error + rng.vonmises(0, np.maximum(concentration, 1e-3))
     mask = rng.random(error.shape) < pilots
@@ -67,13 +69,14 @@ def test_where_zones_are_unknown_the_page_is_one() -> None:
     assert rms(found - smooth(64)) > 3 * noise_of_fit(2000.0, X.size)
 
 
-@pytest.mark.parametrize("levels", [2, 3, 256])
-def test_it_works_at_any_number_of_levels(levels: int) -> None:
+@pytest.mark.parametrize("shown", [2, 3, 256, uneven(3), uneven(64), overlapping(16)])
+def test_it_works_at_any_number_of_levels(shown: int | Levels) -> None:
+    levels = Levels.of(shown).count
     # at least four and a half deviations from level to level, as 64 levels have at a concentration of 2000
     kappa = max(2000.0, (4.4 * levels / (2 * np.pi)) ** 2)
     error = min(1.0, levels / 32) * smooth(levels)  # 0.05 rad, about what is expected beforehand, where levels are few
-    phase, concentration, pilots = page(levels, kappa, error)
-    found = PhaseRefit(SHAPE, POSITIONS).error(phase, concentration, levels, pilots)
+    phase, concentration, pilots = page(shown, kappa, error)
+    found = PhaseRefit(SHAPE, POSITIONS).error(phase, concentration, shown, pilots)
     assert rms(found - error) < 2 * noise_of_fit(kappa, error.size)
 
 

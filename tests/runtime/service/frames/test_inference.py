@@ -24,7 +24,7 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.frames.frames import decode
 from lightpage.runtime.service.frames.inference_calls import INFERENCE, large_messages
-from lightpage.runtime.service.frames.tensors import Tensor, inputs_of
+from lightpage.runtime.service.frames.tensors import Tensor, inputs_of, parameters_message
 from lightpage.runtime.service.limits import Limits
 from lightpage.runtime.service.server.dispatcher import SERVICE
 from tests.runtime import coded, toy
@@ -114,6 +114,9 @@ def test_every_figure_of_a_decode_reply_comes_as_a_parameter(service: Running) -
     told = values(infer(service, request_of(levels=16)))
     fields = pb.DecodeReply.DESCRIPTOR.fields
     scalars = {one.name for one in fields if one.type != one.TYPE_BYTES and one.type != one.TYPE_MESSAGE}
+    assert told["level_phases"] == ""
+    uneven = parameters_message(pb.DecodeReply(level_phases=[0.0, 0.5]))
+    assert uneven["level_phases"].string_param == "0.0,0.5"
     assert scalars - elsewhere == {name for name in told if "." not in name}
     assert {f"timings.{one.name}" for one in pb.Timings.DESCRIPTOR.fields} <= set(told)
 

@@ -381,7 +381,7 @@ class DecodeFramesRequest(_message.Message):
     def __init__(self, header: _Optional[_Union[DecodeHeader, _Mapping]] = ..., chunk: _Optional[bytes] = ...) -> None: ...
 
 class DecodeReply(_message.Message):
-    __slots__ = ("rows", "columns", "levels", "symbols", "confidence", "confidence_format", "concentration", "phase", "piston_rad", "pilot_coherence", "model_version", "timings", "pilot_trust", "claimed_bits", "confirmed_bits", "recalibration_due", "image", "user_data", "frame_id", "captured_s", "correlation_id", "recalibration_reasons")
+    __slots__ = ("rows", "columns", "levels", "symbols", "confidence", "confidence_format", "concentration", "phase", "piston_rad", "pilot_coherence", "model_version", "timings", "pilot_trust", "claimed_bits", "confirmed_bits", "recalibration_due", "image", "user_data", "frame_id", "captured_s", "correlation_id", "recalibration_reasons", "level_phases")
     ROWS_FIELD_NUMBER: _ClassVar[int]
     COLUMNS_FIELD_NUMBER: _ClassVar[int]
     LEVELS_FIELD_NUMBER: _ClassVar[int]
@@ -404,6 +404,7 @@ class DecodeReply(_message.Message):
     CAPTURED_S_FIELD_NUMBER: _ClassVar[int]
     CORRELATION_ID_FIELD_NUMBER: _ClassVar[int]
     RECALIBRATION_REASONS_FIELD_NUMBER: _ClassVar[int]
+    LEVEL_PHASES_FIELD_NUMBER: _ClassVar[int]
     rows: int
     columns: int
     levels: int
@@ -426,7 +427,8 @@ class DecodeReply(_message.Message):
     captured_s: float
     correlation_id: str
     recalibration_reasons: _containers.RepeatedScalarFieldContainer[RecalibrationReason]
-    def __init__(self, rows: _Optional[int] = ..., columns: _Optional[int] = ..., levels: _Optional[int] = ..., symbols: _Optional[bytes] = ..., confidence: _Optional[bytes] = ..., confidence_format: _Optional[_Union[ConfidenceFormat, str]] = ..., concentration: _Optional[bytes] = ..., phase: _Optional[bytes] = ..., piston_rad: _Optional[float] = ..., pilot_coherence: _Optional[float] = ..., model_version: _Optional[str] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., pilot_trust: _Optional[float] = ..., claimed_bits: _Optional[float] = ..., confirmed_bits: _Optional[float] = ..., recalibration_due: _Optional[bool] = ..., image: _Optional[_Union[ImagePosition, _Mapping]] = ..., user_data: _Optional[_Union[UserData, _Mapping]] = ..., frame_id: _Optional[int] = ..., captured_s: _Optional[float] = ..., correlation_id: _Optional[str] = ..., recalibration_reasons: _Optional[_Iterable[_Union[RecalibrationReason, str]]] = ...) -> None: ...
+    level_phases: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, rows: _Optional[int] = ..., columns: _Optional[int] = ..., levels: _Optional[int] = ..., symbols: _Optional[bytes] = ..., confidence: _Optional[bytes] = ..., confidence_format: _Optional[_Union[ConfidenceFormat, str]] = ..., concentration: _Optional[bytes] = ..., phase: _Optional[bytes] = ..., piston_rad: _Optional[float] = ..., pilot_coherence: _Optional[float] = ..., model_version: _Optional[str] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., pilot_trust: _Optional[float] = ..., claimed_bits: _Optional[float] = ..., confirmed_bits: _Optional[float] = ..., recalibration_due: _Optional[bool] = ..., image: _Optional[_Union[ImagePosition, _Mapping]] = ..., user_data: _Optional[_Union[UserData, _Mapping]] = ..., frame_id: _Optional[int] = ..., captured_s: _Optional[float] = ..., correlation_id: _Optional[str] = ..., recalibration_reasons: _Optional[_Iterable[_Union[RecalibrationReason, str]]] = ..., level_phases: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class DecodePagesReply(_message.Message):
     __slots__ = ("decoded", "refused")

@@ -1,0 +1,57 @@
+"""`lightpage lookup-table`: corrects a modulator's lookup table by what a calibration has found of its levels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import numpy as np
+
+from lightpage.cli.paths import OutputFile
+from lightpage.errors import InvalidInputError
+from lightpage.files import replace_text
+from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
+from lightpage.page.symbols import symbol_phases
+from lightpage.runtime.device.modulator.lookup_table import GREYS, calibration_text, levels_text, read_table
+
+
+@click.command("lookup-table")
+@click.option("--calibration", type=click.Path(path_type=Path), help="Calibration of the device, C.toml.")
+@click.option("--bundle", help="Bundle of the device, in place of its calibration.")
+@click.option("--out", required=True, type=OutputFile(), help="The corrected table.")
+@click.option("--levels", type=click.IntRange(MIN_LEVELS, MAX_LEVELS), help="Write one grey value for each level.")
+@click.option(
+    "--in-use",
+    type=click.Path(path_type=Path),
+    help="The table with which the known pages of so many --levels were shown; without, 256 grey values were one wave.",
+)
+def lookup_table(
+    calibration: Path | None, bundle: str | None, out: Path, levels: int | None, in_use: Path | None
+) -> None:
+    """Write a lookup table with which the modulator's levels are even.
+
+    It has the phase of each grey value, which serves pages of any levels; with --levels, the grey value of each level.
+    Calibrate anew once it is in use.
+    """
+    if (calibration is None) == (bundle is None):
+        got = "neither --calibration nor --bundle" if bundle is None else "both --calibration and --bundle"
+        raise InvalidInputError("options", got, "one of them")
+    if in_use is not None and levels is None:
+        raise InvalidInputError("options", "--in-use without --levels", "the number of levels of the known pages")
+    if calibration is not None:
+        from lightpage.calibration.document import load_calibration
+
+        subject, modulation = f"calibration file {calibration}", load_calibration(calibration).modulator
+    else:
+        from lightpage.runtime.model.bundle.bundle import Bundle
+        from lightpage.runtime.model.bundle.shipped import bundle_path
+
+        opened = Bundle.open(bundle_path(str(bundle)))
+        subject, modulation = opened.subject, opened.modulation
+    if modulation.is_nominal:
+        raise InvalidInputError(subject, "no modulation", "one that tells what the modulator makes of its levels")
+    count = GREYS if in_use is None else int(levels or 0)
+    greys = np.arange(GREYS) if in_use is None else read_table(in_use, count).astype(np.int64)
+    curve = dict(zip(greys.tolist(), modulation.phase(symbol_phases(np.arange(count), count)).tolist(), strict=True))
+    text = calibration_text(curve) if levels is None else levels_text(curve, levels, f"modulator of {subject}")
+    replace_text(out, text, "lookup table")
