@@ -81,7 +81,7 @@ class Killed:
             client.jobs.recalibrate(count=2)
 
     def check(self, service: RunningService, expected: set[str]) -> str:
-        """What the service that came after a kill serves; whatever should not be is noted."""
+        """Look at what the service that came after a kill serves, and note whatever should not be."""
         with LightpageClient(service.target, 60) as client:
             version = client.describe().model.version
             if version not in expected:

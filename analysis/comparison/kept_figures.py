@@ -1,4 +1,4 @@
-"""What kept decoders read, beside the same ones as they were trained: on new pages of their device.
+"""Measures what kept decoders read, beside the same ones as they were trained: on new pages of their device.
 
     python -m analysis.comparison.kept_figures --kept analysis/weights/bench/-0.6deg-32e-4px \
         --trained runs/decoders/-0.6deg-32e-4px --out runs/kept-figures

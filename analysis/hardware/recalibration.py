@@ -1,4 +1,4 @@
-"""What a recalibration in its own process costs reads, and what busy reads cost it.
+"""Measures what a recalibration in its own process costs reads, and what busy reads cost it.
 
     python -m analysis.hardware.recalibration --json FILE
 

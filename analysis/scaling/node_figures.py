@@ -1,4 +1,4 @@
-"""What one node takes, measured on this machine: for a page, for a range, and of the driver."""
+"""Measures what one node takes, measured on this machine: for a page, for a range, and of the driver."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class RunFigures(Part):
 
 
 class DriverFigures(Part):
-    """What the driver takes for a range, handing it out and taking what comes back.
+    """Measure what the driver takes for a range, handing it out and taking what comes back.
 
     Attributes:
         in_flight: ranges on their way at once.

@@ -1,4 +1,4 @@
-"""What a call takes beside the decode: frames in chunks, in shared memory, and a bare stream of the same bytes.
+"""Measures what a call takes beside the decode: frames in chunks, in shared memory, and a bare stream of the same bytes.
 
     python -m analysis.service.transport --json FILE
 

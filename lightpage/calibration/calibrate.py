@@ -1,4 +1,4 @@
-"""From nominal geometry to this device: coarse-to-fine registration of a known page by rays, then a fit by waves."""
+"""Finds a device from nominal geometry: coarse-to-fine registration of a known page by rays, then a fit by waves."""
 
 from __future__ import annotations
 
