@@ -1,4 +1,4 @@
-"""Measures whether the monitor's alarm comes in time: gradual drifts until pages are lost, and a quiet week without an alarm.
+"""Times the monitor's alarm: gradual drifts until pages are lost, and a quiet week without an alarm.
 
     python -m analysis.hardware.drifts --out FOLDER --json FILE
 

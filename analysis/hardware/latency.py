@@ -1,4 +1,4 @@
-"""Times the way from the trigger to user bytes: encoded pages through the simulated device as hardware, and what each step takes.
+"""Times trigger to user bytes: encoded pages through the simulated device as hardware, and what each step takes.
 
     python -m analysis.hardware.latency --pages 100 --json runs/latency.json
 

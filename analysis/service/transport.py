@@ -1,4 +1,4 @@
-"""Measures what a call takes beside the decode: frames in chunks, in shared memory, and a bare stream of the same bytes.
+"""Times a call beside its decode: frames in chunks, in shared memory, and a bare stream of the same bytes.
 
     python -m analysis.service.transport --json FILE
 
