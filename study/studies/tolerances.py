@@ -18,6 +18,7 @@ import math
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -93,14 +94,17 @@ class Range:
     def text(self, factor: float = 1.0) -> str:
         """Tell both ends in another unit; `<` and `>` say that no more was lost as far as was measured."""
         low = "" if self.below or self.low == 0 else "<"
-        return f"{low}{factor * self.low:.2g} to {'' if self.above else '>'}{factor * self.high:.2g}"
+        return f"{low}{_short(factor * self.low)} to {'' if self.above else '>'}{_short(factor * self.high)}"
+
+
+def _short(value: float) -> str:
+    """Two digits of a number."""
+    return f"{float(f'{value:.2g}'):g}"
 
 
 def _outwards(values: Real, airs: Real, least: float) -> tuple[float, bool]:
     """The value at which AIRs first fall below `least`; the last one where they never do, and whether they do."""
-    for (here, air), (there, less) in zip(
-        zip(values, airs, strict=True), zip(values[1:], airs[1:], strict=True), strict=False
-    ):
+    for (here, air), (there, less) in pairwise(zip(values, airs, strict=True)):
         if less < least:
             return float(here + (there - here) * (air - least) / (air - less)), True
     return float(values[-1]), False
@@ -119,7 +123,7 @@ def _cases(settings: Settings) -> list[Case]:
         values = [knob.values[place] for place in _QUICK_VALUES] if settings.quick else knob.values
         anew = () if settings.quick else knob.values[::-2][:_ANEW_VALUES]
         of_knob = {"knob": name, "at": knob.at(_device(settings))}
-        cases += [{"name": f"{name}-{value:g}", **of_knob, "value": value, "anew": value in anew} for value in values]
+        cases += [{"name": f"{name}={value:g}", **of_knob, "value": value, "anew": value in anew} for value in values]
     return cases
 
 
