@@ -37,7 +37,7 @@ class Knob:
 
     def turned(self, device: Device, value: float) -> Device:
         """Return the device with this knob at a value."""
-        return device.with_settings([f"{key}={factor * value!r}" for key, factor in self.settings.items()])
+        return device.with_values({key: factor * value for key, factor in self.settings.items()})
 
     def at(self, device: Device) -> float:
         """Return the number that a device has, by the first of the settings."""
@@ -77,6 +77,11 @@ class _FullSize:
     def tilt(self) -> tuple[float, str]:
         """Tilt of a sensor that changes the scale by all of it from the page's centre to its right edge."""
         return math.degrees(self._focal_m / (self.profile.page_width_m / 2)), "degrees"
+
+    @cached_property
+    def axial_tilt(self) -> tuple[float, str]:
+        """Tilt of a plane whose right edge is a radian of defocus further off than its middle."""
+        return math.degrees(1e-3 * self.axial[0] / (self.profile.page_width_m / 2)), "degrees"
 
     @cached_property
     def beam(self) -> tuple[float, str]:
@@ -206,6 +211,29 @@ def _knobs() -> tuple[Knob, ...]:
             full.length,
         ),
         Knob(
+            "pipe-height",
+            "wall distance along y against x",
+            "relative",
+            (-0.006, -0.003, -0.001, 0.001, 0.003, 0.006),
+            {"geometry.pipe_height_relative_error": 1.0},
+            full.width,
+        ),
+        Knob(
+            "taper",
+            "taper of the pipe",
+            "relative",
+            (-0.02, -0.005, -0.001, 0.001, 0.005, 0.02),
+            {"geometry.pipe_taper_relative": 1.0},
+            full.width,
+        ),
+        Knob(
+            "ghost",
+            "light that passes the pipe three times",
+            "relative",
+            (0.02, 0.035, 0.07, 0.12, 0.2, 0.35),
+            {"geometry.ghost_relative": 1.0},
+        ),
+        Knob(
             "pipe-roll",
             "roll of the pipe against the page",
             "degrees",
@@ -245,6 +273,23 @@ def _knobs() -> tuple[Knob, ...]:
                 waves,
             )
             for name in ("defocus", "astigmatism", "coma")
+        ),
+        # tilted planes
+        Knob(
+            "modulator-tilt",
+            "tilt of the modulator",
+            "rad at the wall",
+            (0.2, 0.5, 1.0, 1.5, 2.5, 4.0),
+            {"geometry.modulator_tilt_x_rad": 1.0},
+            full.axial_tilt,
+        ),
+        Knob(
+            "camera-tilt",
+            "defocus of tilted cameras, opposite",
+            "rad at the wall",
+            (0.2, 0.5, 1.0, 1.5, 2.5, 4.0),
+            _both("tilt_x_rad", opposite),
+            full.axial_tilt,
         ),
         # cameras
         Knob(
@@ -353,6 +398,27 @@ def _knobs() -> tuple[Knob, ...]:
             (0.0, 0.25, 0.4, 0.55, 0.7, 0.8, 0.9),
             {"slm.falloff_relative": 1.0},
         ),
+        Knob(
+            "crosstalk",
+            "step in phase that a neighbour takes over",
+            "relative",
+            (0.01, 0.02, 0.04, 0.07, 0.12, 0.2),
+            {"slm.crosstalk_relative": 1.0},
+        ),
+        Knob(
+            "flicker",
+            "flicker of 2 pi from page to page",
+            "rad",
+            (0.02, 0.05, 0.1, 0.15, 0.25, 0.4),
+            {"slm.flicker_rad": 1.0},
+        ),
+        Knob(
+            "dead-pixels",
+            "dead pixels of the modulator",
+            "share",
+            (0.0005, 0.002, 0.005, 0.01, 0.03, 0.1),
+            {"slm.dead_pixel_share": 1.0},
+        ),
         # sensors
         Knob(
             "read-noise",
@@ -368,6 +434,27 @@ def _knobs() -> tuple[Knob, ...]:
             (0.02, 0.06, 0.2, 0.5, 1.5, 2.5, 5.0),
             {"sensor.exposure_relative": 1.0},
             logarithmic=True,
+        ),
+        Knob(
+            "nonlinearity",
+            "error of a full well's counts",
+            "relative",
+            (-0.2, -0.08, -0.03, 0.03, 0.08, 0.2),
+            {"sensor.nonlinearity_relative": 1.0},
+        ),
+        Knob(
+            "hot-pixels",
+            "hot pixels of a camera",
+            "share",
+            (0.0002, 0.001, 0.003, 0.01, 0.03, 0.1),
+            {"sensor.hot_pixel_share": 1.0},
+        ),
+        Knob(
+            "dust",
+            "specks of dust on a camera",
+            "specks",
+            (10.0, 25.0, 60.0, 150.0, 400.0, 1_000.0),
+            {"sensor.dust_specks": 1.0},
         ),
     )
 

@@ -6,7 +6,8 @@ one pass by waves.
 - *re-fitted*: the weights of the device as it was; geometry and levels calibrated from nominal on two known pages.
 - *told*: the same weights; geometry, levels and angle between the arms are the true ones, as far as calibrations have
   numbers for them. This oracle says what the re-fit costs; it is told nothing of what calibrations do not fit.
-- *trained anew*: the re-fitted decoder, trained on pages of this device from the kept weights on, at a few values.
+- *trained anew*: the re-fitted decoder, trained on pages of this device from the kept weights on; at three values at
+  most, and only where it reads clearly less than the device that taught it.
 
 What the first loses and the last does not is the kept weights' fault, and training mends it. What both lose is gone
 from the light, or from the model of the device.
@@ -51,7 +52,7 @@ _QUICK_KNOBS = ("stroke", "modulator-axial", "keystone", "phase-noise")
 _QUICK_VALUES = (2, -1)
 """Of a knob's values, by place."""
 _ANEW_VALUES = 3
-_COLUMNS, _TITLE = 5, 32
+_COLUMNS, _TITLE, _MOST_BITS = 5, 32, 8
 _FEWEST = 2
 """Values of a knob that make a curve, that of the device itself among them."""
 _CURVES = {
@@ -147,8 +148,8 @@ def _read(settings: Settings, kept: Path, device: Device, work: Path, progress: 
     """What decoders read of a device.
 
     Returns:
-        air, told, anew: bits a symbol, re-fitted, told and trained anew; no number where that was not trained, and 0
-            where calibration refuses the pages; refused: what it says then.
+        air, told, anew: bits a symbol, re-fitted, told and trained anew; not a number where that was not trained, and
+            0 where calibration refuses the pages; refused: what it says then.
     """
     profile, decoder = settings.profile, KeptDecoder.of(kept)
     progress("simulate", 0.5)
@@ -161,7 +162,7 @@ def _read(settings: Settings, kept: Path, device: Device, work: Path, progress: 
         calibration = fitted.calibration(profile, fitted.registered(profile, lambda *_: None))
         found = CalibratedDevice.of(profile, calibration, pages.references)
         result["air"] = decoder.air(found, judged)
-        if anew:
+        if anew and result["air"] < decoder.run.validation_air - LOSS:
             progress("train anew", 0.8)
             trained = taught(work, profile, device, _ANEW, settings.seed, lambda _: calibration, kept)
             result["anew"] = trained.air(found, judged)
@@ -190,12 +191,19 @@ class _Curve:
         """Bits a symbol, [N]: none where less than none is read, and not a number where nothing was measured."""
         return np.maximum([result[name] for result in self.results], 0.0)
 
+    @property
+    def trained_airs(self) -> Real:
+        """The same of decoders that are trained where a re-fit is not enough, [N]."""
+        anew, air = self.airs("anew"), self.airs("air")
+        enough = air >= air[np.argmin(np.abs(self.values - self.at))] - LOSS
+        return np.where(np.isnan(anew) & enough, air, anew)
+
     def range(self, name: str) -> Range | None:
         """The range within which no more than `LOSS` is lost of what is read of the device that was trained on.
 
         None where nothing but that was measured.
         """
-        airs = self.airs(name)
+        airs = self.trained_airs if name == "anew" else self.airs(name)
         known = np.isfinite(airs)
         if np.count_nonzero(known) < _FEWEST:
             return None
@@ -247,7 +255,9 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
         row[0].set_ylabel("AIR, bits a symbol")
     if curves:
         handles, labels = axes.flat[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
+        figure.legend(
+            handles, labels, loc="outside upper center", ncols=min(columns + 1, len(labels)), fontsize="small"
+        )
     return figure
 
 
@@ -263,7 +273,7 @@ def _draw(axis: Axes, curve: _Curve) -> None:
         axis.set_xscale("log")
     axis.set_title(textwrap.fill(curve.knob.title, _TITLE), fontsize="small")
     axis.set_xlabel(curve.knob.unit, fontsize="small")
-    axis.set_ylim(0, None)
+    axis.set_ylim(0, _MOST_BITS)
     axis.tick_params(labelsize="small")
 
 
