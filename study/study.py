@@ -106,7 +106,7 @@ def measured(study: Study, settings: Settings, case: Case, folder: Path, progres
 
 
 def _names(cases: Sequence[Case]) -> str:
-    return "the beginning of one of " + ", ".join(str(case["name"]) for case in cases)
+    return "one of " + ", ".join(dict.fromkeys(str(case["name"]).partition("=")[0] for case in cases))
 
 
 def aligned(header: Row, rows: Sequence[Row]) -> str:

@@ -21,6 +21,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -156,7 +157,7 @@ def _read(settings: Settings, kept: Path, device: Device, work: Path, progress: 
     pages = Known.of(profile, device, FITTED_PAGES + _JUDGED, settings.seed)
     fitted, judged = pages.part(slice(FITTED_PAGES)), pages.part(slice(FITTED_PAGES, None))
     told = decoder.air(perfectly_calibrated(profile, device, pages.references), judged)
-    result = {"air": 0.0, "told": told, "anew": math.nan, "refused": ""}
+    result: dict[str, Any] = {"air": 0.0, "told": told, "anew": math.nan, "refused": ""}
     try:
         progress("calibrate", 0.6)
         calibration = fitted.calibration(profile, fitted.registered(profile, lambda *_: None))
@@ -198,7 +199,7 @@ class _Curve:
         enough = air >= air[np.argmin(np.abs(self.values - self.at))] - LOSS
         return np.where(np.isnan(anew) & enough, air, anew)
 
-    def range(self, name: str) -> Range | None:
+    def within(self, name: str) -> Range | None:
         """The range within which no more than `LOSS` is lost of what is read of the device that was trained on.
 
         None where nothing but that was measured.
@@ -216,12 +217,12 @@ class _Curve:
 
 
 def _curves(cases: Sequence[Case], results: Sequence[Result]) -> list[_Curve]:
-    trained, curves = {**results[0], "anew": results[0]["air"]}, []
+    trained, curves = {**results[0], "anew": results[0]["air"]}, list[_Curve]()
     for name, knob in KNOBS.items():
         own = [(case, result) for case, result in zip(cases, results, strict=True) if case.get("knob") == name]
         if own:
             at = own[0][0]["at"]
-            points = {at: trained} | {case["value"]: result for case, result in own}
+            points: dict[float, Result] = {at: trained, **{case["value"]: result for case, result in own}}
             values = sorted(points)
             curves.append(_Curve(knob, at, np.array(values), [points[value] for value in values]))
     return curves
@@ -231,7 +232,7 @@ def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:
     air, told = (f"{results[0][name]:.2f} bits" for name in ("air", "told"))
     rows: list[Row] = [("the device that was trained on", "", "", air, "", told, "")]
     for curve in _curves(cases, results):
-        knob, within = curve.knob, {name: curve.range(name) for name in ("air", "told", "anew")}
+        knob, within = curve.knob, {name: curve.within(name) for name in ("air", "told", "anew")}
         texts = {name: "-" if found is None else found.text() for name, found in within.items()}
         full = ""
         if knob.full_size is not None and within["air"] is not None:
@@ -263,7 +264,7 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
 
 def _draw(axis: Axes, curve: _Curve) -> None:
     """One knob: AIR over its values, the range shaded within which `LOSS` is lost."""
-    within = curve.range("air")
+    within = curve.within("air")
     if within is not None:
         axis.axvspan(within.low, within.high, color="tab:blue", alpha=0.12, label=f"{LOSS:g} bit lost within")
     for name, (label, style, colour) in _CURVES.items():

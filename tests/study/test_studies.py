@@ -63,7 +63,7 @@ def test_what_cannot_be_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         (("rays", "--channels", "16", *out), "--channels"),
         (("angle", "--full", *out), "CUDA"),
         (("rays", "--only", "ray", *out), "--only"),
-        (("tolerances", "--only", "wobble", *out), "stroke=-0.06"),
+        (("tolerances", "--only", "wobble", *out), "stroke, level"),
     ):
         with pytest.raises(InvalidInputError, match=named):
             run(*words)
