@@ -10,9 +10,7 @@ from typing import Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from lightpage.calibration.calibrate import KnownPage, Registered, calibrate
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.document import Calibration
 from lightpage.device.profile import Profile
@@ -20,30 +18,20 @@ from lightpage.device.state import Device
 from lightpage.metrics.information import achievable_rate
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.page.pilots import Pilots, read_pilots, remove_piston
-from lightpage.page.symbols import pilot_mask, random_symbols, symbol_phases
-from lightpage.progress import Progress, reporting
-from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.layout import hash_frames
+from lightpage.page.symbols import pilot_mask
+from lightpage.progress import reporting
 from lightpage.recording.reader import Recording
 from lightpage.runtime.model.decoding.phase_refit import PhaseRefit
 from lightpage.simulator.recording_job import RecordingJob
-from lightpage.simulator.simulator import Simulator
+from lightpage.study.known import Known
 from lightpage.train.data.features import FeatureExtractor
 from lightpage.train.models.decoder import SymbolDecoder
-from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
 from lightpage.train.models.presets import PRESETS, STANDARD
-from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.train.runs import Run, load_decoder, load_run
 from lightpage.train.trainers.symbols import SymbolTrainer
 from lightpage.train.trainers.whole_run import Split, make_run, usable_pages
 
-FITTED_PAGES = 2
-"""Known pages of a calibration, as `lightpage calibrate` takes them."""
 _VALIDATION_SHARE = 0.1
-_FIRST_SEED = 10_000
-"""Of the pages that decoders are judged by, far from those that they are trained on."""
-_SYMBOLS = 3
-"""Random stream of their symbols, beside those of the simulator."""
 
 
 @dataclass(frozen=True)
@@ -59,50 +47,6 @@ class Teaching:
     pages: int
     synthetic_pages: int
     steps: int
-
-
-@dataclass(frozen=True)
-class Known:
-    """Pages of a simulated device whose symbols are known.
-
-    Attributes:
-        references: reference-only frames.
-        pairs: frame pairs, one a page.
-        symbols: what was written, uint8 [ny, nx], one a page.
-    """
-
-    references: FramePair
-    pairs: tuple[FramePair, ...]
-    symbols: tuple[NDArray[np.uint8], ...]
-
-    @classmethod
-    def of(cls, profile: Profile, device: Device, pages: int, seed: int) -> Self:
-        """Simulate pages; those of one seed carry the same symbols and noise whatever the device."""
-        simulator = Simulator(profile, device, MAX_LEVELS, _FIRST_SEED + seed)
-        rng = np.random.default_rng([_FIRST_SEED + seed, _SYMBOLS])
-        symbols = random_symbols(profile, MAX_LEVELS, pages, rng)
-        return cls(simulator.references(), tuple(simulator.page(page) for page in symbols), tuple(symbols))
-
-    def part(self, pages: slice) -> Self:
-        """Some of the pages."""
-        return replace(self, pairs=self.pairs[pages], symbols=self.symbols[pages])
-
-    def registered(self, profile: Profile, progress: Progress) -> Registered:
-        """Calibrate from nominal with these pages.
-
-        Raises:
-            CalibrationError: nothing within the capture range explains them.
-        """
-        pages = [
-            KnownPage(pair, np.exp(1j * symbol_phases(symbols, MAX_LEVELS)))
-            for pair, symbols in zip(self.pairs, self.symbols, strict=True)
-        ]
-        solver = TorchFieldSolver(FieldRecovery(profile))
-        return calibrate(TorchTwin(RayTwin(profile)), solver, profile, self.references, pages, progress)
-
-    def calibration(self, profile: Profile, registered: Registered) -> Calibration:
-        """Return the document of a registration with these pages."""
-        return Calibration.from_registered(registered, profile, [hash_frames(pair) for pair in self.pairs])
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,9 @@ from lightpage.errors import CalibrationError
 from lightpage.progress import Progress
 from lightpage.recording.reader import Recording
 from lightpage.simulator.true_optics import perfectly_calibrated
-from lightpage.study.kept import FITTED_PAGES, KeptDecoder, Known, Teaching, taught
+from lightpage.study.kept import KeptDecoder, Teaching, taught
 from lightpage.study.knobs import KNOBS, Knob
+from lightpage.study.known import FITTED_PAGES, Known
 from lightpage.study.study import Case, Result, Row, Settings, Study
 from lightpage.train.commands.calibrate import calibrate_recording
 
@@ -134,15 +135,19 @@ def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> 
     if case["name"] == _KEPT:
 
         def calibration(recording: Recording) -> Calibration:
-            return calibrate_recording(recording, settings.profile, range(FITTED_PAGES), lambda *_: None)
+            return calibrate_recording(recording, settings.profile, range(FITTED_PAGES), _part(progress, 0.0, 0.2))
 
-        progress("train", 0.0)
         teaching = _QUICK_TEACHING if settings.quick else _TEACHING
         taught(work, settings.profile, device, teaching, settings.seed, calibration)
     else:
         device = KNOBS[case["knob"]].turned(device, case["value"])
     kept = work.parent / _KEPT / "run"
     return _read(settings, kept, device, work, progress, anew=case.get("anew", False))
+
+
+def _part(progress: Progress, first: float, last: float) -> Progress:
+    """Progress of a part of a case's work."""
+    return lambda what, share: progress(what, first + share * (last - first))
 
 
 def _read(settings: Settings, kept: Path, device: Device, work: Path, progress: Progress, *, anew: bool) -> Result:
@@ -159,8 +164,7 @@ def _read(settings: Settings, kept: Path, device: Device, work: Path, progress: 
     told = decoder.air(perfectly_calibrated(profile, device, pages.references), judged)
     result: dict[str, Any] = {"air": 0.0, "told": told, "anew": math.nan, "refused": ""}
     try:
-        progress("calibrate", 0.6)
-        calibration = fitted.calibration(profile, fitted.registered(profile, lambda *_: None))
+        calibration = fitted.calibration(profile, _part(progress, 0.6, 0.8))
         found = CalibratedDevice.of(profile, calibration, pages.references)
         result["air"] = decoder.air(found, judged)
         if anew and result["air"] < decoder.run.validation_air - LOSS:
