@@ -97,7 +97,7 @@ def measured(study: Study, settings: Settings, case: Case, folder: Path, progres
     """
     path = folder / f"{case['name']}.json"
     if path.exists():
-        return _load(path)
+        return load_result(path)
     work = folder / str(case["name"])
     work.mkdir(parents=True, exist_ok=True)
     result = study.measure(settings, case, work, progress)
@@ -131,7 +131,12 @@ def _save(path: Path, result: Result) -> None:
     replace_text(path, json.dumps({"values": rest, "arrays": list(arrays)}, indent=1), "result of a study")
 
 
-def _load(path: Path) -> Result:
+def load_result(path: Path) -> Result:
+    """Read the result of a case.
+
+    Raises:
+        InvalidInputError: it is missing or damaged.
+    """
     try:
         kept = json.loads(path.read_text())
         arrays = load_arrays(_arrays(path))

@@ -38,7 +38,7 @@ from lightpage.simulator.true_optics import perfectly_calibrated
 from lightpage.study.kept import KeptDecoder, Teaching, taught
 from lightpage.study.knobs import KNOBS, Knob
 from lightpage.study.known import FITTED_PAGES, Known
-from lightpage.study.study import Case, Result, Row, Settings, Study
+from lightpage.study.study import Case, Result, Row, Settings, Study, load_result
 from lightpage.train.commands.calibrate import calibrate_recording
 
 Real = NDArray[np.float64]
@@ -131,18 +131,19 @@ def _cases(settings: Settings) -> list[Case]:
 
 
 def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> Result:
-    device = _device(settings)
+    device, kept, least = _device(settings), work.parent / _KEPT, -math.inf
     if case["name"] == _KEPT:
 
         def calibration(recording: Recording) -> Calibration:
             return calibrate_recording(recording, settings.profile, range(FITTED_PAGES), _part(progress, 0.0, 0.2))
 
         teaching = _QUICK_TEACHING if settings.quick else _TEACHING
-        taught(work, settings.profile, device, teaching, settings.seed, calibration)
+        taught(kept, settings.profile, device, teaching, settings.seed, calibration)
     else:
         device = KNOBS[case["knob"]].turned(device, case["value"])
-    kept = work.parent / _KEPT / "run"
-    return _read(settings, kept, device, work, progress, anew=case.get("anew", False))
+        if case["anew"]:
+            least = load_result(kept.with_suffix(".json"))["air"] - LOSS
+    return _read(settings, kept / "run", device, work, progress, least)
 
 
 def _part(progress: Progress, first: float, last: float) -> Progress:
@@ -150,8 +151,16 @@ def _part(progress: Progress, first: float, last: float) -> Progress:
     return lambda what, share: progress(what, first + share * (last - first))
 
 
-def _read(settings: Settings, kept: Path, device: Device, work: Path, progress: Progress, *, anew: bool) -> Result:
+def _read(settings: Settings, kept: Path, device: Device, work: Path, progress: Progress, least: float) -> Result:
     """What decoders read of a device.
+
+    Args:
+        settings: of the study.
+        kept: run of the decoder that is kept.
+        device: that is read.
+        work: folder of the case.
+        progress: told of every step.
+        least: AIR below which it is trained anew.
 
     Returns:
         air, told, anew: bits a symbol, re-fitted, told and trained anew; not a number where that was not trained, and
@@ -167,7 +176,7 @@ def _read(settings: Settings, kept: Path, device: Device, work: Path, progress: 
         calibration = fitted.calibration(profile, _part(progress, 0.6, 0.8))
         found = CalibratedDevice.of(profile, calibration, pages.references)
         result["air"] = decoder.air(found, judged)
-        if anew and result["air"] < decoder.run.validation_air - LOSS:
+        if result["air"] < least:
             progress("train anew", 0.8)
             trained = taught(work, profile, device, _ANEW, settings.seed, lambda _: calibration, kept)
             result["anew"] = trained.air(found, judged)

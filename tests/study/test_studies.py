@@ -134,13 +134,13 @@ def test_every_setting_of_a_device_has_a_knob_unless_it_is_known_why_not() -> No
 def test_tolerances_say_within_which_range_a_tenth_of_a_bit_is_lost() -> None:
     knob, settings = KNOBS["modulator-axial"], Settings(SMALL)
     cases = tolerances.STUDY.chosen(settings, ["modulator-axial", "full-well"])
-    assert [case["name"] for case in cases[:2]] == ["kept", "modulator-axial=-3"]
-    lost = {-1.5: 0.0, -0.75: 0.05, 0.75: 0.05, 1.5: 0.15, 3.0: 5.0, 1000.0: 0.02, 300.0: 0.18}
+    assert [case["name"] for case in cases[:2]] == ["kept", "modulator-axial=-6"]
+    lost = {1.5: 0.05, 3.0: 0.15, 6.0: 5.0, 1000.0: 0.02, 300.0: 0.18}
     airs = [6.3 - lost.get(case.get("value", 0), 0.0) for case in cases]
     results = [{"air": air, "told": 6.3, "anew": np.nan} for air in airs]
     device, axial, well = tolerances.STUDY.rows(cases, results)
     assert device[3:6] == ("6.30 bits", "", "6.30 bits")
-    assert axial[3:] == ("<-3 to 1.1", "<-1 to 0.39 mm", "<-3 to >3", "-")
+    assert axial[3:] == ("<-6 to 2.2", "<-2.1 to 0.77 mm", "<-6 to >6", "-")
     assert well[3] == "550 to >100000"  # half way between 300 and 1000, in ratio
     assert knob.full_size is not None
     assert 1.2 * knob.full_size[0] == pytest.approx(0.41, abs=0.005)
