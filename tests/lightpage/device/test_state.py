@@ -33,7 +33,7 @@ def test_the_rough_device_is_the_realistic_one_with_more_faults() -> None:
     rough, plain = load_device("rough").model_dump(), Device().model_dump()
     changed = {(table, key) for table, keys in plain.items() for key in keys if keys[key] != rough[table][key]}
     assert {plain[table][key] for table, key in changed} == {0}
-    assert changed >= {("geometry", "ghost_relative"), ("in_phase_camera", "tilt_y_rad"), ("sensor", "dust_specks")}
+    assert len(changed) == 21
 
 
 def test_settings_change_what_they_name_and_nothing_else() -> None:
@@ -117,11 +117,9 @@ def test_rough_devices_scatter_by_their_deviations_and_stay_inside_the_capture_r
         table, _, key = name.partition(".")
         if isinstance(knob, Spread) and knob.deviation:
             values = np.array([device[table][key] for device in drawn])
-            clipped = np.random.default_rng(2).normal(knob.centre, knob.deviation, 100_000).clip(knob.low, knob.high)
             assert knob.low <= values.min() < values.max() <= knob.high, name
-            # of 400 the root mean square is off by 4% as a rule
-            around = np.sqrt(np.mean((values - knob.centre) ** 2))
-            assert around == pytest.approx(np.sqrt(np.mean((clipped - knob.centre) ** 2)), rel=0.16), name
+            # clipping takes at most an eighth off, and that of 400 is off by 4% as a rule
+            assert 0.78 < np.sqrt(np.mean((values - knob.centre) ** 2)) / knob.deviation < 1.16, name
 
 
 def test_a_pipe_deviates_from_the_angle_of_its_profile_unless_its_own_is_given() -> None:
