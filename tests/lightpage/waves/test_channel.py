@@ -158,8 +158,8 @@ class TestLens:
         page, wall = 0.95e-3, DEVICE.pipe_width_m / 2
         radians = {(4, 0): -5, (3, 1): -4, (2, 2): -3, (1, 3): -1.5, (0, 4): -1, (0, 2): 1.5, (1, 2): 0.8}
         of = {powers: value / page ** powers[0] / wall ** powers[1] for powers, value in radians.items()}
-        whole = SeidelTerms(of[4, 0], of[3, 1], of[2, 2], -of[2, 2], of[1, 3], of[0, 4], of[0, 2])
-        terms = whole._replace(tilt_x=of[1, 2], tilt_y=-of[1, 2])
+        even = of[4, 0], of[3, 1], of[2, 2], -of[2, 2], of[1, 3], of[0, 4], of[0, 2]
+        terms = SeidelTerms(*even, of[1, 2], -of[1, 2])
         geometry = replace(device(-0.6, 0.2), lens_path=terms, camera_path=terms.mirrored())
         x, y = axis(60, 27e-6) + 18e-6, axis(44, 23e-6) - 30e-6
         plane = noise(44, 60)
