@@ -376,7 +376,7 @@ def draw_rough(rng: np.random.Generator) -> Device:
             values[key] = knob(rng)
         elif knob.deviation:
             values[key] = knob.normal(rng)
-    del values["sensor.bit_depth"]
+    del values["sensor.bit_depth"]  # the electronics are those of the realistic device
     return Device().with_values(values | _smooth_error(_SMOOTH_ERROR.normal(rng), rng))
 
 

@@ -136,6 +136,12 @@ class Simulator:
         """Reference-only frames, the mean of so many exposures that only quantisation is left."""
         return self._frames(None, (0.0, 0.0), None)
 
+    def dark(self) -> FramePair:
+        """Frames without any light, in which hot pixels alone show."""
+        sensor, dark = self.device.sensor, np.zeros(self.profile.frame_shape, np.uint16)
+        frames = (blemishes.counted(dark, sensor) for blemishes in self.optics.blemishes)
+        return FramePair(*(frame.astype(frame_type(sensor.bit_depth)) for frame in frames))
+
     def _drift(self) -> None:
         """Walk on by one page; its noise has a stream of its own, so that pages can pass without being computed."""
         drift = self.device.drift
