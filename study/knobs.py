@@ -159,7 +159,7 @@ def _knobs() -> tuple[Knob, ...]:
             "cameras-apart",
             "cameras off their focal plane, opposite",
             "rad at the wall",
-            (0.4, 0.8, 1.5, 2.5, 4.0, 6.0),
+            (0.1, 0.2, 0.4, 0.8, 1.5, 2.5),
             _both("axial_rad", opposite),
             full.axial,
         ),
