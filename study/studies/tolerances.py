@@ -55,8 +55,6 @@ _QUICK_VALUES = (2, -1)
 """Of a knob's values, by place."""
 _ANEW_VALUES = 3
 _COLUMNS, _TITLE, _MOST_BITS = 5, 32, 8
-_FEWEST = 2
-"""Values of a knob that make a curve, that of the device itself among them."""
 _CURVES = {
     "air": ("re-fitted", "o-", "tab:blue"),
     "told": ("told", ".--", "tab:orange"),
@@ -205,6 +203,10 @@ class _Curve:
         """Bits a symbol, [N]: none where less than none is read, and not a number where nothing was measured."""
         return np.maximum([result[name] for result in self.results], 0.0)
 
+    def measured(self, name: str) -> bool:
+        """Whether there is a number at another value than that of the device that was trained on."""
+        return np.count_nonzero(np.isfinite(self.airs(name))) > 1
+
     @property
     def trained_airs(self) -> Real:
         """The same of decoders that are trained where a re-fit is not enough, [N]."""
@@ -217,10 +219,10 @@ class _Curve:
 
         None where nothing but that was measured.
         """
+        if not self.measured(name):
+            return None
         airs = self.trained_airs if name == "anew" else self.airs(name)
         known = np.isfinite(airs)
-        if np.count_nonzero(known) < _FEWEST:
-            return None
         values, airs, at = self.values[known], airs[known], self.at
         least = float(airs[np.argmin(np.abs(values - at))]) - LOSS
         if not self.knob.logarithmic:
@@ -267,11 +269,11 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
         axis.set_visible(False)
     for row in axes:
         row[0].set_ylabel("AIR, bits a symbol")
-    if curves:
-        handles, labels = axes.flat[0].get_legend_handles_labels()
-        figure.legend(
-            handles, labels, loc="outside upper center", ncols=min(columns + 1, len(labels)), fontsize="small"
-        )
+    named = {
+        label: handle for axis in axes.flat for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
+    }
+    columns = min(columns + 1, len(_CURVES) + 2)
+    figure.legend(named.values(), named.keys(), loc="outside upper center", ncols=columns, fontsize="small")
     return figure
 
 
@@ -281,6 +283,8 @@ def _draw(axis: Axes, curve: _Curve) -> None:
     if within is not None:
         axis.axvspan(within.low, within.high, color="tab:blue", alpha=0.12, label=f"{LOSS:g} bit lost within")
     for name, (label, style, colour) in _CURVES.items():
+        if not curve.measured(name):
+            continue
         axis.plot(curve.values, curve.airs(name), style, color=colour, markersize=4, linewidth=1.2, label=label)
     axis.axvline(curve.at, color="0.6", linestyle=":", linewidth=1, label="trained at")
     if curve.knob.logarithmic:
