@@ -54,7 +54,7 @@ _QUICK_KNOBS = ("stroke", "modulator-axial", "keystone", "phase-noise")
 _QUICK_VALUES = (2, -1)
 """Of a knob's values, by place."""
 _ANEW_VALUES = 3
-_COLUMNS, _TITLE, _MOST_BITS = 5, 32, 8
+_COLUMNS, _TITLE, _MOST_BITS, _TICKS = 5, 32, 8, 5
 _CURVES = {
     "air": ("re-fitted", "o-", "tab:blue"),
     "told": ("told", ".--", "tab:orange"),
@@ -92,9 +92,14 @@ class Range:
         high, above = _outwards(values[nearest:], airs[nearest:], least)
         return cls(low, high, below, above)
 
-    def text(self, factor: float = 1.0) -> str:
-        """Tell both ends in another unit; `<` and `>` say that no more was lost as far as was measured."""
-        low = "" if self.below or self.low == 0 else "<"
+    def text(self, factor: float = 1.0, least: float | None = None) -> str:
+        """Tell both ends; `<` and `>` say that no more was lost as far as was measured.
+
+        Args:
+            factor: on the numbers, for another unit.
+            least: value below which there is none.
+        """
+        low = "" if self.below or self.low == least else "<"
         return f"{low}{_short(factor * self.low)} to {'' if self.above else '>'}{_short(factor * self.high)}"
 
 
@@ -205,7 +210,7 @@ class _Curve:
 
     def measured(self, name: str) -> bool:
         """Whether there is a number at another value than that of the device that was trained on."""
-        return np.count_nonzero(np.isfinite(self.airs(name))) > 1
+        return bool(np.count_nonzero(np.isfinite(self.airs(name))) > 1)
 
     @property
     def trained_airs(self) -> Real:
@@ -248,7 +253,8 @@ def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:
     rows: list[Row] = [("the device that was trained on", "", "", air, "", told, "")]
     for curve in _curves(cases, results):
         knob, within = curve.knob, {name: curve.within(name) for name in ("air", "told", "anew")}
-        texts = {name: "-" if found is None else found.text() for name, found in within.items()}
+        least = 0.0 if knob.values[0] >= 0 else None
+        texts = {name: "-" if found is None else found.text(1.0, least) for name, found in within.items()}
         full = ""
         if knob.full_size is not None and within["air"] is not None:
             factor, unit = knob.full_size
@@ -289,6 +295,8 @@ def _draw(axis: Axes, curve: _Curve) -> None:
     axis.axvline(curve.at, color="0.6", linestyle=":", linewidth=1, label="trained at")
     if curve.knob.logarithmic:
         axis.set_xscale("log")
+    else:
+        axis.locator_params(axis="x", nbins=_TICKS)
     axis.set_title(textwrap.fill(curve.knob.title, _TITLE), fontsize="small")
     axis.set_xlabel(curve.knob.unit, fontsize="small")
     axis.set_ylim(0, _MOST_BITS)
