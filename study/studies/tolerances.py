@@ -258,7 +258,7 @@ def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:
         full = ""
         if knob.full_size is not None and within["air"] is not None:
             factor, unit = knob.full_size
-            full = f"{within['air'].text(factor)} {unit}"
+            full = f"{within['air'].text(factor, least)} {unit}"
         rows.append((knob.title, knob.unit, curve.at, texts["air"], full, texts["told"], texts["anew"]))
     return rows
 
