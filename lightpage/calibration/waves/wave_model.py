@@ -152,13 +152,21 @@ class FittedWaves:
         """Defocus of the in-phase camera beyond that of both on average, rad/m^2."""
         self._camera = self.against_reference / stride  # samples that stand for more area are larger
 
+    def to_exit(self, field: Complex, passed: Real | float = 1.0) -> Complex:
+        """Field on the modulator to the exit facet's grid; `passed` as for `WaveChannel.exit_field`."""
+        return self.channel.exit_field(field * self.launch, passed)
+
+    def from_exit(self, leaving: Complex) -> Complex:
+        """Field on the exit facet's grid to the common grid [Gy, Gx], against the reference."""
+        return np.asarray(self.channel.camera_field(leaving) * self._camera)
+
     def to_camera(self, field: Complex) -> Complex:
         """Field on the modulator [ny samples, nx samples] to the common grid [Gy, Gx], against the reference."""
-        return np.asarray(self.channel.forward(field * self.launch) * self._camera)
+        return self.from_exit(self.to_exit(field))
 
     def to_cameras(self, field: Complex) -> Complex:
         """The same as either camera sees it from where it stands, in-phase and quadrature, [2, Gy, Gx]."""
-        leaving = self.channel.exit_field(field * self.launch)
+        leaving = self.to_exit(field)
         beyond = (self._apart, -self._apart) if self._apart else (0.0,)
         seen = [self.channel.camera_field(leaving, each) * self._camera for each in beyond]
         return np.stack([seen[0], seen[-1]])
