@@ -26,7 +26,9 @@ _END_S = 10.0
 
 @click.command(context_settings={"ignore_unknown_options": True})
 @click.option("--profile", "profile_name", default="bench", show_default=True, help="A shipped profile, or a file.")
-@click.option("--device", "device_file", type=click.Path(), help="True state of the device, TOML; realistic if absent.")
+@click.option(
+    "--device", "device_file", type=click.Path(), help="Its true state: `rough`, or TOML; a realistic one if absent."
+)
 @click.option("--set", "settings", multiple=True, metavar="TABLE.KEY=VALUE", help="Change one number of that state.")
 @click.option("--out", required=True, type=OutputFolder(), help="Folder for port, socket and device.toml.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Of noise and drift.")

@@ -88,14 +88,14 @@ class WaveChannel:
     @cached_property
     def entrance_window(self) -> Real:
         """Transmission of the SLM's pixel shape and blur at the entrance facet, [cells_y - 1, cells_x - 1]."""
-        facet_y, facet_x = (facet_axis(count, self.geometry.pipe_width_m) for count in self.cells)
+        facet_y, facet_x = map(facet_axis, self.cells, self.geometry.facet_sides_m())
         window = entrance_window(self.geometry, facet_x, facet_y, self.envelope_m, self.blur_m)
         return np.asarray(window, dtype=np.float32)
 
     @cached_property
     def facet_radius2_m2(self) -> Real:
-        """R^2 of the facets' samples, [cells_y - 1, cells_x - 1]."""
-        facet_y, facet_x = (facet_axis(count, self.geometry.pipe_width_m) for count in self.cells)
+        """R^2 of the exit facet's samples, [cells_y - 1, cells_x - 1]."""
+        facet_y, facet_x = map(facet_axis, self.cells, self.geometry.facet_sides_m(second=True))
         along, upward = on_facet(couplings(self.geometry), facet_x, facet_y[:, None])
         return np.asarray(along**2 + upward**2)
 

@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 
 from lightpage.device.profile import load_profile, to_toml
-from lightpage.device.state import Device, Geometry, draw_device, load_device, parse_device
+from lightpage.device.state import (
+    CAPTURE_RANGE,
+    Device,
+    Geometry,
+    Spread,
+    draw_device,
+    draw_rough,
+    load_device,
+    parse_device,
+)
 from lightpage.errors import ProfileError
 from tests.lightpage.refused import refused
 
@@ -18,6 +27,13 @@ def test_device_survives_the_round_trip_through_toml(tmp_path: Path) -> None:
     path = tmp_path / "device.toml"
     path.write_text(to_toml(device), "utf-8")
     assert load_device(path) == device
+
+
+def test_the_rough_device_is_the_realistic_one_with_more_faults() -> None:
+    rough, plain = load_device("rough").model_dump(), Device().model_dump()
+    changed = {(table, key) for table, keys in plain.items() for key in keys if keys[key] != rough[table][key]}
+    assert {plain[table][key] for table, key in changed} == {0}
+    assert changed >= {("geometry", "ghost_relative"), ("in_phase_camera", "tilt_y_rad"), ("sensor", "dust_specks")}
 
 
 def test_settings_change_what_they_name_and_nothing_else() -> None:
@@ -81,11 +97,31 @@ def test_drawn_devices_fill_the_capture_range_and_stay_inside() -> None:
         ("aberration", "distortion_relative", 0.003),
         ("reference", "tilt_x_rad", 3.0),
         ("homodyne", "quadrature_error_deg", 6.0),
+        ("slm", "stroke_relative_error", 0.03),
+        ("quadrature_camera", "axial_rad", 1.5),
     ):
         values = [getattr(getattr(device, table), key) for device in devices]
         assert 0.9 * limit < -min(values) <= limit, key
         assert 0.9 * limit < max(values) <= limit, key
     assert {d.homodyne.quadrature_sign for d in devices} == {-1, 1}
+    errors = [
+        abs(d.slm.level_sine_rad) + abs(d.slm.level_cosine_rad) + abs(d.slm.level_sine_twice_rad) for d in devices
+    ]
+    assert 0.27 < max(errors) <= 0.3 + 1e-12
+
+
+def test_rough_devices_scatter_by_their_deviations_and_stay_inside_the_capture_range() -> None:
+    rng = np.random.default_rng(1)
+    drawn = [draw_rough(rng).model_dump() for _ in range(400)]
+    for name, knob in CAPTURE_RANGE.items():
+        table, _, key = name.partition(".")
+        if isinstance(knob, Spread) and knob.deviation:
+            values = np.array([device[table][key] for device in drawn])
+            clipped = np.random.default_rng(2).normal(knob.centre, knob.deviation, 100_000).clip(knob.low, knob.high)
+            assert knob.low <= values.min() < values.max() <= knob.high, name
+            # of 400 the root mean square is off by 4% as a rule
+            around = np.sqrt(np.mean((values - knob.centre) ** 2))
+            assert around == pytest.approx(np.sqrt(np.mean((clipped - knob.centre) ** 2)), rel=0.16), name
 
 
 def test_a_pipe_deviates_from_the_angle_of_its_profile_unless_its_own_is_given() -> None:

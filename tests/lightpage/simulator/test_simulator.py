@@ -264,6 +264,62 @@ class TestLight:
         assert np.angle(factor[-1, -1]) == pytest.approx(expected, abs=0.02)
         assert np.angle(factor[-1, 0]) == pytest.approx(expected - 0.4 * half_x / np.sqrt(corner2), abs=0.02)
 
+    @pytest.mark.parametrize(("axis", "place"), [("x", 0.7), ("y", -0.6)])
+    def test_a_tilted_camera_sees_each_place_out_of_focus_by_so_much(self, axis: str, place: float) -> None:
+        tilted, profile = CameraPose(**{f"tilt_{axis}_rad": 1.0}), small_profile()
+        optics = TrueOptics(profile, perfect_device(in_phase_camera=tilted))
+        flat = TrueOptics(profile, perfect_device())
+        exit_field = flat.exit_field(on_slm(random_phases(profile, 3), profile))
+        x, y = optics.camera_axes_m
+        half = {"x": profile.page_width_m / 2, "y": profile.page_height_m / 2}
+        at = np.argmin(np.abs({"x": x, "y": y}[axis] - place * half[axis]))
+        line = np.s_[:, at] if axis == "x" else np.s_[at, :]
+        seen, there, focused = (
+            found.camera_field(exit_field, pose)[line]
+            for found, pose in ((optics, tilted), (flat, CameraPose(axial_rad=place)), (flat, CameraPose()))
+        )
+        assert np.linalg.norm(seen - there) < 0.02 * np.linalg.norm(there) < 0.1 * np.linalg.norm(seen - focused)
+
+
+FAULTS = {
+    "geometry.pipe_height_relative_error": (0.001, 0),
+    "geometry.pipe_taper_relative": (0.0005, 0),
+    "geometry.ghost_relative": (0.035, -29.1),
+    "geometry.modulator_tilt_x_rad": (0.1, 0),
+    "in_phase_camera.tilt_y_rad": (0.1, 0),
+    "slm.crosstalk_relative": (0.02, 0),
+    "slm.flicker_rad": (0.01, 0),
+    "slm.dead_pixel_share": (0.001, -28.2),
+    "sensor.nonlinearity_relative": (-0.03, 0),
+    "sensor.hot_pixel_share": (0.0002, 0),
+    "sensor.dust_specks": (25, 0),
+}
+"""Values of a bench, and the power of what they change in the frames over that of the signal there, dB."""
+
+
+class TestFaults:
+    @pytest.mark.parametrize("knob", FAULTS)
+    def test_a_fault_changes_as_much_of_the_frames_as_it_should(self, knob: str) -> None:
+        value, expected = FAULTS[knob]
+        off, on = (
+            Simulator(small_profile(), gentle().with_settings([f"{knob}={each}"]), levels=16, seed=1, steps=16)
+            for each in (0, value)
+        )
+        (plain, reference), (faulty, _) = ((each.page(symbols(each.profile)), each.references()) for each in (off, on))
+        signal, change = (
+            np.sum((one.in_phase.astype(float) - other.in_phase) ** 2)
+            for one, other in ((plain, reference), (faulty, plain))
+        )
+        assert 10 * np.log10(change / signal) == pytest.approx(expected, abs=0.5)
+
+    def test_what_draws_the_faults_changes_nothing_where_there_are_none(self) -> None:
+        seeds = ["slm.dead_pixel_seed=7", "sensor.blemish_seed=7"]
+        frames = [
+            Simulator(TINY, Device().with_settings(each), levels=16, seed=1, steps=8).page(symbols(TINY)).in_phase
+            for each in ([], seeds)
+        ]
+        assert np.array_equal(*frames)
+
 
 @cache
 def mishandled() -> Device:
