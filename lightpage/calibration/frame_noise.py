@@ -42,9 +42,7 @@ def noise_variance(frame: NDArray[np.integer]) -> tuple[float, float]:
     return float(fixed), float(by_count)
 
 
-def with_more_noise(
-    frame: NDArray[np.integer], times: float, rng: np.random.Generator
-) -> NDArray[np.integer]:
+def with_more_noise(frame: NDArray[np.integer], times: float, rng: np.random.Generator) -> NDArray[np.integer]:
     """A frame of the same type with so many times its noise added.
 
     Args:

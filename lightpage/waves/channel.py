@@ -127,14 +127,20 @@ class WaveChannel:
         down, across = self._between
         return real_products(down, sparse, across.T)
 
-    def to_exit(self, field: Complex) -> Complex:
-        """Field on the camera plane back to the exit facet's grid, by the adjoint."""
+    def to_exit(self, field: Complex, defocus: float = 0.0) -> Complex:
+        """Field on the camera plane, or on one of further `defocus`, back to the exit facet's grid, by the adjoint."""
         if self._between is not None:
             down, across = self._between
             field = real_products(down.T, field, across)
-        return self.delaunch_lens.to_facet(field)
+        exit_field = self.delaunch_lens.to_facet(field)
+        if defocus:
+            exit_field = exit_field * np.exp(-1j * defocus * self.facet_radius2_m2).astype(np.complex64)
+        return exit_field
+
+    def to_page(self, exit_field: Complex) -> Complex:
+        """Field on the exit facet's grid back to the SLM, by the adjoint: undoes the pipe exactly."""
+        return self.launch_lens.to_plane(self.pipe.adjoint(exit_field) * self.entrance_window)
 
     def adjoint(self, field: Complex) -> Complex:
         """Field on the camera plane back to the SLM: undoes the pipe exactly, the chain inside the pipe's band."""
-        at_entrance = self.pipe.adjoint(self.to_exit(field))
-        return self.launch_lens.to_plane(at_entrance * self.entrance_window)
+        return self.to_page(self.to_exit(field))
