@@ -7,8 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 
-from lightpage.calibration.goodness import Goodness, Map
+from lightpage.calibration.goodness.verdict import Goodness, Map
 
 _SIZE = (7.2, 3.1)
 """Inches."""
@@ -29,7 +30,7 @@ def goodness_figure(goodness: Goodness) -> Figure:
     return figure
 
 
-def _draw(axis: Axes, values: Map, title: str, box: float | None) -> object:
+def _draw(axis: Axes, values: Map, title: str, box: float | None) -> AxesImage:
     shown = axis.imshow(np.array(values), cmap="cividis", norm=LogNorm(1, _MOST))
     axis.set_title(title, fontsize=9)
     axis.set_xticks([])

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.coherence import COHERENT_BRANCHES, page_coherence
-from lightpage.calibration.goodness import Goodness, measure_goodness
+from lightpage.calibration.goodness.measure import measure_goodness
+from lightpage.calibration.goodness.verdict import Goodness
 from lightpage.calibration.interfaces import FieldSolver, Twin
 from lightpage.calibration.parameters import NAMES, PARAMETERS, indices, nominal
 from lightpage.calibration.patch_fit import PatchFit, fit_parameters

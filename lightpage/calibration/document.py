@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, field_serializer
 
 from lightpage.calibration.calibrate import Registered
-from lightpage.calibration.goodness import USABLE, Goodness
+from lightpage.calibration.goodness.verdict import USABLE, Goodness
 from lightpage.calibration.parameters import KNOWN, NAMES, as_dict, as_vector
 from lightpage.device.profile import Count, Finite, Profile, TomlTable, to_toml, validate
 from lightpage.errors import CalibrationError, ProfileError

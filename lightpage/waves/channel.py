@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lightpage.waves.geometry import (
     Complex,
@@ -103,7 +105,7 @@ class WaveChannel:
         """Field on the SLM [ny, nx] to the field on the camera plane."""
         return self.camera_field(self.exit_field(field))
 
-    def exit_field(self, field: Complex, passed: Real | float = 1.0) -> Complex:
+    def exit_field(self, field: Complex, passed: NDArray[Any] | float = 1.0) -> Complex:
         """Field on the SLM [ny, nx] to the field on the exit facet's grid.
 
         Args:

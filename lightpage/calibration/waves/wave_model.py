@@ -154,7 +154,7 @@ class FittedWaves:
         self._apart = defocus(axial_of_cameras(value)[1], geometry.pipe_width_m)
         self._camera = self.against_reference / stride  # samples that stand for more area are larger
 
-    def to_exit(self, field: Complex, passed: Real | float = 1.0) -> Complex:
+    def to_exit(self, field: Complex, passed: NDArray[Any] | float = 1.0) -> Complex:
         """Field on the modulator to the exit facet's grid; `passed` as for `WaveChannel.exit_field`."""
         return self.channel.exit_field(field * self.launch, passed)
 

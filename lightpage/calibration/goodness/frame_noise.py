@@ -54,4 +54,4 @@ def with_more_noise(frame: NDArray[np.integer], times: float, rng: np.random.Gen
     expected = scipy.ndimage.uniform_filter(frame.astype(np.float32), _SMOOTHED_PX)
     deviation = times * np.sqrt(np.clip(fixed + by_count * expected, 0, None))
     seen = np.rint(frame + deviation * rng.standard_normal(frame.shape, dtype=np.float32))
-    return np.clip(seen, 0, np.iinfo(frame.dtype).max).astype(frame.dtype)
+    return np.asarray(np.clip(seen, 0, np.iinfo(frame.dtype).max), dtype=frame.dtype)
