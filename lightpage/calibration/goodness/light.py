@@ -48,8 +48,8 @@ class SeenLight:
         waves: the fitted ones.
         page: light on the modulator, [ny samples, nx samples].
         fields: what either camera should see.
-        counts: what it saw beyond its reference, over twice that.
-        references: counts of the references.
+        counts: what it saw beyond its reference, over twice that, [2, Gy, Gx].
+        references: counts of the references, [2, Gy, Gx].
     """
 
     def __init__(
@@ -137,7 +137,7 @@ class SeenLight:
         """Equations [2, Gy, Gx], or on the coarse grid, over their noise, on that grid; flat."""
         if left.shape[1:] == self._seen.shape:
             left = left[:, *_EVERY]
-        weighted = left / np.sqrt(np.abs(self._along[:, *_EVERY]) ** 2 + _FLOOR)
+        weighted = left / np.sqrt(self.brightness[:, *_EVERY] + _FLOOR)
         return np.asarray(weighted[:, self._seen[_EVERY]].ravel())
 
     def equations_of(self, change: Complex) -> Real:
@@ -164,6 +164,11 @@ class SeenLight:
         """Places (x, y) of the coarse grid over its half width and half height, to be spread over it."""
         x, y = self._grid.x_m[::_STRIDE], self._grid.y_m[::_STRIDE]
         return (x / self._grid.x_m[-1])[None, :], (y / self._grid.y_m[-1])[:, None]
+
+    @property
+    def brightness(self) -> Real:
+        """What the cameras should have counted, over the reference's counts, [2, Gy, Gx]."""
+        return np.abs(self._along) ** 2
 
     @property
     def left_of_equations(self) -> Real:
@@ -195,7 +200,7 @@ class SeenLight:
     def _mending(self, left: Real) -> Complex:
         """Light of both cameras that mends what is left of their equations, each weighted by its noise."""
         along = self._along
-        return np.asarray(self._seen * self._amplitude * along * left / (np.abs(along) ** 2 + _FLOOR))
+        return np.asarray(self._seen * self._amplitude * along * left / (self.brightness + _FLOOR))
 
     def _filtered(self, pair: FramePair, references: FramePair) -> list[NDArray[np.float32]]:
         """What either frame shows beyond its reference, filtered as a decoder filters it."""

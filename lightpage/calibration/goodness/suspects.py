@@ -19,7 +19,7 @@ _STEP = 1e-4
 _RANK = 1e-4
 """Singular values are dropped below this share of the largest."""
 _LOCAL = 0.3
-"""Share of the errors' power in a hundredth of the symbols from which on it lies in few places; noise has 0.06."""
+"""Share of what is left in a hundredth of the equations from which on it lies in few places; noise has 0.08."""
 _FOREIGN = 0.1
 """Mean square of the symbols' relative errors from which on light belongs to other symbols."""
 _TELLING = 0.2
@@ -47,10 +47,10 @@ def likeliest(light: SeenLight, errors: Complex, *, levels: bool) -> str:
     words, most = max(((words, share(columns)) for words, columns in _suspects(light)), key=lambda found: found[1])
     if most > _TELLING:
         return f"{words} ({most:.0%} of what is left)"
-    power = np.sort(np.abs(errors).ravel() ** 2)
+    power = np.sort(left**2)
     if power[-len(power) // 100 :].sum() > _LOCAL * power.sum():
-        return "light in few places: dust, hot or dead pixels?"
-    if power.mean() > _FOREIGN:
+        return "light in few places: is there dust, are there hot pixels?"
+    if np.mean(np.abs(errors) ** 2) > _FOREIGN:
         return "light of other symbols: are these the pages that were written, and is this their profile?"
     return "nothing that the model knows: light comes by a way that it lacks, or not all symbols are as written"
 
@@ -98,5 +98,5 @@ def _suspects(light: SeenLight) -> Iterator[tuple[str, list[Real]]]:
     length = light.waves.channel.geometry.pipe_length_m
     ghost = light.changed(pipe_length_m=3 * length).to_cameras(page)
     yield "light that passes the pipe three times", [light.equations_of(each) for each in (ghost, 1j * ghost)]
-    bright = light.references * (light.counts + 0.5) ** 2
+    bright = light.references * light.brightness**2
     yield "counts that are not in proportion to the light", [light.equations(bright * each) for each in (one, 1 - one)]
