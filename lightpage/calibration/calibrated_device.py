@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.calibration.document import Calibration
 from lightpage.calibration.sampling_table import stand_apart
 from lightpage.device.profile import Profile
 from lightpage.page.modulation import NOMINAL, Modulation
 from lightpage.recording.frame_pair import FramePair
+
+if TYPE_CHECKING:
+    from lightpage.calibration.document import Calibration
 
 
 @dataclass(frozen=True)
