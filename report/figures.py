@@ -12,11 +12,11 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Colormap
 from numpy.typing import NDArray
 
+from lightpage.calibration.goodness.figure import goodness_figure
 from lightpage.report.contents.data import Golden, Real, ReportData
 from lightpage.report.drawing import BLUE, GREEN, GREY, ORANGE, Picture, as_picture, new_figure, one_axis
 from lightpage.report.words import number, signed
 from lightpage.train.fitting.curves import Curve
-from lightpage.train.goodness_figure import goodness_figure
 from lightpage.train.published.rays import RayTracer
 
 _MISSING = "#bbbbbb"

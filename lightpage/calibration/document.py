@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, field_serializer
 
 from lightpage.calibration.calibrate import Registered
+from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.goodness.verdict import USABLE, Goodness
 from lightpage.calibration.parameters import KNOWN, NAMES, as_dict, as_vector
 from lightpage.device.profile import Count, Finite, Profile, TomlTable, to_toml, validate
@@ -20,6 +21,7 @@ from lightpage.files import read_text, replace_text
 from lightpage.page import modulation as modulations
 from lightpage.page.modulation import NOMINAL, Modulation
 from lightpage.progress import warn
+from lightpage.recording.frame_pair import FramePair
 
 Real = NDArray[np.float64]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -153,6 +155,10 @@ class Calibration(TomlTable):
     def modulator(self) -> Modulation:
         """What the modulator makes of its levels."""
         return Modulation(tuple(self.modulation.values()))
+
+    def device(self, profile: Profile, references: FramePair) -> CalibratedDevice:
+        """The device that was found, with its reference-only frames."""
+        return CalibratedDevice(profile, self.vector, self.turn_rad, references, self.modulator)
 
     def angle_deg(self, profile: Profile) -> float:
         """Angle of the pipe, degrees: the profile's and what was fitted on top."""

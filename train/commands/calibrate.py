@@ -12,6 +12,7 @@ import numpy as np
 from lightpage.calibration.calibrate import calibrate as register
 from lightpage.calibration.coherence import seen_share
 from lightpage.calibration.document import Calibration
+from lightpage.calibration.goodness.figure import goodness_figure
 from lightpage.calibration.known_pages import first_lit_pages, known_pages
 from lightpage.cli.paths import OutputFile
 from lightpage.cli.progress_bar import percent_bar
@@ -20,7 +21,6 @@ from lightpage.files import replace_file, write_json
 from lightpage.pictures import write_figure_png
 from lightpage.progress import Progress, warn
 from lightpage.recording.reader import Recording
-from lightpage.train.goodness_figure import goodness_figure
 from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
 from lightpage.train.models.twin import RayTwin, TorchTwin
 

@@ -100,7 +100,7 @@ class Bench:
         references = self.recording.references()
         if method == ORACLE:
             return perfectly_calibrated(self.profile, self.device, references)
-        return CalibratedDevice.of(self.profile, self.fitted, references)
+        return self.fitted.device(self.profile, references)
 
     def extractor(self, method: str) -> FeatureExtractor:
         """Of the calibrated device; the true one for an oracle's further pass, the signal's power left in."""

@@ -146,7 +146,7 @@ def test_what_was_found_is_written_as_json(tmp_path: Path, monkeypatch: pytest.M
 def test_a_wrong_fit_is_an_error_and_is_there_to_be_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake_registration(monkeypatch, replace(REGISTERED, goodness=UNEXPLAINED))
     out, picture = tmp_path / "calibration.toml", tmp_path / "left.png"
-    with pytest.raises(CalibrationError, match=r"wrong fit.*1.20 bit a symbol: a curvature"):
+    with pytest.raises(CalibrationError, match="wrong fit"):
         run(flat_recording(tmp_path / "R.h5", 100), out, "--picture", str(picture))
     assert load_calibration(out).goodness == UNEXPLAINED
     assert picture.read_bytes().startswith(b"\x89PNG")
