@@ -60,17 +60,7 @@ def test_a_callers_own_modules_break_nothing(toy_zip: Path, tmp_path: Path) -> N
     toy.write_toy_recording(tmp_path / "R.h5", toy.ToyDevice(), 16, 2)
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
     command = [Path(sys.executable).with_name("lightpage")]
-    bulk = [
-        "bulk",
-        "evaluate",
-        "out",
-        "--recordings",
-        "R.h5",
-        "--bundle",
-        toy_zip,
-        "--workers",
-        "1",
-    ]  # in another process
+    bulk = ["bulk", "evaluate", "out", "--recordings", "R.h5", "--bundle", toy_zip, "--workers", "1"]  # another process
     for line in (
         [*command, "train", "--help"],
         [*command, "export", "--help"],

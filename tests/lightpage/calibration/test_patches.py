@@ -29,7 +29,6 @@ PITCH = PROFILE.symbol_pitch_m
 PIXEL = PROFILE.camera.pitch_m
 MIDDLE = patches(PROFILE)[5]
 FINE = PROFILE.with_symbols_of(2)
-FINE_SYMBOLS = np.exp(1j * random_phases(FINE, 1))
 
 
 def look(
