@@ -1,7 +1,5 @@
 """Fixtures that several packages' tests share because they are dear."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import signal

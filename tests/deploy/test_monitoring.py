@@ -1,7 +1,5 @@
 """Dashboard, alerts and configurations ask for what the service shows, and their own programs take them."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Published decoders as bundles: what the runtime says of a recording is what torch says."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A device for tests, an eighth of the full size: zones, symbols and sampling of `bench` on a quarter of its area."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lightpage.device.profile import Camera, Lens, LensPath, PageLayout, Pipe, Profile, load_profile

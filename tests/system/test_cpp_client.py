@@ -1,7 +1,5 @@
 """The client in C++ compiles without a warning, and every command of its example does what it says."""
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 import subprocess

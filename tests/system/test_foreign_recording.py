@@ -1,7 +1,5 @@
 """The strictest test: recordings made by a simulator that shares nothing with ours, through the commands."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

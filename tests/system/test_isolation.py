@@ -1,7 +1,5 @@
 """The runtime serves without torch, nothing is sent to anybody, and setuptools finds every folder of code."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """One name: all that is installed lies under `lightpage.`, and a caller's own modules of any name break nothing."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re

@@ -1,7 +1,5 @@
 """The shell around the code: set-up, release, image and commands are what they say."""
 
-from __future__ import annotations
-
 import ast
 import io
 import json

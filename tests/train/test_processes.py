@@ -1,7 +1,5 @@
 """Several processes train as one does with all of their pages, and what cannot be is told before anything is begun."""
 
-from __future__ import annotations
-
 import os
 import socket
 import subprocess

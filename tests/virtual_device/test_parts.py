@@ -1,7 +1,5 @@
 """The emulated pulse generator answers as the manual says; ports and private networks are there, or said not to be."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket

@@ -1,7 +1,5 @@
 """Comparisons of decoders: what each command writes, and what it takes up from earlier runs."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

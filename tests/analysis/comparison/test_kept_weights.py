@@ -1,7 +1,5 @@
 """Weights of kept decoders: what rounding changes, and what is read again."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

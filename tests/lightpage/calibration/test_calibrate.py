@@ -1,7 +1,5 @@
 """Claims about registration on pages smaller than the shipped devices': how far it gets, and what it says then."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The calibration document: read back as written, wrong documents refused by name."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

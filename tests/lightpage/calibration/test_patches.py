@@ -1,7 +1,5 @@
 """Claims about local measurements: a patch finds the shift, phase and slope put in, and knows light that is not its."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A code is found for what pages are like, whatever the shape of their noise, and pages written with it are read."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

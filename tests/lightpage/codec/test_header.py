@@ -1,7 +1,5 @@
 """Headers: what is written is read, damage is noticed, what does not fit is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

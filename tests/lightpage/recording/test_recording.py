@@ -1,7 +1,5 @@
 """Recordings: what is written comes back, what is damaged is refused by name, an interruption loses nothing."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path

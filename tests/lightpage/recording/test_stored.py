@@ -1,7 +1,5 @@
 """What is opened is what it says: nothing that HDF5 fills in, finds elsewhere or cannot decode is believed."""
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil

@@ -1,7 +1,5 @@
 """The commands of the runtime: figures and files that they write, what they refuse, and how they end."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Callable, Iterator

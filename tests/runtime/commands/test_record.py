@@ -1,7 +1,5 @@
 """Pages of a source become a recording: gone on with after an interruption, every lost shot noted."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`lightpage serve`: its settings, its log and record of model changes, what it refuses, how it ends; its health."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """`lightpage top`: what it says of a real service, of one that was restarted, and of one that is gone."""
 
-from __future__ import annotations
-
 import math
 import os
 import pty

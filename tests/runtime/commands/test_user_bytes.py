@@ -1,7 +1,5 @@
 """A file to pages and back by the commands, and every way in which that can go wrong."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

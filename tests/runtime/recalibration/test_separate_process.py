@@ -1,7 +1,5 @@
 """A recalibration in its own process ends as one in this process does, or changes nothing and leaves nothing behind."""
 
-from __future__ import annotations
-
 import os
 import re
 import tempfile

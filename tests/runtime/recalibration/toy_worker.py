@@ -1,7 +1,5 @@
 """Known pages of a toy device that has drifted, and workers that fit it, or come to no good end."""
 
-from __future__ import annotations
-
 import os
 import signal
 from typing import Any

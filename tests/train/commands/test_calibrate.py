@@ -1,7 +1,5 @@
 """`lightpage calibrate`: finds the device, or says that it found nothing, and never writes a guess."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

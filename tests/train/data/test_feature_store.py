@@ -1,7 +1,5 @@
 """Features on disk: what an interruption left is taken up, what belongs to something else is not."""
 
-from __future__ import annotations
-
 import errno
 import os
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """`lightpage bulk`: every page once, whatever happens in between, and what is done is not done again."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

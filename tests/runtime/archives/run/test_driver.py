@@ -1,7 +1,5 @@
 """The driver: hands out what is missing, tries again what may pass, and counts what became of everything."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

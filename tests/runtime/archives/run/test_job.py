@@ -1,7 +1,5 @@
 """What a run was asked: the same question goes on, another one is refused, and names mean the files that are there."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """The folder of a run: who may work in it, what is missing there, and what is read again."""
 
-from __future__ import annotations
-
 import errno
 from pathlib import Path
 

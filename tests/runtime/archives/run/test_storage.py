@@ -1,7 +1,5 @@
 """A fault of storage is no finding about a page: ranges are missing until it answers, and lost on request alone."""
 
-from __future__ import annotations
-
 import errno
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """What a worker makes of a range: a finding about each page, or none at all, which another try may change."""
 
-from __future__ import annotations
-
 import errno
 import os
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Cameras, trigger, modulator and beams make pages; what goes wrong is repeated or mended, named and counted."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from functools import partial

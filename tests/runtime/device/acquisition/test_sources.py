@@ -1,7 +1,5 @@
 """Pages come from files, uploads, recordings and simulated devices, by number or in turn."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from importlib.metadata import EntryPoint

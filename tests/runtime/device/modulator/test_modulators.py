@@ -1,7 +1,5 @@
 """A monitor, a controller or a person shows pages and moves beams; what goes wrong loses that page alone."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """A bundle is loaded whole, unchanged and, with a key, signed, or not at all; its golden page is in few counts."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,7 +1,5 @@
 """What computes pages: names, options, refusals, tensors that stay where it computes; the share of cores and memory."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 from pathlib import Path

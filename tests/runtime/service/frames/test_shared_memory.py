@@ -1,7 +1,5 @@
 """Shared memory: frames in it are decoded as those that are sent, and what a client does there harms nobody."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import secrets

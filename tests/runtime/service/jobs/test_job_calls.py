@@ -1,7 +1,5 @@
 """Recalibrations as jobs over the wire: they survive their callers, and frames that are sent serve as a recording."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Jobs are told apart, kept over a restart whatever ended the service, and cost nobody more than their record."""
 
-from __future__ import annotations
-
 import logging
 import sqlite3
 import threading

@@ -1,7 +1,5 @@
 """Recalibration over the endpoint: what it brings, what it refuses, and that nothing is lost or changed meanwhile."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

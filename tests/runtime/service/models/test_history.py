@@ -1,7 +1,5 @@
 """The history of models: back, forward, elsewhere, and only a few of them loaded."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from dataclasses import replace

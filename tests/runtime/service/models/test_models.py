@@ -1,7 +1,5 @@
 """The models over the endpoint: listed, rolled back and forward, uploaded, put in service, pinned."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import threading

@@ -1,7 +1,5 @@
 """What callers send again or leave behind is bounded: answers by request id, and the memory of pairs."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Certificates count anew without a restart, and are named where they are no good; what they say of who calls."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import ssl

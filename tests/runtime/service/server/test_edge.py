@@ -1,7 +1,5 @@
 """The service towards many callers, and bad ones: it stays right, polite and small."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The running service: what it answers, what it refuses, and that it keeps nothing behind."""
 
-from __future__ import annotations
-
 import errno
 import tempfile
 import threading
