@@ -23,7 +23,7 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.frames.frames import PairReceiver
 from lightpage.runtime.service.shared_memory import Region, SharedMemory
 from tests.runtime import toy
-from tests.runtime.service.conftest import begun
+from tests.runtime.conftest import begun
 from tests.runtime.service.stage import Refused, Running, Start, a_page, header, refused
 from tests.waiting import eventually
 
