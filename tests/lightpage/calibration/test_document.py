@@ -1,6 +1,7 @@
 """The calibration document: read back as written, wrong documents refused by name."""
 
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -148,10 +149,7 @@ def test_a_page_too_small_to_be_found_is_refused_before_anything_is_searched() -
     profile = PROFILE.model_copy(update={"page": PROFILE.page.model_copy(update={"columns": 20, "rows": 24})})
     frame = np.ones(profile.frame_shape, np.uint8)
     page = KnownPage(FramePair(frame, frame), np.ones(profile.page_shape, complex))
-
-    def solve(*_: object) -> tuple[np.ndarray, np.ndarray]:
-        raise AssertionError("nothing may be computed")
-
+    solve = Mock(side_effect=AssertionError("nothing may be computed"))
     with refused("profile bench", "20 x 24", CalibrationError):
         calibrate(FlatTwin(profile), solve, profile, page.pair, [page])
 

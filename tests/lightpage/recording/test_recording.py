@@ -4,6 +4,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import h5py
 import numpy as np
@@ -426,12 +427,8 @@ class TestInterruption:
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         path, profile = tmp_path / "own.h5", small_profile()
-
-        def interrupt(made: Path, final: Path) -> None:
-            raise KeyboardInterrupt
-
         with monkeypatch.context() as patch:
-            patch.setattr("lightpage.recording.writer.move_into_place", interrupt)
+            patch.setattr("lightpage.recording.writer.move_into_place", Mock(side_effect=KeyboardInterrupt))
             writer = RecordingWriter(path, profile, LEVELS, 12, random_frames(100))
             for page in range(3):
                 writer.append(None, random_frames(page))

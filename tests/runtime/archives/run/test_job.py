@@ -6,6 +6,7 @@ import json
 import shutil
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -142,10 +143,6 @@ def test_a_bundle_that_cannot_be_read_is_told_from_one_that_is_another(
 ) -> None:
     with pytest.raises(BundleError, match="gone"):
         bundle_sha256(tmp_path / "gone.zip")
-
-    def fails(*_: object) -> None:
-        raise OSError(errno.EIO, "Input/output error")
-
-    monkeypatch.setattr(hashlib, "file_digest", fails)
+    monkeypatch.setattr(hashlib, "file_digest", Mock(side_effect=OSError(errno.EIO, "Input/output error")))
     with pytest.raises(StorageError, match="bundle"):
         bundle_sha256(toy_zip)

@@ -4,6 +4,7 @@ import errno
 import os
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import h5py
 import pytest
@@ -91,9 +92,7 @@ def test_what_nobody_foresaw_ends_the_worker(asked: Callable[..., Task], monkeyp
 def test_results_that_storage_does_not_take_make_no_page_lost(
     asked: Callable[..., Task], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(*_: object) -> None:
-        raise StorageError("shard", "Input/output error", "a file that can be written")
-
+    refuse = Mock(side_effect=StorageError("shard", "Input/output error", "a file that can be written"))
     monkeypatch.setattr("lightpage.runtime.archives.workers.page_range.write_user_bytes", refuse)
     failed = failure(asked(Operation.RECOVER, give_up=True))
     assert (failed.problem.subject, failed.problem.passes) == ("shard", True)

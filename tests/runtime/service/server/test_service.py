@@ -7,6 +7,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import grpc
 import h5py
@@ -270,9 +271,7 @@ def test_a_server_is_found_where_it_is_and_says_what_it_lacks(service: Running, 
 def test_a_recalibration_without_any_folder_is_refused_before_it_begins(
     start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def none(*_: object, **__: object) -> str:
-        raise FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp']")
-
+    none = Mock(side_effect=FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp']"))
     service = start()
     monkeypatch.setattr(tempfile, "mkdtemp", none)
     with pytest.raises(StoreError):
