@@ -118,19 +118,6 @@ def test_a_recording_that_opens_at_the_second_try_costs_a_second(
     assert archive.clock.now() == AGAIN_S[0]
 
 
-def test_a_newer_model_reads_only_what_was_not_read_well(archive: Archive) -> None:
-    toy.write_toy_recording(archive.folder / "b.h5", toy.ToyDevice((158.0, 110.0), seed=3), 16, PAGES, 5)
-    status, figures = archive.run("evaluate")
-    assert (status, figures["pages_lost"] + figures["pages_recalibration_due"]) == (2, PAGES)
-    newer = toy.write_toy_bundle(archive.folder / "newer.zip", version="toy-2")
-    status, figures = archive.run("evaluate", "--again-with", str(newer), asked=False)
-    assert {name for name, _ in archive.firsts()} == {"b"}
-    assert (status, sum(len(task.pages) for task in archive.tasks), figures["rounds"][0]["pages"]) == (2, PAGES, PAGES)
-    moved = newer.rename(archive.folder / "moved.zip")  # is the same round
-    archive.run("evaluate", "--again-with", str(moved), asked=False)
-    assert (archive.tasks, len(json.loads((archive.out / "job.json").read_text())["rounds"])) == ([], 1)
-
-
 def test_files_come_back_from_pages_in_several_recordings(archive: Archive) -> None:
     _, options = archive.shows_a_file({2: coded.dark})
     status, figures = archive.run("recover", *options)
