@@ -56,11 +56,6 @@ class Refusing(Helper):
         raise RecalibrationRefusedError("fit", "worse", "better")
 
 
-class Killed(Helper):
-    def recalibrate(self, *task: Any, progress: Progress) -> None:
-        os.kill(os.getpid(), signal.SIGKILL)
-
-
 class Broken(Helper):
     def recalibrate(self, *task: Any, progress: Progress) -> None:
         raise ZeroDivisionError
