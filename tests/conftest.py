@@ -17,6 +17,7 @@ from lightpage.calibration.parameters import NAMES
 from lightpage.cli.simulate import simulate
 from lightpage.device.state import Device
 from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.bundle.manifest import TWIN
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.simulator.true_optics import true_parameters
 from tests.lightpage.small import small_profile
@@ -74,6 +75,15 @@ def small_bundle(small_run: Path, tmp_path_factory: pytest.TempPathFactory) -> P
         export_run(small_run, out, version="small-1")
 
     return _made_once(tmp_path_factory, "small.zip", make)
+
+
+@pytest.fixture
+def ready_twin(small_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Has exports take the graph of the small profile's rays from there: making it takes half a minute."""
+    from lightpage.export import from_run
+
+    graph = Bundle.open(small_bundle).files[TWIN]
+    monkeypatch.setattr(from_run, "twin_onnx", lambda twin: graph)
 
 
 @pytest.fixture(scope="session")

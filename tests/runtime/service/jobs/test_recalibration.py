@@ -1,5 +1,6 @@
 """Recalibration over the endpoint: what it brings, what it refuses, and that nothing is lost or changed meanwhile."""
 
+import json
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -167,6 +168,12 @@ def test_the_service_ends_beside_one_that_does_not_stop_and_it_changes_nothing_a
     go.set()
     eventually(lambda: service.count("lightpage_recalibrations_total", result="dropped") == 1)
     assert [model.version for model in service.plane.models.loaded] == ["toy-1"]
+
+
+def test_who_asked_for_a_change_is_written_down(start: Start, tmp_path: Path) -> None:
+    file = tmp_path / "audit.jsonl"
+    start(audit=file).client.jobs.recalibrate(count=2)
+    assert json.loads(file.read_text("utf-8"))["who"].startswith("ipv4:127.0.0.1:")
 
 
 def test_a_caller_who_leaves_ends_it(start: Start) -> None:
