@@ -302,17 +302,6 @@ class TestWriting:
             assert not recording.has_symbols
             assert recording.pilots() is None
 
-    def test_an_older_recording_stays_until_the_new_one_is_complete(self, tmp_path: Path) -> None:
-        path = tmp_path / "own.h5"
-        write_own(path)
-        before = path.read_bytes()
-        with RecordingWriter(path, small_profile(), LEVELS, 12, random_frames(9)) as writer:
-            writer.append(None, random_frames(0))
-            assert path.read_bytes() == before
-        with Recording.open(path) as recording:
-            assert recording.pages == 1
-        assert list(tmp_path.iterdir()) == [path]
-
     @pytest.mark.parametrize(
         ("frame", "got"),
         [

@@ -89,20 +89,6 @@ def test_another_question_or_a_second_run_in_the_same_folder_is_refused(archive:
         assert archive.tasks == []
 
 
-def test_each_part_does_its_recordings_and_the_whole_is_added_up_without_parts(archive: Archive) -> None:
-    shutil.copy(archive.folder / "a.h5", archive.folder / "c.h5")
-    done = []
-    for part, names in (("1/2", {"b"}), ("0/2", {"a", "c"})):
-        status, figures = archive.run("evaluate", "--part", part)
-        assert {name for name, _ in archive.firsts()} == names
-        assert (status, figures["part"], figures["pages_missing"]) == (0, part, 0)
-        assert figures["pages"] == figures["this_run"]["pages"] == PAGES * len(names)
-        done += [row["recording"] for row in figures["recordings"]]
-    status, figures = archive.run("evaluate", asked=False)
-    assert (status, archive.tasks, figures["part"], figures["pages_read"]) == (0, [], None, 3 * PAGES)
-    assert sorted(done) == [row["recording"] for row in figures["recordings"]]
-
-
 def test_a_recording_that_opens_at_the_second_try_costs_a_second(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:

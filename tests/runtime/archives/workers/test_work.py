@@ -19,7 +19,6 @@ from lightpage.runtime.archives.workers.device import EVERY_S, StepLog
 from lightpage.runtime.archives.workers.work import Worker
 from tests.clock import HandClock
 from tests.runtime import coded, toy
-from tests.runtime.archives.archive import spoil_page
 
 OPERATIONS = [Operation.DECODE, Operation.EVALUATE, Operation.RECOVER]
 PAGES = 3
@@ -96,14 +95,6 @@ def test_results_that_storage_does_not_take_make_no_page_lost(
     monkeypatch.setattr("lightpage.runtime.archives.workers.page_range.write_user_bytes", refuse)
     failed = failure(asked(Operation.RECOVER, give_up=True))
     assert (failed.problem.subject, failed.problem.passes) == ("shard", True)
-
-
-def test_a_page_that_is_black_is_a_finding(asked: Callable[..., Task], tmp_path: Path) -> None:
-    spoil_page(tmp_path / "a.h5", 1)
-    for operation, cause in zip(OPERATIONS, ("BlackFrameError", "BlackFrameError", "optics"), strict=True):
-        done = Worker(1).work(asked(operation))
-        assert isinstance(done, Done)
-        assert done.lost == {cause: 1}
 
 
 def test_another_recording_or_bundle_than_the_run_began_with_is_not_read(

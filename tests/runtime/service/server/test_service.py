@@ -100,19 +100,6 @@ def test_what_is_asked_of_a_pair_is_done_and_no_more_is_sent(service: Running) -
         assert (answer.code, answer.subject) == (INVALID, "black_level")
 
 
-def test_pages_are_read_from_the_source_in_turn_or_by_number(start: Start) -> None:
-    client = start().client
-    pages = [client.pages.read(want_written=True), client.pages.read(want_written=True), client.pages.read(9)]
-    assert [page.page for page in pages] == [0, 1, 9]
-    for page in pages[:2]:
-        assert page.written is not None
-        assert page.pilot_mask is not None
-        assert (page.symbols == page.written).all()
-        assert (page.pilot_mask == pilot_mask(toy.PROFILE)).all()
-    assert pages[2].written is None
-    assert client.pages.read(1, 8).levels == 8
-
-
 # ---- refusals -----------------------------------------------------------------------------------------------------
 
 _, PAIR = a_page()
