@@ -9,11 +9,36 @@ from lightpage.codec.erasure import check_group, parity_of, restore
 from tests.lightpage.refused import refused
 
 
+def product(a: int, b: int) -> int:
+    """In GF(2^8) with polynomial 0x11D."""
+    out = 0
+    while b:
+        out ^= a if b & 1 else 0
+        a = a << 1 ^ (0x11D if a & 0x80 else 0)
+        b >>= 1
+    return out
+
+
+INVERSE = {a: next(b for b in range(256) if product(a, b) == 1) for a in range(1, 256)}
+
+
 def group_of(data_pages: int, parity_pages: int, size: int, seed: int = 0) -> tuple[list[bytes], dict[int, bytes]]:
     """Data pages, and all pages of their group by place."""
     rng = np.random.default_rng([data_pages, parity_pages, seed])
     data = [rng.bytes(size) for _ in range(data_pages)]
     return data, dict(enumerate(data + parity_of(data, parity_pages)))
+
+
+@pytest.mark.parametrize(("data_pages", "parity_pages"), [(1, 1), (1, 4), (5, 3), (20, 6), (61, 3), (250, 5)])
+@pytest.mark.parametrize("size", [1, 3])
+def test_parity_is_the_documented_sum(data_pages: int, parity_pages: int, size: int) -> None:
+    data, pages = group_of(data_pages, parity_pages, size)
+    for i in range(parity_pages):
+        expected = bytearray(size)
+        for j, page in enumerate(data):
+            for place, byte in enumerate(page):
+                expected[place] ^= product(byte, INVERSE[(data_pages + i) ^ j])
+        assert pages[data_pages + i] == bytes(expected)
 
 
 @pytest.mark.parametrize(
