@@ -73,6 +73,7 @@ def test_a_device_that_nobody_here_made_is_calibrated_trained_exported_and_decod
     known = ["--profile", toml, "--recording", recording]
     found = figures_of(tmp_path, "calibrate", *known, "--out", calibration, "--pages", 1)
     assert abs(found["angle_deg"] - device.parameters.pipe_angle_deg) <= 0.03
+    assert found["coherence_after"] > 10 * found["coherence_before"]
     trained = ["--calibration", calibration, *choices.split(), "--synthetic-pages", synthetic]
     lightpage("train", *known, *trained, "--out", run)
     lightpage("export", run, "--out", bundle)
