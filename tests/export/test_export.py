@@ -1,7 +1,5 @@
 """An exported run says what torch says, carries its table as a default, and fails loudly where it does not."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

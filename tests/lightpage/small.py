@@ -1,14 +1,11 @@
 """A device for tests, an eighth of the full size: zones, symbols and sampling of `bench` on a quarter of its area."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lightpage.calibration.goodness.verdict import Goodness
 from lightpage.device.profile import Camera, Lens, LensPath, PageLayout, Pipe, Profile, load_profile
-from lightpage.device.state import CameraPose, Device, ideal_device
+from lightpage.device.state import Device, ideal_device
 
-PLAIN_POSE = CameraPose()
 THICK = LensPath(
     piston_rad=-5,
     distortion_rad=-4.4,

@@ -1,7 +1,5 @@
 """`lightpage report`: every section of a run and of an evaluation, their figures, and what is refused."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

@@ -1,7 +1,5 @@
 """Each benchmark of the hardware runs small; of the loop, whose measurements take hours, the sums are tested."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

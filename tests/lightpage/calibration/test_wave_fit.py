@@ -1,7 +1,5 @@
 """Claims about the fit to waves: a known page places both cameras and tells the device, with calibrated deviations."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

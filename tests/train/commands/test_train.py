@@ -1,7 +1,5 @@
 """`lightpage train` on a small device: a run, its interruption, and what it refuses."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Sequence
