@@ -31,7 +31,13 @@ class Rays(NamedTuple):
 
 
 class Twin(Protocol):
-    """A ray tracer of the device with the parameters of `lightpage.calibration.parameters`."""
+    """A ray tracer of the device with the parameters of `lightpage.calibration.parameters`.
+
+    Attributes:
+        known: how many of them it knows, the first ones; see `KNOWN` there. The others do nothing.
+    """
+
+    known: int
 
     def trace(self, parameters: Real, points: Real, anchors: Real | None = None) -> Rays:
         """Trace page points.

@@ -207,7 +207,7 @@ class TorchTwin:
     """`RayTwin` behind the numpy interface that registration takes (`lightpage.calibration.interfaces.Twin`)."""
 
     def __init__(self, twin: RayTwin) -> None:
-        self.module = twin
+        self.module, self.known = twin, len(NAMES)
 
     def trace(self, parameters: Real, points: Real, anchors: Real | None = None) -> Rays:
         """See `lightpage.calibration.interfaces.Twin`."""

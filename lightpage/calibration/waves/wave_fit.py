@@ -40,8 +40,8 @@ as much as several rounds, but one from further off leaves axial places twenty d
 _CONVERGED = 1e-3
 """Relative fall of the residual below which another round does not pay."""
 _LEAST_OFF = 2.0
-"""Mean square of the modulation's coefficients over their deviations from which on levels are uneven: a nominal device
-has 1 or less, and more than 2 in one of seventy fits."""
+"""Mean square of the distances of a modulation's coefficients from the usual ones, over their deviations, from which on
+it is another one: a nominal device has 1 or less, and more than 2 in one of seventy fits."""
 _LARGEST_MOVE_PX = 1.5
 """A round's largest step: the model is linear in the displacement over about a speckle."""
 _EQUATIONS = 100_000
@@ -72,7 +72,7 @@ class WaveFitted:
         quadrature_phase: angle between the homodyne arms, radians.
         residual: root mean square of what is left of the equations, in standard deviations of the reference's noise
             times an unknown factor: it says which of two fits is better.
-        modulation: what the modulator makes of its levels; nominal where the page does not tell it from that.
+        modulation: what the modulator makes of its levels; the prior's centre where a page does not tell it from that.
         modulation_deviations: standard deviations of its coefficients, zero where held.
     """
 
@@ -82,6 +82,18 @@ class WaveFitted:
     residual: float
     modulation: Modulation = NOMINAL
     modulation_deviations: tuple[float, ...] = (0.0,) * len(modulations.NAMES)
+
+
+class LevelPrior(NamedTuple):
+    """What is known of a modulation before a page is seen.
+
+    Attributes:
+        centre: most likely one.
+        deviations: standard deviations of its coefficients about it.
+    """
+
+    centre: Modulation = NOMINAL
+    deviations: Real = modulations.PRIORS
 
 
 class _State(NamedTuple):
@@ -159,8 +171,7 @@ class WaveFit:
         prior_scale: float | Real = 1.0,
         progress: Callable[[float], None] = lambda share: None,
         modulation: Modulation = NOMINAL,
-        *,
-        levels: bool = False,
+        levels: LevelPrior | None = None,
     ) -> WaveFitted:
         """Fit the parameters of `groups` and the angle between the arms.
 
@@ -174,7 +185,7 @@ class WaveFit:
             progress: told of every round and of every derivative, with the share of the most rounds that is behind,
                 0 to 1. It may raise to stop the work.
             modulation: what the modulator makes of its levels, to start from.
-            levels: whether that is fitted too.
+            levels: what is known of it beforehand where it is fitted too, None where it is held.
         """
         without_effect = _OF_REAL_LENSES if self._profile.ideal_lenses else ()
         of_light = [index for index in indices(*groups) if index not in (*_SEEN, *without_effect)]
@@ -193,7 +204,7 @@ class WaveFit:
                 break
             if slopes is None or residual < (1 - _STALE) * taken_at:
                 told, taken_at = partial(_within_round, progress, number), residual
-                slopes = self._slopes(state, of_light, of_cameras, told, levels=levels)
+                slopes = self._slopes(state, of_light, of_cameras, told, levels=levels is not None)
             directions = _directions(state.light, bends="launch" not in groups)
             columns = self._columns(state, fields, slopes, directions)
             # What is unexplained differs from symbol to symbol, so equations tell no more than symbols do.
@@ -202,12 +213,13 @@ class WaveFit:
             fitted_levels = slice(others - (len(modulations.NAMES) if levels else 0), others)
             prior = np.zeros(columns.shape[1])
             prior[others:] = precision
-            prior[fitted_levels] = 1 / modulations.PRIORS[: others - fitted_levels.start] ** 2
+            if levels:
+                prior[fitted_levels] = 1 / levels.deviations**2
             information = columns.T @ columns / variance + np.diag(prior)
             pull = columns.T @ left / variance
             pull[others:] -= precision * (state.parameters[free] - centre[free])
             if levels:
-                pull[fitted_levels] -= prior[fitted_levels] * state.levels
+                pull[fitted_levels] -= prior[fitted_levels] * (state.levels - levels.centre.coefficients)
             covariance = _inverse(information)
             known = np.sqrt(np.diag(covariance))
             deviations = np.zeros(len(PARAMETERS))
@@ -221,7 +233,7 @@ class WaveFit:
                 tuple(known[fitted_levels].tolist()) if levels else best.modulation_deviations,
             )
             state = self._moved(state, covariance @ pull, directions, fitted_levels, free)
-        return _told_apart(best)
+        return best if levels is None else _told_apart(best, levels.centre)
 
     def _waves(self, parameters: Real) -> FittedWaves:
         return FittedWaves(self._profile, parameters, self._samples, filled=True)
@@ -369,13 +381,10 @@ def _directions(light: Complex, *, bends: bool) -> Complex:
     return np.concatenate([light[0] / abs(light[0]) * terms, 1j * light[None]])
 
 
-def _told_apart(found: WaveFitted) -> WaveFitted:
-    """A fit whose modulation is nominal unless its coefficients differ from zero by more than their deviations."""
-    known = np.array(found.modulation_deviations)
-    if not known.any():
-        return found
-    off = np.sum((np.array(found.modulation.coefficients) / known) ** 2)
-    return replace(found, modulation=NOMINAL) if off < _LEAST_OFF * len(known) else found
+def _told_apart(found: WaveFitted, usual: Modulation) -> WaveFitted:
+    """A fit whose modulation is the usual one unless it differs from that by more than its deviations."""
+    away = np.subtract(found.modulation.coefficients, usual.coefficients) / found.modulation_deviations
+    return replace(found, modulation=usual) if np.mean(away**2) < _LEAST_OFF else found
 
 
 def _weight(here: Complex, phasor: complex) -> Real:
