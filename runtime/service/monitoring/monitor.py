@@ -105,6 +105,9 @@ SHIFT = Sign("shift_px", window=5, raise_by=4.0, clear_by=3.0, rises=True, absol
 """Distance of the image from where calibration saw it. It is followed, yet a search reaches 12 px: a third of that is
 left to a device's walk (0.9 px in a quiet week), the rest to a knock."""
 
+STROKE = Sign("stroke_relative", window=15, raise_by=0.003, clear_by=0.0015, rises=True)
+"""Distance of the modulator's stroke from its calibration, either way, as the pilots show it."""
+
 PISTON_WALK = Sign("piston_walk_rad", window=15, raise_by=0.6, clear_by=0.3, rises=True, decides=False)
 """Step of the piston from page to page. It shows a restless interferometer, which no recalibration cures."""
 
@@ -120,7 +123,7 @@ class MonitorSettings:
     """
 
     baseline_pages: int = 20
-    signs: tuple[Sign, ...] = (MARGIN, AIR, TRUST, SHARE, CHANGED, UNREAD, RESIDUAL, SHIFT, PISTON_WALK)
+    signs: tuple[Sign, ...] = (MARGIN, AIR, TRUST, SHARE, CHANGED, UNREAD, RESIDUAL, SHIFT, STROKE, PISTON_WALK)
 
 
 @dataclass(frozen=True)
@@ -204,8 +207,7 @@ class _Followed:
         """Take the best window as usual, and the scatter from page to page as noise: both bear a drift meanwhile."""
         window = self.sign.window
         best = min if self.sign.rises else max
-        ends = range(window, len(self.first) + 1)
-        self.baseline = best(self._smoothed(self.first[end - window : end]) for end in ends)
+        self.baseline = best(self._smoothed(self.first[n : n + window]) for n in range(len(self.first) - window + 1))
         steps = np.abs(np.diff(self.first))
         self.noise = _MEDIAN_ERROR * _MAD_DEVIATIONS * float(np.median(steps)) / math.sqrt(2 * window)
 
@@ -226,10 +228,9 @@ class _Followed:
         return statistics.fmean(values) if self.sign.mean else statistics.median(values)
 
     def state(self) -> SignState:
-        raise_at = None
-        if self.baseline is not None:
-            raise_at = self.baseline + (1 if self.sign.rises else -1) * self._distance(self.sign.raise_by)
-        return SignState(self.sign.name, self.value, self.baseline, raise_at, self.raised, self.sign.decides)
+        sign, usual, side = self.sign, self.baseline, 1 if self.sign.rises else -1
+        raise_at = None if usual is None else usual + side * self._distance(sign.raise_by)
+        return SignState(sign.name, self.value, usual, raise_at, self.raised, sign.decides)
 
 
 class PageFigures:
@@ -255,6 +256,7 @@ class PageFigures:
             TRUST.name: page.pilot_trust,
             SHARE.name: page.check.share,
             RESIDUAL.name: page.residual_rad,
+            STROKE.name: abs(page.stroke_relative),
         }
         if observation.tells:
             figures[CHANGED.name] = float(page.check.recalibration_due)
