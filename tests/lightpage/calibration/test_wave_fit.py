@@ -7,7 +7,7 @@ import pytest
 
 from lightpage.calibration.parameters import NAMES, PARAMETERS, PRIORS, indices
 from lightpage.calibration.waves import wave_fit
-from lightpage.calibration.waves.wave_fit import WaveFit
+from lightpage.calibration.waves.wave_fit import LevelPrior, WaveFit
 from lightpage.device.profile import Profile
 from lightpage.device.state import (
     Aberration,
@@ -20,7 +20,7 @@ from lightpage.device.state import (
     SlmDefects,
     draw_device,
 )
-from lightpage.page.modulation import NOMINAL
+from lightpage.page.modulation import DRIFTS, NOMINAL
 from lightpage.page.symbols import symbol_phases
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_modulation, true_parameters
@@ -136,7 +136,7 @@ def test_a_nominal_modulator_stays_nominal_and_axial_places_are_found_from_far_a
     truth = true_parameters(PROFILE, device)
     start, axial = truth.copy(), indices("axial")
     start[axial] += [0.4, -0.2, 0.1]
-    found = seen_by(device, 5).fit(start, device.homodyne.turn_rad, EVERY, levels=True)
+    found = seen_by(device, 5).fit(start, device.homodyne.turn_rad, EVERY, levels=LevelPrior())
     assert found.modulation is NOMINAL
     assert all(found.modulation_deviations)
     off = ((found.parameters - truth) / np.maximum(found.deviations, 1e-12))[axial]
@@ -148,9 +148,22 @@ def test_what_the_modulator_makes_of_its_levels_comes_back_with_calibrated_devia
     slm = SlmDefects(stroke_relative_error=-0.08, level_sine_rad=0.2, level_cosine_rad=0.1, unmodulated_relative=0.1)
     device = Device(slm=slm, drift=Drift(shift_px=0))
     start, truth = true_parameters(PROFILE, device), true_modulation(slm)
-    found = seen_by(device, 2).fit(start, device.homodyne.turn_rad, EVERY, levels=True)
+    found = seen_by(device, 2).fit(start, device.homodyne.turn_rad, EVERY, levels=LevelPrior())
     off = np.array(found.modulation.coefficients) - truth.coefficients
     assert np.sqrt(np.mean((off / found.modulation_deviations) ** 2)) < 2
     # of levels: what a decision among 256 of them notices is a tenth of their distance, the noise of most pages 0.02
     phases = found.modulation.phases(256) - truth.phases(256)
     assert np.std(phases) < 0.02 < 0.1 < np.std(truth.phases(256) - symbol_phases(np.arange(256), 256))
+
+
+@pytest.mark.parametrize("stroke", [0.0, -0.01])
+def test_a_re_fit_finds_a_stroke_that_has_changed_and_else_leaves_the_levels_as_they_were(stroke: float) -> None:
+    slm = SlmDefects(level_sine_rad=0.1, unmodulated_relative=0.05)
+    earlier, later = (true_modulation(slm.model_copy(update={"stroke_relative_error": by})) for by in (0.0, stroke))
+    device = Device(slm=slm.model_copy(update={"stroke_relative_error": stroke}), drift=Drift(shift_px=0))
+    start, drift = true_parameters(PROFILE, device), LevelPrior(earlier, DRIFTS)
+    found = seen_by(device, 2).fit(start, device.homodyne.turn_rad, ("in_phase",), modulation=earlier, levels=drift)
+    assert (found.modulation is earlier) == (stroke == 0)
+    off = np.array(found.modulation.coefficients) - later.coefficients
+    assert abs(off[0]) < 3 * found.modulation_deviations[0] < 0.003
+    assert np.abs(off[1:]).max() < 0.02

@@ -149,8 +149,9 @@ def found(loss: Loss | None, margin: float) -> PageBytes:
 
 def test_what_a_page_says_of_the_device(page: DecodedPage) -> None:
     figures = PageFigures()
-    told = figures.of(observation(replace(page, piston_rad=3.0, image=ImagePosition(3.0, -4.0))))
-    assert told["shift_px"] == 5
+    there = replace(page, piston_rad=3.0, image=ImagePosition(3.0, -4.0), stroke_relative=-0.01)
+    told = figures.of(observation(there))
+    assert (told["shift_px"], told["stroke_relative"]) == (5, 0.01)
     assert told["share"] == page.check.share
     assert told["page_due"] == 0
     assert not {"margin_bits", "piston_walk_rad"} & told.keys()
