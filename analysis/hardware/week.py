@@ -116,6 +116,7 @@ def table_of(rows: Rows, pages: int) -> list[str]:
 @click.option("--pages", default=2000, show_default=True, type=click.IntRange(10), help="Of the week.")
 @click.option("--stop-after", type=click.IntRange(1), help="End after so many pages of it; a later run goes on.")
 @click.option("--pages-during", default=2, show_default=True, type=click.IntRange(0), help="Of a recalibration.")
+@click.option("--true-every", default=1, show_default=True, type=click.IntRange(1), help="Pages from one true AIR on.")
 @click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
 @click.option("--bundle", default=DEFAULT, show_default=True, help="That the service begins with.")
 @click.option("--stroke", default=0.0, show_default=True, help="Change of the modulator's stroke, relative.")
@@ -126,6 +127,7 @@ def main(
     pages: int,
     stop_after: int | None,
     pages_during: int,
+    true_every: int,
     threads: int | None,
     bundle: str,
     stroke: float,
@@ -136,7 +138,7 @@ def main(
     """Live through a week, and tell how it went."""
     out.mkdir(parents=True, exist_ok=True)
     logging.basicConfig(level=logging.INFO, filename=out / "log", format="%(asctime)s %(levelname)s %(message)s")
-    week = Week(out, pages, pages_during, threads, bundle_path(bundle), LightDrift(stroke, axial))
+    week = Week(out, pages, pages_during, threads, bundle_path(bundle), LightDrift(stroke, axial), true_every)
     week.read_until(pages if stop_after is None else min(pages, stop_after))
     figures = figures_of(week.rows, pages)
     draw(week.rows, out / "week.png", int(KNOCK_SHARE * pages), PAGE_S)
