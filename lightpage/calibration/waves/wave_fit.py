@@ -121,7 +121,7 @@ class _Slopes(NamedTuple):
         by_term: of the light by the illumination's terms, [T, 2, ...].
         by_level: of the light by what the logarithm of the modulation is made of, [K, 2, ...]; none where it is held.
         of_light: of the light by parameters that change it, [2, ...] each.
-        of_cameras: of the places' pixels by parameters that move them, [2, ..., 2] each.
+        of_cameras: of the places (x, y), grid samples, by parameters that move the cameras, [2, ..., 2] each.
     """
 
     by_term: Complex
@@ -152,7 +152,7 @@ class WaveFit:
         waves = self._waves(np.zeros(len(PARAMETERS)))
         self._terms = np.stack(illumination_terms(waves.x, waves.y))
         grid = field_grid(profile)
-        self._pitch_px = grid.pitch_m / profile.camera.pitch_m
+        self._beside = grid.pitch_m * np.array([[0, 0], [1, 0], [0, 1]])
         self._stride = max(_LEAST_STRIDE, int(np.sqrt(np.prod(grid.shape) / _EQUATIONS)))
         self._every = (slice(None, None, self._stride), slice(None, None, self._stride))
         self._places = np.stack(np.meshgrid(grid.x_m, grid.y_m), axis=-1)[self._every]
@@ -286,7 +286,7 @@ class WaveFit:
         page, field = even * np.tensordot(state.light, self._terms, 1), np.tensordot(state.light, by_term, 1)
         functions = [on_modulator(one, self._samples) for one in modulations.basis(self._phases)] if levels else []
         by_level = [here.to_cameras(page * one) for one in functions]
-        light, pixels = list[Complex](), list[Real]()
+        light, places = list[Complex](), list[Real]()
         for number, index in enumerate(of_light):
             progress(number / len(of_light))
             there, step = stepped(index)
@@ -295,8 +295,14 @@ class WaveFit:
             ratio = moved.against_reference / here.against_reference
             light.append(((field * ratio if at_camera else moved.to_cameras(page)) - field) / step)
         for there, step in map(stepped, of_cameras):
-            pixels.append((self._pixels(there) - self._pixels(state.parameters)) / step)
-        return _Slopes(by_term, by_level, light, pixels)
+            moved_px = (self._pixels(there) - self._pixels(state.parameters)) / step
+            places.append(moved_px @ self._samples_per_pixel(state.parameters)[:, None])
+        return _Slopes(by_term, by_level, light, places)
+
+    def _samples_per_pixel(self, parameters: Real) -> Real:
+        """Grid samples (x, y) for a pixel along (column, row) of either camera, [2, 2, 2]."""
+        middle, right, below = np.moveaxis(self._twin.pixels(parameters, self._beside), 1, 0)
+        return np.asarray(np.linalg.inv(np.stack([right - middle, below - middle], axis=1)))
 
     def _pixels(self, parameters: Real) -> Real:
         """Where both cameras see the places [...], [2, ..., 2]."""
@@ -339,7 +345,7 @@ class WaveFit:
 
         of_phase, of_amplitude = [1j * each for each in slopes.by_level], slopes.by_level[1:]
         changes = [*np.tensordot(directions, slopes.by_term, 1), *of_phase, *of_amplitude, *slopes.of_light]
-        moves = [pixels[:, chosen] for pixels in slopes.of_cameras]
+        moves = [places[:, chosen] for places in slopes.of_cameras]
         columns = []
         for camera, arm in enumerate((0.0, state.quadrature_phase)):
             phasor, field = np.exp(-1j * arm), fields[camera]
@@ -348,7 +354,7 @@ class WaveFit:
             along = (phasor + here.conj()) * weight  # derivative of the count by e
             mine = [(along * seen(change[camera])).real for change in changes]
             mine.insert(len(directions), (here * phasor * -1j).real * weight * camera)
-            slope = np.stack([(along * part).real for part in (across, down)]) / self._pitch_px
+            slope = np.stack([(along * part).real for part in (across, down)])
             mine += [-(slope * move[camera].T).sum(axis=0) for move in moves]
             columns.append(np.stack(mine, axis=1))
         return np.concatenate(columns)
