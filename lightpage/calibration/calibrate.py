@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.calibration.coherence import COHERENT_BRANCHES, page_coherence
-from lightpage.calibration.interfaces import FieldSolver, Twin
+from lightpage.calibration.interfaces import FieldSolver, RememberingTwin, Twin
 from lightpage.calibration.parameters import NAMES, PARAMETERS, indices, nominal
 from lightpage.calibration.patch_fit import PatchFit, fit_parameters
 from lightpage.calibration.patches import (
@@ -345,7 +345,7 @@ class _Registration:
             for how in list(ORIENTATIONS)[1:]:
                 self._set_orientation(camera, how)
                 sampler = self._frame_samplers(self.pages[0])[camera]
-                seen = self._measure(sampler, stage, (camera,), camera / 2)
+                (seen,) = self._measure(stage, {(camera,): sampler})
                 if _significant(seen) > most:
                     best, most, found[camera] = how, _significant(seen), seen
             self._set_orientation(camera, best)
@@ -375,7 +375,8 @@ class _Registration:
         """Measure branches on the recovered field and fit."""
         self._begin(stage.name)
         sampler = FieldSampler(self._field(self.pages[0])[0], self.grid)
-        self._fit(stage, self._measure(sampler, stage, (0, 1)), prior_scale)
+        (found,) = self._measure(stage, {(0, 1): sampler})
+        self._fit(stage, found, prior_scale)
 
     def estimate_turn(self) -> None:
         """The angle between the arms, from the phases that the same known symbols show on either camera."""
@@ -481,38 +482,35 @@ class _Registration:
 
     def _on_each_camera(self, stage: _Stage) -> list[list[Measurement]]:
         """The first page's patches as either camera sees them by itself."""
-        return [
-            self._measure(sampler, stage, (camera,), camera / 2)
-            for camera, sampler in enumerate(self._frame_samplers(self.pages[0]))
-        ]
+        return self._measure(stage, {(camera,): one for camera, one in enumerate(self._frame_samplers(self.pages[0]))})
 
     def _measure(
-        self, sampler: FrameSampler | FieldSampler, stage: _Stage, cameras: tuple[int, ...], begun: float = 0.0
-    ) -> list[Measurement]:
-        """The first page's patches as `sampler` sees them.
+        self, stage: _Stage, samplers: Mapping[tuple[int, ...], FrameSampler | FieldSampler]
+    ) -> list[list[Measurement]]:
+        """The first page's patches as each of `samplers` sees them.
 
         Args:
-            sampler: the field, or one camera's light.
             stage: what to look for.
-            cameras: through which of the two; each takes half of the stage.
-            begun: share of the stage that is behind.
+            samplers: the field, or one camera's light, by the cameras that it is seen through.
         """
         window = search_window(stage.reach_px * self._pixel, stage.step_px * self._pixel)
-        where, light, found = self._where(stage), self.pages[0].light(self.modulation), list[Measurement]()
+        twin, where, light = RememberingTwin(self.twin), self._where(stage), self.pages[0].light(self.modulation)
+        found: list[list[Measurement]] = [[] for _ in samplers]
         for number, patch in enumerate(where):
-            self._tell(begun + number / len(where) * len(cameras) / 2)
-            found += measure(
-                sampler,
-                self.twin,
-                self.parameters,
-                self.profile,
-                patch,
-                light,
-                stage.branches,
-                window,
-                samples=max(1, self._samples // 2) if stage.half_rate else self._samples,
-                cameras=cameras,
-            )
+            self._tell(number / len(where))
+            for own, (cameras, sampler) in zip(found, samplers.items(), strict=True):
+                own += measure(
+                    sampler,
+                    twin,
+                    self.parameters,
+                    self.profile,
+                    patch,
+                    light,
+                    stage.branches,
+                    window,
+                    samples=max(1, self._samples // 2) if stage.half_rate else self._samples,
+                    cameras=cameras,
+                )
         return found
 
     def _fit(self, stage: _Stage, found: list[Measurement], prior_scale: float | Real = 1.0) -> None:

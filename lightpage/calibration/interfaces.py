@@ -58,6 +58,25 @@ class Twin(Protocol):
         ...
 
 
+class RememberingTwin:
+    """A twin that remembers its last trace: either camera is looked at for the same one.
+
+    Args:
+        twin: what traces.
+    """
+
+    def __init__(self, twin: Twin) -> None:
+        self.known, self.pixels = twin.known, twin.pixels
+        self._twin, self._asked, self._rays = twin, tuple[Real, ...](), Rays(*[np.zeros(0)] * 3)
+
+    def trace(self, parameters: Real, points: Real, anchors: Real | None = None) -> Rays:
+        """See `Twin`."""
+        asked = parameters, points, points if anchors is None else anchors
+        if not (self._asked and all(map(np.array_equal, asked, self._asked))):
+            self._asked, self._rays = asked, self._twin.trace(*asked)
+        return self._rays
+
+
 class FieldSolver(Protocol):
     """Turns a frame pair into the signal field on the common grid of `lightpage.waves.grid`."""
 
