@@ -8,7 +8,8 @@ Every page's figures are kept. An interrupted run goes on as a service does that
 store.
 
 With `--stroke -0.02 --axial 0.2`, the light drifts too: the modulator's stroke, and modulator and cameras out of focus.
-The table then says what was true and what the model in service took for it.
+The table then says what was true and what the model in service took for it. Focus needs a `--bundle` whose graphs know
+axial places.
 
 In the simulated week a recalibration ends before the next page is read. Here pages are read without a pause; while a
 recalibration runs, `--pages-during` of them are read at most, and then its end is waited for.

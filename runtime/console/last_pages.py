@@ -59,7 +59,7 @@ class PageRow:
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures by name; None for what is not a number."""
-        return {name: _number(value) if isinstance(value, float) else value for name, value in vars(self).items()}
+        return {name: None if isinstance(v, float) and not np.isfinite(v) else v for name, v in vars(self).items()}
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,3 @@ def _row(observation: Observation) -> PageRow:
         stroke_relative=None if page is None else page.stroke_relative,
         recalibration_due=page is not None and bool(page.check.recalibration_due),
     )
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
