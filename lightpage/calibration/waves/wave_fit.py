@@ -42,7 +42,7 @@ _CONVERGED = 1e-3
 _LEAST_OFF = 2.0
 """Mean square of the distances of a modulation's coefficients from the usual ones, over their deviations, from which on
 it is another one: a nominal device has 1 or less, and more than 2 in one of seventy fits."""
-_LEAST_FAR = 4.0
+_LEAST_FAR = 3.5
 """Deviations of a single coefficient from which on it is another one too: of all, a stroke alone may drift."""
 _LARGEST_MOVE_PX = 1.5
 """A round's largest step: the model is linear in the displacement over about a speckle."""
