@@ -31,7 +31,7 @@ def goodness_figure(goodness: Goodness) -> Figure:
 
 
 def _draw(axis: Axes, values: Map, title: str, box: float | None) -> AxesImage:
-    shown = axis.imshow(np.array(values), cmap="cividis", norm=LogNorm(1, _MOST))
+    shown = axis.imshow(np.array(values), cmap="cividis", norm=LogNorm(1, _MOST), aspect="auto")
     axis.set_title(title, fontsize=9)
     axis.set_xticks([])
     axis.set_yticks([])
