@@ -18,12 +18,14 @@ from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
-from lightpage.train.models.filters import along_columns, along_rows, block_weights, in_blocks
+from lightpage.train.models.filters import BLOCK, block_weights
 
 ROUNDS = 14
 _WEIGHT = 0.75
 """Of the likelihood against staying: a larger one takes fewer rounds and, in dim light, lets more noise in."""
+_STIFF = 1 + 2 * _WEIGHT
 _RELAXATION = 1.4
 """Of a round's step; below 2."""
 _DARK = 1e-9
@@ -38,34 +40,34 @@ class CamerasApart(NamedTuple):
     """The defocus of the in-phase camera against the mean of both; the quadrature camera's is its conjugate.
 
     Attributes:
-        real, imaginary: of the kernel along either axis, see `block_weights`.
+        there: filters of either axis, real and imaginary part of what in-phase and of what quadrature sees,
+            [4 BLOCK, 2, taps], see `block_weights`.
+        back: their adjoint, along the first axis, [4 BLOCK, 2, taps].
+        added: the adjoint along the other one, where both cameras' light is added up, [2 BLOCK, 4, taps].
     """
 
-    real: Tensor
-    imaginary: Tensor
+    there: Tensor
+    back: Tensor
+    added: Tensor
 
     @classmethod
     def of(cls, taps: Tensor) -> Self:
         """The cameras of a kernel's real and imaginary part, [2, taps]."""
-        return cls(block_weights(taps[0]), block_weights(taps[1]))
+        real, imaginary = block_weights(taps[0]), block_weights(taps[1])
+        forth = [torch.stack([real, -imaginary], 1), torch.stack([imaginary, real], 1)]
+        adjoint = [torch.stack([real, imaginary], 1), torch.stack([-imaginary, real], 1)]
+        added = [torch.cat(pair, 1) for pair in zip(adjoint, forth, strict=True)]
+        return cls(torch.cat(forth + adjoint), torch.cat(adjoint + forth), torch.cat(added))
 
     def seen(self, field: Tensor) -> Tensor:
         """What the cameras see of a field [2, ny, nx]: in-phase, then quadrature, [4, ny, nx]."""
-        whole = in_blocks(field)
-        even, odd = along_rows(whole, self.real), _quarter_turn(along_rows(whole, self.imaginary))
-        along = torch.cat([even + odd, even - odd])
-        even, odd = along_columns(along, self.real), along_columns(along, self.imaginary)
-        both = torch.cat([even[:2] + _quarter_turn(odd[:2]), even[2:] - _quarter_turn(odd[2:])])
-        return both if whole is field else both[:, : field.shape[1], : field.shape[2]]
+        ny, nx = field.shape[1:]
+        return _along_columns(_along_rows(_in_blocks(field), self.there), self.there)[:, :ny, :nx]
 
     def gathered(self, both: Tensor) -> Tensor:
         """The adjoint of `seen`: [4, ny, nx] to [2, ny, nx]."""
-        whole = in_blocks(both)
-        even, odd = along_rows(whole, self.real), along_rows(whole, self.imaginary)
-        in_phase, quadrature = even[:2] - _quarter_turn(odd[:2]), even[2:] + _quarter_turn(odd[2:])
-        even = along_columns(in_phase + quadrature, self.real)
-        field = even + _quarter_turn(along_columns(quadrature - in_phase, self.imaginary))
-        return field if whole is both else field[:, : both.shape[1], : both.shape[2]]
+        ny, nx = both.shape[1:]
+        return _along_rows(_along_columns(_in_blocks(both), self.back), self.added)[:, :ny, :nx]
 
     def recovered(
         self,
@@ -88,15 +90,16 @@ class CamerasApart(NamedTuple):
         Returns:
             e, [2, ny, nx].
         """
-        brightness = torch.clamp(brightness, min=0)
-        shown = self.seen(start * amplitude) * inverse_amplitude
-        state, field = shown, start
+        pulling = 8 * _WEIGHT * _STIFF * torch.clamp(brightness, min=0)
+        half = amplitude / 2
+        of_arms = self.gathered(arms * half)
+        field = start * amplitude
+        state = light = self.seen(field) * inverse_amplitude + arms
         for number in range(ROUNDS):
-            moved = _likely(2 * shown - state + arms, brightness) - arms
-            state = state + _RELAXATION * (moved - shown)
-            field = band(self.gathered(state * amplitude)) / 2
-            if number < ROUNDS - 1:
-                shown = self.seen(field) * inverse_amplitude
+            if number:
+                light = self.seen(field) * inverse_amplitude + arms
+            state = state + _RELAXATION * (_likely(2 * light - state, pulling) - light)
+            field = band(self.gathered(state * half) - of_arms)
         return field * inverse_amplitude
 
     def recovered_linearly(self, left: Tensor, arms: Tensor, band: Filter) -> Tensor:
@@ -113,27 +116,53 @@ class CamerasApart(NamedTuple):
         before = estimate = torch.zeros_like(left)
         for _ in range(ROUNDS):
             ahead = estimate + _LINEAR_MOMENTUM * (estimate - before)
-            along = self.seen(ahead) * arms
-            beyond = left - torch.stack([along[0] + along[1], along[2] + along[3]])
-            pull = torch.cat([beyond[:1], beyond[:1], beyond[1:], beyond[1:]]) * arms
-            before, estimate = estimate, ahead + band(_LINEAR_STEP * self.gathered(pull))
+            beyond = left - _by_camera(self.seen(ahead) * arms)
+            pull = self.gathered(_for_both_parts(beyond) * arms)
+            before, estimate = estimate, ahead + band(_LINEAR_STEP * pull)
         return estimate
 
 
-def _likely(light: Tensor, brightness: Tensor) -> Tensor:
-    """Light [4, ny, nx] of both cameras, moved towards a measured brightness [2, ny, nx].
+def _likely(light: Tensor, pulling: Tensor) -> Tensor:
+    """Light [4, ny, nx] of both cameras, moved towards a measured brightness.
 
     The length r, rho before, makes (r - rho)^2 / 2 + weight (r^2 - brightness log r^2) least; the second is the
-    negative logarithm of photons' likelihood.
+    negative logarithm of photons' likelihood. It is the larger root of stiff r^2 - rho r - 2 weight brightness.
+
+    Args:
+        light: real and imaginary parts.
+        pulling: 8 weight stiff times the brightness, [2, ny, nx].
     """
-    square = light * light
-    length = torch.sqrt(torch.stack([square[0] + square[1], square[2] + square[3]]) + _DARK)
-    stiff = 1 + 2 * _WEIGHT
-    wanted = (length + torch.sqrt(length * length + 8 * _WEIGHT * stiff * brightness)) / (2 * stiff)
-    in_phase, quadrature = wanted / length
-    return torch.cat([light[:2] * in_phase, light[2:] * quadrature])
+    longer = 1 + torch.sqrt(1 + pulling / (_by_camera(light * light) + _DARK))
+    return light * _for_both_parts(longer / (2 * _STIFF))
 
 
-def _quarter_turn(light: Tensor) -> Tensor:
-    """Light [2, ny, nx] times i."""
-    return torch.stack([-light[1], light[0]])
+def _by_camera(parts: Tensor) -> Tensor:
+    """Sums over real and imaginary part, [4, ny, nx] to [2, ny, nx]."""
+    return torch.stack([parts[0] + parts[1], parts[2] + parts[3]])
+
+
+def _for_both_parts(values: Tensor) -> Tensor:
+    """The values of either camera twice, [2, ny, nx] to [4, ny, nx]."""
+    return torch.stack([values[0], values[0], values[1], values[1]])
+
+
+def _in_blocks(images: Tensor) -> Tensor:
+    """Images [C, ny, nx] of whole blocks, zeros at the right and below where there are none."""
+    ny, nx = images.shape[1:]
+    return functional.pad(images, (0, -nx % BLOCK, 0, -ny % BLOCK)) if ny % BLOCK or nx % BLOCK else images
+
+
+def _along_rows(images: Tensor, weights: Tensor) -> Tensor:
+    """Rows of images [C, ny, nx] of whole blocks, filtered, by the groups of channels that the weights are for."""
+    reach, groups = (weights.shape[2] - BLOCK) // 2, len(images) // weights.shape[1]
+    split = functional.conv2d(images, weights[:, :, None, :], stride=(1, BLOCK), padding=(0, reach), groups=groups)
+    ny, nx = images.shape[1:]
+    return split.reshape(-1, BLOCK, ny, nx // BLOCK).permute(0, 2, 3, 1).reshape(-1, ny, nx)
+
+
+def _along_columns(images: Tensor, weights: Tensor) -> Tensor:
+    """The same of columns."""
+    reach, groups = (weights.shape[2] - BLOCK) // 2, len(images) // weights.shape[1]
+    split = functional.conv2d(images, weights[:, :, :, None], stride=(BLOCK, 1), padding=(reach, 0), groups=groups)
+    ny, nx = images.shape[1:]
+    return split.reshape(-1, BLOCK, ny // BLOCK, nx).permute(0, 2, 1, 3).reshape(-1, ny, nx)

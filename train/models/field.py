@@ -25,7 +25,8 @@ from lightpage.errors import InvalidInputError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.train.models.apart import CamerasApart
 from lightpage.train.models.filters import BLOCK, SeparableFilter
-from lightpage.waves.grid import FieldGrid, field_grid
+from lightpage.waves.defocus import resampled_taps
+from lightpage.waves.grid import GRID_STEP_PX, FieldGrid, field_grid
 
 ROUNDS = 6
 """Of descent; beyond these the band filter's ripple adds up."""
@@ -157,6 +158,9 @@ class FieldRecovery(nn.Module):
         for power_name, axis in (("u", grid.x_m), ("v", grid.y_m)):
             powers = np.stack([(axis / corner) ** power for power in range(_CUBIC + 1)])
             self.register_buffer(power_name, torch.tensor(powers, dtype=torch.float32))
+        self.to_taps: Tensor
+        to_taps = resampled_taps(grid.step_px / GRID_STEP_PX)
+        self.register_buffer("to_taps", torch.tensor(to_taps, dtype=torch.float32), persistent=False)
 
     def forward(self, *seen: Tensor) -> tuple[Tensor, Tensor]:
         """Recover the field; arguments as for `measure`, results as of `solve`."""
@@ -180,7 +184,8 @@ class FieldRecovery(nn.Module):
             registration: [2, 2, 10], pixel (column, row) of each camera as a cubic in the grid's (x, y), each over
                 the page's corner radius.
             homodyne: [2], cosine and sine of the turn between the two arms.
-            apart: kernel of the in-phase camera's defocus, see `CamerasApart.of`; None where both see the same plane.
+            apart: kernel of the in-phase camera's defocus on the usual grid, see
+                `lightpage.calibration.sampling_table.cameras_apart`; None where both cameras see the same plane.
         """
         frames = _block_means(_stacked(in_phase, quadrature), self.binning)
         references = _block_means(_stacked(reference_in_phase, reference_quadrature), self.binning)
@@ -196,7 +201,7 @@ class FieldRecovery(nn.Module):
         reference = torch.maximum(reference, floor)
         a, b = lit * gained / (2 * reference)
         amplitude = torch.sqrt(reference[0])
-        defocus = None if apart is None else CamerasApart.of(apart)
+        defocus = None if apart is None else CamerasApart.of(apart @ self.to_taps.T)
         return Measured(a, b, homodyne[0], homodyne[1], amplitude / amplitude.mean(), lit, defocus)
 
     def solve(self, measured: Measured) -> tuple[Tensor, Tensor]:

@@ -22,40 +22,36 @@ class SeparableFilter(nn.Module):
 
     def __init__(self, taps: NDArray[np.float64]) -> None:
         super().__init__()
+        self.reach = len(taps) // 2
         self.weights: Tensor
-        self.register_buffer("weights", block_weights(torch.tensor(taps, dtype=torch.float32)))
+        self.register_buffer("weights", block_weights(torch.tensor(taps, dtype=torch.float32))[:, None])
 
     def forward(self, images: Tensor) -> Tensor:
         """Filtered images [C, H, W]."""
         height, width = images.shape[1:]
-        whole = in_blocks(images)
-        filtered = along_columns(along_rows(whole, self.weights), self.weights)
-        return filtered if whole is images else filtered[:, :height, :width]
+        missing_rows, missing_columns = -height % BLOCK, -width % BLOCK
+        if missing_rows or missing_columns:
+            images = functional.pad(images, (0, missing_columns, 0, missing_rows))
+        filtered = self._along_columns(self._along_rows(images))
+        return filtered[:, :height, :width] if missing_rows or missing_columns else filtered
+
+    def _along_rows(self, images: Tensor) -> Tensor:
+        """Each row with the taps."""
+        split = functional.conv2d(
+            images[:, None], self.weights[:, :, None, :], stride=(1, BLOCK), padding=(0, self.reach)
+        )
+        return split.permute(0, 2, 3, 1).reshape(images.shape)
+
+    def _along_columns(self, images: Tensor) -> Tensor:
+        """Each column with the taps."""
+        split = functional.conv2d(
+            images[:, None], self.weights[:, :, :, None], stride=(BLOCK, 1), padding=(self.reach, 0)
+        )
+        return split.permute(0, 2, 1, 3).reshape(images.shape)
 
 
 def block_weights(taps: Tensor) -> Tensor:
-    """Weights of an odd, symmetric kernel [K] for `along_rows` and `along_columns`, [BLOCK, 1, BLOCK + K - 1]."""
+    """Filters [BLOCK, BLOCK + K - 1] by which a kernel [K] gives so many outputs together."""
     tap = torch.arange(BLOCK + len(taps) - 1, device=taps.device) - torch.arange(BLOCK, device=taps.device)[:, None]
     beyond = (tap < 0) | (tap >= len(taps))
-    return functional.pad(taps, (0, 1))[torch.where(beyond, len(taps), tap)][:, None]
-
-
-def in_blocks(images: Tensor) -> Tensor:
-    """Images [C, H, W] of whole blocks, zeros at the right and below where there are none."""
-    height, width = images.shape[1:]
-    missing_rows, missing_columns = -height % BLOCK, -width % BLOCK
-    return functional.pad(images, (0, missing_columns, 0, missing_rows)) if missing_rows or missing_columns else images
-
-
-def along_rows(images: Tensor, weights: Tensor) -> Tensor:
-    """Each row of images [C, H, W] of whole blocks with a kernel, zeros beyond the edges."""
-    reach = (weights.shape[-1] - BLOCK) // 2
-    split = functional.conv2d(images[:, None], weights[:, :, None, :], stride=(1, BLOCK), padding=(0, reach))
-    return split.permute(0, 2, 3, 1).reshape(images.shape)
-
-
-def along_columns(images: Tensor, weights: Tensor) -> Tensor:
-    """Each column of images [C, H, W] of whole blocks with a kernel, zeros beyond the edges."""
-    reach = (weights.shape[-1] - BLOCK) // 2
-    split = functional.conv2d(images[:, None], weights[:, :, :, None], stride=(BLOCK, 1), padding=(reach, 0))
-    return split.permute(0, 2, 1, 3).reshape(images.shape)
+    return functional.pad(taps, (0, 1))[torch.where(beyond, len(taps), tap)]
