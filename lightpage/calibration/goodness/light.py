@@ -195,7 +195,7 @@ class SeenLight:
     @property
     def _along(self) -> Complex:
         """Directions of the field along which the cameras' counts grow."""
-        return self._arms + self.fields / self._amplitude
+        return np.asarray(self._arms + self.fields / self._amplitude)
 
     def _mending(self, left: Real) -> Complex:
         """Light of both cameras that mends what is left of their equations, each weighted by its noise."""
