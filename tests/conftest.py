@@ -20,7 +20,7 @@ from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import TWIN
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.simulator.true_optics import true_parameters
-from tests.lightpage.small import small_profile
+from tests.lightpage.small import EXPLAINED, small_profile
 from tests.runtime import toy
 
 pytest_plugins = ["pytester", "tests.skips", "tests.own_network"]
@@ -44,7 +44,7 @@ def small_device(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
         made = f"--profile {folder}/small.toml --pages {SMALL_PAGES} --seed 4 --out {folder}/R.h5"
         _command(simulate, *made.split())
         truth, turn = true_parameters(profile, state), state.homodyne.turn_rad
-        right = Registered(truth, np.ones(len(NAMES)), turn, 0.0, 0.5, 1.0, 0.5)
+        right = Registered(truth, np.ones(len(NAMES)), turn, 0.0, 0.5, 1.0, 0.5, goodness=EXPLAINED)
         Calibration.from_registered(right, profile, ["0" * 64]).save(folder / "C.toml")
 
     folder = _made_once(tmp_path_factory, "small-device", make)

@@ -25,7 +25,7 @@ from lightpage.errors import (
 from lightpage.failures import short_resource
 from lightpage.metrics.information import decide_with_confidence
 from lightpage.page.levels import MAX_LEVELS, check_levels
-from lightpage.page.pilots import Pilots, read_pilots, remove_piston
+from lightpage.page.pilots import Pilots, read_pilots, remove_piston, stroke_error
 from lightpage.recording.exposure import check_light
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.bundle import Bundle
@@ -284,6 +284,7 @@ class Decoder:
             timings=Timings(0.0, 0.0, 0.0),
             phase_error=error,
             level_phases=shown.uneven,
+            stroke_relative=stroke_error(phase, concentration, reading.sound),
         )
 
     def _check_graph(self) -> None:

@@ -19,6 +19,7 @@ from lightpage.recording.reader import Recording
 from lightpage.recording.writer import RecordingWriter
 from tests.lightpage.calibration.flat_twin import FlatTwin
 from tests.lightpage.refused import refused
+from tests.lightpage.small import UNEXPLAINED
 from tests.lightpage.uneven import UNEVEN
 
 PROFILE = load_profile("bench")
@@ -38,6 +39,7 @@ def calibration() -> Calibration:
         significant=0.7,
         modulation=UNEVEN,
         modulation_deviations=tuple(PRIORS_OF_LEVELS / 20),
+        goodness=UNEXPLAINED,
     )
     return Calibration.from_registered(registered, PROFILE, HASHES)
 

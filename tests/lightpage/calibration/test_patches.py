@@ -37,8 +37,9 @@ def look(
     step_px: float = 3,
     ramp: tuple[float, float] = (0.0, 0.0),
     profile: Profile = PROFILE,
+    turned: bool = False,
 ) -> Measurement:
-    twin, window = FlatTwin(profile, ramp), search_window(reach_px * PIXEL, step_px * PIXEL)
+    twin, window = FlatTwin(profile, ramp, turned), search_window(reach_px * PIXEL, step_px * PIXEL)
     samples = symbol_samples(profile)
     return measure(sampler, twin, nominal(), profile, patch, symbols, ("direct",), window, samples)[0]
 
@@ -118,9 +119,10 @@ class TestFinding:
             away = places - np.array(MIDDLE.centre_m)
             return picture(places) * np.exp(1j * (away / PIXEL) @ per_px)
 
-        found = look(tilted)
-        assert found.carrier == pytest.approx(per_px, abs=0.01)
-        assert look(picture).carrier == pytest.approx([0, 0], abs=0.005)
+        for turned in (False, True):
+            by_camera = np.stack([per_px, -per_px if turned else per_px]) / 2
+            assert look(tilted, turned=turned).carrier == pytest.approx(by_camera, abs=0.005)
+        assert look(picture).carrier == pytest.approx(np.zeros((2, 2)), abs=0.0025)
 
 
 class TestSignificance:

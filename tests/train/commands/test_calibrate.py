@@ -22,6 +22,7 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
 from lightpage.recording.writer import RecordingWriter
 from lightpage.train.commands.calibrate import calibrate
+from tests.lightpage.small import EXPLAINED, UNEXPLAINED
 from tests.told import Told
 
 
@@ -69,6 +70,7 @@ REGISTERED = Registered(
     coherence_after=0.71,
     cost=1.0,
     significant=0.5,
+    goodness=EXPLAINED,
 )
 
 
@@ -126,6 +128,16 @@ def test_what_was_found_is_written_as_json(tmp_path: Path, monkeypatch: pytest.M
     assert (data["pages_used"], data["coherence_before"], data["coherence_after"]) == (2, 0.02, 0.71)
     assert data["parameters"] == calibration.parameters
     assert data["symbols_beside_cameras"] == 0
+    assert data["goodness"] == EXPLAINED.model_dump()
+
+
+def test_a_wrong_fit_is_an_error_and_is_there_to_be_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fake_registration(monkeypatch, replace(REGISTERED, goodness=UNEXPLAINED))
+    out, picture = tmp_path / "calibration.toml", tmp_path / "left.png"
+    with pytest.raises(CalibrationError, match="wrong fit"):
+        run(flat_recording(tmp_path / "R.h5", 100), out, "--picture", str(picture))
+    assert load_calibration(out).goodness == UNEXPLAINED
+    assert picture.read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize(
