@@ -61,7 +61,6 @@ def test_a_callers_own_modules_break_nothing(toy_zip: Path, tmp_path: Path) -> N
     bulk = ["bulk", "evaluate", "out", "--recordings", "R.h5", "--bundle", toy_zip, "--workers", "1"]  # another process
     for line in (
         [*command, "train", "--help"],
-        [*command, "export", "--help"],
         [*command, *bulk],
         [sys.executable, "-m", "lightpage", "serve", "--help"],
         [sys.executable, "-c", f"import lightpage; lightpage.load({str(toy_zip)!r}); lightpage.LightpageClient"],
