@@ -1,6 +1,6 @@
 """Calibrations that must not be called good: wrong symbols, profiles, cameras, and devices that the model lacks.
 
-    python -m analysis.comparison.wrong_fits --json F
+    python -m analysis.calibration.wrong_fits --json F
 
 Each fit is refused with an error or gets a verdict; none may be good.
 """
@@ -135,4 +135,4 @@ def main(profile_name: str, seed: int, json_path: Path) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(run(main, name="python -m analysis.comparison.wrong_fits"))
+    sys.exit(run(main, name="python -m analysis.calibration.wrong_fits"))

@@ -1,9 +1,9 @@
 """Calibration from nominal on drawn devices: angle errors, coherence, verdict, time.
 
-    python -m analysis.comparison.calibration --devices 20 --first-seed 1000 --pages 2 --json F
-    python -m analysis.comparison.calibration --devices 50 --draw rough --json F
-    python -m analysis.comparison.calibration --devices 3 --foreign --json F
-    python -m analysis.comparison.calibration --symbol-size 2 --devices 3 --json F
+    python -m analysis.calibration.devices --devices 20 --first-seed 1000 --pages 2 --json F
+    python -m analysis.calibration.devices --devices 50 --draw rough --json F
+    python -m analysis.calibration.devices --devices 3 --foreign --json F
+    python -m analysis.calibration.devices --symbol-size 2 --devices 3 --json F
 
 Devices are drawn over the whole capture range, or as they scatter on a bench (`rough`). The coherence of the calibrated
 geometry is put in ratio to that of the true one (the oracle), fields recovered with the true cameras and turn, the
@@ -25,7 +25,7 @@ from pathlib import Path
 
 import click
 
-from analysis.comparison.calibration_bench import HEADER, Bench, Outcome
+from analysis.calibration.bench import HEADER, Bench, Outcome
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import load_profile
@@ -132,4 +132,4 @@ def main(
 
 
 if __name__ == "__main__":
-    sys.exit(run(main, name="python -m analysis.comparison.calibration"))
+    sys.exit(run(main, name="python -m analysis.calibration.devices"))
