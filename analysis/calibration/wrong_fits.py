@@ -64,11 +64,16 @@ def taken(
 def wrong_fits(profile: Profile, seed: int) -> Iterator[tuple[str, Taken]]:
     """Name and what a calibration is given of each."""
     right, rng = taken(profile, seed), np.random.default_rng(seed)
-    lens, slm = profile.lens, profile.slm
-    longer = lens.model_copy(update={"focal_length_m": 1.01 * lens.focal_length_m})
-    coarser = slm.model_copy(update={"pitch_m": 1.01 * slm.pitch_m})
-    for name, changed in (("focal length", {"lens": longer}), ("modulator pitch", {"slm": coarser})):
-        yield f"profile: {name} 1% off", replace(right, profile=profile.model_copy(update=changed))
+    lens, pipe = profile.lens, profile.pipe
+    longer = {
+        "lens": lens.model_copy(update={"focal_length_m": 1.06 * lens.focal_length_m}),
+        "pipe": pipe.model_copy(update={"length_m": 1.06 * pipe.length_m}),
+    }
+    for part, changed in longer.items():
+        yield (
+            f"profile of another device: {part} 6% longer",
+            replace(right, profile=profile.model_copy(update={part: changed})),
+        )
 
     def with_symbols(change: Callable[[np.ndarray], np.ndarray]) -> Taken:
         return replace(right, pages=[KnownPage(page.pair, change(page.symbols)) for page in right.pages])
