@@ -20,7 +20,8 @@ from lightpage.errors import BundleError, InvalidInputError
 from lightpage.export import from_run, run_graph
 from lightpage.export.command import export
 from lightpage.export.from_run import export_run
-from lightpage.export.graph import TABLE_INPUTS, angle
+from lightpage.export.graph import TABLE_INPUTS, FieldGraph, angle
+from lightpage.export.onnx_files import field_onnx
 from lightpage.export.operators.check import fallbacks, page_part
 from lightpage.export.operators.operator_list import PROVIDERS
 from lightpage.export.parity import check_parity
@@ -31,6 +32,7 @@ from lightpage.runtime.model.bundle.manifest import DECODER, FIELD, TWIN
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.execution.session import open_session
 from lightpage.simulator.true_optics import true_parameters
+from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
 from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.train.runs import GOLDEN, REFERENCES, WEIGHTS, load_run
 from lightpage.waves.grid import field_grid
@@ -115,6 +117,33 @@ def test_the_fields_own_graph_shows_the_decoders_field(
     monkeypatch.setattr("lightpage.runtime.model.decoding.decoder.field_grid", partial(field_grid, step_px=3))
     with pytest.raises(BundleError, match="output field"):
         without.field_solver(*asked)
+
+
+def test_a_fields_graph_takes_the_defocus_of_cameras_that_stand_apart(
+    exported: Bundle, small_run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lightpage.train.models.apart.ROUNDS", 2)  # of many alike
+    profile, (apart, other) = small_profile(), (Device().in_phase_camera, Device().quadrature_camera)
+    parameters = true_parameters(
+        profile,
+        Device(
+            in_phase_camera=apart.model_copy(update={"axial_rad": 0.8}),
+            quadrature_camera=other.model_copy(update={"axial_rad": -0.7}),
+        ),
+    )
+    table = sampling_table(TorchTwin(RayTwin(profile)), parameters, np.pi / 2, profile)
+    with np.load(small_run / REFERENCES) as kept:
+        references = FramePair(kept["in_phase"], kept["quadrature"])
+    pair, names = exported.golden.pair, ("registration", "homodyne", "apart")
+    tensors = {"reference_in_phase": references.in_phase, "reference_quadrature": references.quadrature, **table}
+    session = open_session(field_onnx(FieldGraph(profile, apart=True), "uint8", tensors), "field", 1)
+    fed = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **tensors}
+    (field,) = session.run(["field"], {port.name: fed[port.name] for port in session.get_inputs()})
+    recover = TorchFieldSolver(FieldRecovery(profile))
+    expected, _ = recover(pair, references, *(table[name] for name in names))
+    together, _ = recover(pair, references, *(table[name] for name in names[:2]))
+    np.testing.assert_allclose(field[0] + 1j * field[1], expected, atol=1e-3)
+    assert np.abs(expected - together).max() > 0.1
 
 
 def test_the_table_is_a_default_that_another_replaces(decoder: Decoder) -> None:
