@@ -13,7 +13,7 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from lightpage.calibration.parameters import nominal
+from lightpage.calibration.parameters import NAMES, nominal
 from lightpage.calibration.sampling_table import sampling_table
 from lightpage.device.state import Device
 from lightpage.errors import BundleError, InvalidInputError
@@ -123,25 +123,17 @@ def test_a_fields_graph_takes_the_defocus_of_cameras_that_stand_apart(
     exported: Bundle, small_run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lightpage.train.models.apart.ROUNDS", 2)  # of many alike
-    profile, (apart, other) = small_profile(), (Device().in_phase_camera, Device().quadrature_camera)
-    parameters = true_parameters(
-        profile,
-        Device(
-            in_phase_camera=apart.model_copy(update={"axial_rad": 0.8}),
-            quadrature_camera=other.model_copy(update={"axial_rad": -0.7}),
-        ),
-    )
+    profile, parameters, pair = small_profile(), nominal(), exported.golden.pair
+    parameters[[NAMES.index(f"{camera}_axial_rad") for camera in ("in_phase", "quadrature")]] = 0.8, -0.7
     table = sampling_table(TorchTwin(RayTwin(profile)), parameters, np.pi / 2, profile)
     with np.load(small_run / REFERENCES) as kept:
         references = FramePair(kept["in_phase"], kept["quadrature"])
-    pair, names = exported.golden.pair, ("registration", "homodyne", "apart")
     tensors = {"reference_in_phase": references.in_phase, "reference_quadrature": references.quadrature, **table}
     session = open_session(field_onnx(FieldGraph(profile, apart=True), "uint8", tensors), "field", 1)
     fed = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **tensors}
     (field,) = session.run(["field"], {port.name: fed[port.name] for port in session.get_inputs()})
-    recover = TorchFieldSolver(FieldRecovery(profile))
-    expected, _ = recover(pair, references, *(table[name] for name in names))
-    together, _ = recover(pair, references, *(table[name] for name in names[:2]))
+    at, recover = (table["registration"], table["homodyne"]), TorchFieldSolver(FieldRecovery(profile))
+    expected, together = (recover(pair, references, *at, apart)[0] for apart in (table["apart"], None))
     np.testing.assert_allclose(field[0] + 1j * field[1], expected, atol=1e-3)
     assert np.abs(expected - together).max() > 0.1
 
