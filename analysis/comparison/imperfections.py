@@ -122,7 +122,7 @@ def measured(name: str, settings: list[str], profile: Profile, pages: int, steps
     "--device", "names", type=click.Choice(list(DEVICES)), multiple=True, help="All of them if neither is given."
 )
 @click.option("--set", "settings", multiple=True, metavar="TABLE.KEY=VALUE", help="A device of your own.")
-@click.option("--pages", type=click.IntRange(12), default=28, show_default=True, help="A fifth of them held out.")
+@click.option("--pages", type=click.IntRange(6), default=28, show_default=True, help="A fifth of them held out.")
 @click.option("--steps", type=click.IntRange(10), default=600, show_default=True)
 @click.option("--seed", type=click.IntRange(min=0), default=7, show_default=True)
 @click.option("--out", type=OutputFolder(), required=True, help="Folder for all of it, imperfections.json too.")

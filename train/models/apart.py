@@ -29,6 +29,7 @@ _STIFF = 1 + 2 * _WEIGHT
 _RELAXATION = 1.4
 """Of a round's step; below 2."""
 _DARK = 1e-9
+_LINEAR_ROUNDS = 30
 _LINEAR_STEP = 0.7
 """Linear equations have curvatures up to 2; the step times that must stay below 1.5 with this momentum."""
 _LINEAR_MOMENTUM = 0.5
@@ -114,7 +115,7 @@ class CamerasApart(NamedTuple):
             e, [2, ny, nx]; on the ring of the determinant's zero, what one of two real numbers says of it.
         """
         before = estimate = torch.zeros_like(left)
-        for _ in range(ROUNDS):
+        for _ in range(_LINEAR_ROUNDS):
             ahead = estimate + _LINEAR_MOMENTUM * (estimate - before)
             beyond = left - _by_camera(self.seen(ahead) * arms)
             pull = self.gathered(_for_both_parts(beyond) * arms)

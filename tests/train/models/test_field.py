@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 import torch
 
+from analysis.comparison.methods.oracle import without_signal_power
 from lightpage.calibration.samplers import FieldSampler
 from lightpage.calibration.sampling_table import cameras_apart, monomial_powers
 from lightpage.device.state import Aberration, CameraPose, Device, Drift, Homodyne, Reference, Sensor
@@ -15,7 +16,7 @@ from lightpage.errors import InvalidInputError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.simulator.cameras import resample
 from lightpage.simulator.simulator import Simulator
-from lightpage.simulator.true_optics import true_parameters
+from lightpage.simulator.true_optics import TrueOptics, true_parameters
 from lightpage.train.models.field import ROUNDS, FieldRecovery, TorchFieldSolver
 from lightpage.waves.grid import field_grid
 from tests.lightpage.small import small_profile
@@ -33,7 +34,9 @@ class Recorded:
     references: FramePair
     truth: np.ndarray
     turn: float
-    apart: np.ndarray | None = None
+    exit_field: np.ndarray
+    optics: TrueOptics
+    apart: np.ndarray | None
 
 
 def record(
@@ -57,7 +60,8 @@ def record(
     real, imaginary = (resample(part, *optics.camera_axes_m, x, y) for part in (field.real, field.imag))
     turn = sign * np.pi / 2 + np.deg2rad(ERROR_DEG)
     apart = cameras_apart(true_parameters(PROFILE, device), PROFILE) if any(axial) else None
-    return Recorded(page.pair, simulator.references(), real + 1j * imaginary, turn, apart)
+    truth = real + 1j * imaginary
+    return Recorded(page.pair, simulator.references(), truth, turn, page.exit_field, optics, apart)
 
 
 def registration(shifts_px: tuple[float, float] = SHIFTS_PX) -> np.ndarray:
@@ -146,6 +150,11 @@ class TestAccuracy:
             expected_db, abs=0.5
         )
 
+    def test_an_oracle_is_spared_what_the_signal_alone_brings_to_each_camera(self) -> None:
+        page = record(axial=(0.4, -0.3))
+        plain = replace(page, pair=without_signal_power(page.pair, page.exit_field, (0.0, 0.0), page.optics))
+        assert error_db(recovered(plain, FieldRecovery(PROFILE, with_signal_power=False)), page.truth) < -28
+
     def test_blocks_that_the_references_blocks_are_no_multiple_of_are_refused(self) -> None:
         with pytest.raises(InvalidInputError, match="binning"):
             FieldRecovery(PROFILE, binning=3)
@@ -195,11 +204,12 @@ class TestDarkness:
             dark[:, : dark.shape[1] // 2] = stray
             return dark
 
-        dimmed = Recorded(
-            FramePair(half_dark(recorded.pair.in_phase, 4), half_dark(recorded.pair.quadrature, 3)),
-            FramePair(half_dark(recorded.references.in_phase, 0), half_dark(recorded.references.quadrature, 0)),
-            recorded.truth,
-            recorded.turn,
+        dimmed = replace(
+            recorded,
+            pair=FramePair(half_dark(recorded.pair.in_phase, 4), half_dark(recorded.pair.quadrature, 3)),
+            references=FramePair(
+                half_dark(recorded.references.in_phase, 0), half_dark(recorded.references.quadrature, 0)
+            ),
         )
         field, residual = solve(dimmed)
         assert np.isfinite([*np.abs(field).ravel(), *residual.ravel()]).all()
@@ -211,7 +221,7 @@ class TestDarkness:
 
     def test_no_light_at_all_gives_no_nan(self, recorded: Recorded) -> None:
         black = FramePair(*(np.zeros(PROFILE.frame_shape, np.uint8) for _ in range(2)))
-        field, residual = solve(Recorded(black, recorded.references, recorded.truth, recorded.turn))
+        field, residual = solve(replace(recorded, pair=black))
         assert np.isfinite(field).all()
         assert np.isfinite(residual).all()
 
@@ -221,5 +231,5 @@ class TestGain:
         def brighter(frames: FramePair) -> FramePair:
             return FramePair(frames.in_phase.astype(np.uint16) * 3, frames.quadrature.astype(np.uint16) * 7)
 
-        same = Recorded(brighter(recorded.pair), brighter(recorded.references), recorded.truth, recorded.turn)
+        same = replace(recorded, pair=brighter(recorded.pair), references=brighter(recorded.references))
         np.testing.assert_allclose(solve(same)[0], solve(recorded)[0], atol=1e-4)
