@@ -43,8 +43,8 @@ _LEAST_OFF = 2.0
 """Mean square of the distances of a modulation's coefficients from the usual ones, over their deviations, from which on
 it is another one: a nominal device has 1 or less, and more than 2 in one of seventy fits."""
 _LEAST_STROKE = 2.0
-"""Deviations of the stroke alone from which on it is another one too: it drifts by itself, and on the bench device three
-of them cost a twentieth of a bit."""
+"""Deviations of the stroke alone from which on it is another one too: it drifts by itself, and on the bench device
+three of them cost a twentieth of a bit."""
 _LARGEST_MOVE_PX = 1.5
 """A round's largest step: the model is linear in the displacement over about a speckle."""
 _EQUATIONS = 100_000
