@@ -80,7 +80,7 @@ def orientations(linear: NDArray[np.floating]) -> NDArray[np.floating]:
     Returns:
         Zeros, and in each row and column one of 1 and -1, [..., 2, 2].
     """
-    return np.rint(linear / np.abs(linear).max(axis=(-2, -1), keepdims=True))
+    return np.asarray(np.rint(linear / np.abs(linear).max(axis=(-2, -1), keepdims=True)))
 
 
 def shifted(registration: NDArray[np.float32], shift_px: Real) -> NDArray[np.float32]:
