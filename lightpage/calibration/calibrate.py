@@ -9,7 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.coherence import COHERENT_BRANCHES, page_coherence
+from lightpage.calibration.goodness.measure import measure_goodness
+from lightpage.calibration.goodness.verdict import Goodness
 from lightpage.calibration.interfaces import FieldSolver, RememberingTwin, Twin
 from lightpage.calibration.parameters import NAMES, PARAMETERS, indices, nominal
 from lightpage.calibration.patch_fit import PatchFit, fit_parameters
@@ -107,6 +110,7 @@ class Registered:
         significant: share of the measured patches that were found, in the last stage.
         modulation: what the modulator makes of its levels.
         modulation_deviations: standard deviations of its coefficients.
+        goodness: how well all that explains the first page's light; None where that was not measured.
     """
 
     parameters: Real
@@ -118,6 +122,7 @@ class Registered:
     significant: float
     modulation: Modulation = NOMINAL
     modulation_deviations: tuple[float, ...] = NOMINAL.coefficients
+    goodness: Goodness | None = None
 
 
 @dataclass(frozen=True)
@@ -181,7 +186,7 @@ def calibrate(
         CalibrationError: nothing within the capture range explains the frames, or the page is too small to tell.
     """
     work = _Registration(twin, solve_field, profile, references, list(pages), progress)
-    work.total = len(_SINGLE_CAMERA) + len(_COMPLEX) + len(_PHASES) + 5
+    work.total = len(_SINGLE_CAMERA) + len(_COMPLEX) + len(_PHASES) + 6
     work.any_orientation = any_orientation
     for stage in _SINGLE_CAMERA:
         work.single_camera(stage)
@@ -221,7 +226,7 @@ def refine(
     work = _Registration(twin, solve_field, profile, references, list(pages), progress)
     work.parameters, work.centre, work.quadrature_phase = start.copy(), start, quadrature_phase
     work.modulation, work.levels = modulation, LevelPrior(modulation, DRIFTS)
-    work.total = len(_DRIFTED) + 2
+    work.total = len(_DRIFTED) + 3
     known = tuple(group for group in _ALL_GROUPS if max(indices(group)) < twin.known)
     for stage in _DRIFTED:
         work.complex_field(replace(stage, groups=known), _DRIFT_SCALE)
@@ -300,6 +305,7 @@ class _Registration:
         self.levels = LevelPrior()
         self.modulation, self.modulation_deviations = NOMINAL, NOMINAL.coefficients
         self.fit: PatchFit | None = None
+        self.illumination: NDArray[np.complexfloating] | None = None
         self.total = 1
         self._stage, self._done = "", 0
         self._pixel = profile.camera.pitch_m
@@ -413,6 +419,7 @@ class _Registration:
         self.parameters, self.deviations = found.parameters, found.deviations
         self.quadrature_phase = found.quadrature_phase
         self.modulation, self.modulation_deviations = found.modulation, found.modulation_deviations
+        self.illumination = found.illumination
 
     def result(self) -> Registered:
         """Judge the outcome."""
@@ -440,7 +447,19 @@ class _Registration:
             significant=significant,
             modulation=self.modulation,
             modulation_deviations=self.modulation_deviations,
+            goodness=self._goodness(),
         )
+
+    def _goodness(self) -> Goodness | None:
+        """How well what was fitted explains the light of the first page."""
+        if self.illumination is None:
+            return None
+        self._begin("unexplained light")
+        device = CalibratedDevice(
+            self.profile, self.parameters, self.quadrature_phase, self.references, self.modulation
+        )
+        page = self.pages[0]
+        return measure_goodness(self.twin, device, self.illumination, page.pair, page.symbols, self._tell)
 
     def _share(self, branch: str) -> float:
         """Share of the patches of a branch that the last stage found."""

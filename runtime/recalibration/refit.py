@@ -99,6 +99,8 @@ def refit(
         )
     hashes = [hash_frames(pair) for pair in pages.pairs]
     fitted = earlier.followed_by(Calibration.from_registered(registered, profile, hashes))
+    if not earlier.is_wrong:
+        fitted.check_good("re-fit, outcome", ": else calibrate anew")
     table = {
         "reference_in_phase": references.in_phase,
         "reference_quadrature": references.quadrature,

@@ -77,6 +77,7 @@ class WaveFitted:
             times an unknown factor: it says which of two fits is better.
         modulation: what the modulator makes of its levels; the prior's centre where a page does not tell it from that.
         modulation_deviations: standard deviations of its coefficients, zero where held.
+        illumination: coefficients [T] of the terms of the page's illumination.
     """
 
     parameters: Real
@@ -85,6 +86,7 @@ class WaveFitted:
     residual: float
     modulation: Modulation = NOMINAL
     modulation_deviations: tuple[float, ...] = (0.0,) * len(modulations.NAMES)
+    illumination: Complex | None = None
 
 
 class LevelPrior(NamedTuple):
@@ -234,6 +236,7 @@ class WaveFit:
                 residual,
                 Modulation(tuple(state.levels.tolist())),
                 tuple(known[fitted_levels].tolist()) if levels else best.modulation_deviations,
+                state.light,
             )
             state = self._moved(state, covariance @ pull, directions, fitted_levels, free)
         return best if levels is None else _told_apart(best, levels.centre)

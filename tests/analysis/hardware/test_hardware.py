@@ -1,7 +1,5 @@
 """Each benchmark of the hardware runs small; of the loop, whose measurements take hours, the sums are tested."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -21,6 +19,8 @@ def measured(command: click.Command, arguments: str, folder: Path) -> Any:
     return json.loads(out.read_text())
 
 
+# Full frames of two formats over loopback; what the driver does with them is tested by itself.
+@pytest.mark.long
 @pytest.mark.own_network
 def test_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     small = {"FULL": (128, 128), "PACKETS_BYTES": (1400,), "TOLERANCES_S": (0.02,), "FORMATS": ("Mono8", "Mono12p")}

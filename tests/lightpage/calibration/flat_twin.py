@@ -1,7 +1,5 @@
 """A device too simple to be wrong: the page is imaged onto itself, each branch with a known shift and phase ramp."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import ndimage
 

@@ -1,7 +1,5 @@
 """Claims about the fit: its derivative, its priors, what it recovers, and what outliers do to it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

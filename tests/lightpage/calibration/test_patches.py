@@ -1,7 +1,5 @@
 """Claims about local measurements: a patch finds the shift, phase and slope put in, and knows light that is not its."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -29,7 +27,6 @@ PITCH = PROFILE.symbol_pitch_m
 PIXEL = PROFILE.camera.pitch_m
 MIDDLE = patches(PROFILE)[5]
 FINE = PROFILE.with_symbols_of(2)
-FINE_SYMBOLS = np.exp(1j * random_phases(FINE, 1))
 
 
 def look(

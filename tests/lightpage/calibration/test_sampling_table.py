@@ -1,7 +1,5 @@
 """Claims about the sampling table: rebuilt from it, every sample of every symbol lies where the twin would trace it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

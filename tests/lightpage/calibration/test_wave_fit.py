@@ -1,7 +1,5 @@
 """Claims about the fit to waves: a known page places both cameras and tells the device, with calibrated deviations."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -88,12 +86,13 @@ def test_both_cameras_and_the_angle_between_the_arms_come_back_in_dim_light(turn
 
 def test_a_realistic_device_is_told_from_near_it_with_calibrated_deviations() -> None:
     seed = 1
-    device = draw_device(np.random.default_rng(seed))
-    truth = true_parameters(PROFILE, device)
+    # a taper is told by the other parameters
+    device = draw_device(np.random.default_rng(seed)).with_settings(["geometry.pipe_taper_relative=0.003"])
+    truth, levels = true_parameters(PROFILE, device), true_modulation(device.slm)
     rng, angle = np.random.default_rng([seed, 1]), NAMES.index("pipe_angle_rad")
     start = truth + 0.02 * PRIORS * rng.standard_normal(len(PRIORS))
     start[angle] = truth[angle] + 4e-4
-    found = seen_by(device, seed).fit(start, device.homodyne.turn_rad, EVERY)
+    found = seen_by(device, seed).fit(start, device.homodyne.turn_rad, EVERY, modulation=levels)
     assert abs(found.parameters[angle] - truth[angle]) < found.deviations[angle] < 1e-4
     assert np.rad2deg(abs(found.quadrature_phase - device.homodyne.turn_rad)) < 0.3
     moving = indices("in_phase", "quadrature")[::6], indices("in_phase", "quadrature")[1::6]
@@ -126,12 +125,12 @@ def test_how_much_path_real_lenses_add_comes_back() -> None:
 
 def test_held_parameters_keep_their_values_and_priors_hold_the_others() -> None:
     device = draw_device(np.random.default_rng(3))
-    truth = true_parameters(PROFILE, device)
+    truth, levels = true_parameters(PROFILE, device), true_modulation(device.slm)
     fit, start = seen_by(device, 3), truth.copy()
     angle = NAMES.index("pipe_angle_rad")
     start[angle] += 4e-4
-    free = fit.fit(start, device.homodyne.turn_rad, ("angle",))
-    held = fit.fit(start, device.homodyne.turn_rad, ("angle",), centre=start, prior_scale=1e-4)
+    free = fit.fit(start, device.homodyne.turn_rad, ("angle",), modulation=levels)
+    held = fit.fit(start, device.homodyne.turn_rad, ("angle",), centre=start, prior_scale=1e-4, modulation=levels)
     assert np.array_equal(np.flatnonzero(free.parameters - start), [angle])
     assert abs(free.parameters[angle] - truth[angle]) < 1e-4
     assert abs(held.parameters[angle] - start[angle]) < 1e-5

@@ -1,7 +1,5 @@
 """The pilots give the piston, how far a decoder may be trusted, and whether a page may be given out."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
