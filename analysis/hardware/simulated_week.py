@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -69,15 +70,16 @@ class LightDrift:
     def of(self, device: Device, share: float) -> Device:
         """A device after a share of the week."""
         axial = ("geometry.modulator_axial_rad", "in_phase_camera.axial_rad", "quadrature_camera.axial_rad")
-        focus = [f"{name}={self.axial_rad * share!r}" for name in axial]
-        return device.with_settings([f"slm.stroke_relative_error={self.stroke_relative * share!r}", *focus])
+        changes = {"slm.stroke_relative_error": self.stroke_relative, **dict.fromkeys(axial, self.axial_rad)}
+        values = {name: attrgetter(name)(device) + by * share for name, by in changes.items()}
+        return device.with_settings([f"{name}={value!r}" for name, value in values.items()])
 
 
-def state(moment: float, pages: int, light: LightDrift) -> Device:
-    """The true device at a time of a week of `pages`, in pages: it was calibrated cold, at its beginning."""
+def state(begun: Device, moment: float, pages: int, light: LightDrift) -> Device:
+    """The true device at a time of a week of `pages`, in pages, that was `begun` when it was calibrated, cold."""
     day = np.sin(2 * np.pi * moment / DAY_PAGES)
     warm_up = 1 - np.exp(-moment / WARM_UP_PAGES)
-    device = moved(Device(), WARM_UP_UNITS * warm_up * direction(1) + DAILY_UNITS * day * direction(2))
+    device = moved(begun, WARM_UP_UNITS * warm_up * direction(1) + DAILY_UNITS * day * direction(2))
     device = light.of(device, moment / pages)
     if moment < KNOCK_SHARE * pages:
         return device
@@ -106,6 +108,7 @@ class Week:
         pages_during: that are read while a recalibration runs, at most.
         threads: of an inference.
         bundle: that the service begins with.
+        device: true state at the beginning.
         light: what drifts beside the geometry.
         true_every: pages from one that is read with the true table, too, to the next.
     """
@@ -115,6 +118,7 @@ class Week:
     pages_during: int
     threads: int | None
     bundle: Path
+    device: Device
     light: LightDrift
     true_every: int = 1
     rows: Rows = field(default_factory=list)
@@ -125,7 +129,7 @@ class Week:
         path = self.out / "rows.jsonl"
         self.rows = kept_rows(path)
         base = Decoder.load(self.bundle, self.threads)
-        source = DriftingSource(base, lambda moment: state(moment, self.pages, self.light), seed=7)
+        source = DriftingSource(base, lambda moment: state(self.device, moment, self.pages, self.light), seed=7)
         knock = int(KNOCK_SHARE * self.pages)
         if self.rows:
             source.skip(int(self.rows[-1]["shots"]))

@@ -33,6 +33,7 @@ from analysis.hardware.simulated_week import KNOCK_SHARE, PAGE_S, LightDrift, We
 from analysis.hardware.week_figure import draw
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile, OutputFolder
+from lightpage.device.state import Device, load_device
 from lightpage.files import write_json
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 
@@ -120,6 +121,7 @@ def table_of(rows: Rows, pages: int) -> list[str]:
 @click.option("--true-every", default=1, show_default=True, type=click.IntRange(1), help="Pages from one true AIR on.")
 @click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
 @click.option("--bundle", default=DEFAULT, show_default=True, help="That the service begins with.")
+@click.option("--device", type=click.Path(path_type=Path), help="True state (TOML) at the beginning.")
 @click.option("--stroke", default=0.0, show_default=True, help="Change of the modulator's stroke, relative.")
 @click.option("--axial", default=0.0, show_default=True, help="Change of all places along the axis, rad.")
 @click.option("--out", required=True, type=OutputFolder(), help="Where pages, models and frames are kept.")
@@ -131,6 +133,7 @@ def main(
     true_every: int,
     threads: int | None,
     bundle: str,
+    device: Path | None,
     stroke: float,
     axial: float,
     out: Path,
@@ -139,7 +142,8 @@ def main(
     """Live through a week, and tell how it went."""
     out.mkdir(parents=True, exist_ok=True)
     logging.basicConfig(level=logging.INFO, filename=out / "log", format="%(asctime)s %(levelname)s %(message)s")
-    week = Week(out, pages, pages_during, threads, bundle_path(bundle), LightDrift(stroke, axial), true_every)
+    begun = Device() if device is None else load_device(device)
+    week = Week(out, pages, pages_during, threads, bundle_path(bundle), begun, LightDrift(stroke, axial), true_every)
     week.read_until(pages if stop_after is None else min(pages, stop_after))
     figures = figures_of(week.rows, pages)
     draw(week.rows, out / "week.png", int(KNOCK_SHARE * pages), PAGE_S)

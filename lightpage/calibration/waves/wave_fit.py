@@ -42,8 +42,9 @@ _CONVERGED = 1e-3
 _LEAST_OFF = 2.0
 """Mean square of the distances of a modulation's coefficients from the usual ones, over their deviations, from which on
 it is another one: a nominal device has 1 or less, and more than 2 in one of seventy fits."""
-_LEAST_FAR = 3.5
-"""Deviations of a single coefficient from which on it is another one too: of all, a stroke alone may drift."""
+_LEAST_STROKE = 2.0
+"""Deviations of the stroke alone from which on it is another one too: it drifts by itself, and on the bench device
+three of them cost a twentieth of a bit."""
 _LARGEST_MOVE_PX = 1.5
 """A round's largest step: the model is linear in the displacement over about a speckle."""
 _EQUATIONS = 100_000
@@ -395,7 +396,7 @@ def _directions(light: Complex, *, bends: bool) -> Complex:
 def _told_apart(found: WaveFitted, usual: Modulation) -> WaveFitted:
     """A fit whose modulation is the usual one unless it differs from that by more than its deviations."""
     away = np.subtract(found.modulation.coefficients, usual.coefficients) / found.modulation_deviations
-    same = np.mean(away**2) < _LEAST_OFF and np.abs(away).max() < _LEAST_FAR
+    same = np.mean(away**2) < _LEAST_OFF and abs(away[0]) < _LEAST_STROKE
     return replace(found, modulation=usual) if same else found
 
 

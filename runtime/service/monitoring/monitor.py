@@ -109,8 +109,8 @@ SHIFT = Sign("shift_px", window=5, raise_by=4.0, clear_by=3.0, rises=True, absol
 left to a device's walk (0.9 px in a quiet week), the rest to a knock."""
 
 STROKE = Sign("stroke_relative", window=15, raise_by=0.002, clear_by=0.001, either=True)
-"""Change of the modulator's stroke since calibration, as the pilots show it. Pages of a quiet bench device show
--0.001 +- 0.001, so 0.002 is six standard errors of the median; twice that costs a tenth of a bit."""
+"""Change of the modulator's stroke since calibration, as the pilots show it. A quiet bench page
+shows 0.0000 +- 0.0012, so 0.002 is five standard errors of the median; twice that costs a tenth of a bit."""
 
 PISTON_WALK = Sign("piston_walk_rad", window=15, raise_by=0.6, clear_by=0.3, rises=True, decides=False)
 """Step of the piston from page to page. It shows a restless interferometer, which no recalibration cures."""
