@@ -177,7 +177,7 @@ def _read(settings: Settings, kept: Path, device: Device, work: Path, progress: 
     result: dict[str, Any] = {"air": 0.0, "told": told, "anew": math.nan, "refused": ""}
     try:
         calibration = fitted.calibration(profile, _part(progress, 0.6, 0.8))
-        found = CalibratedDevice.of(profile, calibration, pages.references)
+        found = calibration.device(profile, pages.references)
         result["air"] = decoder.air(found, judged)
         if result["air"] < least:
             progress("train anew", 0.8)
