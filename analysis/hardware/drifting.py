@@ -211,14 +211,14 @@ class TrueTable:
             "reference_quadrature": references.quadrature,
             **sampling_table(self._twin, parameters, truth.device.homodyne.turn_rad, profile),
         }
-        graph = self.decoder.graph
-        if "parameters" in graph.ports:
-            table["parameters"] = table["parameters"][: graph.ports["parameters"].shape[0]]
-        table = {name: value for name, value in table.items() if name in graph.ports}
         bundle, modulation = self.decoder.bundle, true_modulation(truth.device.slm)
         calibration = bundle.calibration.model_copy(update={"modulation": modulation.as_dict()}).to_toml()
         manifest = bundle.manifest.model_copy(update={"calibration": calibration})
-        fed = Decoder(replace(bundle, manifest=manifest), self.decoder.threads, graph.with_table(table))
+        fed = Decoder(
+            replace(bundle, manifest=manifest),
+            self.decoder.threads,
+            self.decoder.graph.with_table(self.decoder.taken(table)),
+        )
         shown = modulation.page_levels(levels)
         page = fed.decode(truth.pair, levels, pilots=Pilots.of_symbols(bundle.pilot_mask, truth.symbols, shown))
         return air_bits(page, truth.symbols, self.data, shown)

@@ -106,10 +106,8 @@ def refit(
         "reference_quadrature": references.quadrature,
         **sampling_table(twin, registered.parameters, registered.quadrature_phase, profile),
     }
-    if "parameters" in decoder.graph.ports:
-        table["parameters"] = table["parameters"][: decoder.graph.ports["parameters"].shape[0]]
     return RefitResult(
-        table={name: value for name, value in table.items() if name in decoder.graph.ports},
+        table=decoder.taken(table),
         calibration_toml=fitted.to_toml(),
         report=RefitReport(
             angle_deg=fitted.angle_deg(profile),

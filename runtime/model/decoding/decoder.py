@@ -113,6 +113,14 @@ class Decoder:
         """
         return Decoder(self.bundle, self.threads, self.graph.with_table(table))
 
+    def taken(self, table: SamplingTable) -> SamplingTable:
+        """The tensors of a traced table that the graph takes; of parameters those that it knows, the first ones."""
+        ports = self.graph.ports
+        taken = {name: value for name, value in table.items() if name in ports}
+        if "parameters" in taken:
+            taken["parameters"] = taken["parameters"][: ports["parameters"].shape[0]]
+        return taken
+
     def of_bundle(self, bundle: Bundle) -> Decoder:
         """This decoder with the table of a bundle of the same graphs, whose golden page is not looked at.
 
