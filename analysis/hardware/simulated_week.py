@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +70,9 @@ class LightDrift:
         """A device after a share of the week."""
         axial = ("geometry.modulator_axial_rad", "in_phase_camera.axial_rad", "quadrature_camera.axial_rad")
         changes = {"slm.stroke_relative_error": self.stroke_relative, **dict.fromkeys(axial, self.axial_rad)}
-        values = {name: attrgetter(name)(device) + by * share for name, by in changes.items()}
+        known = device.model_dump()
+        paths = {name: name.split(".") for name in changes}
+        values = {name: known[table][key] + share * changes[name] for name, (table, key) in paths.items()}
         return device.with_settings([f"{name}={value!r}" for name, value in values.items()])
 
 
