@@ -30,3 +30,9 @@ def defocus_taps(geometry: WaveGeometry, defocus: float, pitch_m: float) -> NDAr
     places = np.arange(-_REACH, _REACH + 1) * pitch_m
     taps = np.mean(passed * np.cos(np.outer(places, frequency)), axis=1)
     return np.stack([taps.real, taps.imag]).astype(np.float32)
+
+
+def resampled_taps(step: float) -> NDArray[np.float64]:
+    """Matrix [taps, taps] that takes a kernel along an axis to that of samples `step` times as far apart."""
+    frequency, taps = (np.arange(_NODES) + 0.5) / _NODES * np.pi, np.arange(-_REACH, _REACH + 1)
+    return np.asarray(np.cos(np.outer(taps, frequency)) @ np.cos(np.outer(frequency / step, taps)) / _NODES)

@@ -28,7 +28,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.document import Calibration
 from lightpage.device.state import Device
 from lightpage.errors import CalibrationError
@@ -177,7 +176,7 @@ def _read(settings: Settings, kept: Path, device: Device, work: Path, progress: 
     result: dict[str, Any] = {"air": 0.0, "told": told, "anew": math.nan, "refused": ""}
     try:
         calibration = fitted.calibration(profile, _part(progress, 0.6, 0.8))
-        found = CalibratedDevice.of(profile, calibration, pages.references)
+        found = calibration.device(profile, pages.references)
         result["air"] = decoder.air(found, judged)
         if result["air"] < least:
             progress("train anew", 0.8)

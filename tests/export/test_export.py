@@ -1,10 +1,9 @@
 """An exported run says what torch says, carries its table as a default, and fails loudly where it does not."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -13,14 +12,15 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from lightpage.calibration.parameters import nominal
+from lightpage.calibration.parameters import NAMES, nominal
 from lightpage.calibration.sampling_table import sampling_table
 from lightpage.device.state import Device
 from lightpage.errors import BundleError, InvalidInputError
 from lightpage.export import from_run, run_graph
 from lightpage.export.command import export
 from lightpage.export.from_run import export_run
-from lightpage.export.graph import TABLE_INPUTS, angle
+from lightpage.export.graph import TABLE_INPUTS, FieldGraph, angle
+from lightpage.export.onnx_files import field_onnx
 from lightpage.export.operators.check import fallbacks, page_part
 from lightpage.export.operators.operator_list import PROVIDERS
 from lightpage.export.parity import check_parity
@@ -31,10 +31,11 @@ from lightpage.runtime.model.bundle.manifest import DECODER, FIELD, TWIN
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.execution.session import open_session
 from lightpage.simulator.true_optics import true_parameters
+from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
 from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.train.runs import GOLDEN, REFERENCES, WEIGHTS, load_run
 from lightpage.waves.grid import field_grid
-from tests.lightpage.small import small_profile
+from tests.lightpage.small import UNEXPLAINED, small_profile
 
 
 @pytest.fixture(scope="module")
@@ -117,6 +118,25 @@ def test_the_fields_own_graph_shows_the_decoders_field(
         without.field_solver(*asked)
 
 
+def test_a_fields_graph_takes_the_defocus_of_cameras_that_stand_apart(
+    exported: Bundle, small_run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lightpage.train.models.apart.ROUNDS", 2)  # of many alike
+    profile, parameters, pair = small_profile(), nominal(), exported.golden.pair
+    parameters[[NAMES.index(f"{camera}_axial_rad") for camera in ("in_phase", "quadrature")]] = 0.8, -0.7
+    table = sampling_table(TorchTwin(RayTwin(profile)), parameters, np.pi / 2, profile)
+    with np.load(small_run / REFERENCES) as kept:
+        references = FramePair(kept["in_phase"], kept["quadrature"])
+    tensors = {"reference_in_phase": references.in_phase, "reference_quadrature": references.quadrature, **table}
+    session = open_session(field_onnx(FieldGraph(profile, apart=True), "uint8", tensors), "field", 1)
+    fed = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **tensors}
+    (field,) = session.run(["field"], {port.name: fed[port.name] for port in session.get_inputs()})
+    at, recover = (table["registration"], table["homodyne"]), TorchFieldSolver(FieldRecovery(profile))
+    expected, together = (recover(pair, references, *at, apart)[0] for apart in (table["apart"], None))
+    np.testing.assert_allclose(field[0] + 1j * field[1], expected, atol=1e-3)
+    assert np.abs(expected - together).max() > 0.1
+
+
 def test_the_table_is_a_default_that_another_replaces(decoder: Decoder) -> None:
     golden = decoder.bundle.golden
     plain = decoder.infer(golden.pair).p
@@ -186,6 +206,16 @@ def test_a_run_file_that_was_cut_off_is_named(small_run: Path, tmp_path: Path, n
         (cut / name).write_bytes((small_run / name).read_bytes()[:size])
         with pytest.raises(InvalidInputError, match=name):
             export_run(cut, tmp_path / "n.zip")
+
+
+def test_a_run_with_a_wrong_fit_is_not_exported_unasked(small_run: Path, tmp_path: Path) -> None:
+    folder, run = tmp_path / "run", load_run(small_run)
+    folder.mkdir()
+    wrong = run.calibration.model_copy(update={"goodness": UNEXPLAINED})
+    replace(run, calibration_toml=wrong.to_toml()).save(folder)
+    for words, message in (((), "wrong fit"), (("--accept-wrong-fit",), "arrays")):
+        result = CliRunner().invoke(export, [str(folder), "--out", str(tmp_path / "b.zip"), *words])
+        assert message in str(result.exception)
 
 
 def test_parity_is_judged_against_the_norm_and_never_passes_nan() -> None:

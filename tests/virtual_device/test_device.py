@@ -1,7 +1,5 @@
 """A page travels from the modulator through light, trigger and packets to its symbols."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

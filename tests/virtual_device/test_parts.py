@@ -1,7 +1,5 @@
 """The emulated pulse generator answers as the manual says; ports and private networks are there, or said not to be."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket
@@ -42,27 +40,6 @@ from tests.runtime.device.acquisition.lab import reason_of
 )
 def test_grammar(message: str, answer: str) -> None:
     assert PulseGeneratorEmulator().answer(message) == answer
-
-
-def test_single_shots_and_edges_reach_the_channels_that_are_on() -> None:
-    fired: list[int] = []
-    cables = {1: lambda: fired.append(1), 2: lambda: fired.append(2)}
-    device = PulseGeneratorEmulator(cables)
-    device.answer(":PULSE2:STATE ON")
-    device.answer(":PULSE0:STATE ON")
-    assert fired == []  # a train of pulses is no single shot
-    device.answer(":PULSE0:STATE OFF")
-    device.answer(":PULSE0:MODE SING")
-    device.answer(":PULSE0:STATE ON")
-    assert (fired, device.answer(":PULSE0:STATE?")) == ([2], "0")
-    device.answer(":PULSE0:TRIG:MODE TRIG")
-    assert (device.answer("*TRG"), device.shots) == ("?8", 1)
-    device.answer(":PULSE0:STATE ON")
-    assert [device.answer("*TRG") for _ in range(2)] == ["ok", "ok"]
-    assert fired == [2, 2, 2]
-    device.answer(":PULSE2:STATE 1")
-    assert device.answer("*RST") == "ok"
-    assert device.answer(":PULSE2:STATE?") == "0"
 
 
 def test_an_address_that_cannot_be_had() -> None:

@@ -23,13 +23,13 @@ from lightpage.calibration.waves.wave_fit import READ_NOISE
 from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError
 from lightpage.recording.frame_pair import FramePair
+from lightpage.train.models.apart import CamerasApart
 from lightpage.train.models.filters import BLOCK, SeparableFilter
-from lightpage.waves.grid import FieldGrid, field_grid
+from lightpage.waves.defocus import resampled_taps
+from lightpage.waves.grid import GRID_STEP_PX, FieldGrid, field_grid
 
 ROUNDS = 6
 """Of descent; beyond these the band filter's ripple adds up."""
-APART_ROUNDS = 18
-"""The same where cameras stand apart: what the one misses of a frequency, the other must make up for."""
 _STEP = 0.9
 """Along the weighted gradient: the weights bound the curvature by 2, and step times curvature must stay below 2."""
 _MOMENTUM = 0.5
@@ -50,8 +50,7 @@ class Measured(NamedTuple):
         cos, sin: of the turn between the arms.
         amplitude: the reference's over its mean, by which e becomes E.
         lit: one where both cameras have a reference, else zero.
-        apart: kernel of the defocus of the in-phase camera against the mean of both, real and imaginary part
-            [2, taps]; None where both see the same plane. The quadrature camera's is its conjugate.
+        apart: the defocus of the cameras; None where both see the same plane.
     """
 
     a: Tensor
@@ -60,7 +59,7 @@ class Measured(NamedTuple):
     sin: Tensor
     amplitude: Tensor
     lit: Tensor
-    apart: Tensor | None = None
+    apart: CamerasApart | None = None
 
     def left(self, e: Tensor) -> Tensor:
         """What is left of the two equations at e, [2, ny, nx] real and imaginary part."""
@@ -81,13 +80,22 @@ class Measured(NamedTuple):
         if self.apart is not None:
             (real_a, imaginary_a), (real_b, imaginary_b) = (each.unbind() for each in seen)
             by_b = pull_b * (real_b + self.cos), pull_b * (imaginary_b + self.sin)
-            return _together(torch.stack([pull_a * (real_a + 1), pull_a * imaginary_a, *by_b]), self.apart)
+            return self.apart.gathered(torch.stack([pull_a * (real_a + 1), pull_a * imaginary_a, *by_b]))
         total, (real, imaginary) = pull_a + pull_b, e.unbind()
         return torch.stack([total * real + pull_a + self.cos * pull_b, total * imaginary + self.sin * pull_b])
 
+    @property
+    def arms(self) -> Tensor:
+        """Phasors of both arms, real and imaginary parts [4, 1, 1]."""
+        one = torch.ones_like(self.cos)
+        return torch.stack([one, 0 * one, self.cos, self.sin])[:, None, None]
+
     def _seen(self, e: Tensor) -> tuple[Tensor, Tensor]:
         """The field as either camera sees it, [2, ny, nx] each."""
-        return (e, e) if self.apart is None else _apart(e, self.apart)
+        if self.apart is None:
+            return e, e
+        both = self.apart.seen(e)
+        return both[:2], both[2:]
 
     def _brightness(self, e: Tensor, other: Tensor, floor: Tensor | float) -> tuple[Tensor, Tensor]:
         """|1 + e|^2 and |exp(i turn) + other|^2, each with the floor on it, [ny, nx]."""
@@ -150,6 +158,9 @@ class FieldRecovery(nn.Module):
         for power_name, axis in (("u", grid.x_m), ("v", grid.y_m)):
             powers = np.stack([(axis / corner) ** power for power in range(_CUBIC + 1)])
             self.register_buffer(power_name, torch.tensor(powers, dtype=torch.float32))
+        self.to_taps: Tensor
+        to_taps = resampled_taps(grid.step_px / GRID_STEP_PX)
+        self.register_buffer("to_taps", torch.tensor(to_taps, dtype=torch.float32), persistent=False)
 
     def forward(self, *seen: Tensor) -> tuple[Tensor, Tensor]:
         """Recover the field; arguments as for `measure`, results as of `solve`."""
@@ -173,7 +184,8 @@ class FieldRecovery(nn.Module):
             registration: [2, 2, 10], pixel (column, row) of each camera as a cubic in the grid's (x, y), each over
                 the page's corner radius.
             homodyne: [2], cosine and sine of the turn between the two arms.
-            apart: see `Measured`.
+            apart: kernel of the in-phase camera's defocus on the usual grid, see
+                `lightpage.calibration.sampling_table.cameras_apart`; None where both cameras see the same plane.
         """
         frames = _block_means(_stacked(in_phase, quadrature), self.binning)
         references = _block_means(_stacked(reference_in_phase, reference_quadrature), self.binning)
@@ -189,7 +201,8 @@ class FieldRecovery(nn.Module):
         reference = torch.maximum(reference, floor)
         a, b = lit * gained / (2 * reference)
         amplitude = torch.sqrt(reference[0])
-        return Measured(a, b, homodyne[0], homodyne[1], amplitude / amplitude.mean(), lit, apart)
+        defocus = None if apart is None else CamerasApart.of(apart @ self.to_taps.T)
+        return Measured(a, b, homodyne[0], homodyne[1], amplitude / amplitude.mean(), lit, defocus)
 
     def solve(self, measured: Measured) -> tuple[Tensor, Tensor]:
         """Solve what was measured.
@@ -226,9 +239,11 @@ class FieldRecovery(nn.Module):
 
         Each sample alone is a quadratic with two roots, which meet where the signal outshines the reference. So: the
         closed root nearer to the linear estimate, then descent with momentum towards the most likely field in the
-        pipe's band.
+        pipe's band. Where the cameras stand apart, that is but a start (`CamerasApart.recovered`).
         """
-        a, b, cos, sin, amplitude, *_ = measured
+        a, b, cos, sin, amplitude, _, apart = measured
+        if apart is not None and not self.with_signal_power:
+            return apart.recovered_linearly(torch.stack([a, b]), measured.arms, self.band)
         start = self.band(torch.stack([a, (b - cos * a) / sin]) * amplitude) * inverse_amplitude
         if not self.with_signal_power:
             return torch.as_tensor(start)
@@ -241,7 +256,10 @@ class FieldRecovery(nn.Module):
         root = torch.sqrt(torch.clamp(discriminant, min=0)) / quadratic
         real = middle + torch.where(start[0] < middle, -root, root)
         before = estimate = self.band(torch.stack([real, slope * real - offset]) * amplitude) * inverse_amplitude
-        for _ in range(self.rounds if measured.apart is None else APART_ROUNDS):
+        if apart is not None:
+            brightness = 1 + 2 * torch.stack([a, b])
+            return apart.recovered(estimate, brightness, measured.arms, amplitude, inverse_amplitude, self.band)
+        for _ in range(self.rounds):
             ahead = estimate + _MOMENTUM * (estimate - before)
             step = measured.pull(ahead, READ_NOISE, _STEP)
             before, estimate = estimate, self.band((ahead + step) * amplitude) * inverse_amplitude
@@ -274,25 +292,6 @@ class FieldRecovery(nn.Module):
         ny, nx = self.grid.shape
         rows = _interpolated(seen.transpose(1, 2), ny).transpose(1, 2)
         return _interpolated(rows, nx)
-
-
-def _apart(field: Tensor, taps: Tensor) -> tuple[Tensor, Tensor]:
-    """A field [2, ny, nx] through the defocus of one camera, and of the other one."""
-    real, imaginary = taps
-    weights = torch.stack([real, -imaginary, imaginary, real, real, imaginary, -imaginary, real])
-    along = functional.conv2d(field[None], weights.reshape(4, 2, 1, -1), padding=(0, taps.shape[1] // 2))
-    both = functional.conv2d(along, weights.reshape(4, 2, -1, 1), padding=(taps.shape[1] // 2, 0), groups=2)[0]
-    return both[:2], both[2:]
-
-
-def _together(both: Tensor, taps: Tensor) -> Tensor:
-    """The adjoint of `_apart`: [4, ny, nx] to [2, ny, nx]."""
-    real, imaginary = taps
-    back = torch.stack([real, imaginary, -imaginary, real, real, -imaginary, imaginary, real])
-    added = torch.stack([real, imaginary, real, -imaginary, -imaginary, real, imaginary, real])
-    reach = taps.shape[1] // 2
-    along = functional.conv2d(both[None], back.reshape(4, 2, -1, 1), padding=(reach, 0), groups=2)
-    return functional.conv2d(along, added.reshape(2, 4, 1, -1), padding=(0, reach))[0]
 
 
 def _stacked(in_phase: Tensor, quadrature: Tensor) -> Tensor:

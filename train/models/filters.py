@@ -23,11 +23,8 @@ class SeparableFilter(nn.Module):
     def __init__(self, taps: NDArray[np.float64]) -> None:
         super().__init__()
         self.reach = len(taps) // 2
-        weights = np.zeros((BLOCK, BLOCK + len(taps) - 1))
-        for output in range(BLOCK):
-            weights[output, output : output + len(taps)] = taps
         self.weights: Tensor
-        self.register_buffer("weights", torch.tensor(weights, dtype=torch.float32)[:, None])
+        self.register_buffer("weights", block_weights(torch.tensor(taps, dtype=torch.float32))[:, None])
 
     def forward(self, images: Tensor) -> Tensor:
         """Filtered images [C, H, W]."""
@@ -51,3 +48,10 @@ class SeparableFilter(nn.Module):
             images[:, None], self.weights[:, :, :, None], stride=(BLOCK, 1), padding=(self.reach, 0)
         )
         return split.permute(0, 2, 1, 3).reshape(images.shape)
+
+
+def block_weights(taps: Tensor) -> Tensor:
+    """Filters [BLOCK, BLOCK + K - 1] by which a kernel [K] gives so many outputs together."""
+    tap = torch.arange(BLOCK + len(taps) - 1, device=taps.device) - torch.arange(BLOCK, device=taps.device)[:, None]
+    beyond = (tap < 0) | (tap >= len(taps))
+    return functional.pad(taps, (0, 1))[torch.where(beyond, len(taps), tap)]

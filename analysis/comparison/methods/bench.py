@@ -11,13 +11,14 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.comparison.data_set import CALIBRATED, calibrated
+from analysis.comparison.data_set import CALIBRATED, LEVELS, calibrated
 from analysis.comparison.methods.oracle import Oracle
 from analysis.comparison.weight_store import CALIBRATION, WeightStore
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.document import Calibration
 from lightpage.device.profile import Profile
 from lightpage.device.state import Device
+from lightpage.page.levels import Levels
 from lightpage.page.symbols import pilot_mask
 from lightpage.recording.reader import Recording
 from lightpage.simulator.true_optics import perfectly_calibrated
@@ -100,7 +101,11 @@ class Bench:
         references = self.recording.references()
         if method == ORACLE:
             return perfectly_calibrated(self.profile, self.device, references)
-        return CalibratedDevice.of(self.profile, self.fitted, references)
+        return self.fitted.device(self.profile, references)
+
+    def levels_of(self, method: str) -> Levels:
+        """Levels of the pages, as the modulator of the device that a method knows shows them."""
+        return self.calibrated_device(method).modulation.page_levels(LEVELS)
 
     def extractor(self, method: str) -> FeatureExtractor:
         """Of the calibrated device; the true one for an oracle's further pass, the signal's power left in."""

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
-from analysis.comparison.data_set import LEVELS
 from analysis.comparison.decoders_figure import MAP
 from analysis.comparison.methods.bench import Bench
 from analysis.comparison.outcome import Outcome, gained_at_the_end, symbols_by_walls
@@ -42,13 +41,14 @@ def judged(
 ) -> Outcome:
     """Figures of the held-out pages, kappa calibrated on the validation pages."""
     module: DecoderTraining[Any] = trained.module
+    levels = module.levels
     scale = best_kappa_scale(module, validation, bench.mask)
     px, py = decoded(bench, module, unseen, scale)
     truth = [bench.recording.symbols(page) for page in bench.unseen]
     symbols = np.concatenate([page[~bench.mask] for page in truth if page is not None])
-    figures = measure(np.arctan2(py, px), np.hypot(px, py), symbols, LEVELS)
+    figures = measure(np.arctan2(py, px), np.hypot(px, py), symbols, levels)
     by_symbol = np.full(bench.profile.page_shape, np.nan)
-    rates = achievable_rate(np.arctan2(py, px), np.hypot(px, py), symbols, LEVELS)
+    rates = achievable_rate(np.arctan2(py, px), np.hypot(px, py), symbols, levels)
     by_symbol[~bench.mask] = rates.reshape(len(truth), -1).mean(axis=0)
     np.save(folder / MAP, by_symbol)
     zones = symbols_by_walls(bench.profile, bench.fitted)
@@ -66,7 +66,7 @@ def judged(
         air=figures.air_bits_per_symbol,
         own_mi=figures.own_mi_bits_per_symbol,
         symbol_error_rate=figures.symbol_error_rate,
-        own_mi_unscaled=float(own_information(np.arctan2(py, px), np.hypot(px, py) / scale, LEVELS).mean()),
+        own_mi_unscaled=float(own_information(np.arctan2(py, px), np.hypot(px, py) / scale, levels).mean()),
         page_kB=page_kilobytes(figures.air_bits_per_symbol, data),
         own_mi_kB=page_kilobytes(figures.own_mi_bits_per_symbol, data),
         by_walls={name: float(air.mean()) if air.size else float("nan") for name, air in groups.items()},

@@ -23,13 +23,13 @@ def without_signal_power(
 ) -> FramePair:
     """The frames of a page with the counts that |E|^2 adds taken off, noise and quantisation left in, float32."""
     device = optics.device
-    power = np.abs(optics.camera_field(exit_field)) ** 2
     counts = optics.electrons_per_unit * (2**device.sensor.bit_depth - 1) / device.sensor.full_well_e
     frames = []
     for frame, pose, gain, blemishes in (
         (pair.in_phase, device.in_phase_camera, 1.0, optics.blemishes[0]),
         (pair.quadrature, device.quadrature_camera, device.homodyne.quadrature_gain, optics.blemishes[1]),
     ):
+        power = np.abs(optics.camera_field(exit_field, pose)) ** 2
         seen = resample(power, *optics.camera_axes_m, *optics.view(pose, shift_px))
         frames.append((frame - gain * counts * blemishes.transmission * seen).astype(np.float32))
     return FramePair(*frames)
@@ -60,6 +60,6 @@ class Oracle:
                 assert symbols is not None
                 moved = truth["shift_px"][index]
                 plain = without_signal_power(pair, truth["exit_field"][index], (moved[0], moved[1]), self._optics)
-                phases = symbol_phases(symbols, self._recording.levels)
+                phases = self._extractor.device.modulation.phase(symbol_phases(symbols, self._recording.levels))
                 features, shift = self._extractor.page(self._extractor.field(plain), phases, shift)
                 yield features

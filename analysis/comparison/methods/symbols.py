@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
-from analysis.comparison.data_set import LEVELS, recorded
+from analysis.comparison.data_set import recorded
 from analysis.comparison.levels import LevelFigures, level_figures
 from analysis.comparison.methods.bench import ORACLE, Bench
 from analysis.comparison.methods.judgement import decoded, judged
@@ -88,7 +88,7 @@ def first_pass(
     return (
         folder,
         features,
-        fit_network(folder, choices, bench.mask, LEVELS, patches, validation, processes=ONE),
+        fit_network(folder, choices, bench.mask, bench.levels_of(name), patches, validation, processes=ONE),
         preparing,
     )
 

@@ -1,7 +1,5 @@
 """Comparisons of decoders: what each command writes, and what it takes up from earlier runs."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path
@@ -10,8 +8,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from analysis.comparison import decoders, kept_figures
+from analysis.comparison import decoders, imperfections, kept_figures
 from analysis.comparison.kept_figures import FOURTH_DIGIT
+from analysis.comparison.kept_weights import moved_bits
 from analysis.comparison.outcome import symbols_by_walls
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.document import Calibration
@@ -76,3 +75,32 @@ def test_the_command_compares_methods_and_says_what_the_device_is(tmp_path: Path
     assert float(line[1]) == pytest.approx(float(line[2]), abs=FOURTH_DIGIT)
     trained, kept = sorted((tmp_path / "figures").rglob(FITTED_WEIGHTS))
     assert trained.read_bytes() != kept.read_bytes()
+
+
+def test_what_is_said_moves_by_the_relative_entropy() -> None:
+    said = np.array([4.0, -3.0]).reshape(1, 2, 1, 1)
+    theta = np.linspace(-np.pi, np.pi, 4000, endpoint=False)
+
+    def log_density(p: np.ndarray) -> np.ndarray:
+        log = p[0, 0] * np.cos(theta) + p[0, 1] * np.sin(theta)
+        return np.asarray((log - np.log(np.exp(log).sum()))[0])
+
+    now = np.array([1.0, 2.0]).reshape(1, 2, 1, 1)
+    before, after = log_density(said), log_density(now)
+    assert moved_bits(said, now) == pytest.approx(np.sum(np.exp(before) * (before - after)) / np.log(2), rel=1e-6)
+    assert moved_bits(said, said) == 0
+
+
+def test_a_decoder_of_a_device_of_ones_own_is_told_beside_an_oracle(tmp_path: Path) -> None:
+    settings = ["in_phase_camera.axial_rad=0.4", "quadrature_camera.axial_rad=-0.3"]
+    device = Device().of_profile(PROFILE).with_settings(settings)
+    (tmp_path / "set").mkdir()
+    calibration_of(device).save(tmp_path / "set" / "calibration.toml")
+    (tmp_path / "small.toml").write_text(PROFILE.to_toml())
+    words = ["--profile", str(tmp_path / "small.toml"), "--pages", "6", "--steps", "10", "--out", str(tmp_path)]
+    words += [word for setting in settings for word in ("--set", setting)]
+    done = CliRunner().invoke(imperfections.main, words, catch_exceptions=False)
+    (row,) = json.loads((tmp_path / "imperfections.json").read_text())["rows"]
+    assert done.output.splitlines()[-1].split()[:3] == ["set", f"{row['air']:.3f}", f"{row['oracle_air']:.3f}"]
+    assert row["air"] == pytest.approx(row["oracle_air"], rel=0.1)
+    assert row["air"] > 3

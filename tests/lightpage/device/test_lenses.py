@@ -1,7 +1,5 @@
 """Lenses: a real one's path, and prescriptions against known figures, closed forms and themselves turned round."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

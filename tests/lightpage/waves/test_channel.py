@@ -1,7 +1,5 @@
 """Claims about the waves: what the pipe and the lenses keep, undo and image, against direct sums and other methods."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 

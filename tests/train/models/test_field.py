@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 import torch
 
+from analysis.comparison.methods.oracle import without_signal_power
 from lightpage.calibration.samplers import FieldSampler
-from lightpage.calibration.sampling_table import monomial_powers
+from lightpage.calibration.sampling_table import cameras_apart, monomial_powers
 from lightpage.device.state import Aberration, CameraPose, Device, Drift, Homodyne, Reference, Sensor
 from lightpage.errors import InvalidInputError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.simulator.cameras import resample
 from lightpage.simulator.simulator import Simulator
+from lightpage.simulator.true_optics import TrueOptics, true_parameters
 from lightpage.train.models.field import ROUNDS, FieldRecovery, TorchFieldSolver
 from lightpage.waves.grid import field_grid
 from tests.lightpage.small import small_profile
@@ -32,12 +34,17 @@ class Recorded:
     references: FramePair
     truth: np.ndarray
     turn: float
+    exit_field: np.ndarray
+    optics: TrueOptics
+    apart: np.ndarray | None
 
 
-def record(sign: int = 1, ratio: float = 1.6, full_well_e: float = 15_000.0) -> Recorded:
+def record(
+    sign: int = 1, ratio: float = 1.6, full_well_e: float = 15_000.0, axial: tuple[float, float] = (0.0, 0.0)
+) -> Recorded:
     device = Device(
-        in_phase_camera=CameraPose(shift_x_px=SHIFTS_PX[0]),
-        quadrature_camera=CameraPose(shift_x_px=SHIFTS_PX[1]),
+        in_phase_camera=CameraPose(shift_x_px=SHIFTS_PX[0], axial_rad=axial[0]),
+        quadrature_camera=CameraPose(shift_x_px=SHIFTS_PX[1], axial_rad=axial[1]),
         aberration=Aberration(distortion_relative=0),
         reference=Reference(amplitude_ratio=ratio),
         homodyne=Homodyne(quadrature_error_deg=ERROR_DEG, quadrature_sign=sign),
@@ -52,7 +59,9 @@ def record(sign: int = 1, ratio: float = 1.6, full_well_e: float = 15_000.0) -> 
     x, y = np.meshgrid(grid.x_m, grid.y_m)
     real, imaginary = (resample(part, *optics.camera_axes_m, x, y) for part in (field.real, field.imag))
     turn = sign * np.pi / 2 + np.deg2rad(ERROR_DEG)
-    return Recorded(page.pair, simulator.references(), real + 1j * imaginary, turn)
+    apart = cameras_apart(true_parameters(PROFILE, device), PROFILE) if any(axial) else None
+    truth = real + 1j * imaginary
+    return Recorded(page.pair, simulator.references(), truth, turn, page.exit_field, optics, apart)
 
 
 def registration(shifts_px: tuple[float, float] = SHIFTS_PX) -> np.ndarray:
@@ -80,6 +89,13 @@ def solve(
         registration() if where is None else where,
         np.array([np.cos(angle), np.sin(angle)], np.float32),
     )
+
+
+def recovered(page: Recorded, recovery: FieldRecovery) -> np.ndarray:
+    """The field on the usual grid."""
+    homodyne, usual = np.array([np.cos(page.turn), np.sin(page.turn)], np.float32), field_grid(PROFILE)
+    field, _ = TorchFieldSolver(recovery)(page.pair, page.references, registration(), homodyne, page.apart)
+    return FieldSampler(field, recovery.grid)(np.stack(np.meshgrid(usual.x_m, usual.y_m), axis=-1))
 
 
 def inside() -> np.ndarray:
@@ -119,12 +135,25 @@ class TestAccuracy:
     def test_hurry_and_a_coarser_grid_cost_what_the_documents_say(
         self, rounds: int, binning: int, step_px: int, expected_db: float
     ) -> None:
-        dim, grid, usual = record(full_well_e=32), field_grid(PROFILE, step_px), field_grid(PROFILE)
-        recovery = FieldRecovery(PROFILE, rounds=rounds, binning=binning, grid=grid)
-        homodyne = np.array([np.cos(dim.turn), np.sin(dim.turn)], np.float32)
-        field, _ = TorchFieldSolver(recovery)(dim.pair, dim.references, registration(), homodyne)
-        seen = FieldSampler(field, grid)(np.stack(np.meshgrid(usual.x_m, usual.y_m), axis=-1))
-        assert error_db(seen, dim.truth) == pytest.approx(expected_db, abs=0.5)
+        dim, grid = record(full_well_e=32), field_grid(PROFILE, step_px)
+        field = recovered(dim, FieldRecovery(PROFILE, rounds=rounds, binning=binning, grid=grid))
+        assert error_db(field, dim.truth) == pytest.approx(expected_db, abs=0.5)
+
+    @pytest.mark.parametrize(
+        ("full_well_e", "step_px", "expected_db"), [(15_000, 2, -25.6), (15_000, 3, -15.6), (32, 2, -9.0)]
+    )
+    def test_cameras_that_stand_apart_show_one_field(
+        self, full_well_e: float, step_px: int, expected_db: float
+    ) -> None:
+        page, grid = record(full_well_e=full_well_e, axial=(0.8, -0.7)), field_grid(PROFILE, step_px)
+        assert error_db(recovered(page, FieldRecovery(PROFILE, grid=grid)), page.truth) == pytest.approx(
+            expected_db, abs=0.5
+        )
+
+    def test_an_oracle_is_spared_what_the_signal_alone_brings_to_each_camera(self) -> None:
+        page = record(axial=(0.4, -0.3))
+        plain = replace(page, pair=without_signal_power(page.pair, page.exit_field, (0.0, 0.0), page.optics))
+        assert error_db(recovered(plain, FieldRecovery(PROFILE, with_signal_power=False)), page.truth) < -28
 
     def test_blocks_that_the_references_blocks_are_no_multiple_of_are_refused(self) -> None:
         with pytest.raises(InvalidInputError, match="binning"):
@@ -175,11 +204,12 @@ class TestDarkness:
             dark[:, : dark.shape[1] // 2] = stray
             return dark
 
-        dimmed = Recorded(
-            FramePair(half_dark(recorded.pair.in_phase, 4), half_dark(recorded.pair.quadrature, 3)),
-            FramePair(half_dark(recorded.references.in_phase, 0), half_dark(recorded.references.quadrature, 0)),
-            recorded.truth,
-            recorded.turn,
+        dimmed = replace(
+            recorded,
+            pair=FramePair(half_dark(recorded.pair.in_phase, 4), half_dark(recorded.pair.quadrature, 3)),
+            references=FramePair(
+                half_dark(recorded.references.in_phase, 0), half_dark(recorded.references.quadrature, 0)
+            ),
         )
         field, residual = solve(dimmed)
         assert np.isfinite([*np.abs(field).ravel(), *residual.ravel()]).all()
@@ -191,7 +221,7 @@ class TestDarkness:
 
     def test_no_light_at_all_gives_no_nan(self, recorded: Recorded) -> None:
         black = FramePair(*(np.zeros(PROFILE.frame_shape, np.uint8) for _ in range(2)))
-        field, residual = solve(Recorded(black, recorded.references, recorded.truth, recorded.turn))
+        field, residual = solve(replace(recorded, pair=black))
         assert np.isfinite(field).all()
         assert np.isfinite(residual).all()
 
@@ -201,5 +231,5 @@ class TestGain:
         def brighter(frames: FramePair) -> FramePair:
             return FramePair(frames.in_phase.astype(np.uint16) * 3, frames.quadrature.astype(np.uint16) * 7)
 
-        same = Recorded(brighter(recorded.pair), brighter(recorded.references), recorded.truth, recorded.turn)
+        same = replace(recorded, pair=brighter(recorded.pair), references=brighter(recorded.references))
         np.testing.assert_allclose(solve(same)[0], solve(recorded)[0], atol=1e-4)
