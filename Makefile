@@ -172,6 +172,7 @@ bench-hardware: $(STAMP)  ## cameras, trigger, pairing over fake cameras in half
 	$(BIN)/python -m analysis.hardware.latency --pages 100 --json $(BENCH_HARDWARE)/latency.json
 	$(BIN)/python -m analysis.hardware.drifts --out $(BENCH_HARDWARE)/drifts --json $(BENCH_HARDWARE)/drifts.json
 	$(BIN)/python -m analysis.hardware.week --out $(BENCH_HARDWARE)/week --json $(BENCH_HARDWARE)/week.json
+	$(BIN)/python -m analysis.hardware.week --pages 500 --stroke -0.02 --axial 0.2 --out $(BENCH_HARDWARE)/light --json $(BENCH_HARDWARE)/light.json
 
 bench-image-search: $(STAMP)  ## how the image is found, followed and confirmed: tables and a picture, in more than an hour
 	$(BIN)/python -m analysis.tracking.image_search --out runs/bench-image-search

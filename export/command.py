@@ -13,6 +13,8 @@ from lightpage.export.half import PRECISIONS
 from lightpage.files import write_json
 from lightpage.progress import note
 from lightpage.runtime.model.bundle.manifest import FLOAT32, Precision
+from lightpage.train.commands.options import ACCEPT
+from lightpage.train.runs import load_run
 
 
 @click.command()
@@ -28,6 +30,7 @@ from lightpage.runtime.model.bundle.manifest import FLOAT32, Precision
     show_default=True,
     help="Of network and waves; float16 pays on a GPU alone.",
 )
+@click.option(ACCEPT, "accept_wrong_fit", is_flag=True, help="Export a run whose calibration is a wrong fit too.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def export(
     run: Path,
@@ -36,6 +39,7 @@ def export(
     version: str | None,
     recording: Path | None,
     precision: Precision,
+    accept_wrong_fit: bool,
     json_path: Path | None,
 ) -> None:
     """Export a training run, proving the bundle against torch with the runtime's own decoder.
@@ -43,6 +47,8 @@ def export(
     With --recording the bundle also holds how user bytes are protected on the device's pages, as `lightpage code` would
     choose it by the pages of the recording that the run was not trained on.
     """
+    if not accept_wrong_fit:
+        load_run(run).calibration.check_good(f"run {run}, calibration", f", or {ACCEPT}")
     with percent_bar() as progress:
         bundle, error = export_run(run, out, name, version, progress, recording, precision)
     if bundle.code is None:

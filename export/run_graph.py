@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.sampling_table import sampling_table
 from lightpage.export.graph import DecoderGraph, Graph, PublishedGraph, published_tensors, table_tensors
 from lightpage.export.parity import torch_answer
@@ -35,7 +34,7 @@ def graph_of(folder: Path, run: Run, references: FramePair, twin: RayTwin) -> tu
         published = PublishedGraph(load_weights(folder, decoder), run.kappa_scale).eval()
         return published, published_tensors(decoder)
     table = sampling_table(TorchTwin(twin), calibration.vector, calibration.turn_rad, profile)
-    apart = CalibratedDevice.of(profile, calibration, references).stands_apart
+    apart = calibration.device(profile, references).stands_apart
     graph = DecoderGraph(profile, load_decoder(folder, run), run.kappa_scale, apart=apart).eval()
     return graph, table_tensors(graph, table, references)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image
@@ -17,7 +17,7 @@ _UNSEEN = 8
 """Of 255, by which a palette may change the colours of a pixel; beyond, gradients show bands."""
 
 
-def write_png(path: Path, png: bytes) -> None:
+def write_png(path: Path | IO[bytes], png: bytes) -> None:
     """Write a picture that is PNG, its transparency left out; the same picture gives the same bytes.
 
     Raises:
@@ -30,7 +30,7 @@ def write_png(path: Path, png: bytes) -> None:
     (few if off <= _UNSEEN else every).save(path, "PNG", optimize=True)
 
 
-def write_figure_png(path: Path, figure: Figure, **how: Any) -> None:
+def write_figure_png(path: Path | IO[bytes], figure: Figure, **how: Any) -> None:
     """Write a figure as PNG; `how` is what its `savefig` takes.
 
     Raises:

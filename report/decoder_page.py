@@ -21,6 +21,7 @@ def shown(data: ReportData) -> dict[str, Any]:
         "calibration": data.calibration,
         "turn_deg": float(np.rad2deg(data.calibration.turn_rad)),
         "geometry": geometry(data),
+        "goodness": figures.goodness(data),
         "zones": zones(data, centroids),
         "maps": figures.maps(data, centroids),
         "reliability": [figures.reliability(data), figures.concentration(data)],

@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Colormap
 from numpy.typing import NDArray
 
+from lightpage.calibration.goodness.figure import goodness_figure
 from lightpage.report.contents.data import Golden, Real, ReportData
 from lightpage.report.drawing import BLUE, GREEN, GREY, ORANGE, Picture, as_picture, new_figure, one_axis
 from lightpage.report.words import number, signed
@@ -65,6 +66,16 @@ def maps(data: ReportData, centroids: Real) -> list[Picture]:
         _map(label, values, colormaps[colours], limits, centroids, caption)
         for label, values, colours, limits, caption in rows
     ]
+
+
+def goodness(data: ReportData) -> list[Picture]:
+    """Where the light lies that the calibration leaves; none where that was not measured."""
+    found = data.calibration.goodness
+    if found is None:
+        return []
+    alt = f"Maps of the light that the calibration leaves, over page and exit facet: the fit is {found.verdict}"
+    caption = "Light that the fitted device leaves of a known page, over what noise leaves: 1 is noise alone."
+    return [as_picture(goodness_figure(found), alt, caption, image=True)]
 
 
 def _map(

@@ -15,6 +15,7 @@ from lightpage.study.studies import (
     receptive_field,
     scaling,
     symbol_size,
+    tolerances,
 )
 from lightpage.study.study import Study
 
@@ -31,5 +32,6 @@ STUDIES: dict[str, Study] = {
     "pipe-length": pipe_length.STUDY,
     "angle": angle.STUDY,
     "heads": heads.STUDY,
+    "tolerances": tolerances.STUDY,
 }
 """By the names of the command line."""

@@ -42,6 +42,12 @@ _RESULTS = "results"
     show_default=True,
     help="Of the published network at sample pitch, where a study trains: half as many take a quarter of the time.",
 )
+@click.option(
+    "--only",
+    multiple=True,
+    metavar="WORD",
+    help="Of a study that varies many things, the cases whose names begin so; others can follow in the same OUT.",
+)
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 @click.option("--json", "json_path", type=OutputFile(), help="Write settings and table to this file too.")
 def study(
@@ -52,6 +58,7 @@ def study(
     full: bool,
     share: float,
     channels: int,
+    only: tuple[str, ...],
     seed: int,
     json_path: Path | None,
 ) -> None:
@@ -67,6 +74,8 @@ def study(
     if channels != Settings.channels and (quick or not chosen.trains):
         got = f"{channels} {'with --quick' if chosen.trains else 'of a study that trains nothing'}"
         raise InvalidInputError(f"study {name} --channels", got, "no --channels")
+    if only and not chosen.parts:
+        raise InvalidInputError(f"study {name} --only", " ".join(only), "no --only: its picture needs all of its cases")
     context = click.get_current_context()
     context.meta["lightpage.resume"] = "run the same command again; it goes on where it was"
     settings = Settings(load_profile(_FULL if full else profile_name or "bench"), quick, seed, share, channels)
@@ -79,7 +88,7 @@ def study(
         raise InvalidInputError(f"study {out}", "results of unknown origin", expected)
     begin(out, {"study": name, "results": RESULTS, **settings.key()})
     results_folder.mkdir(exist_ok=True)
-    cases, results = chosen.cases(settings), []
+    cases, results = chosen.chosen(settings, only), []
     with percent_bar() as progress:
         for number, case in enumerate(cases):
             results.append(

@@ -62,7 +62,8 @@ class Study:
         header: of the table.
         rows: of the table, from cases and results.
         plot: a picture of all results.
-        trains: whether it trains networks, which takes hours without a GPU at full scale.
+        trains: whether it trains published decoders, which takes hours without a GPU at full scale.
+        parts: whether table and picture can be made of some of the cases, with those that say `needed`.
     """
 
     title: str
@@ -73,6 +74,19 @@ class Study:
     rows: Callable[[Sequence[Case], Sequence[Result]], list[Row]]
     plot: Callable[[Settings, Sequence[Case], Sequence[Result]], Figure]
     trains: bool = False
+    parts: bool = False
+
+    def chosen(self, settings: Settings, only: Sequence[str]) -> list[Case]:
+        """Return the cases whose names begin with one of some words, and those that are needed; all without a word.
+
+        Raises:
+            InvalidInputError: no name begins so.
+        """
+        cases = self.cases(settings)
+        for word in only:
+            if not any(str(case["name"]).startswith(word) for case in cases):
+                raise InvalidInputError(f"--only {word}", "no such case", _names(cases))
+        return [c for c in cases if not only or c.get("needed") or str(c["name"]).startswith(tuple(only))]
 
 
 def measured(study: Study, settings: Settings, case: Case, folder: Path, progress: Progress) -> Result:
@@ -83,12 +97,16 @@ def measured(study: Study, settings: Settings, case: Case, folder: Path, progres
     """
     path = folder / f"{case['name']}.json"
     if path.exists():
-        return _load(path)
+        return load_result(path)
     work = folder / str(case["name"])
     work.mkdir(parents=True, exist_ok=True)
     result = study.measure(settings, case, work, progress)
     _save(path, result)
     return result
+
+
+def _names(cases: Sequence[Case]) -> str:
+    return "one of " + ", ".join(dict.fromkeys(str(case["name"]).partition("=")[0] for case in cases))
 
 
 def aligned(header: Row, rows: Sequence[Row]) -> str:
@@ -113,7 +131,12 @@ def _save(path: Path, result: Result) -> None:
     replace_text(path, json.dumps({"values": rest, "arrays": list(arrays)}, indent=1), "result of a study")
 
 
-def _load(path: Path) -> Result:
+def load_result(path: Path) -> Result:
+    """Read the result of a case.
+
+    Raises:
+        InvalidInputError: it is missing or damaged.
+    """
     try:
         kept = json.loads(path.read_text())
         arrays = load_arrays(_arrays(path))

@@ -1,7 +1,5 @@
 """Runs a command and says how far it stayed below its budget: `python -m tests.budget NAME COMMAND ...`."""
 
-from __future__ import annotations
-
 import os
 import resource
 import subprocess

@@ -1,7 +1,5 @@
 """Runs a command several times beside processes that keep the cores busy: `python -m tests.busy TIMES COMMAND ...`."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """Fixtures that several packages' tests share because they are dear."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import signal
@@ -14,48 +12,25 @@ import pytest
 from click.testing import CliRunner
 
 from lightpage.calibration.calibrate import Registered
-from lightpage.calibration.document import Calibration, load_calibration
+from lightpage.calibration.document import Calibration
 from lightpage.calibration.parameters import NAMES
 from lightpage.cli.simulate import simulate
-from lightpage.device.profile import Profile, load_profile
 from lightpage.device.state import Device
 from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.bundle.manifest import TWIN
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.simulator.true_optics import true_parameters
-from tests.lightpage.small import small_profile
+from tests.lightpage.small import EXPLAINED, small_profile
 from tests.runtime import toy
 
 pytest_plugins = ["pytester", "tests.skips", "tests.own_network"]
 
-BENCH_PAGES = 3
 SMALL_PAGES = 8
 
 
 def pytest_configure() -> None:
     """Let Ctrl-C reach programs that tests start, even if the tests run in the background, where shells ignore it."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-@pytest.fixture(scope="session")
-def bench_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three pages of the realistic bench device, M = 16."""
-    arguments = f"--profile bench --pages {BENCH_PAGES} --levels 16 --seed 11 --out"
-    return _made_once(tmp_path_factory, "bench.h5", lambda out: _command(simulate, *arguments.split(), out))
-
-
-@pytest.fixture(scope="session")
-def bench_calibration(
-    bench_recording: Path, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Profile, Path, Calibration]:
-    """The bench profile, a recording of a realistic device, and what the command finds by its first page."""
-
-    def make(out: Path) -> None:
-        from lightpage.train.commands.calibrate import calibrate
-
-        _command(calibrate, "--profile", "bench", "--recording", bench_recording, "--pages", 1, "--out", out)
-
-    calibration = load_calibration(_made_once(tmp_path_factory, "bench-calibration.toml", make))
-    return load_profile("bench"), bench_recording, calibration
 
 
 @pytest.fixture(scope="session")
@@ -69,7 +44,7 @@ def small_device(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
         made = f"--profile {folder}/small.toml --pages {SMALL_PAGES} --seed 4 --out {folder}/R.h5"
         _command(simulate, *made.split())
         truth, turn = true_parameters(profile, state), state.homodyne.turn_rad
-        right = Registered(truth, np.ones(len(NAMES)), turn, 0.0, 0.5, 1.0, 0.5)
+        right = Registered(truth, np.ones(len(NAMES)), turn, 0.0, 0.5, 1.0, 0.5, goodness=EXPLAINED)
         Calibration.from_registered(right, profile, ["0" * 64]).save(folder / "C.toml")
 
     folder = _made_once(tmp_path_factory, "small-device", make)
@@ -100,6 +75,15 @@ def small_bundle(small_run: Path, tmp_path_factory: pytest.TempPathFactory) -> P
         export_run(small_run, out, version="small-1")
 
     return _made_once(tmp_path_factory, "small.zip", make)
+
+
+@pytest.fixture
+def ready_twin(small_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Has exports take the graph of the small profile's rays from there: making it takes half a minute."""
+    from lightpage.export import from_run
+
+    graph = Bundle.open(small_bundle).files[TWIN]
+    monkeypatch.setattr(from_run, "twin_onnx", lambda twin: graph)
 
 
 @pytest.fixture(scope="session")

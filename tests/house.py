@@ -1,7 +1,5 @@
 """How large the house is: `python -m tests.house` prints its figures beside their limits, those of `limits.toml`."""
 
-from __future__ import annotations
-
 import ast
 import io
 import sys

@@ -4,8 +4,6 @@ All such tests of a file are run at once, by a second pytest inside that network
 Their fixtures are set up in both, so they must not hold cameras.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

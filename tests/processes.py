@@ -1,7 +1,5 @@
 """Processes that this one, or one of its children, has started."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 

@@ -9,8 +9,6 @@
 - There are no more lines than `limits.toml` allows, and what git tracks has no more bytes.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 import subprocess

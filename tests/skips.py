@@ -1,7 +1,5 @@
 """Where everything must be tested, a skipped test fails: `.ci/run` sets LIGHTPAGE_REQUIRE_ALL=1."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Generator
 from typing import TypeVar

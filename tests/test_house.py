@@ -1,7 +1,5 @@
 """The house stays small: its rooms, floors, arrows, folders and lines have limits."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -26,13 +26,14 @@ _END_S = 10.0
 
 @click.command(context_settings={"ignore_unknown_options": True})
 @click.option("--profile", "profile_name", default="bench", show_default=True, help="A shipped profile, or a file.")
-@click.option("--device", "device_file", type=click.Path(), help="True state of the device, TOML; realistic if absent.")
+@click.option(
+    "--device", "device_file", type=click.Path(), help="Its true state: `rough`, or TOML; a realistic one if absent."
+)
 @click.option("--set", "settings", multiple=True, metavar="TABLE.KEY=VALUE", help="Change one number of that state.")
 @click.option("--out", required=True, type=OutputFolder(), help="Folder for port, socket and device.toml.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Of noise and drift.")
 @click.option("--pixel-format", default="Mono8", show_default=True, help="Of both cameras.")
 @click.option("--black-level", default=0, show_default=True, type=click.IntRange(0, 1000), help="Counts in the dark.")
-@click.option("--hot-pixels", default=0, show_default=True, type=click.IntRange(0, 10_000), help="Of each camera.")
 @click.argument("command", nargs=-1, type=click.UNPROCESSED)
 def virtual_device(
     profile_name: str,
@@ -42,7 +43,6 @@ def virtual_device(
     seed: int,
     pixel_format: str,
     black_level: int,
-    hot_pixels: int,
     command: tuple[str, ...],
 ) -> None:
     """Run a simulated device as hardware: two GigE cameras, a pulse generator on a serial port, a modulator.
@@ -57,7 +57,7 @@ def virtual_device(
     context.meta[RESUME_KEY] = "the simulated device has ended, and its command with it"
     profile = load_profile(profile_name)
     device = (load_device(device_file) if device_file else Device()).of_profile(profile).with_settings(list(settings))
-    with VirtualDevice(profile, device, out, seed, pixel_format, black_level, hot_pixels) as running:
+    with VirtualDevice(profile, device, out, seed, pixel_format, black_level) as running:
         click.echo(f"simulated device at camera:{running.config}", err=True)
         status = run_to_its_end(command or (os.environ.get("SHELL", "/bin/sh"),))
         running.check()

@@ -44,7 +44,6 @@ class VirtualDevice:
         seed: of noise and drift.
         pixel_format: of both cameras.
         black_level: counts that both cameras add.
-        hot_pixels: pixels of each camera that are always at full scale.
 
     Raises:
         InvalidInputError: a bit depth that the pixel format does not have.
@@ -59,15 +58,12 @@ class VirtualDevice:
         seed: int = 0,
         pixel_format: str = "Mono8",
         black_level: int = 0,
-        hot_pixels: int = 0,
     ) -> None:
         if bit_depth(pixel_format) != device.sensor.bit_depth:
             got = f"{device.sensor.bit_depth} bits in format {pixel_format}"
             raise InvalidInputError("simulated device", got, f"{bit_depth(pixel_format)} bits")
-        places = np.random.default_rng(seed).choice(np.prod(profile.frame_shape), hot_pixels, replace=False)
-        hot = np.stack(np.unravel_index(places, profile.frame_shape), axis=1)
         self.profile, self.folder = profile, folder
-        self.light = Light(profile, device, seed, black_level, hot)
+        self.light = Light(profile, device, seed, black_level)
         self.wire: Wire = self._edge
         self._stack = ExitStack()
         try:

@@ -26,28 +26,18 @@ class Light:
         device: true state.
         seed: of noise and drift.
         black_level: counts that both cameras add.
-        hot: row and column [n, 2] of pixels that are always at full scale, on both cameras.
     """
 
-    def __init__(
-        self,
-        profile: Profile,
-        device: Device,
-        seed: int = 0,
-        black_level: int = 0,
-        hot: NDArray[np.intp] | None = None,
-    ) -> None:
-        self.profile = profile
+    def __init__(self, profile: Profile, device: Device, seed: int = 0, black_level: int = 0) -> None:
         self.bit_depth = device.sensor.bit_depth
         self._simulator = Simulator(profile, device, MAX_LEVELS, seed)
         self._black_level = black_level
-        self._hot = np.zeros((0, 2), np.intp) if hot is None else hot
         self._working = threading.Lock()
         """Held while the simulator works, which may take minutes."""
         self._lock = threading.Lock()
         """Guards what the cameras see; never held while anything is simulated."""
         self._page: FramePair | None = None
-        self._reference = self._simulator.references()
+        self._reference, self._dark = self._simulator.references(), self._simulator.dark()
         self._signal = self._reference_beam = True
         self.page_index = -1
 
@@ -73,16 +63,15 @@ class Light:
         """Let the device drift; the next page that is shown shows it."""
         with self._working:
             self._simulator.set_device(device)
-            references = self._simulator.references()
+            references, dark = self._simulator.references(), self._simulator.dark()
             with self._lock:
-                self._reference = references
+                self._reference, self._dark = references, dark
 
     def pair(self) -> FramePair:
-        """What both cameras see now, black level and hot pixels included."""
+        """What both cameras see now, black level included."""
         with self._lock:
             if not self._reference_beam:
-                dark = np.zeros(self.profile.frame_shape, frame_type(self.bit_depth))
-                pair = FramePair(dark, dark)
+                pair = self._dark
             elif self._page is None or not self._signal:
                 pair = self._reference
             else:
@@ -90,8 +79,6 @@ class Light:
         return FramePair(self._seen(pair.in_phase), self._seen(pair.quadrature))
 
     def _seen(self, frame: NDArray[np.integer[Any]]) -> Counts:
-        top = 2**self.bit_depth - 1
-        if self._black_level or len(self._hot):
-            frame = np.minimum(frame.astype(np.int64) + self._black_level, top)
-            frame[tuple(self._hot.T)] = top
+        if self._black_level:
+            frame = np.minimum(frame.astype(np.int64) + self._black_level, 2**self.bit_depth - 1)
         return frame.astype(frame_type(self.bit_depth))

@@ -10,7 +10,6 @@ import numpy as np
 from analysis.comparison.data_set import CALIBRATED, LEVELS
 from analysis.comparison.kept_weights import read_weights
 from analysis.comparison.weight_store import KEPT_WEIGHTS
-from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.document import Calibration
 from lightpage.calibration.known_pages import known_pages
 from lightpage.calibration.sampling_table import sampling_table
@@ -42,7 +41,7 @@ def kept_decoder(
     decoder = SymbolDecoder(profile, calibration.vector, localizer, choices)
     decoder.network.load_state_dict(read_weights(trained / KEPT_WEIGHTS))
     if refinements:
-        extractor = FeatureExtractor(CalibratedDevice.of(profile, calibration, recording.references()), localizer)
+        extractor = FeatureExtractor(calibration.device(profile, recording.references()), localizer)
         pages = known_pages(recording, profile, range(CALIBRATED, CALIBRATED + MATCHED_PAGES))
         decoder.prediction = fit_prediction(extractor, explained(extractor, pages))
         decoder.refiners[0].load_state_dict(read_weights(trained / "refinement-1" / KEPT_WEIGHTS))

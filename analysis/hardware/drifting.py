@@ -6,7 +6,7 @@ import io
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,7 +23,7 @@ from lightpage.runtime.device.acquisition.source import SHOT_S, FrameSource, Sho
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.execution.twin import OnnxTwin
 from lightpage.simulator.simulator import Simulator
-from lightpage.simulator.true_optics import true_parameters
+from lightpage.simulator.true_optics import true_modulation, true_parameters
 
 UNITS: Mapping[str, float] = {
     "geometry.pipe_angle_deg": 0.0037,
@@ -211,9 +211,14 @@ class TrueTable:
             "reference_quadrature": references.quadrature,
             **sampling_table(self._twin, parameters, truth.device.homodyne.turn_rad, profile),
         }
-        fed = self.decoder.with_table(
-            {name: value for name, value in table.items() if name in self.decoder.graph.ports}
+        bundle, modulation = self.decoder.bundle, true_modulation(truth.device.slm)
+        calibration = bundle.calibration.model_copy(update={"modulation": modulation.as_dict()}).to_toml()
+        manifest = bundle.manifest.model_copy(update={"calibration": calibration})
+        fed = Decoder(
+            replace(bundle, manifest=manifest),
+            self.decoder.threads,
+            self.decoder.graph.with_table(self.decoder.taken(table)),
         )
-        pilots = Pilots.of_symbols(self.decoder.bundle.pilot_mask, truth.symbols, levels)
-        page = fed.decode(truth.pair, levels, pilots=pilots)
-        return air_bits(page, truth.symbols, self.data, levels)
+        shown = modulation.page_levels(levels)
+        page = fed.decode(truth.pair, levels, pilots=Pilots.of_symbols(bundle.pilot_mask, truth.symbols, shown))
+        return air_bits(page, truth.symbols, self.data, shown)

@@ -8,16 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from analysis.hardware.drifting import DriftingSource, TrueTable, direction, moved
 from analysis.hardware.rows import Rows, append_row, kept_rows
 from analysis.hardware.watched_recalibrator import WatchedRecalibrator
+from lightpage.calibration.parameters import NAMES, as_dict, indices
 from lightpage.clock import Clock
 from lightpage.device.state import Device
 from lightpage.errors import FramesDisagreeError, LightpageError, LostPageError
+from lightpage.page.levels import Levels
+from lightpage.page.modulation import Modulation
 from lightpage.progress import track
 from lightpage.runtime.archives.recordings.coded_pages import air_bits
-from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.service.caller import Caller
@@ -29,6 +32,7 @@ from lightpage.runtime.service.models.store import Store
 from lightpage.runtime.service.monitoring.flight_recorder import FlightRecorder
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.pages.reading import read_page
+from lightpage.simulator.true_optics import true_modulation, true_parameters
 
 PAGE_S = 300.0
 """Simulated time from one page to the next."""
@@ -50,11 +54,34 @@ CALIBRATION_PAGES = (1_000_000, 1_000_001)
 """Numbers of the fully known pages, which nobody else reads."""
 
 
-def state(moment: float, pages: int) -> Device:
-    """The true device at a time of a week of `pages`, in pages: it was calibrated cold, at its beginning."""
+@dataclass(frozen=True)
+class LightDrift:
+    """What changes in a week evenly, beside the geometry.
+
+    Attributes:
+        stroke_relative: of the modulator.
+        axial_rad: places of modulator and cameras along the axis, as phases at the middle of the facet's wall.
+    """
+
+    stroke_relative: float = 0.0
+    axial_rad: float = 0.0
+
+    def of(self, device: Device, share: float) -> Device:
+        """A device after a share of the week."""
+        axial = ("geometry.modulator_axial_rad", "in_phase_camera.axial_rad", "quadrature_camera.axial_rad")
+        changes = {"slm.stroke_relative_error": self.stroke_relative, **dict.fromkeys(axial, self.axial_rad)}
+        known = device.model_dump()
+        paths = {name: name.split(".") for name in changes}
+        values = {name: known[table][key] + share * changes[name] for name, (table, key) in paths.items()}
+        return device.with_settings([f"{name}={value!r}" for name, value in values.items()])
+
+
+def state(begun: Device, moment: float, pages: int, light: LightDrift) -> Device:
+    """The true device at a time of a week of `pages`, in pages, that was `begun` when it was calibrated, cold."""
     day = np.sin(2 * np.pi * moment / DAY_PAGES)
     warm_up = 1 - np.exp(-moment / WARM_UP_PAGES)
-    device = moved(Device(), WARM_UP_UNITS * warm_up * direction(1) + DAILY_UNITS * day * direction(2))
+    device = moved(begun, WARM_UP_UNITS * warm_up * direction(1) + DAILY_UNITS * day * direction(2))
+    device = light.of(device, moment / pages)
     if moment < KNOCK_SHARE * pages:
         return device
     angle = device.geometry.pipe_angle_deg + KNOCK_DEG
@@ -81,12 +108,20 @@ class Week:
         pages: of the week.
         pages_during: that are read while a recalibration runs, at most.
         threads: of an inference.
+        bundle: that the service begins with.
+        device: true state at the beginning.
+        light: what drifts beside the geometry.
+        true_every: pages from one that is read with the true table, too, to the next.
     """
 
     out: Path
     pages: int
     pages_during: int
     threads: int | None
+    bundle: Path
+    device: Device
+    light: LightDrift
+    true_every: int = 1
     rows: Rows = field(default_factory=list)
     moment: int = 0
 
@@ -94,8 +129,8 @@ class Week:
         """Read the pages before number `end` that are not kept yet."""
         path = self.out / "rows.jsonl"
         self.rows = kept_rows(path)
-        base = Decoder.load(bundle_path(DEFAULT), self.threads)
-        source = DriftingSource(base, lambda moment: state(moment, self.pages), seed=7)
+        base = Decoder.load(self.bundle, self.threads)
+        source = DriftingSource(base, lambda moment: state(self.device, moment, self.pages, self.light), seed=7)
         knock = int(KNOCK_SHARE * self.pages)
         if self.rows:
             source.skip(int(self.rows[-1]["shots"]))
@@ -129,28 +164,39 @@ class Week:
     ) -> dict[str, Any]:
         """Read a page; what it was like, and what it would have been like with the true table."""
         row: dict[str, Any] = {"page": number, "air": 0.0, "margin": None, "shift_px": None, "failed": False}
-        before = plane.models.current.version
+        before = plane.models.current
         try:
             found = read_page(plane, number, None, Caller(), user_data=True)
         except LightpageError as error:
             disagree = isinstance(error.__cause__, FramesDisagreeError)
             failed = not (isinstance(error, LostPageError) or disagree)
-            row |= {"lost": type(error).__name__, "failed": failed, "version": before}
+            row |= {"lost": type(error).__name__, "failed": failed, "version": before.version}
         else:
             answer, symbols = found.answer, source.truth(number).symbols
             data, page = answer.user_data, answer.page
             assert data is not None  # asked for
             row |= {
-                "air": air_bits(page, symbols, true_table.data, source.levels),
+                "air": air_bits(page, symbols, true_table.data, Levels(page.levels, page.level_phases)),
                 "margin": data.margin_bits,
                 "lost": "" if data.loss is None else data.loss.value,
                 "version": answer.model_version,
                 "shift_px": None if page.image is None else [page.image.shift_x_px, page.image.shift_y_px],
             }
+        looked = not self.rows or number % self.true_every == 0
+        truth, bundle = source.truth(number), before.decoder.bundle
+        device = truth.device
         row |= {
-            "true_air": true_table.air(source.truth(number), source.levels),
+            "true_air": true_table.air(truth, source.levels) if looked else self.rows[-1]["true_air"],
             "due": monitor.due,
             "reasons": list(monitor.state().reasons),
             "shots": source.shots,
+            "true": _light_of(true_parameters(bundle.profile, device), true_modulation(device.slm)),
+            "fitted": _light_of(bundle.calibration.vector, bundle.modulation),
         }
         return row
+
+
+def _light_of(parameters: NDArray[np.float64], modulation: Modulation) -> dict[str, float]:
+    """What `LightDrift` changes of a device, by name."""
+    names = [NAMES[index] for index in indices("axial")]
+    return {"stroke_relative": modulation.coefficients[0], **{name: as_dict(parameters)[name] for name in names}}

@@ -7,6 +7,10 @@ service reads it, with tracker, monitor, self-calibration and flight recorder. A
 Every page's figures are kept. An interrupted run goes on as a service does that was started anew, with the model of its
 store.
 
+With `--stroke -0.02 --axial 0.2`, the light drifts too: the modulator's stroke, and modulator and cameras out of focus.
+The table then says what was true and what the model in service took for it. Focus needs a `--bundle` whose graphs know
+axial places.
+
 In the simulated week a recalibration ends before the next page is read. Here pages are read without a pause; while a
 recalibration runs, `--pages-during` of them are read at most, and then its end is waited for.
 """
@@ -15,6 +19,7 @@ from __future__ import annotations
 
 import logging
 import sys
+from itertools import pairwise
 from pathlib import Path
 from statistics import fmean, median
 from typing import Any
@@ -24,14 +29,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.hardware.rows import Rows
-from analysis.hardware.simulated_week import KNOCK_SHARE, PAGE_S, Week
+from analysis.hardware.simulated_week import KNOCK_SHARE, PAGE_S, LightDrift, Week
 from analysis.hardware.week_figure import draw
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile, OutputFolder
+from lightpage.device.state import Device, load_device
 from lightpage.files import write_json
+from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 
 WANTED_SHARE = 0.95
 """Of the AIR with the true table that a page should have."""
+
+PARTS = 10
+"""Of the week, lines of its table."""
 
 WORTH = 0.004
 """Share of the true table's AIR that an alarm must be about: half of what half of a page's margin is."""
@@ -86,25 +96,61 @@ def false_alarms(rows: Rows, due: list[int]) -> int:
     return sum(float(np.mean(share[max(0, page - 9) : page + 1])) > 1 - WORTH for page in due)
 
 
+def table_of(rows: Rows, pages: int) -> list[str]:
+    """Return lines of a table: each part of the week, what was read then, and what was true and fitted at its end."""
+    names = list(rows[-1]["true"])
+    edges = np.linspace(0, pages, PARTS + 1).astype(int)
+    lines = [
+        f"| pages | AIR | of the true table's | recalibrations | lost | {' | '.join(names)} |",
+        "|---" * (5 + len(names)) + "|",
+    ]
+    for begin, end in pairwise(edges):
+        if part := [row for row in rows if begin <= row["page"] < end]:
+            air, true = (fmean(row[name] for row in part) for name in ("air", "true_air"))
+            done, lost = sum(row["ended"].count("done") for row in part), sum(bool(row["lost"]) for row in part)
+            light = [f"{part[-1]['true'][name]:.4f}, {part[-1]['fitted'][name]:.4f}" for name in names]
+            figures = [f"{begin}-{end - 1}", f"{air:.3f}", f"{air / true:.3f}", f"{done}", f"{lost}", *light]
+            lines.append(f"| {' | '.join(figures)} |")
+    return lines
+
+
 @click.command()
 @click.option("--pages", default=2000, show_default=True, type=click.IntRange(10), help="Of the week.")
 @click.option("--stop-after", type=click.IntRange(1), help="End after so many pages of it; a later run goes on.")
 @click.option("--pages-during", default=2, show_default=True, type=click.IntRange(0), help="Of a recalibration.")
+@click.option("--true-every", default=1, show_default=True, type=click.IntRange(1), help="Pages from one true AIR on.")
 @click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
+@click.option("--bundle", default=DEFAULT, show_default=True, help="That the service begins with.")
+@click.option("--device", type=click.Path(path_type=Path), help="True state (TOML) at the beginning.")
+@click.option("--stroke", default=0.0, show_default=True, help="Change of the modulator's stroke, relative.")
+@click.option("--axial", default=0.0, show_default=True, help="Change of all places along the axis, rad.")
 @click.option("--out", required=True, type=OutputFolder(), help="Where pages, models and frames are kept.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def main(
-    pages: int, stop_after: int | None, pages_during: int, threads: int | None, out: Path, json_path: Path | None
+    pages: int,
+    stop_after: int | None,
+    pages_during: int,
+    true_every: int,
+    threads: int | None,
+    bundle: str,
+    device: Path | None,
+    stroke: float,
+    axial: float,
+    out: Path,
+    json_path: Path | None,
 ) -> None:
     """Live through a week, and tell how it went."""
     out.mkdir(parents=True, exist_ok=True)
     logging.basicConfig(level=logging.INFO, filename=out / "log", format="%(asctime)s %(levelname)s %(message)s")
-    week = Week(out, pages, pages_during, threads)
+    begun = Device() if device is None else load_device(device)
+    week = Week(out, pages, pages_during, threads, bundle_path(bundle), begun, LightDrift(stroke, axial), true_every)
     week.read_until(pages if stop_after is None else min(pages, stop_after))
     figures = figures_of(week.rows, pages)
     draw(week.rows, out / "week.png", int(KNOCK_SHARE * pages), PAGE_S)
     for name, value in figures.items():
         click.echo(f"{name:<36} {value}")
+    for line in table_of(week.rows, pages):
+        click.echo(line)
     if json_path is not None:
         write_json(json_path, figures)
 

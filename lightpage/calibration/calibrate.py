@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.coherence import COHERENT_BRANCHES, page_coherence
-from lightpage.calibration.interfaces import FieldSolver, Twin
+from lightpage.calibration.goodness.measure import measure_goodness
+from lightpage.calibration.goodness.verdict import Goodness
+from lightpage.calibration.interfaces import FieldSolver, RememberingTwin, Twin
 from lightpage.calibration.parameters import NAMES, PARAMETERS, indices, nominal
 from lightpage.calibration.patch_fit import PatchFit, fit_parameters
 from lightpage.calibration.patches import (
@@ -24,10 +27,10 @@ from lightpage.calibration.patches import (
 )
 from lightpage.calibration.samplers import FieldSampler, FrameSampler
 from lightpage.calibration.sampling_table import cameras_apart, registration_coefficients, stand_apart
-from lightpage.calibration.waves.wave_fit import WaveFit
+from lightpage.calibration.waves.wave_fit import LevelPrior, WaveFit
 from lightpage.device.profile import Profile
 from lightpage.errors import CalibrationError
-from lightpage.page.modulation import NOMINAL, Modulation
+from lightpage.page.modulation import DRIFTS, NOMINAL, Modulation
 from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
 from lightpage.waves.grid import field_grid, symbol_samples
@@ -89,6 +92,10 @@ class KnownPage:
     pair: FramePair
     symbols: NDArray[np.complex128]
 
+    def light(self, modulation: Modulation) -> NDArray[np.complex128]:
+        """What a modulator makes of the symbols, complex [ny, nx]."""
+        return modulation.light(np.angle(self.symbols))
+
 
 @dataclass(frozen=True)
 class Registered:
@@ -103,6 +110,7 @@ class Registered:
         significant: share of the measured patches that were found, in the last stage.
         modulation: what the modulator makes of its levels.
         modulation_deviations: standard deviations of its coefficients.
+        goodness: how well all that explains the first page's light; None where that was not measured.
     """
 
     parameters: Real
@@ -114,6 +122,7 @@ class Registered:
     significant: float
     modulation: Modulation = NOMINAL
     modulation_deviations: tuple[float, ...] = NOMINAL.coefficients
+    goodness: Goodness | None = None
 
 
 @dataclass(frozen=True)
@@ -146,7 +155,7 @@ _PHASES = (_Stage("phases", 2, 1, _ALL_GROUPS, COHERENT_BRANCHES, use_phase=True
 within reach of the waves."""
 _DRIFTED = (_Stage("follow the drift", 6, 2, _ALL_GROUPS, COHERENT_BRANCHES, half_rate=True),)
 """From an earlier calibration: the complex field is right from the start, so nothing is searched camera by camera."""
-_DRIFT_SHARES = {"angle": 1.0, "lengths": 0.2, "in_phase": 0.3, "quadrature": 0.3}
+_DRIFT_SHARES = {"angle": 1.0, "lengths": 0.2, "in_phase": 0.3, "quadrature": 0.3, "axial": 0.2}
 _DRIFT_SCALE: Real = np.array([_DRIFT_SHARES.get(parameter.group, 0.05) for parameter in PARAMETERS])
 """How far a device drifts, as a share of what it may lie from nominal. What a fit cannot tell well stays as it was: a
 decoder has learned the earlier calibration's errors, and loses 0.1 bit a symbol where a re-fit draws others."""
@@ -177,7 +186,7 @@ def calibrate(
         CalibrationError: nothing within the capture range explains the frames, or the page is too small to tell.
     """
     work = _Registration(twin, solve_field, profile, references, list(pages), progress)
-    work.total = len(_SINGLE_CAMERA) + len(_COMPLEX) + len(_PHASES) + 5
+    work.total = len(_SINGLE_CAMERA) + len(_COMPLEX) + len(_PHASES) + 6
     work.any_orientation = any_orientation
     for stage in _SINGLE_CAMERA:
         work.single_camera(stage)
@@ -189,7 +198,7 @@ def calibrate(
     for stage in _PHASES:
         work.complex_field(stage)
     work.waves("waves", _ALL_GROUPS)
-    return work.result(work.centre)
+    return work.result()
 
 
 def refine(
@@ -208,7 +217,7 @@ def refine(
     Args:
         start: [P] earlier parameters.
         quadrature_phase: earlier angle between the homodyne arms.
-        modulation: earlier one, which is fitted again: a stroke changes with temperature.
+        modulation: earlier one, which is fitted again, see `DRIFTS`.
         twin, solve_field, profile, references, pages, progress: as for `calibrate`.
 
     Raises:
@@ -216,12 +225,13 @@ def refine(
     """
     work = _Registration(twin, solve_field, profile, references, list(pages), progress)
     work.parameters, work.centre, work.quadrature_phase = start.copy(), start, quadrature_phase
-    work.modulation = modulation
-    work.total = len(_DRIFTED) + 2
+    work.modulation, work.levels = modulation, LevelPrior(modulation, DRIFTS)
+    work.total = len(_DRIFTED) + 3
+    known = tuple(group for group in _ALL_GROUPS if max(indices(group)) < twin.known)
     for stage in _DRIFTED:
-        work.complex_field(stage, _DRIFT_SCALE)
-    work.waves("waves", _ALL_GROUPS, _DRIFT_SCALE)
-    return work.result(start)
+        work.complex_field(replace(stage, groups=known), _DRIFT_SCALE)
+    work.waves("waves", known, _DRIFT_SCALE)
+    return work.result()
 
 
 def least_coherence(symbols: int) -> float:
@@ -292,8 +302,10 @@ class _Registration:
         self.any_orientation, self.orientations = False, tuple[str, ...]()
         self.deviations = np.zeros_like(self.parameters)
         self.quadrature_phase = np.pi / 2
+        self.levels = LevelPrior()
         self.modulation, self.modulation_deviations = NOMINAL, NOMINAL.coefficients
         self.fit: PatchFit | None = None
+        self.illumination: NDArray[np.complexfloating] | None = None
         self.total = 1
         self._stage, self._done = "", 0
         self._pixel = profile.camera.pitch_m
@@ -339,7 +351,7 @@ class _Registration:
             for how in list(ORIENTATIONS)[1:]:
                 self._set_orientation(camera, how)
                 sampler = self._frame_samplers(self.pages[0])[camera]
-                seen = self._measure(sampler, stage, (camera,), camera / 2)
+                (seen,) = self._measure(stage, {(camera,): sampler})
                 if _significant(seen) > most:
                     best, most, found[camera] = how, _significant(seen), seen
             self._set_orientation(camera, best)
@@ -369,7 +381,8 @@ class _Registration:
         """Measure branches on the recovered field and fit."""
         self._begin(stage.name)
         sampler = FieldSampler(self._field(self.pages[0])[0], self.grid)
-        self._fit(stage, self._measure(sampler, stage, (0, 1)), prior_scale)
+        (found,) = self._measure(stage, {(0, 1): sampler})
+        self._fit(stage, found, prior_scale)
 
     def estimate_turn(self) -> None:
         """The angle between the arms, from the phases that the same known symbols show on either camera."""
@@ -401,18 +414,19 @@ class _Registration:
             prior_scale,
             self._tell,
             self.modulation,
-            levels=True,
+            self.levels,
         )
         self.parameters, self.deviations = found.parameters, found.deviations
         self.quadrature_phase = found.quadrature_phase
         self.modulation, self.modulation_deviations = found.modulation, found.modulation_deviations
+        self.illumination = found.illumination
 
-    def result(self, before: Real) -> Registered:
-        """Judge the outcome; `before` is the geometry that it is compared with."""
+    def result(self) -> Registered:
+        """Judge the outcome."""
         if self.fit is None:
             raise CalibrationError("calibration", "no fit", "at least one stage")
         self._begin("coherence")
-        after = self._coherence(self.parameters)
+        after = self._coherence(self.parameters, self.modulation)
         significant = len(self._found) / len(self._looked)
         reflected = {branch: self._share(branch) for branch in _REFLECTED}
         check_found(after, significant, self.pages[0].symbols.size, reflected)
@@ -427,26 +441,39 @@ class _Registration:
             parameters=self.parameters,
             deviations=self.deviations,
             quadrature_phase=self.quadrature_phase,
-            coherence_before=self._coherence(before, 0.5),
+            coherence_before=self._coherence(self.centre, self.levels.centre, 0.5),
             coherence_after=after,
             cost=self.fit.cost,
             significant=significant,
             modulation=self.modulation,
             modulation_deviations=self.modulation_deviations,
+            goodness=self._goodness(),
         )
+
+    def _goodness(self) -> Goodness | None:
+        """How well what was fitted explains the light of the first page."""
+        if self.illumination is None:
+            return None
+        self._begin("unexplained light")
+        device = CalibratedDevice(
+            self.profile, self.parameters, self.quadrature_phase, self.references, self.modulation
+        )
+        page = self.pages[0]
+        return measure_goodness(self.twin, device, self.illumination, page.pair, page.symbols, self._tell)
 
     def _share(self, branch: str) -> float:
         """Share of the patches of a branch that the last stage found."""
         looked, found = (sum(m.branch == branch for m in part) for part in (self._looked, self._found))
         return found / looked if looked else 0.0
 
-    def _coherence(self, parameters: Real, begun: float = 0.0) -> float:
+    def _coherence(self, parameters: Real, modulation: Modulation, begun: float = 0.0) -> float:
         """Mean over the pages; takes half of the stage, of which the share `begun` is behind."""
         found = []
         for number, page in enumerate(self.pages):
             self._tell(begun + number / len(self.pages) / 2)
             sampler = FieldSampler(self._field(page, parameters)[0], self.grid)
-            found.append(page_coherence(sampler, self.twin, parameters, self.profile, page.symbols))
+            light = page.light(modulation)
+            found.append(page_coherence(sampler, self.twin, parameters, self.profile, light))
         return float(np.mean(found))
 
     def _field(
@@ -474,38 +501,35 @@ class _Registration:
 
     def _on_each_camera(self, stage: _Stage) -> list[list[Measurement]]:
         """The first page's patches as either camera sees them by itself."""
-        return [
-            self._measure(sampler, stage, (camera,), camera / 2)
-            for camera, sampler in enumerate(self._frame_samplers(self.pages[0]))
-        ]
+        return self._measure(stage, {(camera,): one for camera, one in enumerate(self._frame_samplers(self.pages[0]))})
 
     def _measure(
-        self, sampler: FrameSampler | FieldSampler, stage: _Stage, cameras: tuple[int, ...], begun: float = 0.0
-    ) -> list[Measurement]:
-        """The first page's patches as `sampler` sees them.
+        self, stage: _Stage, samplers: Mapping[tuple[int, ...], FrameSampler | FieldSampler]
+    ) -> list[list[Measurement]]:
+        """The first page's patches as each of `samplers` sees them.
 
         Args:
-            sampler: the field, or one camera's light.
             stage: what to look for.
-            cameras: through which of the two; each takes half of the stage.
-            begun: share of the stage that is behind.
+            samplers: the field, or one camera's light, by the cameras that it is seen through.
         """
         window = search_window(stage.reach_px * self._pixel, stage.step_px * self._pixel)
-        where, found = self._where(stage), list[Measurement]()
+        twin, where, light = RememberingTwin(self.twin), self._where(stage), self.pages[0].light(self.modulation)
+        found: list[list[Measurement]] = [[] for _ in samplers]
         for number, patch in enumerate(where):
-            self._tell(begun + number / len(where) * len(cameras) / 2)
-            found += measure(
-                sampler,
-                self.twin,
-                self.parameters,
-                self.profile,
-                patch,
-                self.pages[0].symbols,
-                stage.branches,
-                window,
-                samples=max(1, self._samples // 2) if stage.half_rate else self._samples,
-                cameras=cameras,
-            )
+            self._tell(number / len(where))
+            for own, (cameras, sampler) in zip(found, samplers.items(), strict=True):
+                own += measure(
+                    sampler,
+                    twin,
+                    self.parameters,
+                    self.profile,
+                    patch,
+                    light,
+                    stage.branches,
+                    window,
+                    samples=max(1, self._samples // 2) if stage.half_rate else self._samples,
+                    cameras=cameras,
+                )
         return found
 
     def _fit(self, stage: _Stage, found: list[Measurement], prior_scale: float | Real = 1.0) -> None:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.calibration.document import Calibration
 from lightpage.calibration.sampling_table import stand_apart
 from lightpage.device.profile import Profile
 from lightpage.page.modulation import NOMINAL, Modulation
@@ -37,8 +35,3 @@ class CalibratedDevice:
     def stands_apart(self) -> bool:
         """Whether the cameras stand so far apart that each must be seen through a defocus of its own."""
         return stand_apart(self.parameters)
-
-    @classmethod
-    def of(cls, profile: Profile, calibration: Calibration, references: FramePair) -> Self:
-        """The device of a calibration document."""
-        return cls(profile, calibration.vector, calibration.turn_rad, references, calibration.modulator)

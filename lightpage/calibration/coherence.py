@@ -25,15 +25,15 @@ def page_coherence(
 ) -> float:
     """Coherence of the demodulated branches with the known symbols over the whole page.
 
-    |sum w z conj(s)| / sqrt(sum w^2 sum |z|^2) over symbols and branches, with z the light of a branch demodulated by
-    the twin's phase and averaged over the symbol, s the symbol's phasor and w the share of the beam that leaves
+    |sum w z conj(s)| / sqrt(sum |w s|^2 sum |z|^2) over symbols and branches, with z the light of a branch demodulated
+    by the twin's phase and averaged over the symbol, s the symbol's light and w the share of the beam that leaves
     through the branch's cell (a triangle in the exit centroid).
 
     Args:
         sampler: the recovered field.
         twin, parameters: the geometry to judge.
         profile: the nominal device.
-        symbols: phasors [ny, nx].
+        symbols: light that the modulator makes of them, complex [ny, nx].
     """
     centres = symbol_centres(profile)
     steps = ((np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5) * profile.symbol_pitch_m
@@ -46,8 +46,9 @@ def page_coherence(
             light += sampler(rays.places[chosen]) * np.exp(-1j * rays.phases[chosen])
             positions = rays.positions
     shares = branch_shares(positions)
-    total = np.sum(shares * light * np.conj(symbols.ravel()))
-    norm = np.sqrt(np.sum(shares**2) * np.sum(np.abs(light) ** 2))
+    expected = shares * symbols.ravel()
+    total = np.sum(light * np.conj(expected))
+    norm = np.sqrt(np.sum(np.abs(expected) ** 2) * np.sum(np.abs(light) ** 2))
     return float(abs(total) / max(norm, 1e-30))
 
 

@@ -12,12 +12,16 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, field_serializer
 
 from lightpage.calibration.calibrate import Registered
+from lightpage.calibration.calibrated_device import CalibratedDevice
+from lightpage.calibration.goodness.verdict import USABLE, Goodness
 from lightpage.calibration.parameters import KNOWN, NAMES, as_dict, as_vector
 from lightpage.device.profile import Count, Finite, Profile, TomlTable, to_toml, validate
-from lightpage.errors import ProfileError
+from lightpage.errors import CalibrationError, ProfileError
 from lightpage.files import read_text, replace_text
 from lightpage.page import modulation as modulations
 from lightpage.page.modulation import NOMINAL, Modulation
+from lightpage.progress import warn
+from lightpage.recording.frame_pair import FramePair
 
 Real = NDArray[np.float64]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -29,6 +33,9 @@ _ADDED = {
     "deviations": dict.fromkeys(("lens_path_relative", *_LATER), 0.0),
 }
 """What documents lack that were written before it: they took lenses for ideal, and planes for those of the profile."""
+
+
+_OPTIONAL = ("coherence_at_first", "goodness")
 
 
 def _names_problem(values: dict[str, Any], names: tuple[str, ...] = NAMES) -> str:
@@ -68,6 +75,7 @@ class Calibration(TomlTable):
         modulation: what the modulator makes of its levels, by the names of `lightpage.page.modulation`; nominal in
             documents that do not tell it.
         modulation_deviations: standard deviations of that, same names.
+        goodness: how well the fit explains the light; None where that was not measured, as in documents of before.
     """
 
     schema_version: Literal[1] = 1
@@ -84,6 +92,7 @@ class Calibration(TomlTable):
     deviations: Annotated[dict[str, NonNegative], _just(NAMES)]
     modulation: Annotated[dict[str, Finite], _just(modulations.NAMES)] = NOMINAL.as_dict()
     modulation_deviations: Annotated[dict[str, NonNegative], _just(modulations.NAMES)] = NOMINAL.as_dict()
+    goodness: Goodness | None = None
 
     @field_serializer("calibrated_pages")
     def _as_list(self, pages: tuple[str, ...]) -> list[str]:
@@ -111,6 +120,7 @@ class Calibration(TomlTable):
             deviations=as_dict(registered.deviations),
             modulation=registered.modulation.as_dict(),
             modulation_deviations=Modulation(registered.modulation_deviations).as_dict(),
+            goodness=registered.goodness,
         )
 
     def followed_by(self, fitted: Self) -> Self:
@@ -146,9 +156,36 @@ class Calibration(TomlTable):
         """What the modulator makes of its levels."""
         return Modulation(tuple(self.modulation.values()))
 
+    def device(self, profile: Profile, references: FramePair) -> CalibratedDevice:
+        """The device that was found, with its reference-only frames."""
+        return CalibratedDevice(profile, self.vector, self.turn_rad, references, self.modulator)
+
     def angle_deg(self, profile: Profile) -> float:
         """Angle of the pipe, degrees: the profile's and what was fitted on top."""
         return profile.pipe.angle_deg + float(np.rad2deg(self.parameters["pipe_angle_rad"]))
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether the fit leaves so much light unexplained that it is wrong."""
+        return self.goodness is not None and self.goodness.verdict == "wrong"
+
+    def check_good(self, subject: str, remedy: str = "; mend the cause and calibrate anew") -> None:
+        """Check that the fit is not wrong; a warning where it is only usable.
+
+        Args:
+            subject: what has the calibration.
+            remedy: what to do, after the limit.
+
+        Raises:
+            CalibrationError: it is wrong.
+        """
+        found = self.goodness
+        if found is None or found.verdict == "good":
+            return
+        got = f"a {found.verdict} fit, which costs about {found.bits_lost:.2f} bit a symbol: {found.cause}"
+        if found.verdict == "wrong":
+            raise CalibrationError(subject, got, f"at most {USABLE:g} bit{remedy}")
+        warn(f"{subject}: {got}")
 
     def check_profile(self, profile: Profile) -> None:
         """Check that the calibration belongs to devices of `profile`.
@@ -163,7 +200,7 @@ class Calibration(TomlTable):
 
     def to_toml(self) -> str:
         """The document as TOML text; `parse_calibration` reads it back to an equal calibration."""
-        return to_toml(self, without=("coherence_at_first",) if self.coherence_at_first is None else ())
+        return to_toml(self, without=[name for name in _OPTIONAL if getattr(self, name) is None])
 
     def save(self, path: str | Path) -> None:
         """Write the document, replacing what is there in one step.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.coherence import branch_shares
 from lightpage.calibration.interfaces import BRANCHES, Twin
-from lightpage.calibration.sampling_table import symbol_centres
+from lightpage.calibration.sampling_table import orientations, symbol_centres
 from lightpage.device.profile import Profile
 from lightpage.page.pilots import Pilots
 from lightpage.waves.grid import field_grid, symbol_samples
@@ -113,10 +113,12 @@ class ImageSearch:
         return FoundImage(best, score, needed_significance(len(pilots.phases), len(trials) * COARSE_PX**2))
 
     def _samples_per_pixel(self) -> Real:
-        """Grid samples (x, y) for a camera pixel along x and along y, in the mean of both cameras, [2, 2]."""
+        """Grid samples (x, y) for a camera pixel's way along x and along y, in the mean of both cameras, [2, 2]."""
         places = np.array([[0.0, 0.0], [self._pitch_m, 0.0], [0.0, self._pitch_m]])
-        pixels = self._twin.pixels(self._parameters, places).mean(axis=0)
-        return np.asarray(np.linalg.inv((pixels[1:] - pixels[0]).T))
+        pixels = self._twin.pixels(self._parameters, places)
+        linear = np.swapaxes(pixels[:, 1:] - pixels[:, :1], 1, 2)
+        upright = np.swapaxes(orientations(linear), 1, 2) @ linear
+        return np.asarray(np.linalg.inv(upright.mean(axis=0)))
 
     def _template(self, pilots: Pilots, samples: int) -> _Template:
         """Trace the pilots, `samples` points per symbol and axis."""

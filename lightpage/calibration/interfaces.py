@@ -31,7 +31,13 @@ class Rays(NamedTuple):
 
 
 class Twin(Protocol):
-    """A ray tracer of the device with the parameters of `lightpage.calibration.parameters`."""
+    """A ray tracer of the device with the parameters of `lightpage.calibration.parameters`.
+
+    Attributes:
+        known: how many of them it knows, the first ones; see `KNOWN` there. The others do nothing.
+    """
+
+    known: int
 
     def trace(self, parameters: Real, points: Real, anchors: Real | None = None) -> Rays:
         """Trace page points.
@@ -50,6 +56,25 @@ class Twin(Protocol):
         Parameters [K, P] give [K, 2, N, 2].
         """
         ...
+
+
+class RememberingTwin:
+    """A twin that remembers its last trace: either camera is looked at for the same one.
+
+    Args:
+        twin: what traces.
+    """
+
+    def __init__(self, twin: Twin) -> None:
+        self.known, self.pixels = twin.known, twin.pixels
+        self._twin, self._asked, self._rays = twin, tuple[Real, ...](), Rays(*[np.zeros(0)] * 3)
+
+    def trace(self, parameters: Real, points: Real, anchors: Real | None = None) -> Rays:
+        """See `Twin`."""
+        asked = parameters, points, points if anchors is None else anchors
+        if not (self._asked and all(map(np.array_equal, asked, self._asked))):
+            self._asked, self._rays = asked, self._twin.trace(*asked)
+        return self._rays
 
 
 class FieldSolver(Protocol):

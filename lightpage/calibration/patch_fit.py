@@ -154,7 +154,7 @@ class Design:
         else:
             pixels = self._twin.pixels(parameters, places)
         pixels = np.moveaxis(pixels, -3, -2)
-        read = phases[..., 0] + ((self._read_at - pixels).mean(-2) * self._carrier).sum(-1)
+        read = phases[..., 0] + ((self._read_at - pixels) * self._carrier).sum((-2, -1))
         return pixels, read, slopes / (2 * self._step)
 
     def _slope_weight(self, use_phase: bool) -> Real:

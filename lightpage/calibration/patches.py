@@ -53,7 +53,8 @@ class Measurement:
         cameras: which of the two were looked at.
         read_at: (column, row) on each camera where the twin had put the centre, [2, 2].
         phase: phase of the light against the symbols', radians, read there.
-        carrier: how that phase changes with the point where it is read, radians a pixel along (column, row), [2].
+        carrier: how that phase changes with the pixels where it is read, radians a pixel along (column, row) on each
+            camera, [2, 2]; half of the change belongs to either.
         slope: gradient of that phase along the page's (x, y), rad/m, [2].
         significance: power of the coherent sum over that of the symbols' incoherent sum; the number of symbols when
             all agree, about 1 when they are unrelated.
@@ -134,7 +135,7 @@ def measure(
         parameters: [P] current parameters.
         profile: the nominal device.
         patch: which symbols.
-        symbols: phasors exp(i theta) of the whole page, [ny, nx].
+        symbols: light that the modulator makes of the whole page's, complex [ny, nx].
         branches: which branches to look for.
         window: trial shifts [K, 2], metres on the camera plane, a square lattice (see `search_window`).
         samples: samples per symbol along each axis; the field's own rate (`symbol_samples`), or half of it in a wide
@@ -186,9 +187,12 @@ def measure(
         ramp = np.exp(-1j * (slope_y * (y - centre[1])[:, None] + slope_x * (x - centre[0])[None, :]) / pitch)
         *around, there = demodulated(np.vstack([probe, shift])) * ramp
         read = np.array([np.sum(light) for light in around])
-        reach_px = 2 * _CARRIER_PROBE * pitch / profile.camera.pitch_m
-        carrier = np.angle([read[1] * np.conj(read[2]), read[3] * np.conj(read[4])]) / reach_px
-        read_at, found_at = np.moveaxis(twin.pixels(parameters, np.stack([landing, landing + shift])), 1, 0)
+        across = np.angle([read[1] * np.conj(read[2]), read[3] * np.conj(read[4])])
+        read_at, right, left, down, up, found_at = np.moveaxis(
+            twin.pixels(parameters, landing + np.vstack([probe, shift])), 1, 0
+        )
+        # a camera may show the image turned or mirrored
+        carrier = np.linalg.solve(np.stack([right - left, down - up], axis=1), across[:, None])[..., 0] / 2
         power = abs(np.sum(there)) ** 2
         floor = float(_incoherent(there[None], rows, columns)[0])
         found.append(

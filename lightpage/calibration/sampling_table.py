@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.calibration.interfaces import Twin
-from lightpage.calibration.parameters import as_dict
+from lightpage.calibration.parameters import as_dict, as_vector
 from lightpage.calibration.waves.wave_model import axial_of_cameras, defocus, fitted_geometry
 from lightpage.device.profile import Profile
 from lightpage.waves.defocus import defocus_taps
@@ -71,11 +71,38 @@ def cameras_apart(parameters: Real, profile: Profile) -> NDArray[np.float32]:
     return defocus_taps(geometry, beyond, field_grid(profile).pitch_m)
 
 
+def orientations(linear: NDArray[np.floating]) -> NDArray[np.floating]:
+    """How cameras show the image, from (x, y) to (column, row), but for small turns and scales.
+
+    Args:
+        linear: what they truly do, in any unit, [..., 2, 2].
+
+    Returns:
+        Zeros, and in each row and column one of 1 and -1, [..., 2, 2].
+    """
+    return np.asarray(np.rint(linear / np.abs(linear).max(axis=(-2, -1), keepdims=True)))
+
+
 def shifted(registration: NDArray[np.float32], shift_px: Real) -> NDArray[np.float32]:
-    """The registration [2, 2, 10] of an image that lies (x, y) camera pixels from where calibration saw it."""
-    moved = registration.copy()
-    moved[..., monomial_powers().index((0, 0))] += np.asarray(shift_px, dtype=np.float32)
+    """The registration [2, 2, 10] of an image that lies (x, y) camera pixels from where calibration saw it.
+
+    The shift is that of the image in the camera plane: a camera that is mirrored or turned sees it so.
+    """
+    moved, powers = registration.copy(), monomial_powers()
+    shows = orientations(registration[..., [powers.index((1, 0)), powers.index((0, 1))]])
+    moved[..., powers.index((0, 0))] += np.asarray(shows @ shift_px, dtype=np.float32)
     return moved
+
+
+def moved_cameras(parameters: Real, shift_px: Real) -> Real:
+    """A device's parameters [P] with both cameras where they see the image `shifted`."""
+    moved = as_dict(parameters)
+    for camera in ("in_phase", "quadrature"):
+        rows = ("scale_x_relative", "turn_xy_slope"), ("turn_yx_slope", "scale_y_relative")
+        linear = np.eye(2) + [[moved[f"{camera}_{name}"] for name in row] for row in rows]
+        for axis, by in zip("xy", orientations(linear) @ shift_px, strict=True):
+            moved[f"{camera}_shift_{axis}_px"] += float(by)
+    return as_vector(moved)
 
 
 def sampling_table(twin: Twin, parameters: Real, quadrature_phase: float, profile: Profile) -> SamplingTable:

@@ -32,7 +32,7 @@ from lightpage.simulator.recording_job import RecordingJob
     "--device",
     "device_file",
     type=click.Path(),
-    help="Its true state, TOML; a realistic one if absent: a pipe 0.6 degree below the profile's.",
+    help="Its true state: `rough`, or TOML; a realistic one if absent: a pipe 0.6 degree below the profile's.",
 )
 @click.option("--set", "settings", multiple=True, metavar="TABLE.KEY=VALUE", help="Change one number of that state.")
 @click.option("--truth/--no-truth", default=True, help="Keep what only a simulator knows beside the pages.")

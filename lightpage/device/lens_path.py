@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 
 class SeidelTerms(NamedTuple):
-    """Factors of the terms of W, rad/m^4; numbers or tensors."""
+    """Factors of the terms of W, rad/m^4 unless said otherwise; numbers or tensors."""
 
     piston: Any = 0.0
     """Of r^4, with r^2 = x^2 + y^2."""
@@ -29,6 +29,10 @@ class SeidelTerms(NamedTuple):
     """Of R^4."""
     defocus: Any = 0.0
     """Of R^2, rad/m^2: the outer plane does not stand in the focal plane, see `defocus`."""
+    tilt_x: Any = 0.0
+    """Of x R^2, rad/m^3: the outer plane is tilted, so that its defocus grows with the place."""
+    tilt_y: Any = 0.0
+    """Of y R^2."""
 
     def mirrored(self) -> SeidelTerms:
         """Of the same lens met from the facet, as a lens from camera plane to facet whose adjoint is used.
@@ -47,7 +51,11 @@ class SeidelTerms(NamedTuple):
     @property
     def couples(self) -> bool:
         """Whether any term depends on the field; defocus does not."""
-        return not all(isinstance(term, float) and term == 0.0 for term in self[:-1])
+        return not all(isinstance(term, float) and term == 0.0 for term in self._replace(defocus=0.0))
+
+    def defocus_at(self, x: Any, y: Any) -> Any:
+        """The factor of R^2 that a plane's axial place and tilt make at a field point, rad/m^2."""
+        return self.defocus + self.tilt_x * x + self.tilt_y * y
 
     def of_field(self, x: Any, y: Any) -> Any:
         """The part of W that depends on the field alone, radians."""
@@ -59,18 +67,19 @@ class SeidelTerms(NamedTuple):
         r2, aperture2, product = x * x + y * y, across * across + up * up, x * across + y * up
         odd = self.distortion * r2 + self.coma * aperture2
         even = self.astigmatism * product * product + self.field_curvature * r2 * aperture2
-        return odd * product + even + (self.spherical * aperture2 + self.defocus) * aperture2
+        return odd * product + even + (self.spherical * aperture2 + self.defocus_at(x, y)) * aperture2
 
     def slope(self, x: Any, y: Any, across: Any, up: Any) -> tuple[Any, Any]:
         """Derivatives of W by the aperture's two coordinates, rad/m."""
         r2, aperture2, product = x * x + y * y, across * across + up * up, x * across + y * up
         by_field = self.distortion * r2 + self.coma * aperture2 + 2 * self.astigmatism * product
-        even = self.coma * product + self.field_curvature * r2 + self.defocus
+        even = self.coma * product + self.field_curvature * r2 + self.defocus_at(x, y)
         by_aperture = 2 * even + 4 * self.spherical * aperture2
         return by_field * x + by_aperture * across, by_field * y + by_aperture * up
 
     def slope_on_field(self, x: Any, y: Any, across: Any, up: Any) -> tuple[Any, Any]:
         """Derivatives of W by the field's two coordinates, rad/m."""
+        aperture2 = across * across + up * up
         swapped = SeidelTerms(
             piston=self.spherical,
             distortion=self.coma,
@@ -79,12 +88,14 @@ class SeidelTerms(NamedTuple):
             coma=self.distortion,
             spherical=self.piston,
         )
-        return swapped.slope(across, up, x, y)
+        along_x, along_y = swapped.slope(across, up, x, y)
+        return along_x + self.tilt_x * aperture2, along_y + self.tilt_y * aperture2
 
     def bend(self, x: Any, y: Any, across: Any, up: Any) -> tuple[Any, Any]:
         """Second derivatives of W by either of the aperture's coordinates, rad/m^2."""
         r2, aperture2, product = x * x + y * y, across * across + up * up, x * across + y * up
-        alike = 2 * (self.coma * product + self.field_curvature * r2 + self.defocus) + 4 * self.spherical * aperture2
+        even = self.coma * product + self.field_curvature * r2 + self.defocus_at(x, y)
+        alike = 2 * even + 4 * self.spherical * aperture2
 
         def along(field: Any, aperture: Any) -> Any:
             by_field = 2 * self.astigmatism * field + 4 * self.coma * aperture

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import tomllib
+from collections.abc import Collection
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
@@ -221,7 +222,7 @@ class Profile(TomlTable):
         return to_toml(self, without=("lens_path",) if self.ideal_lenses else ())
 
 
-def to_toml(table: TomlTable, without: tuple[str, ...] = ()) -> str:
+def to_toml(table: TomlTable, without: Collection[str] = ()) -> str:
     """Write a checked table (scalars first, then its sub-tables one level down) as TOML text, some keys left out."""
     scalars: list[str] = []
     tables: list[str] = []

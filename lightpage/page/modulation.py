@@ -25,6 +25,8 @@ NAMES = ("stroke_relative", *(f"phase_{name}_rad" for name in _SERIES), *(f"ampl
 """Of the coefficients, each zero nominally."""
 PRIORS: Real = np.array([0.02, *[0.2 / number for number in range(1, HARMONICS + 1) for _ in "cs"] * 2])
 """Standard deviations of the coefficients about nominal, before data are seen."""
+DRIFTS: Real = PRIORS * [1.0, *[0.1] * (len(NAMES) - 1)]
+"""The same about those of an earlier day: a stroke changes with temperature, a lookup table hardly."""
 
 
 def basis(phases: Real) -> Real:

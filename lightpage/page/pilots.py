@@ -261,11 +261,13 @@ class PilotReading:
         piston: common phase of the page.
         trust: factor on the claimed concentrations, 0..1.
         check: what the decoder claims, and what of it the pilots confirm.
+        sound: the pilots that were read.
     """
 
     piston: Piston
     trust: float
     check: PilotCheck
+    sound: Pilots
 
 
 def read_pilots(p: NDArray[np.floating], pilots: Pilots, gained_nats: float = 0.0) -> PilotReading:
@@ -282,7 +284,25 @@ def read_pilots(p: NDArray[np.floating], pilots: Pilots, gained_nats: float = 0.
     sound = without_outliers(p, pilots)
     piston = estimate_piston(p, sound)
     trust = estimate_trust(p, sound, piston.angle_rad)
-    return PilotReading(piston, trust, check_claims(p, sound, piston.angle_rad, trust, gained_nats))
+    return PilotReading(piston, trust, check_claims(p, sound, piston.angle_rad, trust, gained_nats), sound)
+
+
+def stroke_error(phase: NDArray[np.floating], concentration: NDArray[np.floating], pilots: Pilots) -> float:
+    """How much longer the modulator's stroke is than its calibration says, relative: a slope over the pilots' phases.
+
+    Args:
+        phase: radians, piston and smooth error removed, [ny, nx].
+        concentration: von Mises kappa, [ny, nx].
+        pilots: the known symbols of this page, those left out that are outliers.
+
+    Returns:
+        NaN where the pilots have but one phase.
+    """
+    weight = concentration[pilots.mask].astype(np.float64)
+    error = remove_piston(phase[pilots.mask], pilots.phases)
+    with np.errstate(invalid="ignore"):
+        away = pilots.phases - np.sum(weight * pilots.phases) / weight.sum()
+        return float(np.sum(weight * away * error) / np.sum(weight * away**2))
 
 
 def _errors(p: NDArray[np.floating], pilots: Pilots) -> NDArray[np.complex128]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import scipy
@@ -13,6 +14,11 @@ from lightpage.device.state import CameraPose, Sensor
 
 Real = NDArray[np.floating]
 Complex = NDArray[np.complexfloating]
+
+_SPECK_PX = 2.0, 6.0
+"""Radii of the specks' shadows, standard deviations of a Gaussian."""
+_SPECK_DEPTH = 0.3, 0.9
+"""Shares of the light that they take off in the middle."""
 
 
 def in_phase_intensity(field: Complex, reference: Complex) -> Real:
@@ -65,6 +71,53 @@ class CameraView:
         return x * shrink, y * shrink
 
 
+@dataclass(frozen=True)
+class Blemishes:
+    """What is wrong with single pixels of one camera.
+
+    Attributes:
+        transmission: share of the light that dust lets through, float32 [rows, columns], or 1.
+        hot: pixels that are always at full scale, [rows, columns]; none if there are no such.
+    """
+
+    transmission: Real | float = 1.0
+    hot: NDArray[np.bool_] | None = None
+
+    @classmethod
+    def of(cls, camera: Camera, sensor: Sensor, which: int) -> Self:
+        """Draw those of camera number `which`, always the same."""
+        shape = camera.rows_px, camera.columns_px
+        hot_rng, dust_rng = (np.random.default_rng([sensor.blemish_seed, which, kind]) for kind in range(2))
+        hot, transmission = None, None
+        if sensor.hot_pixel_share:
+            hot = hot_rng.random(shape, dtype=np.float32) < sensor.hot_pixel_share
+        if sensor.dust_specks:
+            transmission = _behind_dust(shape, dust_rng.random((sensor.dust_specks, 4)))
+        return cls(1.0 if transmission is None else transmission, hot)
+
+    def counted(self, counts: NDArray[np.uint16], sensor: Sensor) -> NDArray[np.uint16]:
+        """Counts with those of hot pixels."""
+        return counts if self.hot is None else np.where(self.hot, np.uint16(2**sensor.bit_depth - 1), counts)
+
+
+def _behind_dust(shape: tuple[int, int], drawn: Real) -> Real:
+    """Share of the light that passes specks, float32 [rows, columns].
+
+    Args:
+        shape: (rows, columns).
+        drawn: of each speck four numbers from 0 to 1: row, column, radius and depth of its shadow, [n, 4].
+    """
+    passed = np.ones(shape, np.float32)
+    for row, column, size, depth in drawn:
+        radius = _SPECK_PX[0] + size * (_SPECK_PX[1] - _SPECK_PX[0])
+        centre, reach = (row * shape[0], column * shape[1]), int(np.ceil(4 * radius))
+        y, x = (np.arange(max(0, int(c) - reach), min(n, int(c) + reach)) for c, n in zip(centre, shape, strict=True))
+        away2 = (y[:, None] - centre[0]) ** 2 + (x - centre[1]) ** 2
+        darkest = _SPECK_DEPTH[0] + depth * (_SPECK_DEPTH[1] - _SPECK_DEPTH[0])
+        passed[np.ix_(y, x)] *= 1 - darkest * np.exp(-away2 / (2 * radius**2))
+    return passed
+
+
 def resample(image: Real, x_m: Real, y_m: Real, at_x_m: Real, at_y_m: Real) -> Real:
     """Cubic-spline values of `image`, sampled on the uniform axes (y_m, x_m), at scattered points, float32."""
     rows = (at_y_m - y_m[0]) / (y_m[1] - y_m[0])
@@ -85,6 +138,8 @@ def expose(intensity: Real, electrons_per_unit: float, sensor: Sensor, rng: np.r
 
 def to_counts(electrons: Real, sensor: Sensor) -> NDArray[np.uint16]:
     """Electrons to counts: full scale is the full well."""
+    if sensor.nonlinearity_relative:
+        electrons = electrons * (1 + sensor.nonlinearity_relative * electrons / sensor.full_well_e)
     top = 2**sensor.bit_depth - 1
     counts = np.clip(np.rint(electrons * (top / sensor.full_well_e)), 0, top)
     return np.asarray(counts, dtype=np.uint16)

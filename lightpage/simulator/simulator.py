@@ -20,15 +20,15 @@ from lightpage.simulator.cameras import (
     resample,
     to_counts,
 )
-from lightpage.simulator.true_optics import TrueOptics
+from lightpage.simulator.true_optics import Place, TrueOptics
 from lightpage.waves.grid import check_camera
 
 Complex = NDArray[np.complexfloating]
 
 LIGHT = 1
 """Raised when the same device and pages give other frames: what an earlier version began is then not gone on with."""
-_WALK, _NOISE = 0, 2
-"""Independent random streams drawn from one seed; the last has one for each page."""
+_WALK, _NOISE, _FLICKER = 0, 2, 4
+"""Independent random streams drawn from one seed; the last two have one for each page."""
 
 
 @dataclass(frozen=True)
@@ -122,17 +122,25 @@ class Simulator:
         """
         check_symbols(symbols, self.profile.page_shape, self.levels, "symbols to simulate")
         device, rng = self.device, np.random.default_rng([self.seed, _NOISE, self._page])
+        flicker = device.slm.flicker_rad * np.random.default_rng([self.seed, _FLICKER, self._page]).standard_normal()
         self._drift()
         shift = (float(self._shift[0]), float(self._shift[1]))
         size = self.profile.page.symbol_size_px
         phase = np.kron(symbol_phases(symbols, self.levels), np.ones((size, size)))
-        exit_field = self.optics.exit_field(phase, device.slm.phase_noise_rad * rng.standard_normal(phase.shape))
+        noise = device.slm.phase_noise_rad * rng.standard_normal(phase.shape)
+        exit_field = self.optics.exit_field(phase, noise, flicker)
         frames = self._frames(exit_field, shift, rng)
         return SimulatedPage(frames, exit_field, self._piston, shift)
 
     def references(self) -> FramePair:
         """Reference-only frames, the mean of so many exposures that only quantisation is left."""
         return self._frames(None, (0.0, 0.0), None)
+
+    def dark(self) -> FramePair:
+        """Frames without any light, in which hot pixels alone show."""
+        sensor, dark = self.device.sensor, np.zeros(self.profile.frame_shape, np.uint16)
+        frames = (blemishes.counted(dark, sensor) for blemishes in self.optics.blemishes)
+        return FramePair(*(frame.astype(frame_type(sensor.bit_depth)) for frame in frames))
 
     def _drift(self) -> None:
         """Walk on by one page; its noise has a stream of its own, so that pages can pass without being computed."""
@@ -148,24 +156,26 @@ class Simulator:
         homodyne = device.homodyne
         error, sign = np.deg2rad(homodyne.quadrature_error_deg), homodyne.quadrature_sign
         piston, frames = np.complex64(np.exp(1j * self._piston)), []
-        together = device.in_phase_camera.axial_rad == device.quadrature_camera.axial_rad
+        together = Place.of(device.in_phase_camera) == Place.of(device.quadrature_camera)
         field: Complex = np.zeros(1, np.complex64)
         if exit_field is not None and together:
             field = self.optics.camera_field(exit_field) * piston
-        for pose, quadrature in ((device.in_phase_camera, False), (device.quadrature_camera, True)):
+        for which, pose in enumerate((device.in_phase_camera, device.quadrature_camera)):
             reference = self._reference_behind(pose, shift)
             if exit_field is not None and not together:
                 field = self.optics.camera_field(exit_field, pose) * piston
-            if quadrature:
+            if which:
                 intensity = homodyne.quadrature_gain * quadrature_intensity(field, reference, error, sign)
             else:
                 intensity = in_phase_intensity(field, reference)
+            blemishes = self.optics.blemishes[which]
             seen = resample(intensity, *self.optics.camera_axes_m, *self.optics.view(pose, shift))
+            seen = seen * blemishes.transmission
             if noise is None:
                 counts = to_counts(seen * self.optics.electrons_per_unit, device.sensor)
             else:
                 counts = expose(seen, self.optics.electrons_per_unit, device.sensor, noise)
-            frames.append(counts.astype(frame_type(device.sensor.bit_depth)))
+            frames.append(blemishes.counted(counts, device.sensor).astype(frame_type(device.sensor.bit_depth)))
         return FramePair(*frames)
 
     def _reference_behind(self, pose: CameraPose, shift: tuple[float, float]) -> Complex:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,15 +12,17 @@ from numpy.typing import NDArray
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.parameters import NAMES, as_dict, as_vector
 from lightpage.calibration.waves.wave_model import defocus, fitted_geometry
+from lightpage.device.lens_path import SeidelTerms
 from lightpage.device.profile import Profile
 from lightpage.device.state import CameraPose, Device, SlmDefects
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.page.modulation import NOMINAL, Modulation, basis
 from lightpage.page.symbols import symbol_phases
 from lightpage.recording.frame_pair import FramePair
-from lightpage.simulator.cameras import CameraView
+from lightpage.simulator.cameras import Blemishes, CameraView
+from lightpage.simulator.modulator import dead_pixels, modulated, with_crosstalk
 from lightpage.waves.channel import WaveChannel
-from lightpage.waves.geometry import WaveGeometry, cells_for
+from lightpage.waves.geometry import WaveGeometry, cells_for, taper_defocus
 from lightpage.waves.grid import splitting_steps
 
 Real = NDArray[np.floating]
@@ -35,6 +39,24 @@ _RIPPLE = 1
 """The random stream of the reference's ripple; a simulator draws others from a seed of its own."""
 
 
+class Place(NamedTuple):
+    """How a camera stands against its focal plane, by the numbers of its pose."""
+
+    axial_rad: float
+    tilt_x_rad: float
+    tilt_y_rad: float
+
+    @classmethod
+    def of(cls, pose: CameraPose) -> Place:
+        """The place of a camera."""
+        return cls(pose.axial_rad, pose.tilt_x_rad, pose.tilt_y_rad)
+
+    @property
+    def tilt_rad(self) -> tuple[float, float]:
+        """Both tilts."""
+        return self.tilt_x_rad, self.tilt_y_rad
+
+
 class TrueOptics:
     """The noise-free optics of one device: what a simulator, or an oracle that may know the truth, computes with."""
 
@@ -42,11 +64,12 @@ class TrueOptics:
         self.profile = profile
         self.device = device
         self._steps = splitting_steps(profile) if steps is None else steps
+        self._tilted: dict[tuple[float, float], WaveChannel] = {}
 
     @cached_property
     def geometry(self) -> WaveGeometry:
-        """The true geometry."""
-        return fitted_geometry(self.profile, as_dict(true_parameters(self.profile, self.device)))
+        """The true geometry; its cameras stand where they do on average."""
+        return true_geometry(self.profile, self.device, self._mean_place.tilt_rad)
 
     @cached_property
     def page_axes_m(self) -> tuple[Real, Real]:
@@ -108,29 +131,68 @@ class TrueOptics:
         """Factor that makes the signal's mean power over the page's image one."""
         size = self.profile.page.symbol_size_px
         symbols = np.exp(2j * np.pi * np.random.default_rng(0).random(self.profile.page_shape))
-        field = self.channel.exit_field(self.slm_factor * np.kron(symbols, np.ones((size, size))))
+        field = self._through(np.kron(symbols, np.ones((size, size))))
         # the de-launch is unitary on samples of the camera's pitch, and the page is imaged at its own size
         samples = self.profile.page_width_m * self.profile.page_height_m / self.profile.camera.pitch_m**2
         return float(np.sqrt(samples) / np.linalg.norm(field))
 
-    def exit_field(self, page_phase: Real, noise_rad: Real | float = 0.0) -> Complex:
+    def exit_field(self, page_phase: Real, noise_rad: Real | float = 0.0, flicker_rad: float = 0.0) -> Complex:
         """Nominal phase written on the SLM [ny, nx], radians, to the field on the exit facet.
 
         Args:
             page_phase: of the levels, as their numbers say.
             noise_rad: phase that is added to what the SLM makes of them.
+            flicker_rad: phase that is added to one of 2 pi, and to others in proportion.
         """
-        shown = modulated(self.device.slm, page_phase) * np.exp(1j * np.asarray(noise_rad))
-        return self.signal_scale * self.channel.exit_field(self.slm_factor * shown)
+        slm = self.device.slm
+        if flicker_rad:
+            stroke = slm.stroke_relative_error + flicker_rad / (2 * np.pi)
+            slm = slm.model_copy(update={"stroke_relative_error": stroke})
+        shown = modulated(slm, with_crosstalk(page_phase, slm.crosstalk_relative)) * np.exp(1j * np.asarray(noise_rad))
+        if self._dead_pixels is not None:
+            dead, light = self._dead_pixels
+            shown[dead] = light
+        return self.signal_scale * self._through(shown)
+
+    @cached_property
+    def _dead_pixels(self) -> tuple[NDArray[np.bool_], Complex] | None:
+        page_x, page_y = self.page_axes_m
+        return dead_pixels(self.device.slm, (len(page_y), len(page_x))) if self.device.slm.dead_pixel_share else None
+
+    def _through(self, light: Complex) -> Complex:
+        """Light on the SLM [ny, nx], illuminated evenly, to the exit facet, what the facets reflect included."""
+        field, ghost = self.channel.exit_field(self.slm_factor * light), self.device.geometry.ghost_relative
+        if ghost:
+            back = self.channel.pipe.forward(field)
+            field = field + ghost * self.channel.pipe.forward(back)
+        return field
+
+    @cached_property
+    def blemishes(self) -> tuple[Blemishes, Blemishes]:
+        """Hot pixels and dust of the in-phase and of the quadrature camera."""
+        camera, sensor = self.profile.camera, self.device.sensor
+        return Blemishes.of(camera, sensor, 0), Blemishes.of(camera, sensor, 1)
 
     def camera_field(self, exit_field: Complex, camera: CameraPose | None = None) -> Complex:
         """Field on the exit facet to the computed camera plane, of one camera, or of where both stand on average."""
-        return self.channel.camera_field(exit_field, 0.0 if camera is None else self._beyond_mean(camera))
+        place = self._mean_place if camera is None else Place.of(camera)
+        beyond = defocus(place.axial_rad - self._mean_place.axial_rad, self.geometry.pipe_width_m)
+        return self._channel_to(place.tilt_rad).camera_field(exit_field, float(beyond))
 
-    def _beyond_mean(self, camera: CameraPose) -> float:
-        """Defocus of a camera beyond that of both on average, rad/m^2 of the facet."""
-        mean = (self.device.in_phase_camera.axial_rad + self.device.quadrature_camera.axial_rad) / 2
-        return float(defocus(camera.axial_rad - mean, self.geometry.pipe_width_m))
+    def _channel_to(self, tilt_rad: tuple[float, float]) -> WaveChannel:
+        """The channel to a camera plane that is tilted like this."""
+        if tilt_rad == self._mean_place.tilt_rad:
+            return self.channel
+        if tilt_rad not in self._tilted:
+            geometry = true_geometry(self.profile, self.device, tilt_rad)
+            self._tilted[tilt_rad] = replace(self.channel, geometry=geometry)
+        return self._tilted[tilt_rad]
+
+    @cached_property
+    def _mean_place(self) -> Place:
+        """The middle between the places of both cameras."""
+        both = (Place.of(pose) for pose in (self.device.in_phase_camera, self.device.quadrature_camera))
+        return Place(*((one + other) / 2 for one, other in zip(*both, strict=True)))
 
     @cached_property
     def reference_in_place(self) -> Complex:
@@ -174,15 +236,6 @@ class TrueOptics:
         return full / brightest / max(1.0, self.device.homodyne.quadrature_gain)
 
 
-def modulated(slm: SlmDefects, phase: Real) -> Complex:
-    """Light that a modulator makes of levels of so much nominal phase, radians; of unit amplitude on average nearly."""
-    turn = phase + slm.stroke_relative_error * phase
-    turn = turn + slm.level_sine_rad * np.sin(phase) + slm.level_cosine_rad * np.cos(phase)
-    turn = turn + slm.level_sine_twice_rad * np.sin(2 * phase)
-    amplitude = 1 + slm.level_amplitude_relative * np.cos(phase)
-    return np.asarray(amplitude * np.exp(1j * turn) + slm.unmodulated_relative * np.exp(1j * slm.unmodulated_phase_rad))
-
-
 def perfectly_calibrated(profile: Profile, device: Device, references: FramePair) -> CalibratedDevice:
     """A device as a calibration without any error would find it."""
     parameters, modulation = true_parameters(profile, device), true_modulation(device.slm)
@@ -202,19 +255,58 @@ def true_modulation(slm: SlmDefects) -> Modulation:
     return Modulation((*phase[:-1].tolist(), *amplitude[:-1].tolist()))
 
 
+def true_geometry(profile: Profile, device: Device, camera_tilt_rad: tuple[float, float]) -> WaveGeometry:
+    """The geometry with all that the twin's parameters lack, and with cameras in their mean place, tilted like this."""
+    g, fitted = device.geometry, fitted_geometry(profile, as_dict(true_parameters(profile, device)))
+
+    def tilted(path: SeidelTerms, tilt_x_rad: float, tilt_y_rad: float) -> SeidelTerms:
+        tilt_x, tilt_y = (float(defocus(tilt, fitted.pipe_width_m)) for tilt in (tilt_x_rad, tilt_y_rad))
+        return path._replace(tilt_x=tilt_x / (profile.page_width_m / 2), tilt_y=tilt_y / (profile.page_height_m / 2))
+
+    return replace(
+        fitted,
+        focal_length_m=profile.lens.focal_length_m * (1 + g.focal_length_relative_error),
+        pipe_height_relative=g.pipe_height_relative_error,
+        pipe_taper=g.pipe_taper_relative,
+        lens_path=tilted(fitted.lens_path, g.modulator_tilt_x_rad, g.modulator_tilt_y_rad),
+        # a lens from camera plane to facet, whose adjoint is used
+        camera_path=tilted(fitted.camera_path, -camera_tilt_rad[0], -camera_tilt_rad[1]),
+    )
+
+
+def _like_taper(profile: Profile, device: Device) -> tuple[float, float, float]:
+    """What a taper does, told by parameters that a twin has, to first order.
+
+    Returns:
+        Relative change of the focal length, and what is added to the axial places of modulator and cameras, radians.
+        The cameras' scale is that over 1 + taper.
+    """
+    g, light = device.geometry, profile.light
+    length = profile.pipe.length_m * (1 + g.pipe_length_relative_error)
+    width = profile.pipe.width_m * (1 + g.pipe_width_relative_error)
+    in_glass = profile.pipe.refractive_index * 2 * np.pi / light.wavelength_m
+    bent = taper_defocus(in_glass, length, g.pipe_taper_relative)
+    at_entrance, at_exit = (float(factor) * (width / 2) ** 2 for factor in bent)
+    return (1 + g.pipe_taper_relative) ** 0.5 - 1, at_entrance, at_exit
+
+
 def true_parameters(profile: Profile, device: Device) -> NDArray[np.float64]:
-    """The truth as a ray twin's parameter vector [P] (see `lightpage.calibration.parameters`)."""
+    """The truth as a ray twin's parameter vector [P] (see `lightpage.calibration.parameters`).
+
+    A taper is told by what it does to other parameters. Tilts, walls of two distances and ghosts have none.
+    """
     g, pitch = device.geometry, profile.slm.pitch_m
+    longer, at_modulator, at_cameras = _like_taper(profile, device)
     values = dict.fromkeys(NAMES, 0.0)
     values |= {
         "pipe_angle_rad": np.deg2rad(g.pipe_angle_deg - profile.pipe.angle_deg),
-        "focal_length_relative": g.focal_length_relative_error,
+        "focal_length_relative": g.focal_length_relative_error + (1 + g.focal_length_relative_error) * longer,
         "pipe_length_relative": g.pipe_length_relative_error,
         "pipe_width_relative": g.pipe_width_relative_error,
         "page_centre_x_m": g.page_shift_x_px * pitch,
         "page_centre_y_m": g.page_shift_y_px * pitch,
         "pipe_roll_rad": np.deg2rad(g.pipe_roll_deg),
-        "modulator_axial_rad": g.modulator_axial_rad,
+        "modulator_axial_rad": g.modulator_axial_rad + at_modulator,
         "launch_defocus_rad": device.aberration.defocus_rad,
         "launch_astigmatism_0_rad": device.aberration.astigmatism_rad,
         "launch_coma_x_rad": device.aberration.coma_rad,
@@ -226,7 +318,8 @@ def true_parameters(profile: Profile, device: Device) -> NDArray[np.float64]:
         "distortion_relative": device.aberration.distortion_relative,
     }
     for camera, pose in (("in_phase", device.in_phase_camera), ("quadrature", device.quadrature_camera)):
-        scale, rotation = 1 + pose.scale_relative_error, np.deg2rad(pose.rotation_deg)
+        scale = (1 + pose.scale_relative_error) / (1 + g.pipe_taper_relative)
+        rotation = np.deg2rad(pose.rotation_deg)
         values |= {
             f"{camera}_shift_x_px": pose.shift_x_px,
             f"{camera}_shift_y_px": pose.shift_y_px,
@@ -234,7 +327,7 @@ def true_parameters(profile: Profile, device: Device) -> NDArray[np.float64]:
             f"{camera}_scale_y_relative": scale * np.cos(rotation) - 1,
             f"{camera}_turn_xy_slope": -scale * np.sin(rotation),
             f"{camera}_turn_yx_slope": scale * np.sin(rotation),
-            f"{camera}_axial_rad": pose.axial_rad,
+            f"{camera}_axial_rad": pose.axial_rad + at_cameras,
             f"{camera}_keystone_x_relative": pose.keystone_x_relative,
             f"{camera}_keystone_y_relative": pose.keystone_y_relative,
         }

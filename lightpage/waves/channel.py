@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lightpage.waves.geometry import (
     Complex,
@@ -88,14 +90,14 @@ class WaveChannel:
     @cached_property
     def entrance_window(self) -> Real:
         """Transmission of the SLM's pixel shape and blur at the entrance facet, [cells_y - 1, cells_x - 1]."""
-        facet_y, facet_x = (facet_axis(count, self.geometry.pipe_width_m) for count in self.cells)
+        facet_y, facet_x = map(facet_axis, self.cells, self.geometry.facet_sides_m())
         window = entrance_window(self.geometry, facet_x, facet_y, self.envelope_m, self.blur_m)
         return np.asarray(window, dtype=np.float32)
 
     @cached_property
     def facet_radius2_m2(self) -> Real:
-        """R^2 of the facets' samples, [cells_y - 1, cells_x - 1]."""
-        facet_y, facet_x = (facet_axis(count, self.geometry.pipe_width_m) for count in self.cells)
+        """R^2 of the exit facet's samples, [cells_y - 1, cells_x - 1]."""
+        facet_y, facet_x = map(facet_axis, self.cells, self.geometry.facet_sides_m(second=True))
         along, upward = on_facet(couplings(self.geometry), facet_x, facet_y[:, None])
         return np.asarray(along**2 + upward**2)
 
@@ -103,9 +105,14 @@ class WaveChannel:
         """Field on the SLM [ny, nx] to the field on the camera plane."""
         return self.camera_field(self.exit_field(field))
 
-    def exit_field(self, field: Complex) -> Complex:
-        """Field on the SLM [ny, nx] to the field on the exit facet's grid."""
-        return self.pipe.forward(self.launch_lens.to_facet(field) * self.entrance_window)
+    def exit_field(self, field: Complex, passed: NDArray[Any] | float = 1.0) -> Complex:
+        """Field on the SLM [ny, nx] to the field on the exit facet's grid.
+
+        Args:
+            field: on the SLM.
+            passed: share of the light's amplitude that the entrance facet lets pass, over its grid or everywhere.
+        """
+        return self.pipe.forward(self.launch_lens.to_facet(field) * (self.entrance_window * passed))
 
     def camera_field(self, exit_field: Complex, defocus: float = 0.0) -> Complex:
         """Field on the exit facet's grid to the field on the camera plane, or on a plane of further `defocus`.
@@ -122,10 +129,20 @@ class WaveChannel:
         down, across = self._between
         return real_products(down, sparse, across.T)
 
-    def adjoint(self, field: Complex) -> Complex:
-        """Field on the camera plane back to the SLM: undoes the pipe exactly, the chain inside the pipe's band."""
+    def to_exit(self, field: Complex, defocus: float = 0.0) -> Complex:
+        """Field on the camera plane, or on one of further `defocus`, back to the exit facet's grid, by the adjoint."""
         if self._between is not None:
             down, across = self._between
             field = real_products(down.T, field, across)
-        at_entrance = self.pipe.adjoint(self.delaunch_lens.to_facet(field))
-        return self.launch_lens.to_plane(at_entrance * self.entrance_window)
+        exit_field = self.delaunch_lens.to_facet(field)
+        if defocus:
+            exit_field = exit_field * np.exp(-1j * defocus * self.facet_radius2_m2).astype(np.complex64)
+        return exit_field
+
+    def to_page(self, exit_field: Complex) -> Complex:
+        """Field on the exit facet's grid back to the SLM, by the adjoint: undoes the pipe exactly."""
+        return self.launch_lens.to_plane(self.pipe.adjoint(exit_field) * self.entrance_window)
+
+    def adjoint(self, field: Complex) -> Complex:
+        """Field on the camera plane back to the SLM: undoes the pipe exactly, the chain inside the pipe's band."""
+        return self.to_page(self.to_exit(field))

@@ -30,11 +30,16 @@ class WaveGeometry:
     focal_length_m: float
     pipe_length_m: float
     pipe_width_m: float
+    """Distance of the walls along x, the geometric mean over both facets."""
     refractive_index: float
     pipe_angle: float = 0.0
     """Shear t of the cross-section."""
     pipe_roll: float = 0.0
     """Rotation of the pipe about the optical axis, from x towards y, against page and cameras."""
+    pipe_height_relative: float = 0.0
+    """Distance of the walls along y' over that along x, less one."""
+    pipe_taper: float = 0.0
+    """Both distances at the exit over those at the entrance, less one; `taper_defocus` belongs to the lenses' paths."""
     lens_path: SeidelTerms = IDEAL
     """Of the first lens, the modulator's axial place included."""
     camera_path: SeidelTerms = IDEAL
@@ -44,6 +49,26 @@ class WaveGeometry:
     def wave_number(self) -> float:
         """Free-space k, rad/m."""
         return 2 * np.pi / self.wavelength_m
+
+    def facet_sides_m(self, *, second: bool = False) -> tuple[float, float]:
+        """Sides along (y', x) of the entrance facet, or of the `second` one, the exit."""
+        width = self.pipe_width_m * (1 + self.pipe_taper) ** (0.5 if second else -0.5)
+        return width * (1 + self.pipe_height_relative), width
+
+
+def taper_defocus(wave_number: float, length_m: float, taper: float) -> tuple[float, float]:
+    """What a taper of the pipe bends: factors of R^2 on entrance and exit, rad/m^2.
+
+    Modes of widening walls are those of even ones under exp(i k w'/(2 w) R^2), w' being the growth of the width per
+    length. This is exact for paraxial light and walls that run straight.
+
+    Args:
+        wave_number: k in the glass, rad/m.
+        length_m: of the pipe.
+        taper: see `WaveGeometry`.
+    """
+    bend = wave_number * taper / (2 * length_m)
+    return -bend, bend / (1 + taper)
 
 
 def modes_for(half_extent_m: float, geometry: WaveGeometry, margin: float) -> int:
@@ -68,11 +93,15 @@ def cells_for(
     """
     reach_x, reach_y = float(np.abs(page_x_m).max()), float(np.abs(page_y_m).max())
     shear = abs(geometry.pipe_roll) + 2 * abs(geometry.pipe_angle)
+    wider = (1 + abs(geometry.pipe_taper)) ** 0.5
+    higher = wider * (1 + geometry.pipe_height_relative)
 
-    def cells(reach: float, seen: float) -> int:
-        return max(modes_for(reach, geometry, _MODE_MARGIN), modes_for((reach + seen) / 2, geometry, margin=1))
+    def cells(reach: float, seen: float, larger: float) -> int:
+        return max(
+            modes_for(reach, geometry, _MODE_MARGIN * larger), modes_for((reach + seen) / 2, geometry, margin=larger)
+        )
 
-    return cells(reach_y + shear * reach_x, seen_y_m), cells(reach_x + shear * reach_y, seen_x_m)
+    return cells(reach_y + shear * reach_x, seen_y_m, higher), cells(reach_x + shear * reach_y, seen_x_m, wider)
 
 
 def sine_matrix(cells: int) -> Real:
@@ -90,14 +119,15 @@ def mode_detuning(geometry: WaveGeometry, rows: Real, columns: Real) -> Real:
     """kz - nk of the square pipe's sine modes, rad/m.
 
     Args:
-        geometry: the device; its shear does not count.
+        geometry: the device; neither shear nor taper count.
         rows, columns: mode numbers along y' and x, arrays that broadcast.
 
     Raises:
         ValueError: a mode that does not propagate.
     """
     nk = geometry.refractive_index * geometry.wave_number
-    transverse = (np.pi / geometry.pipe_width_m) ** 2 * (rows**2 + columns**2)
+    higher = 1 + geometry.pipe_height_relative
+    transverse = (np.pi / geometry.pipe_width_m) ** 2 * ((rows / higher) ** 2 + columns**2)
     if transverse.max() >= nk**2:
         raise ValueError(f"modes: got transverse wave number {np.sqrt(transverse.max()):.3g}, wanted below {nk:.3g}")
     return np.asarray(detuning(nk, transverse, np.sqrt))
@@ -130,15 +160,15 @@ def on_facet(factors: Couplings, across: Any, up: Any) -> tuple[Any, Any]:
 
 
 def highest_frequencies(geometry: WaveGeometry, path: SeidelTerms, x_m: Real, y_m: Real) -> tuple[float, float]:
-    """Bounds on the frequencies along x and y that a facet's light has on a lens's plane, cycles a metre.
+    """Bounds on the frequencies along x and y that the exit facet's light has on a lens's plane, cycles a metre.
 
     Args:
         geometry: the device.
         path: of that lens.
         x_m, y_m: what is looked at of the plane.
     """
-    edge, factors = geometry.pipe_width_m / 2, np.abs(couplings(geometry))
-    furthest = on_facet(Couplings(*factors), edge, edge)
+    (height, width), factors = geometry.facet_sides_m(second=True), np.abs(couplings(geometry))
+    furthest = on_facet(Couplings(*factors), width / 2, height / 2)
     corner = np.abs(x_m).max(), np.abs(y_m).max()
     # each term as if it added to the others at the corner of both planes
     slopes = SeidelTerms(*np.abs(path)).slope_on_field(*corner, *furthest)

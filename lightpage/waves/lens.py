@@ -114,15 +114,16 @@ class FourierLens:
     def __init__(
         self, geometry: WaveGeometry, x_m: Real, y_m: Real, cells: tuple[int, int], *, second: bool = False
     ) -> None:
-        w = geometry.pipe_width_m
-        facet_y, facet_x = (facet_axis(count, w) for count in cells)
+        height, width = geometry.facet_sides_m(second=second)
+        facet_y, facet_x = facet_axis(cells[0], height), facet_axis(cells[1], width)
         factors = couplings(geometry)
         path = geometry.camera_path if second else geometry.lens_path
 
         def kernel(factor: float, rows: Real, columns: Real) -> Complex:
             return lens_kernel(geometry, factor * rows, columns)
 
-        area = (x_m[1] - x_m[0]) * (y_m[1] - y_m[0]) * (w / cells[0]) * (w / cells[1]) / np.cos(geometry.pipe_angle)
+        cell_y, cell_x = height / cells[0], width / cells[1]
+        area = (x_m[1] - x_m[0]) * (y_m[1] - y_m[0]) * cell_y * cell_x / np.cos(geometry.pipe_angle)
         unitary = np.sqrt(area) / (geometry.wavelength_m * geometry.focal_length_m)
         self.x_to_x = (unitary * kernel(factors.x_to_x, x_m, facet_x)).astype(np.complex64)
         self.y_and_x = kernel(factors.y_to_x, y_m, facet_x).astype(np.complex64)

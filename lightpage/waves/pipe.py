@@ -21,6 +21,9 @@ class PipePropagator:
     apart and weakly coupled, and in the pipe the phase of what they exchange turns; but kicks in the rhythm of those
     turns would drive it. That is most of what few steps do wrong.
 
+    The modes of a pipe that tapers widen with it and are bent: paraxially, they are those of an even pipe of the mean
+    width between facets of other widths. The phase on each facet (`taper_defocus`) is not applied here.
+
     Args:
         geometry: the device.
         cells: sample intervals along (y', x).
@@ -39,11 +42,15 @@ class PipePropagator:
         self.steps = steps if self.sheared else 1
         w, nk = geometry.pipe_width_m, geometry.refractive_index * geometry.wave_number
         dz = geometry.pipe_length_m / self.steps
-        self.bases = [_parity_basis(n, float(dz * (np.pi / w) ** 2 / (2 * nk))) for n in cells]
+        sides = w * (1 + geometry.pipe_height_relative), w
+        self.bases = [
+            _parity_basis(n, float(dz * (np.pi / side) ** 2 / (2 * nk))) for n, side in zip(cells, sides, strict=True)
+        ]
         y, x = (basis.mode_numbers for basis in self.bases)
         detuning = mode_detuning(geometry, y[:, None, :, None], x[None, :, None, :])
         self.half = np.exp(0.5j * dz * detuning).astype(np.complex64)
         coupling = np.outer(self.bases[0].couplings, self.bases[1].couplings) / w**2
+        coupling /= 1 + geometry.pipe_height_relative
         angle = dz / nk * np.sin(geometry.pipe_angle) * coupling
         self.cos = np.cos(angle).astype(np.float32)
         self.sin = np.sin(angle).astype(np.float32)

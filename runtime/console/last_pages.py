@@ -35,6 +35,7 @@ class PageRow:
         shift_x_px, shift_y_px: of the image since calibration, camera pixels.
         piston_rad: of the page.
         residual_rad: smooth phase error that was taken off.
+        stroke_relative: of the modulator since calibration, as the page's pilots show it.
         recalibration_due: whether the page by itself says so.
     """
 
@@ -53,11 +54,12 @@ class PageRow:
     shift_y_px: float | None
     piston_rad: float | None
     residual_rad: float | None
+    stroke_relative: float | None
     recalibration_due: bool
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures by name; None for what is not a number."""
-        return {name: _number(value) if isinstance(value, float) else value for name, value in vars(self).items()}
+        return {name: None if isinstance(v, float) and not np.isfinite(v) else v for name, v in vars(self).items()}
 
 
 @dataclass(frozen=True)
@@ -123,7 +125,6 @@ class LastPages:
 def _row(observation: Observation) -> PageRow:
     page, data = observation.page, observation.user_data
     image = None if page is None else page.image
-    unread = None if data is None or data.loss is None else data.loss.value
     return PageRow(
         time_s=observation.time_s,
         subject=observation.subject,
@@ -131,7 +132,7 @@ def _row(observation: Observation) -> PageRow:
         model_version=observation.model_version,
         seconds=observation.seconds,
         lost=None if observation.lost is None else observation.lost.value,
-        unread=unread,
+        unread=None if data is None or data.loss is None else data.loss.value,
         margin_bits=None if data is None else data.margin_bits,
         air_bits=None if page is None else page.information_bits,
         trust=None if page is None else page.pilot_trust,
@@ -140,9 +141,6 @@ def _row(observation: Observation) -> PageRow:
         shift_y_px=None if image is None else image.shift_y_px,
         piston_rad=None if page is None else page.piston_rad,
         residual_rad=None if page is None else page.residual_rad,
+        stroke_relative=None if page is None else page.stroke_relative,
         recalibration_due=page is not None and bool(page.check.recalibration_due),
     )
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

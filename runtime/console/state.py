@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import fields
 from typing import Any
 
 from lightpage.runtime.console.actions import ROLE, Actions
@@ -19,7 +20,7 @@ POINTS = 600
 RECENT = 50
 """Pages in the table."""
 _IDLE_S = 30.0
-_SERIES = ("margin_bits", "air_bits", "trust", "share", "shift_x_px", "shift_y_px", "piston_rad", "residual_rad")
+_SERIES = [figure.name for figure in fields(PageRow) if figure.type == "float | None"]
 
 
 class ConsoleState:

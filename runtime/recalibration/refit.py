@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lightpage.calibration.calibrate import LEAST_KEPT, KnownPage, refine
 from lightpage.calibration.document import Calibration
 from lightpage.calibration.image_search import REACH_PX
 from lightpage.calibration.interfaces import FieldSolver, Twin
-from lightpage.calibration.parameters import NAMES
-from lightpage.calibration.sampling_table import sampling_table
+from lightpage.calibration.sampling_table import moved_cameras, sampling_table
 from lightpage.errors import BundleError, CalibrationError
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import symbol_phases
@@ -24,8 +22,6 @@ from lightpage.runtime.model.decoding.image_position import ImagePosition
 from lightpage.runtime.model.execution.twin import OnnxTwin
 from lightpage.runtime.recalibration.known_pages import KnownPages
 from lightpage.runtime.recalibration.recalibration import RefitReport, RefitResult
-
-Real = NDArray[np.float64]
 
 _REFITTED = frozenset({"places", "parameters"})
 """Inputs that a re-fitted geometry is fed to, by one of which a decoder knows it."""
@@ -69,7 +65,9 @@ def refit(
     twin = OnnxTwin(bundle) if twin is None else twin
     progress("find the image", 0.0)
     image = _find(decoder, twin, pages, references)
-    start = moved_cameras(earlier.vector, image)
+    start = earlier.vector
+    if image is not None:
+        start = moved_cameras(start, np.array([image.shift_x_px, image.shift_y_px]))
     known = [
         KnownPage(pair, np.exp(1j * symbol_phases(symbols, pages.levels)))
         for pair, symbols in zip(pages.pairs, pages.symbols, strict=True)
@@ -101,15 +99,15 @@ def refit(
         )
     hashes = [hash_frames(pair) for pair in pages.pairs]
     fitted = earlier.followed_by(Calibration.from_registered(registered, profile, hashes))
+    if not earlier.is_wrong:
+        fitted.check_good("re-fit, outcome", ": else calibrate anew")
     table = {
         "reference_in_phase": references.in_phase,
         "reference_quadrature": references.quadrature,
         **sampling_table(twin, registered.parameters, registered.quadrature_phase, profile),
     }
-    if "parameters" in decoder.graph.ports:
-        table["parameters"] = table["parameters"][: decoder.graph.ports["parameters"].shape[0]]
     return RefitResult(
-        table={name: value for name, value in table.items() if name in decoder.graph.ports},
+        table=decoder.taken(table),
         calibration_toml=fitted.to_toml(),
         report=RefitReport(
             angle_deg=fitted.angle_deg(profile),
@@ -134,16 +132,6 @@ def _find(decoder: Decoder, twin: Twin, pages: KnownPages, references: FramePair
     found = BundleSearch(decoder, twin).find(pages.pairs[0], pilots, around, references)
     x, y = map(float, found.shift_px)
     return ImagePosition(x, y, searched=True, found=True) if found.found else None
-
-
-def moved_cameras(parameters: Real, image: ImagePosition | None) -> Real:
-    """A device's parameters [P] with both cameras where the image was found."""
-    moved = parameters.copy()
-    if image is not None:
-        for camera in ("in_phase", "quadrature"):
-            moved[NAMES.index(f"{camera}_shift_x_px")] += image.shift_x_px
-            moved[NAMES.index(f"{camera}_shift_y_px")] += image.shift_y_px
-    return moved
 
 
 def _kept_references(bundle: Bundle) -> FramePair | None:

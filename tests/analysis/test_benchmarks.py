@@ -1,7 +1,5 @@
 """Every benchmark can be called, and those that take hours are told how to run small."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import os

@@ -1,7 +1,5 @@
 """The demo: decoding fails by drift and comes back by recalibration, with figures that say so."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

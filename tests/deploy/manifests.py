@@ -1,7 +1,5 @@
 """The manifests of deploy/kubernetes, and the schemas that they are held against."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The manifests for Kubernetes: valid by its own schemas, right in themselves, and taken by this program."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import shutil

@@ -1,7 +1,5 @@
 """The probes of the manifest, asked as kubelet asks them, of the service that the manifest starts."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

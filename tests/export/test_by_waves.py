@@ -1,7 +1,5 @@
 """A decoder of two passes as a bundle: it follows a device that drifts, and the image."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Deep recalibration: what it needs, and that a drifted device reads better after it than after a re-fit alone."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from importlib.metadata import EntryPoint

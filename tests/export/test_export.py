@@ -1,10 +1,9 @@
 """An exported run says what torch says, carries its table as a default, and fails loudly where it does not."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -36,7 +35,7 @@ from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
 from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.train.runs import GOLDEN, REFERENCES, WEIGHTS, load_run
 from lightpage.waves.grid import field_grid
-from tests.lightpage.small import small_profile
+from tests.lightpage.small import UNEXPLAINED, small_profile
 
 
 @pytest.fixture(scope="module")
@@ -207,6 +206,16 @@ def test_a_run_file_that_was_cut_off_is_named(small_run: Path, tmp_path: Path, n
         (cut / name).write_bytes((small_run / name).read_bytes()[:size])
         with pytest.raises(InvalidInputError, match=name):
             export_run(cut, tmp_path / "n.zip")
+
+
+def test_a_run_with_a_wrong_fit_is_not_exported_unasked(small_run: Path, tmp_path: Path) -> None:
+    folder, run = tmp_path / "run", load_run(small_run)
+    folder.mkdir()
+    wrong = run.calibration.model_copy(update={"goodness": UNEXPLAINED})
+    replace(run, calibration_toml=wrong.to_toml()).save(folder)
+    for words, message in (((), "wrong fit"), (("--accept-wrong-fit",), "arrays")):
+        result = CliRunner().invoke(export, [str(folder), "--out", str(tmp_path / "b.zip"), *words])
+        assert message in str(result.exception)
 
 
 def test_parity_is_judged_against_the_norm_and_never_passes_nan() -> None:

@@ -1,7 +1,5 @@
 """Graphs as files: a large constant is kept once; what is halved, what stays, and rounding that a CPU shows too."""
 
-from __future__ import annotations
-
 import numpy as np
 import onnx
 import pytest

@@ -1,7 +1,5 @@
 """The exported decoders run on CUDA and TensorRT but for the nodes named here, and a planted one is found."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Published decoders as bundles: what the runtime says of a recording is what torch says."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +18,7 @@ from lightpage.train.published.training import PublishedChoices
 from lightpage.train.runs import load_run, load_weights
 
 
+@pytest.mark.usefixtures("ready_twin")
 def test_a_published_decoder_runs_without_torch_and_says_the_same(
     ray_run: Path, small_device: list[str], tmp_path: Path
 ) -> None:

@@ -1,7 +1,5 @@
 """A disk without room, for tests: the system lets no file of this process grow beyond a size."""
 
-from __future__ import annotations
-
 import resource
 from collections.abc import Generator
 from contextlib import contextmanager

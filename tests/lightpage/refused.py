@@ -1,7 +1,5 @@
 """What an error names, without the sentence that it makes of it."""
 
-from __future__ import annotations
-
 from collections.abc import Generator
 from contextlib import contextmanager
 

@@ -1,13 +1,11 @@
 """A device for tests, an eighth of the full size: zones, symbols and sampling of `bench` on a quarter of its area."""
 
-from __future__ import annotations
-
 import numpy as np
 
+from lightpage.calibration.goodness.verdict import Goodness
 from lightpage.device.profile import Camera, Lens, LensPath, PageLayout, Pipe, Profile, load_profile
-from lightpage.device.state import CameraPose, Device, ideal_device
+from lightpage.device.state import Device, ideal_device
 
-PLAIN_POSE = CameraPose()
 THICK = LensPath(
     piston_rad=-5,
     distortion_rad=-4.4,
@@ -17,6 +15,17 @@ THICK = LensPath(
     spherical_rad=-0.1,
 )
 """About what a real lens does at the full size."""
+EXPLAINED = Goodness(
+    verdict="good",
+    bits_lost=0.01,
+    unexplained_relative=1e-4,
+    noise_relative=2e-4,
+    modulator_noise_rad=0.05,
+    by_page=[[1.0] * 8] * 6,
+    by_facet=[[1.0] * 8] * 6,
+    cause="",
+)
+UNEXPLAINED = EXPLAINED.model_copy(update={"verdict": "wrong", "bits_lost": 1.2, "cause": "a curvature"})
 
 
 def small_profile() -> Profile:

@@ -7,6 +7,7 @@ import stat
 import sys
 import tempfile
 from pathlib import Path
+from unittest.mock import Mock
 
 import click
 import pytest
@@ -61,9 +62,7 @@ def test_content_and_name_are_on_the_disk_before_a_file_is_said_to_be_there(
 
 
 def test_a_write_that_fails_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
+    full = Mock(side_effect=OSError(28, "No space left on device"))
     (tmp_path / "F").write_text("earlier")
     with pytest.raises(SurroundingsError, match="F: got"):
         replace_file(tmp_path / "F", full)
@@ -76,11 +75,8 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path: Path, monkeypatch: p
 
 @pytest.mark.parametrize("links", [True, False])
 def test_a_file_that_is_there_keeps_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool) -> None:
-    def unsupported(made: Path, path: Path) -> None:
-        raise PermissionError(1, "Operation not permitted")
-
     if not links:
-        monkeypatch.setattr(os, "link", unsupported)
+        monkeypatch.setattr(os, "link", Mock(side_effect=PermissionError(1, "Operation not permitted")))
     made, final = tmp_path / "made", tmp_path / "final"
     made.write_text("first")
     move_to_new_name(made, final)
@@ -104,9 +100,7 @@ def test_files_have_the_modes_that_the_umask_leaves(tmp_path: Path) -> None:
 def test_what_a_file_system_lacks_is_gone_without(
     number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def lacking(*_: object) -> None:
-        raise OSError(number, os.strerror(number))
-
+    lacking = Mock(side_effect=OSError(number, os.strerror(number)))
     for name in ("fsync", "link", "chmod", "fchmod"):
         monkeypatch.setattr(os, name, lacking)
     monkeypatch.setattr(fcntl, "flock", lacking)
@@ -126,10 +120,7 @@ def test_what_a_file_system_lacks_is_gone_without(
 def test_what_is_needed_is_named(
     number: int, kind: type[Exception], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def failing(*_: object) -> None:
-        raise OSError(number, os.strerror(number))
-
-    monkeypatch.setattr(os, "fsync", failing)
+    monkeypatch.setattr(os, "fsync", Mock(side_effect=OSError(number, os.strerror(number))))
     with pytest.raises(kind, match="F"):
         replace_text(tmp_path / "F", "text")
     assert list(tmp_path.iterdir()) == []
@@ -175,9 +166,7 @@ def test_an_error_names_the_thing_what_came_and_what_was_wanted() -> None:
 
 
 def test_no_folder_for_temporary_files_is_named_with_the_variable(monkeypatch: pytest.MonkeyPatch) -> None:
-    def nowhere(*_: object) -> None:
-        raise FileNotFoundError(2, "No usable temporary directory found in ['/nowhere']")
-
+    nowhere = Mock(side_effect=FileNotFoundError(2, "No usable temporary directory found in ['/nowhere']"))
     monkeypatch.setattr(tempfile, "mkdtemp", nowhere)
     with pytest.raises(SurroundingsError, match=r"^scratch: .*TMPDIR"):
         temporary_folder("scratch")

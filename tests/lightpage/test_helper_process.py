@@ -1,7 +1,5 @@
 """An object in another process answers, fails, tells and ends as if it were here; whatever ends, nothing is left."""
 
-from __future__ import annotations
-
 import os
 import resource
 import signal

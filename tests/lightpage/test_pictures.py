@@ -1,7 +1,5 @@
 """Pictures for documents: small where nobody sees the difference, whole elsewhere."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

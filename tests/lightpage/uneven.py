@@ -1,7 +1,5 @@
 """Levels of a modulator that is not even, for tests."""
 
-from __future__ import annotations
-
 from lightpage.page.levels import Levels
 from lightpage.page.modulation import NAMES, NOMINAL, Modulation
 

@@ -3,8 +3,6 @@
 `make messages` writes the snapshot anew; nothing else in the tests holds a sentence fixed.
 """
 
-from __future__ import annotations
-
 import shlex
 import socket
 from collections.abc import Iterator

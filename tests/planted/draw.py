@@ -4,8 +4,6 @@
 out, and a fault that was there keeps its tests.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import hashlib

@@ -1,7 +1,5 @@
 """The list of faults, and where each lies in today's sources."""
 
-from __future__ import annotations
-
 import ast
 import json
 import subprocess

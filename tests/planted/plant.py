@@ -1,7 +1,5 @@
 """Plants each fault of the list in a copy of the files, and tells which of them the named tests find."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import hashlib

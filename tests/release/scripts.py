@@ -1,7 +1,5 @@
 """The scripts of release/ as modules: they lie in no package, since they run where nothing is installed."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """An audit that could not look a package up does not end as one that found nothing."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """What may be built is said before anything is, and an image that is not the work tree's is not taken for it."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,7 +1,5 @@
 """The locks name all that an image installs: versions of constraints.txt, a SHA-256 of each file, a known licence."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Iterable, Mapping

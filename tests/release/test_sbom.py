@@ -1,7 +1,5 @@
 """An SBOM names all that is in an image, is CycloneDX, and whatever differs from it afterwards is found."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Pages that `lightpage report` makes, and what a browser would see in them."""
 
-from __future__ import annotations
-
 import re
 from html.parser import HTMLParser
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`lightpage report` of a bulk run: finished or not, of every operation, and without a change to its folder."""
 
-from __future__ import annotations
-
 import html
 import re
 from pathlib import Path

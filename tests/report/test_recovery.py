@@ -1,7 +1,5 @@
 """`lightpage report` of what `lightpage recover --json` writes, and JSON that is neither that nor an evaluation."""
 
-from __future__ import annotations
-
 import base64
 import html
 import json

@@ -1,7 +1,5 @@
 """`lightpage report`: every section of a run and of an evaluation, their figures, and what is refused."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil
@@ -53,7 +51,7 @@ def test_a_run_of_two_passes(small_run: Path, tmp_path: Path) -> None:
     text, seen = page_of(small_run, tmp_path / "R.html")
     check_whole(text, seen, SECTIONS)
     counts = {name: len(pictures) for name, pictures in seen.pictures.items()}
-    assert counts == {"maps": 4, "reliability": 2, "training": 2, "page": 3, "rays": 4}
+    assert counts == {"geometry": 1, "maps": 4, "reliability": 2, "training": 2, "page": 3, "rays": 4}
     data, described = report_of_run(small_run), load_run(small_run)
     facts = dict(data.facts)
     weights = torch.load(small_run / "decoder.pt", weights_only=True)

@@ -1,7 +1,5 @@
 """Files on the toy device: a bundle with a code, pages that show a file, and recordings of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 

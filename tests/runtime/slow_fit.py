@@ -1,7 +1,5 @@
 """A fit that waits for leave to go on."""
 
-from __future__ import annotations
-
 import threading
 from dataclasses import dataclass, field
 

@@ -3,8 +3,6 @@
 in-phase = 128 + 70 cos(theta), quadrature = 80 + 70 sin(theta), so that swapped frames contradict the references.
 """
 
-from __future__ import annotations
-
 import threading
 from dataclasses import dataclass
 from pathlib import Path

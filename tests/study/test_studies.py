@@ -13,16 +13,18 @@ from click.testing import CliRunner
 from PIL import Image
 
 from lightpage.device.profile import Profile, load_profile
+from lightpage.device.state import Device
 from lightpage.errors import InvalidInputError, ProfileError
-from lightpage.study import STUDIES, angle, cross_section, pipe_length, scaling
+from lightpage.study import STUDIES, angle, cross_section, pipe_length, scaling, tolerances
 from lightpage.study.command import study
+from lightpage.study.knobs import KNOBS
 from lightpage.study.study import Settings, measured
 from lightpage.study.trained import chosen
 from lightpage.train.published.training import PublishedChoices
 from tests.lightpage.small import small_profile
 
 SMALL, BENCH, PAPER = small_profile(), load_profile("bench"), load_profile("paper")
-SLOW = {name for name, study in STUDIES.items() if study.trains} - {"heads"} | {"drift"}
+SLOW = {name for name, study in STUDIES.items() if study.trains} - {"heads"} | {"drift", "tolerances"}
 """Four data sets are trained on, or the shipped decoder reads pages; heads trains in the same way, on one."""
 
 
@@ -60,6 +62,8 @@ def test_what_cannot_be_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         (("rays", "--out", ""), "--out"),
         (("rays", "--channels", "16", *out), "--channels"),
         (("angle", "--full", *out), "CUDA"),
+        (("rays", "--only", "ray", *out), "--only"),
+        (("tolerances", "--only", "wobble", *out), "stroke, level"),
     ):
         with pytest.raises(InvalidInputError, match=named):
             run(*words)
@@ -109,3 +113,39 @@ def test_a_study_trains_as_the_authors_did_unless_told_otherwise() -> None:
     assert chosen(Settings(SMALL), "ray", SMALL, 450) == PublishedChoices()
     smaller = chosen(Settings(SMALL, seed=3, share=0.1, channels=16), "mode", SMALL, 450, classes=16)
     assert smaller == PublishedChoices(channels=(16, 32), steps=1125, seed=3, classes=16)
+
+
+@pytest.mark.parametrize("name", KNOBS)
+def test_a_knob_can_be_turned_as_far_as_it_is_measured(name: str) -> None:
+    knob, device = KNOBS[name], Device()
+    assert list(knob.values) == sorted({*knob.values} - {knob.at(device)})
+    for value in knob.values:
+        assert knob.at(knob.turned(device, value)) == pytest.approx(value)
+
+
+def test_every_setting_of_a_device_has_a_knob_unless_it_is_known_why_not() -> None:
+    settings = {f"{table}.{key}" for table, values in Device().model_dump().items() for key in values}
+    left = settings - {key for knob in KNOBS.values() for key in knob.settings}
+    followed, alike = {"drift.piston_rad", "drift.shift_px", "homodyne.quadrature_sign"}, {"slm.unmodulated_phase_rad"}
+    of_others = {"sensor.bit_depth", "aberration.lens_path_relative_error"}  # more is no harm; of real lenses alone
+    assert {key for key in left if not key.endswith("_seed") and "_y_" not in key} == followed | alike | of_others
+
+
+def test_tolerances_say_within_which_range_a_tenth_of_a_bit_is_lost() -> None:
+    knob, settings = KNOBS["modulator-axial"], Settings(SMALL)
+    cases = tolerances.STUDY.chosen(settings, ["modulator-axial", "full-well"])
+    assert [case["name"] for case in cases[:2]] == ["kept", "modulator-axial=-6"]
+    lost = {1.5: 0.05, 3.0: 0.15, 6.0: 5.0, 1000.0: 0.02, 300.0: 0.18}
+    airs = [6.3 - lost.get(case.get("value", 0), 0.0) for case in cases]
+    results = [{"air": air, "told": 6.3, "anew": np.nan} for air in airs]
+    device, axial, well = tolerances.STUDY.rows(cases, results)
+    assert device[3:6] == ("6.30 bits", "", "6.30 bits")
+    assert axial[3:] == ("<-6 to 2.2", "<-2.1 to 0.77 mm", "<-6 to >6", "-")
+    assert well[3] == "550 to >100000"  # half way between 300 and 1000, in ratio
+    assert knob.full_size is not None
+    assert 1.2 * knob.full_size[0] == pytest.approx(0.41, abs=0.005)
+    tilt = KNOBS["keystone"].full_size
+    assert tilt is not None
+    assert 0.0014 * tilt[0] == pytest.approx(1.0, abs=0.01)
+    figure = tolerances.STUDY.plot(settings, cases, results)
+    assert [axis.get_xlabel() for axis in figure.axes if axis.get_visible()] == [knob.unit, "electrons"]

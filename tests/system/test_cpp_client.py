@@ -1,7 +1,5 @@
 """The client in C++ compiles without a warning, and every command of its example does what it says."""
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 import subprocess
@@ -20,13 +18,11 @@ from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from lightpage.runtime.client.wire.status import status_of, told, trailers
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.service.dataplane import DataPlane
-from lightpage.runtime.service.jobs.recalibrator import Recalibrator
-from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.server.certificates import Certificates
-from lightpage.runtime.service.server.server import LightpageServer
 from tests.runtime import toy
+from tests.runtime.conftest import begun
 from tests.runtime.service.server.authority import Authority
+from tests.runtime.service.stage import Running
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = (*sorted((ROOT / "clients/cpp").iterdir()), ROOT / "proto/lightpage/v1/lightpage.proto")
@@ -85,12 +81,10 @@ def succeeds(program: Path, target: str, *words: object) -> str:
 
 
 @pytest.fixture(scope="module")
-def service(decoder: Decoder, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, DataPlane]]:
-    """Where a service of the toy device is, and its plane."""
-    plane = DataPlane(Models(decoder), toy.ToySource(toy.ToyDevice()))
-    recalibrator = Recalibrator(plane, toy.fit_references, tmp_path_factory.mktemp("work"))
-    with LightpageServer(plane, recalibrator) as server:
-        yield server.target, plane
+def service(decoder: Decoder) -> Iterator[Running]:
+    running = begun(decoder)
+    yield running
+    running.end()
 
 
 def raw(path: Path, pair: FramePair) -> Path:
@@ -99,40 +93,40 @@ def raw(path: Path, pair: FramePair) -> Path:
 
 
 def test_it_describes_a_service_decodes_a_pair_that_it_sends_and_reads_a_page(
-    program: Path, service: tuple[str, DataPlane], tmp_path: Path
+    program: Path, service: Running, tmp_path: Path
 ) -> None:
-    described = succeeds(program, service[0], "describe")
+    described = succeeds(program, service.server.target, "describe")
     assert "model toy toy-1\n" in described
     out = tmp_path / "symbols"
-    succeeds(program, service[0], "decode", raw(tmp_path / "frames", PAIR), "--out", out, "--levels", 16)
+    succeeds(program, service.server.target, "decode", raw(tmp_path / "frames", PAIR), "--out", out, "--levels", 16)
     assert out.read_bytes() == SYMBOLS.tobytes()
     for first in ("page 5", "page 5, the answer of an earlier call"):
-        said = succeeds(program, service[0], "read", 5, "--request-id", "a", "--out", out)
+        said = succeeds(program, service.server.target, "read", 5, "--request-id", "a", "--out", out)
         assert said.splitlines()[0] == first
         assert out.read_bytes() == toy.symbols_of(16, 5)[0].tobytes()
 
 
-def test_it_says_what_the_service_does_not_like(program: Path, service: tuple[str, DataPlane], tmp_path: Path) -> None:
+def test_it_says_what_the_service_does_not_like(program: Path, service: Running, tmp_path: Path) -> None:
     swapped = raw(tmp_path / "swapped", FramePair(PAIR.quadrature, PAIR.in_phase))
     for path, levels, said in ((swapped, 16, "FramesDisagreeError"), (swapped, 999, "levels"), (tmp_path, 16, "file")):
-        done = run(program, service[0], "decode", path, "--out", tmp_path / "symbols", "--levels", levels)
+        done = run(program, service.server.target, "decode", path, "--out", tmp_path / "symbols", "--levels", levels)
         assert (done.returncode, done.stdout, said in done.stderr) == (2, "", True), done.stderr
 
 
 def test_it_connects_with_certificates(program: Path, decoder: Decoder, tmp_path: Path) -> None:
     authority = Authority(tmp_path / "certificates")
-    plane = DataPlane(Models(decoder))
-    with LightpageServer(plane, Recalibrator(plane), certificates=Certificates(authority.service())) as server:
-        files = vars(authority.caller("caller", ["read"]))
-        options = [word for name, path in files.items() for word in (f"--{name}", path)]
-        assert "model toy toy-1" in succeeds(program, server.target, *options, "describe")
+    service = begun(decoder, certificates=Certificates(authority.service()))
+    files = vars(authority.caller("caller", ["read"]))
+    options = [word for name, path in files.items() for word in (f"--{name}", path)]
+    assert "model toy toy-1" in succeeds(program, service.server.target, *options, "describe")
+    service.end()
 
 
-def test_it_recalibrates_a_service(program: Path, service: tuple[str, DataPlane]) -> None:
-    said = succeeds(program, service[0], "recalibrate", "--pages", 2)
-    assert service[1].models.current.version == "toy-1+r1"
+def test_it_recalibrates_a_service(program: Path, service: Running) -> None:
+    said = succeeds(program, service.server.target, "recalibrate", "--pages", 2)
+    assert service.version == "toy-1+r1"
     assert "toy-1+r1" in said
-    assert "toy-1+r1" in succeeds(program, service[0], "watch", said.split()[1])
+    assert "toy-1+r1" in succeeds(program, service.server.target, "watch", said.split()[1])
 
 
 # ---- against services that answer as told -------------------------------------------------------------------------

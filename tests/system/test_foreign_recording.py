@@ -1,7 +1,5 @@
 """The strictest test: recordings made by a simulator that shares nothing with ours, through the commands."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -47,20 +45,22 @@ def half_profile() -> Profile:
 
 @pytest.mark.timeout(20 * 60)
 @pytest.mark.parametrize(
-    ("design", "profile", "pages", "choices", "synthetic", "file_bytes"),
+    ("design", "pages", "choices", "synthetic", "size"),
     [
-        (HALF, half_profile(), 6, "--preset standard --channels 16 --blocks 1 --steps 100", 0, 600),
+        (HALF, 6, "--preset standard --channels 16 --blocks 1 --steps 100", 0, 600),
         # minutes: the whole bench device, another one each time
-        pytest.param(
-            BENCH, load_profile("bench"), 16, "--preset accurate --steps 300", 48, 1500, marks=pytest.mark.long
-        ),
+        pytest.param(BENCH, 16, "--preset accurate --steps 300", 48, 1500, marks=pytest.mark.long),
     ],
     ids=["half", "whole"],
 )
 def test_a_device_that_nobody_here_made_is_calibrated_trained_exported_and_decoded(
-    tmp_path: Path, design: Design, profile: Profile, pages: int, choices: str, synthetic: int, file_bytes: int
+    tmp_path: Path, design: Design, pages: int, choices: str, synthetic: int, size: int, request: pytest.FixtureRequest
 ) -> None:
-    drawn = 1 if design is HALF else np.random.SeedSequence().generate_state(1)[0]
+    if design is HALF:
+        profile, drawn = half_profile(), 1
+        request.getfixturevalue("ready_twin")
+    else:
+        profile, drawn = load_profile("bench"), np.random.SeedSequence().generate_state(1)[0]
     seed = int(os.environ.get(SEED) or drawn)
     print(f"foreign device, seed {seed}")
     device, recording, toml = ForeignDevice.draw(seed, design), tmp_path / "R.h5", tmp_path / "profile.toml"
@@ -73,6 +73,7 @@ def test_a_device_that_nobody_here_made_is_calibrated_trained_exported_and_decod
     known = ["--profile", toml, "--recording", recording]
     found = figures_of(tmp_path, "calibrate", *known, "--out", calibration, "--pages", 1)
     assert abs(found["angle_deg"] - device.parameters.pipe_angle_deg) <= 0.03
+    assert found["coherence_after"] > 10 * found["coherence_before"]
     trained = ["--calibration", calibration, *choices.split(), "--synthetic-pages", synthetic]
     lightpage("train", *known, *trained, "--out", run)
     lightpage("export", run, "--out", bundle)
@@ -83,7 +84,7 @@ def test_a_device_that_nobody_here_made_is_calibrated_trained_exported_and_decod
 
     read_after_jumps(device, bundle, evaluation["air_bits_per_symbol"], seed, tmp_path)
     refuse_another_device(device, bundle, seed, tmp_path)
-    carry_a_file(device, bundle, seed, np.random.default_rng(seed).bytes(file_bytes), tmp_path)
+    carry_a_file(device, bundle, seed, np.random.default_rng(seed).bytes(size), tmp_path)
 
 
 def read_after_jumps(device: ForeignDevice, bundle: Path, still: float, seed: int, folder: Path) -> None:

@@ -1,7 +1,5 @@
 """One name: all that is installed lies under `lightpage.`, and a caller's own modules of any name break nothing."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re
@@ -60,20 +58,9 @@ def test_a_callers_own_modules_break_nothing(toy_zip: Path, tmp_path: Path) -> N
     toy.write_toy_recording(tmp_path / "R.h5", toy.ToyDevice(), 16, 2)
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
     command = [Path(sys.executable).with_name("lightpage")]
-    bulk = [
-        "bulk",
-        "evaluate",
-        "out",
-        "--recordings",
-        "R.h5",
-        "--bundle",
-        toy_zip,
-        "--workers",
-        "1",
-    ]  # in another process
+    bulk = ["bulk", "evaluate", "out", "--recordings", "R.h5", "--bundle", toy_zip, "--workers", "1"]  # another process
     for line in (
         [*command, "train", "--help"],
-        [*command, "export", "--help"],
         [*command, *bulk],
         [sys.executable, "-m", "lightpage", "serve", "--help"],
         [sys.executable, "-c", f"import lightpage; lightpage.load({str(toy_zip)!r}); lightpage.LightpageClient"],

@@ -1,7 +1,5 @@
 """What the packages offer by name; the Python client by itself, which needs little of what a service needs."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import re

@@ -1,7 +1,5 @@
 """The shell around the code: set-up, release, image and commands are what they say."""
 
-from __future__ import annotations
-
 import ast
 import io
 import json
@@ -147,7 +145,13 @@ NEED_AN_EXTRA = {"lightpage.runtime.device.modulator.screen.x_window": "xcffib"}
 WITH_TORCH = ("lightpage.train", "lightpage.export", "lightpage.study", "lightpage.report")
 
 IN_THE_IMAGE = f"""
-import importlib, json, pkgutil, sys
+import builtins, importlib, json, os, pkgutil, sys
+os.environ["ORT_DISABLE_TELEMETRY"], load, telemetry = "0", builtins.__import__, set()
+def watch(name, *rest, **named):
+    if name.partition(".")[0] == "onnxruntime" and "onnxruntime" not in sys.modules:
+        telemetry.add(os.environ["ORT_DISABLE_TELEMETRY"])
+    return load(name, *rest, **named)
+builtins.__import__ = watch
 import lightpage
 lacking = {{}}
 rooms = [room for room in pkgutil.iter_modules(lightpage.__path__, "lightpage.") if room.name not in {WITH_TORCH}]
@@ -173,7 +177,8 @@ print(json.dumps({{
     "decoded": [page.symbols.shape, bool(np.median(page.confidence) > 0.5)],
     "help": CliRunner().invoke(lightpage, ["--help"]).output,
     "profiles": [load_profile(name).name for name in ("bench", "paper")],
-    "torch": "torch" in sys.modules,
+    "telemetry": [*telemetry],
+    "strangers": [name for name in sys.modules if name.startswith({("torch", "tests", *WITH_TORCH)})],
     "typed": files("lightpage").joinpath("py.typed").is_file(),
 }}))
 """
@@ -184,7 +189,7 @@ def does_its_work(said: str) -> None:
     told = json.loads(said)
     assert told["decoded"] == [[56, 87], True]
     assert told["profiles"] == ["bench", "paper"]
-    assert (told["torch"], told["typed"]) == (False, True)
+    assert (told["telemetry"], told["strangers"], told["typed"]) == (["1"], [], True)
     assert re.search(r"^  serve ", told["help"], re.MULTILINE), told["help"]
 
 

@@ -1,7 +1,5 @@
 """One process of a training on several nodes, which are shown the same pages between them in each step, unturned."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A command runs beside a simulated device, which ends with it."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

@@ -24,6 +24,8 @@ from lightpage.train.published.training import PublishedChoices
 from lightpage.train.trainers.symbols import SymbolTrainer, default_synthetic_pages
 from lightpage.waves.grid import GRID_STEP_PX
 
+ACCEPT = "--accept-wrong-fit"
+"""Option of commands that else refuse a calibration whose fit is wrong."""
 _ALL = (*PUBLISHED, *LOCALIZERS)
 _COHERENT = tuple(name for name in LOCALIZERS if name != WAVE)
 

@@ -17,7 +17,7 @@ from lightpage.files import write_json
 from lightpage.progress import reporting
 from lightpage.recording.reader import Recording
 from lightpage.train.commands.calibrate import DEFAULT_PAGES, calibrate_recording
-from lightpage.train.commands.options import chosen_localizer, chosen_trainer, given_choices, with_choices
+from lightpage.train.commands.options import ACCEPT, chosen_localizer, chosen_trainer, given_choices, with_choices
 from lightpage.train.fitting.memory import keep_freed_memory
 from lightpage.train.models.decoder import LOCALIZERS
 from lightpage.train.processes import AUTO, STRATEGIES, Processes, Silence, is_first_process, wait_for_first
@@ -37,6 +37,7 @@ from lightpage.train.trainers.whole_run import Split, make_run, usable_pages
 )
 @click.option("--out", required=True, type=OutputFolder(), help="Folder of the run; resumed if it is there.")
 @click.option("--calibration", "calibration_path", type=click.Path(path_type=Path), help="Made here if left out.")
+@click.option(ACCEPT, "accept_wrong_fit", is_flag=True, help="Train with a calibration whose fit is wrong too.")
 @click.option(
     "--validation-share",
     type=FiniteRange(0.01, 0.5),
@@ -66,6 +67,7 @@ def train(
     localizer: str | None,
     out: Path,
     calibration_path: Path | None,
+    accept_wrong_fit: bool,
     validation_share: float,
     test_share: float,
     devices: int | None,
@@ -94,7 +96,10 @@ def train(
         trainer = chosen_trainer(localizer, profile, len(split.training), given)
 
         def calibration() -> Calibration:
-            return _calibration(recording, profile, list(usable)[:DEFAULT_PAGES], calibration_path, out)
+            found = _calibration(recording, profile, list(usable)[:DEFAULT_PAGES], calibration_path, out)
+            if not accept_wrong_fit:
+                found.check_good(f"calibration {calibration_path or 'of the recording'}", f", or {ACCEPT}")
+            return found
 
         run = make_run(out, recording, profile, trainer, usable, split, calibration, processes)
         if run is None:

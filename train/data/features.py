@@ -128,9 +128,9 @@ class FeatureExtractor:
         Raises:
             CalibrationError: it shows hardly more of them than chance does, or clearly less than those pages.
         """
-        field = self.known_field(page.pair, self.device.modulation.phase(np.angle(page.symbols)))
-        sampler = FieldSampler(field, self.grid)
-        found = page_coherence(sampler, self._twin, self.device.parameters, self.device.profile, page.symbols)
+        light = page.light(self.device.modulation)
+        sampler = FieldSampler(self.known_field(page.pair, np.angle(light)), self.grid)
+        found = page_coherence(sampler, self._twin, self.device.parameters, self.device.profile, light)
         least = max(least_coherence(page.symbols.size), LEAST_KEPT * calibrated)
         if not found >= least:
             raise CalibrationError(

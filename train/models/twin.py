@@ -28,8 +28,8 @@ _WIDEST_SPREAD = 1.05
 """Headroom on the nominal exit centroid when counting how many walls a beam can meet."""
 _LANDINGS = 3
 """Rounds in which a place and the second lens's tilt there are made to agree: each leaves a hundredth of the error."""
-_NODES = 8
-"""Places along an axis of the facet that stand for a symbol's light there."""
+_NODES = leggauss(8)
+"""Places along an axis of the facet that stand for a symbol's light there, -1 to 1, and their weights."""
 _DARK = 1e-12
 """Light below which a part of the facet has no middle, over what the symbol sends at most."""
 
@@ -156,7 +156,7 @@ class RayTwin(nn.Module):
         """
         shifted = torch.clamp(met - positions, -1, 1)
         low, high = torch.clamp(shifted - 0.5, min=-0.5), torch.clamp(shifted + 0.5, max=0.5)
-        u, weight = (torch.from_numpy(array).to(met.device) for array in leggauss(_NODES))
+        u, weight = (torch.from_numpy(array).to(met.device) for array in _NODES)
         places = width * ((low + high)[..., None] / 2 + (high - low)[..., None] / 2 * u)
         light = weight * torch.sinc(places * self.symbol_pitch * self.wave_number / (2 * math.pi * focal)) ** 2
         total = light.sum(-1) + _DARK
@@ -207,7 +207,7 @@ class TorchTwin:
     """`RayTwin` behind the numpy interface that registration takes (`lightpage.calibration.interfaces.Twin`)."""
 
     def __init__(self, twin: RayTwin) -> None:
-        self.module = twin
+        self.module, self.known = twin, len(NAMES)
 
     def trace(self, parameters: Real, points: Real, anchors: Real | None = None) -> Rays:
         """See `lightpage.calibration.interfaces.Twin`."""

@@ -101,7 +101,7 @@ class Bench:
         references = self.recording.references()
         if method == ORACLE:
             return perfectly_calibrated(self.profile, self.device, references)
-        return CalibratedDevice.of(self.profile, self.fitted, references)
+        return self.fitted.device(self.profile, references)
 
     def levels_of(self, method: str) -> Levels:
         """Levels of the pages, as the modulator of the device that a method knows shows them."""

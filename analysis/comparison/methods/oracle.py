@@ -25,13 +25,13 @@ def without_signal_power(
     device = optics.device
     counts = optics.electrons_per_unit * (2**device.sensor.bit_depth - 1) / device.sensor.full_well_e
     frames = []
-    for frame, pose, gain in (
-        (pair.in_phase, device.in_phase_camera, 1.0),
-        (pair.quadrature, device.quadrature_camera, device.homodyne.quadrature_gain),
+    for frame, pose, gain, blemishes in (
+        (pair.in_phase, device.in_phase_camera, 1.0, optics.blemishes[0]),
+        (pair.quadrature, device.quadrature_camera, device.homodyne.quadrature_gain, optics.blemishes[1]),
     ):
         power = np.abs(optics.camera_field(exit_field, pose)) ** 2
         seen = resample(power, *optics.camera_axes_m, *optics.view(pose, shift_px))
-        frames.append((frame - gain * counts * seen).astype(np.float32))
+        frames.append((frame - gain * counts * blemishes.transmission * seen).astype(np.float32))
     return FramePair(*frames)
 
 

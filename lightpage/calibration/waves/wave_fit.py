@@ -40,8 +40,11 @@ as much as several rounds, but one from further off leaves axial places twenty d
 _CONVERGED = 1e-3
 """Relative fall of the residual below which another round does not pay."""
 _LEAST_OFF = 2.0
-"""Mean square of the modulation's coefficients over their deviations from which on levels are uneven: a nominal device
-has 1 or less, and more than 2 in one of seventy fits."""
+"""Mean square of the distances of a modulation's coefficients from the usual ones, over their deviations, from which on
+it is another one: a nominal device has 1 or less, and more than 2 in one of seventy fits."""
+_LEAST_STROKE = 2.0
+"""Deviations of the stroke alone from which on it is another one too: it drifts by itself, and on the bench device
+three of them cost a twentieth of a bit."""
 _LARGEST_MOVE_PX = 1.5
 """A round's largest step: the model is linear in the displacement over about a speckle."""
 _EQUATIONS = 100_000
@@ -72,8 +75,9 @@ class WaveFitted:
         quadrature_phase: angle between the homodyne arms, radians.
         residual: root mean square of what is left of the equations, in standard deviations of the reference's noise
             times an unknown factor: it says which of two fits is better.
-        modulation: what the modulator makes of its levels; nominal where the page does not tell it from that.
+        modulation: what the modulator makes of its levels; the prior's centre where a page does not tell it from that.
         modulation_deviations: standard deviations of its coefficients, zero where held.
+        illumination: coefficients [T] of the terms of the page's illumination.
     """
 
     parameters: Real
@@ -82,6 +86,19 @@ class WaveFitted:
     residual: float
     modulation: Modulation = NOMINAL
     modulation_deviations: tuple[float, ...] = (0.0,) * len(modulations.NAMES)
+    illumination: Complex | None = None
+
+
+class LevelPrior(NamedTuple):
+    """What is known of a modulation before a page is seen.
+
+    Attributes:
+        centre: most likely one.
+        deviations: standard deviations of its coefficients about it.
+    """
+
+    centre: Modulation = NOMINAL
+    deviations: Real = modulations.PRIORS
 
 
 class _State(NamedTuple):
@@ -107,7 +124,7 @@ class _Slopes(NamedTuple):
         by_term: of the light by the illumination's terms, [T, 2, ...].
         by_level: of the light by what the logarithm of the modulation is made of, [K, 2, ...]; none where it is held.
         of_light: of the light by parameters that change it, [2, ...] each.
-        of_cameras: of the places' pixels by parameters that move them, [2, ..., 2] each.
+        of_cameras: of the places (x, y), grid samples, by parameters that move the cameras, [2, ..., 2] each.
     """
 
     by_term: Complex
@@ -138,7 +155,7 @@ class WaveFit:
         waves = self._waves(np.zeros(len(PARAMETERS)))
         self._terms = np.stack(illumination_terms(waves.x, waves.y))
         grid = field_grid(profile)
-        self._pitch_px = grid.pitch_m / profile.camera.pitch_m
+        self._beside = grid.pitch_m * np.array([[0, 0], [1, 0], [0, 1]])
         self._stride = max(_LEAST_STRIDE, int(np.sqrt(np.prod(grid.shape) / _EQUATIONS)))
         self._every = (slice(None, None, self._stride), slice(None, None, self._stride))
         self._places = np.stack(np.meshgrid(grid.x_m, grid.y_m), axis=-1)[self._every]
@@ -159,8 +176,7 @@ class WaveFit:
         prior_scale: float | Real = 1.0,
         progress: Callable[[float], None] = lambda share: None,
         modulation: Modulation = NOMINAL,
-        *,
-        levels: bool = False,
+        levels: LevelPrior | None = None,
     ) -> WaveFitted:
         """Fit the parameters of `groups` and the angle between the arms.
 
@@ -174,7 +190,7 @@ class WaveFit:
             progress: told of every round and of every derivative, with the share of the most rounds that is behind,
                 0 to 1. It may raise to stop the work.
             modulation: what the modulator makes of its levels, to start from.
-            levels: whether that is fitted too.
+            levels: what is known of it beforehand where it is fitted too, None where it is held.
         """
         without_effect = _OF_REAL_LENSES if self._profile.ideal_lenses else ()
         of_light = [index for index in indices(*groups) if index not in (*_SEEN, *without_effect)]
@@ -193,7 +209,7 @@ class WaveFit:
                 break
             if slopes is None or residual < (1 - _STALE) * taken_at:
                 told, taken_at = partial(_within_round, progress, number), residual
-                slopes = self._slopes(state, of_light, of_cameras, told, levels=levels)
+                slopes = self._slopes(state, of_light, of_cameras, told, levels=levels is not None)
             directions = _directions(state.light, bends="launch" not in groups)
             columns = self._columns(state, fields, slopes, directions)
             # What is unexplained differs from symbol to symbol, so equations tell no more than symbols do.
@@ -202,12 +218,13 @@ class WaveFit:
             fitted_levels = slice(others - (len(modulations.NAMES) if levels else 0), others)
             prior = np.zeros(columns.shape[1])
             prior[others:] = precision
-            prior[fitted_levels] = 1 / modulations.PRIORS[: others - fitted_levels.start] ** 2
+            if levels:
+                prior[fitted_levels] = 1 / levels.deviations**2
             information = columns.T @ columns / variance + np.diag(prior)
             pull = columns.T @ left / variance
             pull[others:] -= precision * (state.parameters[free] - centre[free])
             if levels:
-                pull[fitted_levels] -= prior[fitted_levels] * state.levels
+                pull[fitted_levels] -= prior[fitted_levels] * (state.levels - levels.centre.coefficients)
             covariance = _inverse(information)
             known = np.sqrt(np.diag(covariance))
             deviations = np.zeros(len(PARAMETERS))
@@ -219,9 +236,10 @@ class WaveFit:
                 residual,
                 Modulation(tuple(state.levels.tolist())),
                 tuple(known[fitted_levels].tolist()) if levels else best.modulation_deviations,
+                state.light,
             )
             state = self._moved(state, covariance @ pull, directions, fitted_levels, free)
-        return _told_apart(best)
+        return best if levels is None else _told_apart(best, levels.centre)
 
     def _waves(self, parameters: Real) -> FittedWaves:
         return FittedWaves(self._profile, parameters, self._samples, filled=True)
@@ -272,7 +290,7 @@ class WaveFit:
         page, field = even * np.tensordot(state.light, self._terms, 1), np.tensordot(state.light, by_term, 1)
         functions = [on_modulator(one, self._samples) for one in modulations.basis(self._phases)] if levels else []
         by_level = [here.to_cameras(page * one) for one in functions]
-        light, pixels = list[Complex](), list[Real]()
+        light, places = list[Complex](), list[Real]()
         for number, index in enumerate(of_light):
             progress(number / len(of_light))
             there, step = stepped(index)
@@ -281,8 +299,14 @@ class WaveFit:
             ratio = moved.against_reference / here.against_reference
             light.append(((field * ratio if at_camera else moved.to_cameras(page)) - field) / step)
         for there, step in map(stepped, of_cameras):
-            pixels.append((self._pixels(there) - self._pixels(state.parameters)) / step)
-        return _Slopes(by_term, by_level, light, pixels)
+            moved_px = (self._pixels(there) - self._pixels(state.parameters)) / step
+            places.append(moved_px @ self._samples_per_pixel(state.parameters)[:, None])
+        return _Slopes(by_term, by_level, light, places)
+
+    def _samples_per_pixel(self, parameters: Real) -> Real:
+        """Grid samples (x, y) for a pixel along (column, row) of either camera, [2, 2, 2]."""
+        middle, right, below = np.moveaxis(self._twin.pixels(parameters, self._beside), 1, 0)
+        return np.asarray(np.linalg.inv(np.stack([right - middle, below - middle], axis=1)))
 
     def _pixels(self, parameters: Real) -> Real:
         """Where both cameras see the places [...], [2, ..., 2]."""
@@ -325,7 +349,7 @@ class WaveFit:
 
         of_phase, of_amplitude = [1j * each for each in slopes.by_level], slopes.by_level[1:]
         changes = [*np.tensordot(directions, slopes.by_term, 1), *of_phase, *of_amplitude, *slopes.of_light]
-        moves = [pixels[:, chosen] for pixels in slopes.of_cameras]
+        moves = [places[:, chosen] for places in slopes.of_cameras]
         columns = []
         for camera, arm in enumerate((0.0, state.quadrature_phase)):
             phasor, field = np.exp(-1j * arm), fields[camera]
@@ -334,7 +358,7 @@ class WaveFit:
             along = (phasor + here.conj()) * weight  # derivative of the count by e
             mine = [(along * seen(change[camera])).real for change in changes]
             mine.insert(len(directions), (here * phasor * -1j).real * weight * camera)
-            slope = np.stack([(along * part).real for part in (across, down)]) / self._pitch_px
+            slope = np.stack([(along * part).real for part in (across, down)])
             mine += [-(slope * move[camera].T).sum(axis=0) for move in moves]
             columns.append(np.stack(mine, axis=1))
         return np.concatenate(columns)
@@ -369,13 +393,11 @@ def _directions(light: Complex, *, bends: bool) -> Complex:
     return np.concatenate([light[0] / abs(light[0]) * terms, 1j * light[None]])
 
 
-def _told_apart(found: WaveFitted) -> WaveFitted:
-    """A fit whose modulation is nominal unless its coefficients differ from zero by more than their deviations."""
-    known = np.array(found.modulation_deviations)
-    if not known.any():
-        return found
-    off = np.sum((np.array(found.modulation.coefficients) / known) ** 2)
-    return replace(found, modulation=NOMINAL) if off < _LEAST_OFF * len(known) else found
+def _told_apart(found: WaveFitted, usual: Modulation) -> WaveFitted:
+    """A fit whose modulation is the usual one unless it differs from that by more than its deviations."""
+    away = np.subtract(found.modulation.coefficients, usual.coefficients) / found.modulation_deviations
+    same = np.mean(away**2) < _LEAST_OFF and abs(away[0]) < _LEAST_STROKE
+    return replace(found, modulation=usual) if same else found
 
 
 def _weight(here: Complex, phasor: complex) -> Real:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -93,6 +94,7 @@ class FittedWaves:
         accuracy: share of the splitting steps that a simulation takes.
         grid: the common grid, where it is not the usual one.
         like: waves whose work is shared where geometry and sampling are the same.
+        changed: fields of the geometry that are not as fitted, by name.
 
     Attributes:
         x, y: places of the modulator's samples over the page's half width and half height, [nx samples], [ny samples].
@@ -112,9 +114,10 @@ class FittedWaves:
         accuracy: float = 1.0,
         grid: FieldGrid | None = None,
         like: FittedWaves | None = None,
+        changed: Mapping[str, Any] | None = None,
     ) -> None:
         value = as_dict(parameters)
-        geometry = fitted_geometry(profile, value)
+        geometry = replace(fitted_geometry(profile, value), **(changed or {}))
         grid = grid or field_grid(profile)
         grid_x, grid_y = grid.x_m[::stride], grid.y_m[::stride]
         x, y = modulator_axes(profile, samples)
@@ -149,23 +152,44 @@ class FittedWaves:
         self.launch: Complex = np.exp(1j * at_launch)
         self.against_reference: Complex = np.exp(1j * at_camera)
         self._apart = defocus(axial_of_cameras(value)[1], geometry.pipe_width_m)
-        """Defocus of the in-phase camera beyond that of both on average, rad/m^2."""
         self._camera = self.against_reference / stride  # samples that stand for more area are larger
+
+    def to_exit(self, field: Complex, passed: NDArray[Any] | float = 1.0) -> Complex:
+        """Field on the modulator to the exit facet's grid; `passed` as for `WaveChannel.exit_field`."""
+        return self.channel.exit_field(field * self.launch, passed)
 
     def to_camera(self, field: Complex) -> Complex:
         """Field on the modulator [ny samples, nx samples] to the common grid [Gy, Gx], against the reference."""
-        return np.asarray(self.channel.forward(field * self.launch) * self._camera)
+        return np.asarray(self.channel.camera_field(self.to_exit(field)) * self._camera)
 
     def to_cameras(self, field: Complex) -> Complex:
         """The same as either camera sees it from where it stands, in-phase and quadrature, [2, Gy, Gx]."""
-        leaving = self.channel.exit_field(field * self.launch)
-        beyond = (self._apart, -self._apart) if self._apart else (0.0,)
+        return self.from_exit(self.to_exit(field))
+
+    def from_exit(self, leaving: Complex) -> Complex:
+        """Field on the exit facet's grid to the common grid as either camera sees it, [2, Gy, Gx]."""
+        beyond = self._beyond if self._apart else (0.0,)
         seen = [self.channel.camera_field(leaving, each) * self._camera for each in beyond]
         return np.stack([seen[0], seen[-1]])
 
+    def back_to_exit(self, seen: Complex) -> Complex:
+        """Fields that either camera sees, [2, Gy, Gx], back to the exit facet's grid, by the adjoint of `from_exit`."""
+        beyond = self._beyond if self._apart else (0.0, 0.0)
+        fields = [self.channel.to_exit(one * self._camera.conj(), each) for one, each in zip(seen, beyond, strict=True)]
+        return np.asarray(fields[0] + fields[1])
+
+    def back_to_page(self, leaving: Complex) -> Complex:
+        """Field on the exit facet's grid back to the modulator, by the adjoint of `to_exit`."""
+        return np.asarray(self.channel.to_page(leaving) * self.launch.conj())
+
     def to_page(self, field: Complex) -> Complex:
         """Field on the common grid [Gy, Gx] back to the modulator, by the adjoint."""
-        return np.asarray(self.channel.adjoint(field * self._camera.conj()) * self.launch.conj())
+        return self.back_to_page(self.channel.to_exit(field * self._camera.conj()))
+
+    @property
+    def _beyond(self) -> tuple[float, float]:
+        """Defocus of either camera beyond that of both on average, rad/m^2."""
+        return self._apart, -self._apart
 
 
 def on_modulator(page: NDArray[Any], samples: int) -> NDArray[Any]:

@@ -14,6 +14,8 @@ const CHARTS = [
     about: "Common phase of a page, which is taken off. It wanders by itself." },
   { title: "Phase residual", unit: "rad", digits: 4, lines: [["residual_rad", "residual"]], zero: true,
     about: "Smooth phase error that was taken off, root mean square." },
+  { title: "Modulator's stroke", unit: "relative", digits: 4, lines: [["stroke_relative", "stroke"]],
+    about: "Its change since calibration, as the pilots show it. It goes with temperature." },
 ];
 const CONDITIONS = { reading: "good", idle: "", "no page yet": "", "recalibration is due": "warn", "pages are being lost": "bad" };
 const W = 420, H = 150, LEFT = 46, RIGHT = 8, TOP = 10, BOTTOM = 22;

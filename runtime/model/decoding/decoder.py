@@ -25,7 +25,7 @@ from lightpage.errors import (
 from lightpage.failures import short_resource
 from lightpage.metrics.information import decide_with_confidence
 from lightpage.page.levels import MAX_LEVELS, check_levels
-from lightpage.page.pilots import Pilots, read_pilots, remove_piston
+from lightpage.page.pilots import Pilots, read_pilots, remove_piston, stroke_error
 from lightpage.recording.exposure import check_light
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.bundle import Bundle
@@ -112,6 +112,14 @@ class Decoder:
             InvalidInputError: a table that does not fit.
         """
         return Decoder(self.bundle, self.threads, self.graph.with_table(table))
+
+    def taken(self, table: SamplingTable) -> SamplingTable:
+        """The tensors of a traced table that the graph takes; of parameters those that it knows, the first ones."""
+        ports = self.graph.ports
+        taken = {name: value for name, value in table.items() if name in ports}
+        if "parameters" in taken:
+            taken["parameters"] = taken["parameters"][: ports["parameters"].shape[0]]
+        return taken
 
     def of_bundle(self, bundle: Bundle) -> Decoder:
         """This decoder with the table of a bundle of the same graphs, whose golden page is not looked at.
@@ -284,6 +292,7 @@ class Decoder:
             timings=Timings(0.0, 0.0, 0.0),
             phase_error=error,
             level_phases=shown.uneven,
+            stroke_relative=stroke_error(phase, concentration, reading.sound),
         )
 
     def _check_graph(self) -> None:

@@ -258,7 +258,7 @@ class BundleTables:
         for name, tilt in zip(("camera_tilt_x_rad", "camera_tilt_y_rad"), tilt_rad, strict=True):
             parameters[NAMES.index(name)] += tilt
         table = sampling_table(self._twin, parameters, self._calibration.turn_rad, bundle.profile)
-        return self._decoder.with_table({n: v for n, v in table.items() if n in self._decoder.graph.ports})
+        return self._decoder.with_table(self._decoder.taken(table))
 
 
 class BundleSearch:

@@ -76,6 +76,8 @@ class DecodedPage:
         phase_error: float32 [ny, nx], smooth error that was taken off `phase`, radians.
         level_phases: phase that stands for each level, radians; None where level s is 2 pi s / M.
         image: where the image lies as this page shows it, None where it is not followed.
+        stroke_relative: what the pilots show of the modulator's stroke beyond its calibration; NaN where they show
+            nothing of it.
     """
 
     symbols: NDArray[np.uint8]
@@ -91,6 +93,7 @@ class DecodedPage:
     phase_error: NDArray[np.float32]
     level_phases: tuple[float, ...] | None = None
     image: ImagePosition | None = None
+    stroke_relative: float = np.nan
 
     @cached_property
     def information_bits(self) -> float:

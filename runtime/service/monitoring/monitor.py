@@ -43,14 +43,16 @@ class Sign:
     """A figure of pages, and when it says that a recalibration is due.
 
     The median of the last pages counts, so one odd page changes nothing. It must leave the baseline, the best median
-    among the first pages of a model, by `raise_by` for the sign to be raised. To be taken back, it must come back to
-    within `clear_by`. Where pages differ much, it must leave it by `deviations` of their noise at least.
+    among the first pages of a model, or the middle one where either way tells, by `raise_by` for the sign to be raised.
+    To be taken back, it must come back to within `clear_by`. Where pages differ much, it must leave it by `deviations`
+    of their noise at least.
 
     Attributes:
         name: of the figure.
         window: pages whose median counts.
         raise_by, clear_by: how far from the baseline, in the figure's unit.
         rises: whether it is its rise that tells, and not its fall.
+        either: whether both do.
         relative: whether `raise_by` and `clear_by` are shares of the baseline.
         absolute: whether the baseline is 0 whatever the first pages show.
         mean: whether the mean counts and not the median, as for shares of pages.
@@ -63,6 +65,7 @@ class Sign:
     raise_by: float
     clear_by: float
     rises: bool = False
+    either: bool = False
     relative: bool = False
     absolute: bool = False
     mean: bool = False
@@ -105,6 +108,10 @@ SHIFT = Sign("shift_px", window=5, raise_by=4.0, clear_by=3.0, rises=True, absol
 """Distance of the image from where calibration saw it. It is followed, yet a search reaches 12 px: a third of that is
 left to a device's walk (0.9 px in a quiet week), the rest to a knock."""
 
+STROKE = Sign("stroke_relative", window=15, raise_by=0.002, clear_by=0.001, either=True)
+"""Change of the modulator's stroke since calibration, as the pilots show it. A quiet bench page
+shows 0.0000 +- 0.0012, so 0.002 is five standard errors of the median; twice that costs a tenth of a bit."""
+
 PISTON_WALK = Sign("piston_walk_rad", window=15, raise_by=0.6, clear_by=0.3, rises=True, decides=False)
 """Step of the piston from page to page. It shows a restless interferometer, which no recalibration cures."""
 
@@ -120,7 +127,7 @@ class MonitorSettings:
     """
 
     baseline_pages: int = 20
-    signs: tuple[Sign, ...] = (MARGIN, AIR, TRUST, SHARE, CHANGED, UNREAD, RESIDUAL, SHIFT, PISTON_WALK)
+    signs: tuple[Sign, ...] = (MARGIN, AIR, TRUST, SHARE, CHANGED, UNREAD, RESIDUAL, SHIFT, STROKE, PISTON_WALK)
 
 
 @dataclass(frozen=True)
@@ -197,15 +204,14 @@ class _Followed:
             return
         now, sign = self.value, 1 if self.sign.rises else -1
         if now is not None:
-            distance = sign * (now - self.baseline)
+            distance = abs(now - self.baseline) if self.sign.either else sign * (now - self.baseline)
             self.raised = distance > self._distance(self.sign.clear_by if self.raised else self.sign.raise_by)
 
     def _settle(self) -> None:
         """Take the best window as usual, and the scatter from page to page as noise: both bear a drift meanwhile."""
         window = self.sign.window
-        best = min if self.sign.rises else max
-        ends = range(window, len(self.first) + 1)
-        self.baseline = best(self._smoothed(self.first[end - window : end]) for end in ends)
+        best = statistics.median if self.sign.either else min if self.sign.rises else max
+        self.baseline = best(self._smoothed(self.first[n : n + window]) for n in range(len(self.first) - window + 1))
         steps = np.abs(np.diff(self.first))
         self.noise = _MEDIAN_ERROR * _MAD_DEVIATIONS * float(np.median(steps)) / math.sqrt(2 * window)
 
@@ -218,18 +224,16 @@ class _Followed:
     @property
     def value(self) -> float | None:
         """What counts of the last pages."""
-        if len(self.last) < self.sign.window:
-            return None
-        return self._smoothed(self.last)
+        return self._smoothed(self.last) if len(self.last) == self.sign.window else None
 
     def _smoothed(self, values: Sequence[float]) -> float:
         return statistics.fmean(values) if self.sign.mean else statistics.median(values)
 
     def state(self) -> SignState:
-        raise_at = None
-        if self.baseline is not None:
-            raise_at = self.baseline + (1 if self.sign.rises else -1) * self._distance(self.sign.raise_by)
-        return SignState(self.sign.name, self.value, self.baseline, raise_at, self.raised, self.sign.decides)
+        sign, usual, now = self.sign, self.baseline, self.value
+        side = 1 if sign.rises or (sign.either and (now or 0.0) >= (usual or 0.0)) else -1
+        raise_at = None if usual is None else usual + side * self._distance(sign.raise_by)
+        return SignState(sign.name, now, usual, raise_at, self.raised, sign.decides)
 
 
 class PageFigures:
@@ -255,6 +259,7 @@ class PageFigures:
             TRUST.name: page.pilot_trust,
             SHARE.name: page.check.share,
             RESIDUAL.name: page.residual_rad,
+            STROKE.name: page.stroke_relative,
         }
         if observation.tells:
             figures[CHANGED.name] = float(page.check.recalibration_due)

@@ -1,7 +1,5 @@
 """Comparisons of decoders: what each command writes, and what it takes up from earlier runs."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path
@@ -12,6 +10,7 @@ from click.testing import CliRunner
 
 from analysis.comparison import decoders, imperfections, kept_figures
 from analysis.comparison.kept_figures import FOURTH_DIGIT
+from analysis.comparison.kept_weights import moved_bits
 from analysis.comparison.outcome import symbols_by_walls
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.document import Calibration
@@ -76,6 +75,20 @@ def test_the_command_compares_methods_and_says_what_the_device_is(tmp_path: Path
     assert float(line[1]) == pytest.approx(float(line[2]), abs=FOURTH_DIGIT)
     trained, kept = sorted((tmp_path / "figures").rglob(FITTED_WEIGHTS))
     assert trained.read_bytes() != kept.read_bytes()
+
+
+def test_what_is_said_moves_by_the_relative_entropy() -> None:
+    said = np.array([4.0, -3.0]).reshape(1, 2, 1, 1)
+    theta = np.linspace(-np.pi, np.pi, 4000, endpoint=False)
+
+    def log_density(p: np.ndarray) -> np.ndarray:
+        log = p[0, 0] * np.cos(theta) + p[0, 1] * np.sin(theta)
+        return np.asarray((log - np.log(np.exp(log).sum()))[0])
+
+    now = np.array([1.0, 2.0]).reshape(1, 2, 1, 1)
+    before, after = log_density(said), log_density(now)
+    assert moved_bits(said, now) == pytest.approx(np.sum(np.exp(before) * (before - after)) / np.log(2), rel=1e-6)
+    assert moved_bits(said, said) == 0
 
 
 def test_a_decoder_of_a_device_of_ones_own_is_told_beside_an_oracle(tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """Each benchmark of the hardware runs small; of the loop, whose measurements take hours, the sums are tested."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -11,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from analysis.hardware import cameras, latency, pairs, plugs, scpi
-from analysis.hardware.week import figures_of
+from analysis.hardware.week import figures_of, table_of
 from analysis.hardware.week_figure import draw
 
 
@@ -21,6 +19,8 @@ def measured(command: click.Command, arguments: str, folder: Path) -> Any:
     return json.loads(out.read_text())
 
 
+# Full frames of two formats over loopback; what the driver does with them is tested by itself.
+@pytest.mark.long
 @pytest.mark.own_network
 def test_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     small = {"FULL": (128, 128), "PACKETS_BYTES": (1400,), "TOLERANCES_S": (0.02,), "FORMATS": ("Mono8", "Mono12p")}
@@ -66,7 +66,8 @@ def test_scpi(tmp_path: Path) -> None:
 
 def row(page: int, **changes: object) -> dict[str, object]:
     plain = {"page": page, "air": 6.6, "true_air": 6.6, "lost": "", "failed": False, "due": False, "during": False}
-    return {**plain, "ended": [], "restarted": False, "shift_px": [0.0, 0.1], **changes}
+    light = {"true": {"stroke": -1e-4 * page}, "fitted": {"stroke": 0.0}}
+    return {**plain, **light, "ended": [], "restarted": False, "shift_px": [0.0, 0.1], **changes}
 
 
 def test_the_week_is_summed_up_and_drawn(tmp_path: Path) -> None:
@@ -81,5 +82,6 @@ def test_the_week_is_summed_up_and_drawn(tmp_path: Path) -> None:
     assert told["pages_from_knock_to_recalibrated"] == 3
     counts = ("recalibrations", "refused_or_failed", "pages_lost", "pages_lost_but_for_the_knock", "alarms")
     assert [told[name] for name in (*counts, "false_alarms", "restarts")] == [1, 1, 2, 0, 2, 1, 0]
+    assert table_of(rows, 100)[7] == "| 50-59 | 5.420 | 0.821 | 1 | 2 | -0.0059, 0.0000 |"
     draw(rows, tmp_path / "week.png", 50, 300.0)
     assert (tmp_path / "week.png").stat().st_size > 10_000

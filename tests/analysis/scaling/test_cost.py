@@ -1,7 +1,5 @@
 """How far a cluster goes: the queues against arithmetic, and the command from what was measured before."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What a call enters, traced in a service that runs, is split into its way and what only records it."""
 
-from __future__ import annotations
-
 import json
 from fnmatch import filter as matching
 from inspect import getfile

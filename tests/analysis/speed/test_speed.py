@@ -1,7 +1,5 @@
 """Benchmarks of speed: each runs small and writes its figures."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

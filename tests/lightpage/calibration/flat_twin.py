@@ -1,7 +1,5 @@
 """A device too simple to be wrong: the page is imaged onto itself, each branch with a known shift and phase ramp."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import ndimage
 
@@ -10,12 +8,15 @@ from lightpage.device.profile import Profile
 
 
 class FlatTwin:
-    """Places are the points themselves, phases a ramp (rad/m), pixels the places over the camera's pitch."""
+    """Places are the points themselves, phases a ramp (rad/m), pixels the places over the camera's pitch.
 
-    def __init__(self, profile: Profile, ramp: tuple[float, float] = (0.0, 0.0)) -> None:
+    The quadrature camera may be turned by 180 degrees.
+    """
+
+    def __init__(self, profile: Profile, ramp: tuple[float, float] = (0.0, 0.0), turned: bool = False) -> None:
         self._pitch = profile.camera.pitch_m
         self._centre = np.array([profile.camera.columns_px - 1, profile.camera.rows_px - 1]) / 2
-        self._ramp = np.array(ramp)
+        self._ramp, self._turned, self.known = np.array(ramp), turned, 0
 
     def trace(self, parameters: np.ndarray, points: np.ndarray, anchors: np.ndarray | None = None) -> Rays:
         """See `lightpage.calibration.interfaces.Twin`."""
@@ -25,7 +26,8 @@ class FlatTwin:
 
     def pixels(self, parameters: np.ndarray, places: np.ndarray) -> np.ndarray:
         """See `lightpage.calibration.interfaces.Twin`."""
-        return np.stack([places / self._pitch + self._centre] * 2)
+        sides = (1, -1 if self._turned else 1)
+        return np.stack([side * places / self._pitch + self._centre for side in sides])
 
 
 class Picture:

@@ -1,7 +1,5 @@
 """Claims about coherence: high for light that the twin explains, next to none for other light, less when misled."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A page's image is found by its pilots wherever it lies within reach, and nothing is found where it is not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

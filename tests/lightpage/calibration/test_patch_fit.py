@@ -1,7 +1,5 @@
 """Claims about the fit: its derivative, its priors, what it recovers, and what outliers do to it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -34,9 +32,9 @@ def measured(
             phases = rays.phases[b]
             pixels = TWIN.pixels(truth, rays.places[b, :1])[:, 0]
             read_at = TWIN.pixels(nominal(), expected.places[b, :1])[:, 0]
-            carrier = np.array([0.02, -0.03])
+            carrier = np.array([[0.01, -0.015], [0.03, 0.01]])
             # read at another place than the true one, the phase is off by the carrier times the way
-            phase = phases[0] + piston + (read_at - pixels).mean(0) @ carrier
+            phase = phases[0] + piston + np.sum((read_at - pixels) * carrier)
             found.append(
                 Measurement(
                     branch=branch,
@@ -69,7 +67,7 @@ def scattered(count: int = 12) -> list[Measurement]:
             cameras=(0, 1) if i % 2 else (0,),
             read_at=rng.uniform(0, 450, (2, 2)),
             phase=float(rng.uniform(-3, 3)),
-            carrier=rng.normal(size=2) * 0.01,
+            carrier=rng.normal(size=(2, 2)) * 0.01,
             slope=rng.normal(size=2) * 1e3,
             significance=float(rng.uniform(20, 90)),
             symbols=100,
@@ -122,7 +120,7 @@ class TestRecovery:
         assert np.abs(off).max() < 5e-3 < 0.05 < np.abs(before).max()
         assert found.cost < 1e-3
         assert np.exp(1j * found.piston) == pytest.approx(np.exp(2.5j), abs=0.01)
-        ignored = [replace(m, carrier=np.zeros(2)) for m in data]
+        ignored = [replace(m, carrier=np.zeros((2, 2))) for m in data]
         wrong = fit_parameters(TWIN, PROFILE, ignored, truth, EVERY, use_phase=True)
         assert wrong.cost > 100 * found.cost
 

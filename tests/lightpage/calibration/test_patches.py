@@ -1,7 +1,5 @@
 """Claims about local measurements: a patch finds the shift, phase and slope put in, and knows light that is not its."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -29,7 +27,6 @@ PITCH = PROFILE.symbol_pitch_m
 PIXEL = PROFILE.camera.pitch_m
 MIDDLE = patches(PROFILE)[5]
 FINE = PROFILE.with_symbols_of(2)
-FINE_SYMBOLS = np.exp(1j * random_phases(FINE, 1))
 
 
 def look(
@@ -40,8 +37,9 @@ def look(
     step_px: float = 3,
     ramp: tuple[float, float] = (0.0, 0.0),
     profile: Profile = PROFILE,
+    turned: bool = False,
 ) -> Measurement:
-    twin, window = FlatTwin(profile, ramp), search_window(reach_px * PIXEL, step_px * PIXEL)
+    twin, window = FlatTwin(profile, ramp, turned), search_window(reach_px * PIXEL, step_px * PIXEL)
     samples = symbol_samples(profile)
     return measure(sampler, twin, nominal(), profile, patch, symbols, ("direct",), window, samples)[0]
 
@@ -121,9 +119,10 @@ class TestFinding:
             away = places - np.array(MIDDLE.centre_m)
             return picture(places) * np.exp(1j * (away / PIXEL) @ per_px)
 
-        found = look(tilted)
-        assert found.carrier == pytest.approx(per_px, abs=0.01)
-        assert look(picture).carrier == pytest.approx([0, 0], abs=0.005)
+        for turned in (False, True):
+            by_camera = np.stack([per_px, -per_px if turned else per_px]) / 2
+            assert look(tilted, turned=turned).carrier == pytest.approx(by_camera, abs=0.005)
+        assert look(picture).carrier == pytest.approx(np.zeros((2, 2)), abs=0.0025)
 
 
 class TestSignificance:

@@ -1,7 +1,5 @@
 """Samplers show the field, one camera's its projection; a shift over a reference that stays adds to its phase."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Claims about the sampling table: rebuilt from it, every sample of every symbol lies where the twin would trace it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -9,8 +7,10 @@ from lightpage.calibration.interfaces import BRANCHES
 from lightpage.calibration.parameters import NAMES, PRIORS, indices
 from lightpage.calibration.sampling_table import (
     monomial_powers,
+    moved_cameras,
     registration_coefficients,
     sampling_table,
+    shifted,
     symbol_centres,
 )
 from lightpage.device.profile import Profile, load_profile
@@ -91,3 +91,13 @@ def test_a_cubic_holds_the_pixels_of_the_whole_grid() -> None:
     terms = np.stack([u**i * v**j for i, j in monomial_powers()])
     rebuilt = np.moveaxis(coefficients @ terms, 1, -1)
     assert np.abs(rebuilt - twin.pixels(parameters, places)).max() < 1e-3
+
+
+def test_an_image_that_moves_moves_the_other_way_on_a_camera_that_is_turned() -> None:
+    profile, parameters, shift = small_profile(), some_device(), np.array([1.5, -0.5])
+    parameters[indices("quadrature")] += [0, 0, -2, -2, 0, 0]
+    twin = TorchTwin(RayTwin(profile))
+    before = registration_coefficients(twin, parameters, profile)
+    after = registration_coefficients(twin, moved_cameras(parameters, shift), profile)
+    np.testing.assert_allclose(shifted(before, shift), after, atol=1e-3)
+    np.testing.assert_allclose((after - before)[..., 0], [shift, -shift], atol=1e-3)

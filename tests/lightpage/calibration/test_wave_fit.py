@@ -1,13 +1,11 @@
 """Claims about the fit to waves: a known page places both cameras and tells the device, with calibrated deviations."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from lightpage.calibration.parameters import NAMES, PARAMETERS, PRIORS, indices
 from lightpage.calibration.waves import wave_fit
-from lightpage.calibration.waves.wave_fit import WaveFit
+from lightpage.calibration.waves.wave_fit import LevelPrior, WaveFit
 from lightpage.device.profile import Profile
 from lightpage.device.state import (
     Aberration,
@@ -20,8 +18,9 @@ from lightpage.device.state import (
     SlmDefects,
     draw_device,
 )
-from lightpage.page.modulation import NOMINAL
+from lightpage.page.modulation import DRIFTS, NOMINAL
 from lightpage.page.symbols import symbol_phases
+from lightpage.recording.frame_pair import FramePair
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_modulation, true_parameters
 from lightpage.train.models.twin import RayTwin, TorchTwin
@@ -34,16 +33,19 @@ TURN = np.deg2rad(-90 + 3)
 EVERY = tuple(dict.fromkeys(parameter.group for parameter in PARAMETERS))
 
 
-def seen_by(device: Device, seed: int, profile: Profile = PROFILE) -> WaveFit:
-    """The fit of one random page of a device."""
+def seen_by(device: Device, seed: int, profile: Profile = PROFILE, *, turned: bool = False) -> WaveFit:
+    """The fit of one random page of a device, whose quadrature camera may be turned by 180 degrees."""
     simulator = Simulator(profile, device, seed=seed)
     symbols = np.random.default_rng(seed).integers(256, size=profile.page_shape).astype(np.uint8)
     pair, references = simulator.page(symbols), simulator.references()
+    if turned:
+        pair, references = (FramePair(each.in_phase, np.flip(each.quadrature)) for each in (pair, references))
     twin = TWIN if profile is PROFILE else TorchTwin(RayTwin(profile))
     return WaveFit(twin, profile, pair, references, np.exp(1j * symbol_phases(symbols, 256)))
 
 
-def test_both_cameras_and_the_angle_between_the_arms_come_back_in_dim_light() -> None:
+@pytest.mark.parametrize("turned", [False, True])
+def test_both_cameras_and_the_angle_between_the_arms_come_back_in_dim_light(turned: bool) -> None:
     device = Device(
         in_phase_camera=CameraPose(scale_relative_error=2e-3, rotation_deg=0.1, shift_x_px=1.0),
         quadrature_camera=CameraPose(scale_relative_error=-1e-3, rotation_deg=-0.1, shift_y_px=-2.0),
@@ -53,11 +55,15 @@ def test_both_cameras_and_the_angle_between_the_arms_come_back_in_dim_light() ->
         sensor=Sensor(full_well_e=100.0),
         drift=Drift(shift_px=0),
     )
-    truth = true_parameters(PROFILE, device)
+    truth, centre = true_parameters(PROFILE, device), np.zeros(len(PRIORS))
+    if turned:
+        centre[indices("quadrature")] = [0, 0, -2, -2, 0, 0]
+        truth = np.where(np.isin(np.arange(len(PRIORS)), indices("quadrature")), centre - truth, truth)
     start = truth.copy()
     start[indices("in_phase")] += [0.3, 0.1, 1e-3, 0, 1e-3, 0]
     start[indices("quadrature")] += [-0.4, 0.2, -1e-3, 1e-3, 0, 2e-3]
-    result = seen_by(device, 1).fit(start, TURN + np.deg2rad(8), ("in_phase", "quadrature"))
+    fit, cameras = seen_by(device, 1, turned=turned), ("in_phase", "quadrature")
+    result = fit.fit(start, TURN + np.deg2rad(8), cameras, centre)
     found, turn = result.parameters, result.quadrature_phase
 
     grid = field_grid(PROFILE)
@@ -80,12 +86,13 @@ def test_both_cameras_and_the_angle_between_the_arms_come_back_in_dim_light() ->
 
 def test_a_realistic_device_is_told_from_near_it_with_calibrated_deviations() -> None:
     seed = 1
-    device = draw_device(np.random.default_rng(seed))
-    truth = true_parameters(PROFILE, device)
+    # a taper is told by the other parameters
+    device = draw_device(np.random.default_rng(seed)).with_settings(["geometry.pipe_taper_relative=0.003"])
+    truth, levels = true_parameters(PROFILE, device), true_modulation(device.slm)
     rng, angle = np.random.default_rng([seed, 1]), NAMES.index("pipe_angle_rad")
     start = truth + 0.02 * PRIORS * rng.standard_normal(len(PRIORS))
     start[angle] = truth[angle] + 4e-4
-    found = seen_by(device, seed).fit(start, device.homodyne.turn_rad, EVERY)
+    found = seen_by(device, seed).fit(start, device.homodyne.turn_rad, EVERY, modulation=levels)
     assert abs(found.parameters[angle] - truth[angle]) < found.deviations[angle] < 1e-4
     assert np.rad2deg(abs(found.quadrature_phase - device.homodyne.turn_rad)) < 0.3
     moving = indices("in_phase", "quadrature")[::6], indices("in_phase", "quadrature")[1::6]
@@ -118,12 +125,12 @@ def test_how_much_path_real_lenses_add_comes_back() -> None:
 
 def test_held_parameters_keep_their_values_and_priors_hold_the_others() -> None:
     device = draw_device(np.random.default_rng(3))
-    truth = true_parameters(PROFILE, device)
+    truth, levels = true_parameters(PROFILE, device), true_modulation(device.slm)
     fit, start = seen_by(device, 3), truth.copy()
     angle = NAMES.index("pipe_angle_rad")
     start[angle] += 4e-4
-    free = fit.fit(start, device.homodyne.turn_rad, ("angle",))
-    held = fit.fit(start, device.homodyne.turn_rad, ("angle",), centre=start, prior_scale=1e-4)
+    free = fit.fit(start, device.homodyne.turn_rad, ("angle",), modulation=levels)
+    held = fit.fit(start, device.homodyne.turn_rad, ("angle",), centre=start, prior_scale=1e-4, modulation=levels)
     assert np.array_equal(np.flatnonzero(free.parameters - start), [angle])
     assert abs(free.parameters[angle] - truth[angle]) < 1e-4
     assert abs(held.parameters[angle] - start[angle]) < 1e-5
@@ -136,7 +143,7 @@ def test_a_nominal_modulator_stays_nominal_and_axial_places_are_found_from_far_a
     truth = true_parameters(PROFILE, device)
     start, axial = truth.copy(), indices("axial")
     start[axial] += [0.4, -0.2, 0.1]
-    found = seen_by(device, 5).fit(start, device.homodyne.turn_rad, EVERY, levels=True)
+    found = seen_by(device, 5).fit(start, device.homodyne.turn_rad, EVERY, levels=LevelPrior())
     assert found.modulation is NOMINAL
     assert all(found.modulation_deviations)
     off = ((found.parameters - truth) / np.maximum(found.deviations, 1e-12))[axial]
@@ -148,9 +155,22 @@ def test_what_the_modulator_makes_of_its_levels_comes_back_with_calibrated_devia
     slm = SlmDefects(stroke_relative_error=-0.08, level_sine_rad=0.2, level_cosine_rad=0.1, unmodulated_relative=0.1)
     device = Device(slm=slm, drift=Drift(shift_px=0))
     start, truth = true_parameters(PROFILE, device), true_modulation(slm)
-    found = seen_by(device, 2).fit(start, device.homodyne.turn_rad, EVERY, levels=True)
+    found = seen_by(device, 2).fit(start, device.homodyne.turn_rad, EVERY, levels=LevelPrior())
     off = np.array(found.modulation.coefficients) - truth.coefficients
     assert np.sqrt(np.mean((off / found.modulation_deviations) ** 2)) < 2
     # of levels: what a decision among 256 of them notices is a tenth of their distance, the noise of most pages 0.02
     phases = found.modulation.phases(256) - truth.phases(256)
     assert np.std(phases) < 0.02 < 0.1 < np.std(truth.phases(256) - symbol_phases(np.arange(256), 256))
+
+
+@pytest.mark.parametrize("stroke", [0.0, -0.02])
+def test_a_re_fit_finds_a_stroke_that_has_changed_and_else_leaves_the_levels_as_they_were(stroke: float) -> None:
+    slm = SlmDefects(level_sine_rad=0.1, unmodulated_relative=0.05)
+    earlier, later = (true_modulation(slm.model_copy(update={"stroke_relative_error": by})) for by in (0.0, stroke))
+    device = Device(slm=slm.model_copy(update={"stroke_relative_error": stroke}), drift=Drift(shift_px=0))
+    start, drift = true_parameters(PROFILE, device), LevelPrior(earlier, DRIFTS)
+    found = seen_by(device, 2).fit(start, device.homodyne.turn_rad, ("in_phase",), modulation=earlier, levels=drift)
+    assert (found.modulation is earlier) == (stroke == 0)
+    off = np.array(found.modulation.coefficients) - later.coefficients
+    assert abs(off[0]) < 3 * found.modulation_deviations[0] < 0.006
+    assert np.abs(off[1:]).max() < 0.02

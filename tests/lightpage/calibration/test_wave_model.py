@@ -1,7 +1,5 @@
 """The wave model of a calibrated device carries the whole page, whatever the pipe's angle."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The command as a process among others: its streams, signals, help, completion, progress and lack of resources."""
 
-from __future__ import annotations
-
 import errno
 import os
 import signal

@@ -1,7 +1,5 @@
 """`lightpage simulate`: reproducible, interruptible, and careful with files that are there."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

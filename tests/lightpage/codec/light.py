@@ -1,7 +1,5 @@
 """Decoded pages drawn for tests: known symbols in von Mises noise, which is what a decoder's posterior claims."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lightpage.codec.code import Code

@@ -1,9 +1,7 @@
 """A code is found for what pages are like, whatever the shape of their noise, and pages written with it are read."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -39,8 +37,14 @@ def choose_by(pages: int, kappa: float, lost_share: float, air_bits: float) -> t
 
 
 @pytest.mark.parametrize(("lost_share", "some_in_cosets"), [(0.0, True), (0.02, False)])
-def test_pages_are_read_with_the_code_that_was_chosen_by_their_like(lost_share: float, some_in_cosets: bool) -> None:
+def test_pages_are_read_with_the_code_that_was_chosen_by_their_like(
+    lost_share: float, some_in_cosets: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measured = Mock(wraps=needed_information)
+    monkeypatch.setattr("lightpage.codec.choose.needed_information", measured)
     chosen, tried = choose_by(3, KAPPA, lost_share, 4.2)
+    levels = [call.args[1][0].levels.count for call in measured.call_args_list]
+    assert levels.count(chosen.code.levels) <= 3  # few codes are tried
     assert (chosen.code.coded_bits < chosen.code.level_bits) == some_in_cosets
     assert chosen.user_bytes == max(each.user_bytes for each in tried)
     codec, rng = PageCodec(chosen.code, PILOTS), np.random.default_rng(8)
@@ -63,15 +67,3 @@ def test_pages_that_nothing_carries_are_refused_with_what_they_were() -> None:
 def test_two_pages_are_too_few() -> None:
     with refused(got=2):
         choose_by(2, KAPPA, 0.0, 4.0)
-
-
-def test_few_codes_of_the_chosen_levels_are_tried(monkeypatch: pytest.MonkeyPatch) -> None:
-    tried = list[int]()
-
-    def counted(*arguments: Any) -> float:
-        tried.append(arguments[1][0].levels.count)
-        return needed_information(*arguments)
-
-    monkeypatch.setattr("lightpage.codec.choose.needed_information", counted)
-    chosen, _ = choose_by(3, KAPPA, 0.0, 4.2)
-    assert tried.count(chosen.code.levels) <= 3

@@ -1,7 +1,5 @@
 """The parameters of a code, and the random bits and checksums of its pages."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Parity pages: what is lost comes back, whichever pages they are, and one more loss is noticed."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

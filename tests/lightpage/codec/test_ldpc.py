@@ -1,7 +1,5 @@
 """LDPC blocks: the standard's code bit for bit, and a decoder that loses nothing against independent ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

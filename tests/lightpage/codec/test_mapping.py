@@ -1,7 +1,5 @@
 """Bits on phases: the ratios are those of the posterior, labels are Gray, levels and labels are inverse."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A page of user bytes: what goes in comes out, or nothing does; never other bytes."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Reed-Solomon words: the library's parity bit for bit, t wrong symbols mended, no more."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import reedsolo

@@ -1,7 +1,5 @@
 """Pages and pilots are those of docs/formats.md, as an independent writer made them: vectors.json says how."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

@@ -1,7 +1,5 @@
 """A file on pages: how they are numbered, that the file comes back whole or not at all, and what is missing."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from io import BytesIO

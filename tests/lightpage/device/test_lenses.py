@@ -1,7 +1,5 @@
 """Lenses: a real one's path, and prescriptions against known figures, closed forms and themselves turned round."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -14,7 +12,7 @@ from lightpage.errors import ProfileError
 from tests.lightpage.refused import refused
 from tests.lightpage.small import THICK, small_profile
 
-TERMS = SeidelTerms(1.1, -0.7, 0.5, 0.9, -1.3, 0.4)
+TERMS = SeidelTerms(1.1, -0.7, 0.5, 0.9, -1.3, 0.4, 0.3, -0.6, 0.8)
 
 
 def test_slope_and_bend_are_the_derivatives() -> None:

@@ -1,7 +1,5 @@
 """Profiles: shipped ones load, every kind of bad profile is refused and names the key, TOML survives a round trip."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

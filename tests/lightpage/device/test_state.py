@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lightpage.device.profile import load_profile, to_toml
-from lightpage.device.state import Device, Geometry, draw_device, load_device, parse_device
+from lightpage.device.state import Device, Geometry, draw_device, draw_rough, load_device, parse_device
 from lightpage.errors import ProfileError
 from tests.lightpage.refused import refused
 
@@ -18,6 +18,13 @@ def test_device_survives_the_round_trip_through_toml(tmp_path: Path) -> None:
     path = tmp_path / "device.toml"
     path.write_text(to_toml(device), "utf-8")
     assert load_device(path) == device
+
+
+def test_the_rough_device_is_the_realistic_one_with_more_faults() -> None:
+    rough, plain = load_device("rough").model_dump(), Device().model_dump()
+    changed = {(table, key) for table, keys in plain.items() for key in keys if keys[key] != rough[table][key]}
+    assert {plain[table][key] for table, key in changed} == {0}
+    assert len(changed) == 21
 
 
 def test_settings_change_what_they_name_and_nothing_else() -> None:
@@ -69,23 +76,32 @@ def test_a_bad_device_file_and_one_that_is_not_there_are_refused_and_named(tmp_p
         load_device(path)
 
 
-def test_drawn_devices_fill_the_capture_range_and_stay_inside() -> None:
+def test_drawn_devices_fill_the_capture_range_and_rough_ones_scatter_within_it() -> None:
     rng = np.random.default_rng(1)
-    devices = [draw_device(rng) for _ in range(200)]
-    for table, key, limit in (
-        ("geometry", "pipe_angle_deg", 1.0),
-        ("geometry", "focal_length_relative_error", 0.003),
-        ("geometry", "pipe_roll_deg", 0.4),
-        ("in_phase_camera", "shift_y_px", 12.0),
-        ("quadrature_camera", "scale_relative_error", 0.01),
-        ("aberration", "distortion_relative", 0.003),
-        ("reference", "tilt_x_rad", 3.0),
-        ("homodyne", "quadrature_error_deg", 6.0),
+    devices, rough = ([draw(rng) for _ in range(200)] for draw in (draw_device, draw_rough))
+    for table, key, limit, deviation in (
+        ("geometry", "pipe_angle_deg", 1.0, 0.6),
+        ("geometry", "focal_length_relative_error", 0.003, 0.001),
+        ("geometry", "pipe_roll_deg", 0.4, 0.1),
+        ("in_phase_camera", "shift_y_px", 12.0, 4),
+        ("quadrature_camera", "scale_relative_error", 0.01, 0.005),
+        ("aberration", "distortion_relative", 0.003, 0.001),
+        ("reference", "tilt_x_rad", 3.0, 1),
+        ("homodyne", "quadrature_error_deg", 6.0, 3),
+        ("slm", "stroke_relative_error", 0.03, 0.005),
+        ("quadrature_camera", "axial_rad", 1.5, 0.3),
     ):
-        values = [getattr(getattr(device, table), key) for device in devices]
+        values, scattered = ([getattr(getattr(each, table), key) for each in some] for some in (devices, rough))
         assert 0.9 * limit < -min(values) <= limit, key
         assert 0.9 * limit < max(values) <= limit, key
+        assert np.abs(scattered).max() <= limit, key
+        # clipping takes at most an eighth off, and that of 200 is off by 5% as a rule
+        assert 0.75 * deviation < np.std(scattered) < 1.2 * deviation, key
     assert {d.homodyne.quadrature_sign for d in devices} == {-1, 1}
+    errors = [
+        abs(d.slm.level_sine_rad) + abs(d.slm.level_cosine_rad) + abs(d.slm.level_sine_twice_rad) for d in devices
+    ]
+    assert 0.27 < max(errors) <= 0.3 + 1e-12
 
 
 def test_a_pipe_deviates_from_the_angle_of_its_profile_unless_its_own_is_given() -> None:

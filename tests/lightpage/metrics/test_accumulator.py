@@ -1,7 +1,5 @@
 """Pages gathered one by one, against the same figures of all of them at once."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 
 import numpy as np

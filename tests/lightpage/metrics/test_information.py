@@ -1,7 +1,5 @@
 """Claims about rates and confidence, against numerical integration and draws from von Mises densities."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.integrate import quad

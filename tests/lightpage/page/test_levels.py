@@ -1,7 +1,5 @@
 """Levels may stand for any phases; what a modulator makes of them says for which."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

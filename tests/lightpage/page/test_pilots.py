@@ -1,13 +1,19 @@
 """The pilots give the piston, how far a decoder may be trusted, and whether a page may be given out."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from lightpage.errors import PageError
 from lightpage.metrics.information import achievable_rate, own_information
-from lightpage.page.pilots import Pilots, estimate_piston, estimate_trust, read_pilots, remove_piston, without_outliers
+from lightpage.page.pilots import (
+    Pilots,
+    estimate_piston,
+    estimate_trust,
+    read_pilots,
+    remove_piston,
+    stroke_error,
+    without_outliers,
+)
 from tests.lightpage.refused import refused
 from tests.runtime import toy
 
@@ -40,6 +46,14 @@ def test_a_pilot_without_confidence_does_not_count() -> None:
     wrong = np.argwhere(pilots.mask)[0]
     p[:, wrong[0], wrong[1]] = [1e-9, -1e-9]
     assert estimate_piston(p, pilots).angle_rad == pytest.approx(0.5, abs=1e-9)
+
+
+def test_a_stroke_that_is_too_long_is_a_slope_over_the_pilots_phases() -> None:
+    symbols = toy.symbols_of(16, 3)[0]
+    phase = np.float32(1.01 * 2 * np.pi / 16 * symbols + 0.1)
+    kappa, everywhere = np.full(toy.PAGE, 5.0), np.ones(toy.PAGE, bool)
+    assert stroke_error(phase, kappa, Pilots.of_symbols(everywhere, symbols, 16)) == pytest.approx(0.01, abs=1e-6)
+    assert np.isnan(stroke_error(phase, kappa, Pilots.of_symbols(everywhere, 0 * symbols, 16)))
 
 
 def test_phase_stays_within_half_a_turn() -> None:

@@ -1,7 +1,5 @@
 """The page: pilots cover it evenly and repeat with the seed; symbols out of range are refused by name."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

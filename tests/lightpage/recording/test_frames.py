@@ -1,7 +1,5 @@
 """Frames: those without usable light are named, darkness comes off, hot pixels are mended, odd counts are noticed."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A disk that fails while a file is written: what fails for a moment costs nothing, and pages that were whole stay."""
 
-from __future__ import annotations
-
 import errno
 from io import FileIO
 from pathlib import Path

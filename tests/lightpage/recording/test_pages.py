@@ -1,7 +1,5 @@
 """Pages to write: what is written comes back, what is damaged is refused by name, nothing is left by half."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,11 +1,10 @@
 """Recordings: what is written comes back, what is damaged is refused by name, an interruption loses nothing."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import h5py
 import numpy as np
@@ -303,17 +302,6 @@ class TestWriting:
             assert not recording.has_symbols
             assert recording.pilots() is None
 
-    def test_an_older_recording_stays_until_the_new_one_is_complete(self, tmp_path: Path) -> None:
-        path = tmp_path / "own.h5"
-        write_own(path)
-        before = path.read_bytes()
-        with RecordingWriter(path, small_profile(), LEVELS, 12, random_frames(9)) as writer:
-            writer.append(None, random_frames(0))
-            assert path.read_bytes() == before
-        with Recording.open(path) as recording:
-            assert recording.pages == 1
-        assert list(tmp_path.iterdir()) == [path]
-
     @pytest.mark.parametrize(
         ("frame", "got"),
         [
@@ -428,12 +416,8 @@ class TestInterruption:
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         path, profile = tmp_path / "own.h5", small_profile()
-
-        def interrupt(made: Path, final: Path) -> None:
-            raise KeyboardInterrupt
-
         with monkeypatch.context() as patch:
-            patch.setattr("lightpage.recording.writer.move_into_place", interrupt)
+            patch.setattr("lightpage.recording.writer.move_into_place", Mock(side_effect=KeyboardInterrupt))
             writer = RecordingWriter(path, profile, LEVELS, 12, random_frames(100))
             for page in range(3):
                 writer.append(None, random_frames(page))

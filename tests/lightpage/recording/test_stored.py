@@ -1,7 +1,5 @@
 """What is opened is what it says: nothing that HDF5 fills in, finds elsewhere or cannot decode is believed."""
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil
@@ -132,12 +130,6 @@ def test_an_array_whose_data_lack_is_named(foreign: Path, name: str, lack: str) 
 
 
 class TestVirtualDatasets:
-    def test_what_sources_hold_is_read(self, foreign: Path) -> None:
-        frames, pilots = virtual(foreign), virtual(foreign, "pilots", "pilots.h5")
-        with Recording.open(foreign) as recording:
-            np.testing.assert_array_equal([recording.frames(page).in_phase for page in range(PAGES)], frames)
-            np.testing.assert_array_equal(recording.pilots(), pilots)
-
     def test_a_source_without_the_dataset_or_with_too_little_or_of_another_type_is_named(self, foreign: Path) -> None:
         data = virtual(foreign)
         for content in (

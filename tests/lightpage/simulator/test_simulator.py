@@ -264,6 +264,48 @@ class TestLight:
         assert np.angle(factor[-1, -1]) == pytest.approx(expected, abs=0.02)
         assert np.angle(factor[-1, 0]) == pytest.approx(expected - 0.4 * half_x / np.sqrt(corner2), abs=0.02)
 
+    def test_a_tilted_camera_sees_each_place_out_of_focus_by_so_much(self) -> None:
+        tilted, profile, place = CameraPose(tilt_x_rad=1.0), small_profile(), 0.7
+        optics, flat = (TrueOptics(profile, perfect_device(in_phase_camera=pose)) for pose in (tilted, CameraPose()))
+        exit_field = flat.exit_field(on_slm(random_phases(profile, 3), profile))
+        at = np.argmin(np.abs(flat.camera_axes_m[0] - place * profile.page_width_m / 2))
+        seen, there, focused = (
+            found.camera_field(exit_field, pose)[:, at]
+            for found, pose in ((optics, tilted), (flat, CameraPose(axial_rad=place)), (flat, CameraPose()))
+        )
+        assert np.linalg.norm(seen - there) < 0.02 * np.linalg.norm(there) < 0.1 * np.linalg.norm(seen - focused)
+
+    @pytest.mark.parametrize(
+        ("knob", "value", "decibel"),
+        [
+            ("geometry.pipe_height_relative_error", 0.001, -19.0),
+            ("geometry.pipe_taper_relative", 0.0005, -31.4),
+            ("geometry.ghost_relative", 0.035, -29.1),  # its own square
+            ("geometry.modulator_tilt_x_rad", 0.1, -38.6),
+            ("in_phase_camera.tilt_y_rad", 0.1, -26.8),  # a third of its square, times the mean of (2 R / w)^4, 0.62
+            ("slm.crosstalk_relative", 0.02, -26.0),  # its square times that of a step, (2 pi)^2 / 6
+            ("slm.flicker_rad", 0.01, -44.0),  # a third of its square; this page's is 1.2 deviations
+            ("slm.dead_pixel_share", 0.001, -31.7),  # 1.5 times the share, half of which light misses the pipe
+            ("slm.dead_pixel_seed", 7, -np.inf),
+            ("sensor.nonlinearity_relative", -0.03, -33.6),
+            ("sensor.hot_pixel_share", 0.0002, -23.4),
+            ("sensor.dust_specks", 25, -22.5),
+            ("sensor.blemish_seed", 7, -np.inf),
+        ],
+    )
+    def test_a_fault_changes_as_much_of_the_frames_as_it_should(self, knob: str, value: float, decibel: float) -> None:
+        plain = quiet_frame()
+        signal, change = plain - quiet_frame(written=False), quiet_frame(f"{knob}={value}") - plain
+        assert np.sum(change**2) == pytest.approx(10 ** (decibel / 10) * np.sum(signal**2), rel=0.07)
+
+
+@cache
+def quiet_frame(*settings: str, written: bool = True) -> np.ndarray:
+    """The in-phase frame of a page, or of the reference, counts."""
+    simulator = Simulator(small_profile(), gentle().with_settings([*settings]), levels=16, seed=7, steps=16)
+    pair = simulator.page(symbols(simulator.profile)) if written else simulator.references()
+    return pair.in_phase.astype(float)
+
 
 @cache
 def mishandled() -> Device:

@@ -1,7 +1,5 @@
 """Claims about the waves: what the pipe and the lenses keep, undo and image, against direct sums and other methods."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -11,7 +9,7 @@ from scipy import fft, integrate, linalg, ndimage
 
 from lightpage.device.lens_path import SeidelTerms
 from lightpage.waves.channel import WaveChannel
-from lightpage.waves.geometry import WaveGeometry, modes_for, sine_matrix
+from lightpage.waves.geometry import WaveGeometry, facet_axis, modes_for, sine_matrix, taper_defocus
 from lightpage.waves.lens import FourierLens
 from lightpage.waves.pipe import PipePropagator
 
@@ -57,15 +55,16 @@ class TestPipe:
         assert np.vdot(other, pipe.forward(facet)) == pytest.approx(np.vdot(pipe.adjoint(other), facet), rel=1e-4)
 
     @pytest.mark.parametrize(
-        ("angle_deg", "length_m", "kept"), [(-10.0, 7e-5, 1.0), (20.0, 7e-5, 1.0), (4.0, 1e-3, 0.5)]
+        ("angle_deg", "length_m", "kept", "higher"),
+        [(-10.0, 7e-5, 1.0, 0.0), (20.0, 7e-5, 1.0, 0.3), (4.0, 1e-3, 0.5, 0.0)],
     )
     def test_a_step_is_the_matrix_exponential_of_the_cross_term_between_half_steps(
-        self, angle_deg: float, length_m: float, kept: float
+        self, angle_deg: float, length_m: float, kept: float, higher: float
     ) -> None:
-        cells, w = (8, 11), 30e-6
-        geometry = replace(device(angle_deg, length_m=length_m), pipe_width_m=w)
+        cells, sides = (8, 11), ((1 + higher) * 30e-6, 30e-6)
+        geometry = replace(device(angle_deg, length_m=length_m), pipe_width_m=sides[1], pipe_height_relative=higher)
         derivatives, coupled = [], []
-        for n in cells:
+        for n, w in zip(cells, sides, strict=True):
             squares = (np.pi * np.arange(1, n) / w) ** 2
             apart = np.abs(squares[:, None] - squares) * length_m / (2 * GLASS)
             derivative = _derivative_between_sines(n - 1) / w
@@ -74,7 +73,7 @@ class TestPipe:
         assert min(coupled) == pytest.approx(kept, abs=0.25 if kept < 1 else 1e-12)
         laplacian = 2 * np.sin(geometry.pipe_angle) * np.kron(*derivatives)
         step = linalg.expm(1j * geometry.pipe_length_m / (2 * GLASS) * laplacian)
-        numbers = [np.pi * np.arange(1, n) / w for n in cells]
+        numbers = [np.pi * np.arange(1, n) / w for n, w in zip(cells, sides, strict=True)]
         transverse = numbers[0][:, None] ** 2 + numbers[1][None, :] ** 2
         half = np.exp(0.5j * (np.sqrt(GLASS**2 - transverse) - GLASS) * geometry.pipe_length_m).ravel()
         field = noise(cells[0] - 1, cells[1] - 1)
@@ -82,6 +81,27 @@ class TestPipe:
         expected = fft.dstn((half * (step @ (half * modes))).reshape(field.shape), type=1, norm="ortho")
         assert off(step, np.eye(len(step))) > 0.1
         assert off(PipePropagator(geometry, cells, 1).forward(field), expected) < 1e-5
+
+    def test_a_taper_bends_light_as_a_staircase_of_even_pipes_does(self) -> None:
+        count, taper, stairs = 23, 0.1, 400
+        geometry = replace(DEVICE, pipe_width_m=0.2e-3, pipe_taper=taper)
+        sides = [geometry.facet_sides_m(second=leaving)[1] for leaving in (False, True)]
+        u, number = (np.arange(2000) + 0.5) / 2000, np.arange(1, count + 1)
+        given = stepped = noise(count) * (number < 12)
+        before = sides[0]
+        for width in sides[0] * (1 + taper * (np.arange(stairs) + 0.5) / stairs):
+            earlier = np.sin(np.pi * number * (0.5 + (u[:, None] - 0.5) * width / before)) @ stepped
+            stepped = 2 / len(u) * np.sqrt(width / before) * np.sin(np.pi * number[:, None] * u) @ earlier
+            stepped *= np.exp(-0.5j * (np.pi * number / width) ** 2 * geometry.pipe_length_m / stairs / GLASS)
+            before = width
+        factors, sines = taper_defocus(GLASS, geometry.pipe_length_m, taper), sine_matrix(count + 1)
+        entrance, leaving = (
+            np.exp(1j * f * facet_axis(count + 1, side) ** 2) for f, side in zip(factors, sides, strict=True)
+        )
+        field = PipePropagator(geometry, (2, count + 1), 1).forward((given @ sines * entrance)[None])[0]
+        found = sines @ (field * leaving)
+        piston = np.vdot(found, stepped)  # the mode along y' turns all of it
+        assert off(found * piston / abs(piston), stepped) < 0.01
 
     def test_modes_that_the_glass_cannot_carry_are_refused(self) -> None:
         with pytest.raises(ValueError, match="wanted"):
@@ -134,9 +154,10 @@ class TestLens:
     @pytest.mark.parametrize("second", [False, True])
     def test_a_real_lens_adds_its_path_to_every_ray_between_plane_and_facet(self, second: bool) -> None:
         page, wall = 0.95e-3, DEVICE.pipe_width_m / 2
-        radians = {(4, 0): -5, (3, 1): -4, (2, 2): -3, (1, 3): -1.5, (0, 4): -1, (0, 2): 1.5}
+        radians = {(4, 0): -5, (3, 1): -4, (2, 2): -3, (1, 3): -1.5, (0, 4): -1, (0, 2): 1.5, (1, 2): 0.8}
         of = {powers: value / page ** powers[0] / wall ** powers[1] for powers, value in radians.items()}
-        terms = SeidelTerms(of[4, 0], of[3, 1], of[2, 2], -of[2, 2], of[1, 3], of[0, 4], of[0, 2])
+        even = of[4, 0], of[3, 1], of[2, 2], -of[2, 2], of[1, 3], of[0, 4], of[0, 2]
+        terms = SeidelTerms(*even, of[1, 2], -of[1, 2])
         geometry = replace(device(-0.6, 0.2), lens_path=terms, camera_path=terms.mirrored())
         x, y = axis(60, 27e-6) + 18e-6, axis(44, 23e-6) - 30e-6
         plane = noise(44, 60)
@@ -148,7 +169,8 @@ class TestLens:
 
         def path(x: np.ndarray, y: np.ndarray, at_x: float, at_y: float) -> np.ndarray:
             r2, aperture2, product = x**2 + y**2, at_x**2 + at_y**2, sign * (x * at_x + y * at_y)
-            powers = r2**2, r2 * product, product**2, r2 * aperture2, aperture2 * product, aperture2**2, aperture2
+            even = r2**2, r2 * product, product**2, r2 * aperture2, aperture2 * product, aperture2**2, aperture2
+            powers = *even, sign * x * aperture2, sign * y * aperture2
             return np.asarray(sign * sum(term * power for term, power in zip(terms, powers, strict=True)))
 
         for row, column, expected in summed_directly(geometry, x, y, plane, path):

@@ -1,7 +1,5 @@
 """Claims about the common grid: it covers the page's image, and its filters pass the pipe's light and stop the rest."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Expansions sum to the phase's phasor, about as well as asked; between sparse samples light of a band is known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Two toy recordings, and `lightpage bulk` on them within this process, by a clock that moves when somebody waits."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable, Generator, Iterable

@@ -1,7 +1,5 @@
 """Jobs, ranges and shards that are told alone: no file is there but what a test writes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
 

@@ -1,10 +1,7 @@
 """The commands of the runtime: figures and files that they write, what they refuse, and how they end."""
 
-from __future__ import annotations
-
 import json
 import sys
-from collections.abc import Callable, Iterator
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
@@ -27,14 +24,9 @@ from lightpage.runtime.client.pages import PagesClient
 from lightpage.runtime.commands.client import recalibrate as cli_recalibrate
 from lightpage.runtime.device.acquisition.source import open_source
 from lightpage.runtime.model.bundle.bundle import Bundle
-from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.recalibration.recalibration import Refit
-from lightpage.runtime.service.dataplane import DataPlane
-from lightpage.runtime.service.jobs.recalibrator import Recalibrator
-from lightpage.runtime.service.models.models import Models
-from lightpage.runtime.service.server.server import LightpageServer
 from tests.lightpage.full_disk import full_disk
 from tests.runtime import toy
+from tests.runtime.service.stage import Running, Start
 from tests.runtime.slow_fit import SlowFit
 from tests.waiting import eventually
 
@@ -254,35 +246,11 @@ def test_options_that_contradict_each_other_are_named(
     assert named in capsys.readouterr().err
 
 
-Start = Callable[..., LightpageServer]
-
-
-@pytest.fixture
-def start(decoder: Decoder, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Start]:
-    """Starts services that read toy pages, and have a recording to recalibrate from."""
-    toy.write_toy_recording((folder := tmp_path_factory.mktemp("known")) / "known.h5", toy.ToyDevice(), 16, 5)
-    running: list[LightpageServer] = []
-
-    def begin(fit: Refit = toy.fit_references) -> LightpageServer:
-        plane = DataPlane(Models(decoder), toy.ToySource(toy.ToyDevice()))
-        running.append(LightpageServer(plane, Recalibrator(plane, fit, folder)).start())
-        return running[-1]
-
-    yield begin
-    for server in running:
-        server.stop(0.5)
-
-
-@pytest.fixture
-def service(start: Start) -> LightpageServer:
-    return start()
-
-
 def test_decode_sends_a_recording_and_keeps_the_symbols(
-    service: LightpageServer, recording: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    service: Running, recording: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, report = tmp_path / "decoded.h5", tmp_path / "d.json"
-    where = ["decode", "--target", service.target, "--recording", recording[0]]
+    where = ["decode", "--target", service.server.target, "--recording", recording[0]]
     assert run(*where, "--out", out, "--json", report) == 0
     with h5py.File(out) as file:
         assert file["symbols"].shape == file["confidence"].shape == (4, *toy.PAGE)
@@ -316,10 +284,10 @@ def test_a_full_disk_leaves_the_earlier_file_and_no_other(tmp_path: Path, room: 
 
 
 def test_decode_goes_on_after_bad_pages_and_ends_with_their_names(
-    service: LightpageServer, with_bad_pages: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    service: Running, with_bad_pages: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, report = tmp_path / "decoded.h5", tmp_path / "d.json"
-    where = ["decode", "--target", service.target, "--recording", with_bad_pages, "--out", out, "--json", report]
+    where = ["decode", "--target", service.server.target, "--recording", with_bad_pages, "--out", out, "--json", report]
     assert run(*where) == 2
     data = json.loads(report.read_text())
     assert [page["page"] for page in data["pages"]] == [0, 2]
@@ -337,7 +305,7 @@ def test_decode_goes_on_after_bad_pages_and_ends_with_their_names(
 
 
 def test_decode_uses_the_devices_own_pilots_and_refuses_pages_where_they_disagree(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    start: Start, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Pages of a device whose pilots are fixed phases, sent and read, without a word of what was written."""
     device, path = toy.ToyDevice(noise=2.0), tmp_path / "own.h5"
@@ -351,22 +319,20 @@ def test_decode_uses_the_devices_own_pilots_and_refuses_pages_where_they_disagre
         for name in ("symbols", "pilots"):
             if name in file:
                 del file[name]
-    decoder = Decoder.load(toy.write_own_pilots_bundle(tmp_path / "own.zip"), threads=1)
-    plane = DataPlane(Models(decoder), open_source(f"recording:{path}"))
-    out = tmp_path / "out.h5"
-    with LightpageServer(plane, Recalibrator(plane, toy.fit_references)) as server:
-        for where in (["--recording", path], ["--source", "--pages", "2"]):
-            assert run("decode", "--target", server.target, *where, "--out", out) == 2
-            with h5py.File(out) as file:
-                assert (file["symbols"][0] == symbols[0])[~toy.OWN_MASK].all()
-                assert list(file["pages"]) == [0]
-            assert "1 of 2" in capsys.readouterr().err
+    bundle, out = toy.write_own_pilots_bundle(tmp_path / "own.zip"), tmp_path / "out.h5"
+    service = start(bundle, source=open_source(f"recording:{path}"))
+    for where in (["--recording", path], ["--source", "--pages", "2"]):
+        assert run("decode", "--target", service.server.target, *where, "--out", out) == 2
+        with h5py.File(out) as file:
+            assert (file["symbols"][0] == symbols[0])[~toy.OWN_MASK].all()
+            assert list(file["pages"]) == [0]
+        assert "1 of 2" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("end", [KeyboardInterrupt, LightpageError("service", "no connection", "one")])
 def test_pages_of_the_source_that_came_before_the_end_are_kept(
     end: BaseException | type[BaseException],
-    service: LightpageServer,
+    start: Start,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -381,8 +347,8 @@ def test_pages_of_the_source_that_came_before_the_end_are_kept(
 
     monkeypatch.setattr(PagesClient, "read", ending)
     out, figures = tmp_path / "decoded.h5", tmp_path / "d.json"
-    arguments = ["decode", "--target", service.target, "--source", "--pages", "5", "--out", out, "--json", figures]
-    assert run(*arguments) == (130 if end is KeyboardInterrupt else 2)
+    asked = ["decode", "--target", start().server.target, "--source", "--pages", "5", "--out", out, "--json", figures]
+    assert run(*asked) == (130 if end is KeyboardInterrupt else 2)
     told = capsys.readouterr()
     assert "2 of 5" in told.err
     pages = json.loads(figures.read_text())["pages"]
@@ -392,15 +358,15 @@ def test_pages_of_the_source_that_came_before_the_end_are_kept(
     assert ("before is kept" in told.err) == (end is KeyboardInterrupt)
 
 
-def test_recalibrate_and_rollback_work_on_a_running_service(service: LightpageServer, tmp_path: Path) -> None:
-    report = tmp_path / "r.json"
-    for more, version in (([], "toy-1+r1"), (["--recording", "known.h5"], "toy-1+r2")):
-        assert run("recalibrate", "--target", service.target, *more, "--pages", "3", "--json", report) == 0
+def test_recalibrate_and_rollback_work_on_a_running_service(start: Start, tmp_path: Path) -> None:
+    service, report = start(), tmp_path / "r.json"
+    toy.write_toy_recording(tmp_path / "known.h5", toy.ToyDevice(), 16, 5)
+    sent = ["--recording", tmp_path / "known.h5", "--send"]
+    for more, version in (([], "toy-1+r1"), (["--recording", "known.h5"], "toy-1+r2"), (sent, "toy-1+r3")):
+        assert run("recalibrate", "--target", service.server.target, *more, "--pages", "3", "--json", report) == 0
         told = json.loads(report.read_text())
         assert (told["version"], told["pages_used"]) == (version, 3)
-    assert run("rollback", "--target", service.target) == 0
-    assert run("rollback", "--target", service.target) == 0
-    assert run("rollback", "--target", service.target) == 2
+    assert [run("rollback", "--target", service.server.target) for _ in range(4)] == [0, 0, 0, 2]
 
 
 def test_a_detached_job_is_named_listed_cancelled_and_watched(
@@ -411,7 +377,7 @@ def test_a_detached_job_is_named_listed_cancelled_and_watched(
         return capsys.readouterr().out
 
     fit = SlowFit()
-    target = start(fit).target
+    target = start(fit=fit).server.target
     assert told("jobs") == "no jobs\n"
     job = told("recalibrate", "--detach", "--json", tmp_path / "j.json").strip()
     assert json.loads((tmp_path / "j.json").read_text()) == {"job": job}
@@ -428,25 +394,10 @@ def test_a_detached_job_is_named_listed_cancelled_and_watched(
     assert "source  toy-1+r1" in line
 
 
-def test_a_recording_here_is_sent(service: LightpageServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    report = tmp_path / "r.json"
-    toy.write_toy_recording(tmp_path / "here.h5", toy.ToyDevice((150.0, 62.0)), 16, 5)
-    sending = ("recalibrate", "--target", service.target, "--recording", tmp_path / "here.h5", "--send")
-    assert run(*sending, "--pages", "3", "--json", report) == 0
-    figures = json.loads(report.read_text())
-    assert (figures["version"], figures["pages_used"]) == ("toy-1+r1", 3)
-    assert figures["air_after"] > figures["air_before"] + 0.5
-    capsys.readouterr()
-    assert run(*sending, "--detach") == 0
-    job = capsys.readouterr().out.strip()
-    with LightpageClient(service.target) as client:
-        assert (client.jobs.list()[0].id, {one.pages_of for one in client.jobs.list()}) == (job, {"frames"})
-
-
 def test_a_sent_recalibration_ends_with_its_command(
     start: Start, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    server = start(SlowFit())
+    server = start(fit=SlowFit()).server
     toy.write_toy_recording(tmp_path / "here.h5", toy.ToyDevice(), 16, 2)
     where = ("--target", server.target, "--recording", tmp_path / "here.h5")
     assert run("recalibrate", *where, "--send", "--timeout", "1.5") == 2

@@ -1,10 +1,9 @@
 """Pages of a source become a recording: gone on with after an interruption, every lost shot noted."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -209,8 +208,6 @@ def test_a_second_run_beside_the_first_is_refused_at_once(record: Record, out: P
 
 
 def test_frames_without_a_page_that_stay_lost_are_lost_data(record: Record, monkeypatch: pytest.MonkeyPatch) -> None:
-    def lost() -> None:
-        raise LostShotError("I: frame", "none", "one", Reason.MISSING_FRAME)
-
+    lost = Mock(side_effect=LostShotError("I: frame", "none", "one", Reason.MISSING_FRAME))
     monkeypatch.setattr(source := Bench(), "dark_frames", lost)
     assert record(source, "--pages", 1) == EXIT_LOST

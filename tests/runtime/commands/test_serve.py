@@ -1,7 +1,5 @@
 """`lightpage serve`: its settings, its log and record of model changes, what it refuses, how it ends; its health."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -33,7 +31,6 @@ from lightpage.runtime.commands.service.serve import serve
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.models.store import Store
-from lightpage.runtime.service.settings import ServiceSettings
 from tests.runtime import toy
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -42,20 +39,6 @@ ROOT = Path(__file__).resolve().parents[3]
 def printed(*arguments: str | Path, **environment: str) -> str:
     words = [*map(str, arguments), "--print-config"]
     return CliRunner().invoke(serve, words, env=environment, standalone_mode=False, catch_exceptions=False).output
-
-
-def test_settings_come_from_the_file_the_environment_and_options(tmp_path: Path) -> None:
-    file = tmp_path / "service.toml"
-    file.write_text("[service]\nsource = 'simulator:bench'\nthreads = 1\ntracking = false\n[limits]\nstall_s = 2.0\n")
-    environment = {"LIGHTPAGE_SERVICE__THREADS": "2", "LIGHTPAGE_METRICS__PORT": "0", "LIGHTPAGE_STORE": "models"}
-    pages = ("--calibration-page", "3", "--calibration-page", "4")
-    text = printed("--config", file, "--metrics-port", "9100", *pages, **environment)
-    settings = ServiceSettings.model_validate(tomllib.loads(text))
-    assert settings.service.source == "simulator:bench"
-    assert (settings.service.threads, settings.service.tracking) == (2, False)
-    assert (settings.metrics.port, settings.limits.stall_s) == (9100, 2.0)
-    assert settings.self_calibration.pages == (3, 4)
-    assert "port = 9100  # option --metrics-port" in text.splitlines()
 
 
 def test_every_option_is_above_the_environment_and_printed_settings_open_nothing(tmp_path: Path) -> None:
@@ -74,6 +57,7 @@ def test_every_option_is_above_the_environment_and_printed_settings_open_nothing
         ("flight_recorder", {"folder": "f", "pages": 9}),
     ):
         assert told[table] | expected == told[table]
+    assert "port = 9  # option --metrics-port" in text.splitlines()
     assert list(tmp_path.iterdir()) == []
 
 

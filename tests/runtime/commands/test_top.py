@@ -1,7 +1,5 @@
 """`lightpage top`: what it says of a real service, of one that was restarted, and of one that is gone."""
 
-from __future__ import annotations
-
 import math
 import os
 import pty
@@ -118,13 +116,8 @@ def test_in_a_terminal_it_outlives_the_service_and_ends_with_q(decoder: Decoder)
     with stage(decoder) as running:
         running.read(3)
         port = running.port
-        command = [
-            sys.executable,
-            "-c",
-            "from lightpage.runtime.commands.client.top import top; top()",
-            "--address",
-            address(running),
-        ]
+        code = "from lightpage.runtime.commands.client.top import top; top()"
+        command = [sys.executable, "-c", code, "--address", address(running)]
         environment = {**os.environ, "TERM": "xterm", "COLUMNS": "120", "LINES": "50", "PYTHONPATH": str(ROOT)}
         process = subprocess.Popen([*command, "--interval", "0.1"], stdin=own, stdout=own, stderr=own, env=environment)
         os.close(own)

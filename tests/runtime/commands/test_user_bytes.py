@@ -1,7 +1,5 @@
 """A file to pages and back by the commands, and every way in which that can go wrong."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -96,14 +94,6 @@ def test_too_many_lost_pages_are_named_and_leave_no_file(bundle: Path, pages: np
     assert read == coded.CONTENT[:size] + bytes(2 * size) + coded.CONTENT[3 * size :]
 
 
-def test_pages_in_any_order_twice_or_missing(bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
-    order = [*range(2, len(pages))[::-1], 3, 3, 5]
-    result, figures = recovered(bundle, coded.recording(tmp_path / "R.h5", pages[order]))
-    assert result.exception is None
-    assert (tmp_path / "read.bin").read_bytes() == coded.CONTENT
-    assert (figures["pages_repeated"], figures["missing"]) == (3, [0, 1])
-
-
 def test_two_volumes(bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
     (tmp_path / "other").mkdir()
     other = coded.pages(bundle, tmp_path / "other", b"other", "--volume", "3", "--data-pages", "1")
@@ -129,13 +119,6 @@ def test_a_recording_that_says_how_it_is_coded_needs_no_other_source(pages: np.n
     for wrong in ("[]", '{"levels": 31}', "{"):
         result, _ = recovered(plain, coded.recording(tmp_path / f"{len(wrong)}.h5", pages, code=wrong))
         assert isinstance(result.exception, RecordingError)
-
-
-def test_pages_of_noise(bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
-    noise = np.random.default_rng(0).integers(0, 32, pages.shape, dtype=np.uint8)
-    result, figures = recovered(bundle, coded.recording(tmp_path / "R.h5", noise))
-    assert isinstance(result.exception, LostDataError)
-    assert {page["loss"] for page in figures["page_results"]} == {"optics"}
 
 
 def test_code_is_chosen_by_known_pages_and_kept_in_a_bundle(tmp_path: Path) -> None:

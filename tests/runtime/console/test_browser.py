@@ -1,7 +1,5 @@
 """A real browser shows the console: pages, losses, silence of the service; nothing leaves the host."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The console says what the service sees, acts for administrators alone, and is bounded."""
 
-from __future__ import annotations
-
 import errno
 import gzip
 import io

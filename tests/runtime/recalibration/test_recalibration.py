@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -71,8 +72,9 @@ def test_a_second_recalibration_keeps_what_the_first_found(decoder: Decoder, tmp
     assert set(Bundle.open(tmp_path / "2.zip").table) == {"homodyne", "reference_in_phase", "reference_quadrature"}
 
 
-def finds_nothing(*_: object) -> RefitResult:
-    raise CalibrationError("known pages", "no significant peak", "a device within the capture range")
+finds_nothing = Mock(
+    side_effect=CalibrationError("known pages", "no significant peak", "a device within the capture range")
+)
 
 
 def leads_away(*_: object) -> RefitResult:
@@ -133,9 +135,7 @@ def test_both_models_are_judged_as_the_tracker_decodes(decoder: Decoder, tmp_pat
 
 
 def test_a_version_that_is_none_is_refused_before_the_fit(decoder: Decoder, tmp_path: Path) -> None:
-    def never(*_: object) -> RefitResult:
-        raise AssertionError("fitted")
-
+    never = Mock(side_effect=AssertionError("fitted"))
     for version in ("v 2", "", "+r1", "x" * 101):
         with pytest.raises(BundleError, match="version"):
             recalibrate(decoder, known(), tmp_path / "n.zip", version, never, quiet)

@@ -1,7 +1,5 @@
 """A recalibration in its own process ends as one in this process does, or changes nothing and leaves nothing behind."""
 
-from __future__ import annotations
-
 import os
 import re
 import tempfile
@@ -77,7 +75,6 @@ def test_it_finds_what_this_process_finds_and_leaves_the_bundle_alone(
     ("worker", "limit_s", "error", "told"),
     [
         ("Refusing", 60.0, RecalibrationRefusedError, "fit: got worse"),
-        ("Killed", 60.0, WorkerError, "signal 9"),
         ("Broken", 60.0, WorkerError, "status 1"),
         ("Silent", 60.0, WorkerError, "60 s"),
         ("Silent", 1000.0, CallerLeft, None),

@@ -1,7 +1,5 @@
 """Known pages of a toy device that has drifted, and workers that fit it, or come to no good end."""
 
-from __future__ import annotations
-
 import os
 import signal
 from typing import Any
@@ -56,11 +54,6 @@ class Sound(RecalibrationWorker):
 class Refusing(Helper):
     def recalibrate(self, *task: Any, progress: Progress) -> None:
         raise RecalibrationRefusedError("fit", "worse", "better")
-
-
-class Killed(Helper):
-    def recalibrate(self, *task: Any, progress: Progress) -> None:
-        os.kill(os.getpid(), signal.SIGKILL)
 
 
 class Broken(Helper):

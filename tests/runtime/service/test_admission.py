@@ -1,7 +1,5 @@
 """Whom the service lets in: slots for which callers queue, sessions that are bounded, a heart that notices a hang."""
 
-from __future__ import annotations
-
 import math
 import queue
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """The Python client has all that the contract offers to one who decodes and reads, bytes of users among it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The service's settings: where they come from, which of them count, and what is said of wrong ones."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`lightpage train` on a small device: a run, its interruption, and what it refuses."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Sequence
@@ -34,7 +32,7 @@ from lightpage.train.models.presets import PRESETS
 from lightpage.train.published.training import PublishedChoices
 from lightpage.train.runs import FORMAT, begin, check_begun, load_run, sole_writer
 from lightpage.train.trainers.whole_run import own_pilots
-from tests.lightpage.small import small_profile
+from tests.lightpage.small import UNEXPLAINED, small_profile
 from tests.told import Told
 
 LAST = Path("checkpoints") / "last.ckpt"
@@ -208,13 +206,16 @@ def test_pilots_of_the_devices_own_are_found(recording: Path) -> None:
     assert len(told.notes) == 1
 
 
-def test_a_calibration_of_another_device_is_refused(device: list[str], tmp_path: Path) -> None:
+def test_a_calibration_that_is_wrong_or_of_another_device_is_refused(device: list[str], tmp_path: Path) -> None:
     calibration = load_calibration(device[5])
     angle = calibration.parameters["pipe_angle_rad"] + float(np.deg2rad(1))
     parameters = calibration.parameters | {"pipe_angle_rad": angle}
-    calibration.model_copy(update={"parameters": parameters}).save(tmp_path / "C.toml")
+    calibration.model_copy(update={"parameters": parameters, "goodness": UNEXPLAINED}).save(tmp_path / "C.toml")
+    words = [*device[:5], tmp_path / "C.toml", *device[6:], "--out", tmp_path / "run"]
+    with pytest.raises(CalibrationError, match=r"wrong fit.*--accept-wrong-fit"):
+        run(*words)
     with pytest.raises(CalibrationError, match="coherence of 0"):
-        run(*device[:5], tmp_path / "C.toml", *device[6:], "--out", tmp_path / "run")
+        run(*words, "--accept-wrong-fit")
 
 
 def test_a_run_is_calibrated_on_its_first_usable_pages_once(

@@ -1,13 +1,12 @@
 """Features on disk: what an interruption left is taken up, what belongs to something else is not."""
 
-from __future__ import annotations
-
 import errno
 import os
 from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -105,9 +104,6 @@ def test_a_part_of_the_pages_is_numbered_from_zero(tmp_path: Path) -> None:
 def test_room_is_taken_before_pages_are_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lacking: str, number: int, kind: type[Exception] | None
 ) -> None:
-    def lacks(*_: object, **__: object) -> None:
-        raise OSError(number, os.strerror(number))
-
-    monkeypatch.setattr(lacking, lacks)
+    monkeypatch.setattr(lacking, Mock(side_effect=OSError(number, os.strerror(number))))
     with pytest.raises(kind) if kind else nullcontext():
         fill(tmp_path, "device", 2, Pages(), "pages")

@@ -1,7 +1,5 @@
 """Patches of pages: the network sees in them what it sees in the page."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Synthetic pages are like the recorded ones of the device that they are made after."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import islice
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Training: it learns, takes up its last checkpoint, and counts no pilot as data."""
 
-from __future__ import annotations
-
 import ctypes
 import math
 import shutil

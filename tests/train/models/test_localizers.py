@@ -1,7 +1,5 @@
 """Localizers on simulated light: the features of a symbol show that symbol."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

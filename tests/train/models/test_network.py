@@ -1,7 +1,5 @@
 """The symbol U-Net, and the separable filter that is plain convolution."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Claims about the ray twin: against single rays followed wall by wall, closed forms, and its own derivatives."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The wave model in torch against the one in numpy, both ways."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The published localizers: where they look, and what the mode localizer undoes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Claims about the published ray tracer: another program's rays, single rays in numpy, closed forms, derivatives."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

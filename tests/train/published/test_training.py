@@ -1,7 +1,5 @@
 """The published decoders: their network, what classes say, learning rates, clipping, and the command."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

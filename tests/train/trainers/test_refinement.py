@@ -1,7 +1,5 @@
 """A further pass: what an estimated page leaves unexplained says where, and which way, the estimate is wrong."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What is read while the caller works: each page in its place, one ahead, its error with it; pages that were seen."""
 
-from __future__ import annotations
-
 import threading
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`lightpage bulk`: every page once, whatever happens in between, and what is done is not done again."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -91,20 +89,6 @@ def test_another_question_or_a_second_run_in_the_same_folder_is_refused(archive:
         assert archive.tasks == []
 
 
-def test_each_part_does_its_recordings_and_the_whole_is_added_up_without_parts(archive: Archive) -> None:
-    shutil.copy(archive.folder / "a.h5", archive.folder / "c.h5")
-    done = []
-    for part, names in (("1/2", {"b"}), ("0/2", {"a", "c"})):
-        status, figures = archive.run("evaluate", "--part", part)
-        assert {name for name, _ in archive.firsts()} == names
-        assert (status, figures["part"], figures["pages_missing"]) == (0, part, 0)
-        assert figures["pages"] == figures["this_run"]["pages"] == PAGES * len(names)
-        done += [row["recording"] for row in figures["recordings"]]
-    status, figures = archive.run("evaluate", asked=False)
-    assert (status, archive.tasks, figures["part"], figures["pages_read"]) == (0, [], None, 3 * PAGES)
-    assert sorted(done) == [row["recording"] for row in figures["recordings"]]
-
-
 def test_a_recording_that_opens_at_the_second_try_costs_a_second(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -118,19 +102,6 @@ def test_a_recording_that_opens_at_the_second_try_costs_a_second(
     monkeypatch.setattr(Recording, "open", hiccup)
     assert archive.run("decode")[0] == 0
     assert archive.clock.now() == AGAIN_S[0]
-
-
-def test_a_newer_model_reads_only_what_was_not_read_well(archive: Archive) -> None:
-    toy.write_toy_recording(archive.folder / "b.h5", toy.ToyDevice((158.0, 110.0), seed=3), 16, PAGES, 5)
-    status, figures = archive.run("evaluate")
-    assert (status, figures["pages_lost"] + figures["pages_recalibration_due"]) == (2, PAGES)
-    newer = toy.write_toy_bundle(archive.folder / "newer.zip", version="toy-2")
-    status, figures = archive.run("evaluate", "--again-with", str(newer), asked=False)
-    assert {name for name, _ in archive.firsts()} == {"b"}
-    assert (status, sum(len(task.pages) for task in archive.tasks), figures["rounds"][0]["pages"]) == (2, PAGES, PAGES)
-    moved = newer.rename(archive.folder / "moved.zip")  # is the same round
-    archive.run("evaluate", "--again-with", str(moved), asked=False)
-    assert (archive.tasks, len(json.loads((archive.out / "job.json").read_text())["rounds"])) == ([], 1)
 
 
 def test_files_come_back_from_pages_in_several_recordings(archive: Archive) -> None:

@@ -1,7 +1,5 @@
 """The driver: hands out what is missing, tries again what may pass, and counts what became of everything."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +10,7 @@ from lightpage.runtime.archives.run.driver import AGAIN_S, Progressed, Watch, ru
 from lightpage.runtime.archives.run.engine import Engine
 from lightpage.runtime.archives.run.job import Job
 from lightpage.runtime.archives.run.ledger import Ledger
-from lightpage.runtime.archives.run.task import Done, Failed, Operation, Outcome, Task
+from lightpage.runtime.archives.run.task import Done, Failed, Outcome, Task
 from tests.clock import HandClock
 from tests.runtime.archives.jobs import NEWER, PAGES, PASSES, RANGE, STAYS, Works, job, lost, page, source, write
 
@@ -164,25 +162,3 @@ def test_a_round_reads_again_what_was_not_read_well_and_what_is_worse_does_not_c
         (2, None, "read"),
     ]
     assert done(tmp_path, asked, works := Works())[0].pages == 0
-
-
-def test_devices_are_counted_by_name_and_not_by_page(tmp_path: Path) -> None:
-    asked = job(
-        source("a1", device="a"),
-        source("a2", device="a"),
-        source("b", device="b"),
-        source("c", STAYS, device="c"),
-        operation=Operation.RECALIBRATE,
-    )
-
-    def fails(task: Task, before: int) -> Outcome | None:
-        return Failed(task=task, problem=STAYS) if task.device == "b" else None
-
-    made, _, seen = done(tmp_path, asked, works := Works(fails))
-    assert [(task.device, [file.path.stem for file in task.files]) for task in works.tasks] == [
-        ("a", ["a1", "a2"]),
-        ("b", ["b"]),
-    ]
-    assert (seen.asked, made.pages, made.failed) == ([(2, 2)], 1, 2)
-    assert made.failures == {("b", Path("/b.h5")): STAYS}
-    assert [problem.subject for problem in made.problems] == ["device c: recording", "device b: recording"]

@@ -1,7 +1,5 @@
 """A fleet: one device is one task, what one lacks is its own affair, and what was trained is not trained again."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,19 +1,18 @@
 """What a run was asked: the same question goes on, another one is refused, and names mean the files that are there."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import json
 import shutil
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
 from lightpage.errors import BundleError, InvalidInputError, StorageError
 from lightpage.runtime.archives.run.job import bundle_sha256
-from lightpage.runtime.archives.run.question import found_recordings, of_fleet, of_recordings
+from lightpage.runtime.archives.run.question import found_recordings, of_fleet, of_recordings, with_round
 from lightpage.runtime.archives.run.task import Choices, FineTuning, NamedBundle, Operation
 from tests.runtime import toy
 from tests.runtime.archives.jobs import BUNDLE, NEWER, PASSES, STAYS, job, source
@@ -68,6 +67,15 @@ def test_a_bundle_is_taken_from_where_it_lies_now_and_kept_where_it_has_gone() -
     assert job().with_bundles_of(job().model_copy(update={"bundles": (UNREAD,)})).bundles == (BUNDLE,)
     unread = job().model_copy(update={"bundles": (UNREAD,)})
     assert unread.with_bundles_of(job()).bundles == (BUNDLE,)
+
+
+def test_a_newer_bundle_is_a_round_and_the_same_round_once_it_has_moved(toy_zip: Path, tmp_path: Path) -> None:
+    moved = shutil.copy(toy_zip, tmp_path / "moved.zip")
+    (newest,) = with_round(with_round(job(), str(toy_zip)), str(moved)).rounds
+    assert (newest.path, newest.version) == (moved, "toy-1")
+    other = toy.write_toy_bundle(tmp_path / "other.zip", version="toy-2")
+    asked = with_round(job(rounds=(newest,)), str(other))
+    assert [model.version for model in asked.rounds] == ["toy-1", "toy-2"]
 
 
 def test_what_may_pass_is_looked_at_again_and_what_was_given_up_on_request(tmp_path: Path) -> None:
@@ -144,10 +152,6 @@ def test_a_bundle_that_cannot_be_read_is_told_from_one_that_is_another(
 ) -> None:
     with pytest.raises(BundleError, match="gone"):
         bundle_sha256(tmp_path / "gone.zip")
-
-    def fails(*_: object) -> None:
-        raise OSError(errno.EIO, "Input/output error")
-
-    monkeypatch.setattr(hashlib, "file_digest", fails)
+    monkeypatch.setattr(hashlib, "file_digest", Mock(side_effect=OSError(errno.EIO, "Input/output error")))
     with pytest.raises(StorageError, match="bundle"):
         bundle_sha256(toy_zip)

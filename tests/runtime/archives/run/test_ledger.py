@@ -1,9 +1,8 @@
 """The folder of a run: who may work in it, what is missing there, and what is read again."""
 
-from __future__ import annotations
-
 import errno
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -73,10 +72,7 @@ def test_a_part_waits_ten_minutes_for_another_one_that_writes_down_what_is_asked
 def test_storage_without_locks_is_gone_without_on_request_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def no_locks(*_: object) -> None:
-        raise OSError(errno.ENOLCK, "No locks available")
-
-    monkeypatch.setattr("fcntl.flock", no_locks)
+    monkeypatch.setattr("fcntl.flock", Mock(side_effect=OSError(errno.ENOLCK, "No locks available")))
     monkeypatch.delenv("HDF5_USE_FILE_LOCKING", raising=False)
     with pytest.raises(SurroundingsError, match="HDF5_USE_FILE_LOCKING=FALSE"), Ledger(tmp_path):
         pass

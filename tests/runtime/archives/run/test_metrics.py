@@ -1,7 +1,5 @@
 """Metrics of a bulk run: scraped while it works, and in a file after its end, as Prometheus would have them."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from urllib.request import urlopen

@@ -1,11 +1,10 @@
 """A fault of storage is no finding about a page: ranges are missing until it answers, and lost on request alone."""
 
-from __future__ import annotations
-
 import errno
 import json
 import subprocess
 import sys
+from unittest.mock import Mock
 
 import pytest
 
@@ -75,11 +74,7 @@ def test_a_file_that_storage_does_not_take_is_not_lost(archive: Archive, monkeyp
     _, options = archive.shows_a_file()
     with monkeypatch.context() as patch:
         for number in (errno.EIO, errno.ENOSPC):
-
-            def failing(*_: object, number: int = number) -> None:
-                raise OSError(number, "")
-
-            patch.setattr("lightpage.codec.volume_file.move_into_place", failing)
+            patch.setattr("lightpage.codec.volume_file.move_into_place", Mock(side_effect=OSError(number, "")))
             assert archive.run("recover", *options)[0] == 75
     status, figures = archive.run("recover", *options)
     assert (status, archive.tasks, len(figures["files"])) == (0, [], 1)

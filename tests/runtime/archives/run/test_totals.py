@@ -1,7 +1,5 @@
 """What a run has found, added up from its shards."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """A worker that dies or waits at ranges of whose recording a file beside it says so."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

@@ -1,7 +1,5 @@
 """Ray: the same results, and a worker or node that dies or hangs costs what it was at. A cluster takes ten seconds."""
 
-from __future__ import annotations
-
 import math
 import os
 import signal

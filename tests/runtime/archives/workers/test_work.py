@@ -1,11 +1,10 @@
 """What a worker makes of a range: a finding about each page, or none at all, which another try may change."""
 
-from __future__ import annotations
-
 import errno
 import os
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import h5py
 import pytest
@@ -20,7 +19,6 @@ from lightpage.runtime.archives.workers.device import EVERY_S, StepLog
 from lightpage.runtime.archives.workers.work import Worker
 from tests.clock import HandClock
 from tests.runtime import coded, toy
-from tests.runtime.archives.archive import spoil_page
 
 OPERATIONS = [Operation.DECODE, Operation.EVALUATE, Operation.RECOVER]
 PAGES = 3
@@ -93,20 +91,10 @@ def test_what_nobody_foresaw_ends_the_worker(asked: Callable[..., Task], monkeyp
 def test_results_that_storage_does_not_take_make_no_page_lost(
     asked: Callable[..., Task], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(*_: object) -> None:
-        raise StorageError("shard", "Input/output error", "a file that can be written")
-
+    refuse = Mock(side_effect=StorageError("shard", "Input/output error", "a file that can be written"))
     monkeypatch.setattr("lightpage.runtime.archives.workers.page_range.write_user_bytes", refuse)
     failed = failure(asked(Operation.RECOVER, give_up=True))
     assert (failed.problem.subject, failed.problem.passes) == ("shard", True)
-
-
-def test_a_page_that_is_black_is_a_finding(asked: Callable[..., Task], tmp_path: Path) -> None:
-    spoil_page(tmp_path / "a.h5", 1)
-    for operation, cause in zip(OPERATIONS, ("BlackFrameError", "BlackFrameError", "optics"), strict=True):
-        done = Worker(1).work(asked(operation))
-        assert isinstance(done, Done)
-        assert done.lost == {cause: 1}
 
 
 def test_another_recording_or_bundle_than_the_run_began_with_is_not_read(

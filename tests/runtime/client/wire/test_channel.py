@@ -1,7 +1,5 @@
 """Addresses that gRPC would guess at are refused; a service that is back is found; what changes nothing is repeated."""
 
-from __future__ import annotations
-
 import socket
 from collections.abc import Callable, Iterator
 from concurrent import futures

@@ -1,7 +1,5 @@
 """Messages and dataclasses made of each other by the names of their fields."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 
 import numpy as np

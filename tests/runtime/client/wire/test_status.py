@@ -1,7 +1,5 @@
 """Errors on the wire: each class has its status and its reason, and comes back as itself."""
 
-from __future__ import annotations
-
 import errno
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A device in memory, by a clock that tests move, with every fault that real ones were seen to have."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Callable
 from pathlib import Path

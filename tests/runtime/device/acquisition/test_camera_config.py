@@ -1,7 +1,5 @@
 """The file that wires a device is checked before anything is connected, and the documents list all its keys."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

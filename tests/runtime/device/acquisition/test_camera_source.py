@@ -1,11 +1,10 @@
 """Cameras, trigger, modulator and beams make pages; what goes wrong is repeated or mended, named and counted."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -203,8 +202,7 @@ def test_a_modulator_that_does_not_open_is_told_before_a_camera_is_looked_for(la
     assert not any(camera.opened for camera in lab.cameras)
 
 
-def refusing() -> float:
-    raise LostShotError("trigger", "?8", "no refusal", Reason.TRIGGER_REFUSED)
+refusing = Mock(side_effect=LostShotError("trigger", "?8", "no refusal", Reason.TRIGGER_REFUSED))
 
 
 def test_devices_are_set_up_again_after_three_contradictions_in_a_row_and_a_refusal(lab: Lab, pages: PageStore) -> None:

@@ -1,7 +1,5 @@
 """No two frames of different shots ever make a pair, whatever goes wrong."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any

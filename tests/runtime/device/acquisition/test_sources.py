@@ -1,12 +1,11 @@
 """Pages come from files, uploads, recordings and simulated devices, by number or in turn."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -43,9 +42,7 @@ def recording(tmp_path: Path) -> tuple[Path, np.ndarray]:
 def test_storage_that_fails_is_no_fault_of_the_source_and_names_the_page(
     recording: tuple[Path, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(*_: object) -> None:
-        raise StorageError("recording R.h5: dataset 'in_phase'", "Input/output error", "data")
-
+    fail = Mock(side_effect=StorageError("recording R.h5: dataset 'in_phase'", "Input/output error", "data"))
     source = RecordingSource(recording[0])
     monkeypatch.setattr(Recording, "frames", fail)
     with pytest.raises(StorageError, match=r"^page 1"), own_fault():

@@ -1,7 +1,5 @@
 """A camera over Aravis: real GigE Vision packets from a fake camera, and all that can go wrong on the way."""
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

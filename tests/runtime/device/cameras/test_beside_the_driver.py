@@ -1,7 +1,5 @@
 """What is asked of a GigE camera beside its driver, and of the kernel; and a driver that is missing."""
 
-from __future__ import annotations
-
 import socket
 import struct
 import threading

@@ -1,7 +1,5 @@
 """A camera behind a GenTL producer: TLSimu of genicam, whose pictures are ramps that move by one with a frame."""
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Every count survives every pixel format, and lies in the bytes where the standard says."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

@@ -1,10 +1,9 @@
 """A monitor, a controller or a person shows pages and moves beams; what goes wrong loses that page alone."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -88,10 +87,6 @@ def lab() -> Lab:
     return Lab()
 
 
-def broken() -> bool:
-    raise WorkerError("window", "nothing", "an answer")
-
-
 def test_a_page_counts_as_shown_when_the_liquid_crystal_has_settled(lab: Lab) -> None:
     assert not lab.screen.shows()
     begun = lab.clock.now()
@@ -105,7 +100,7 @@ def test_a_page_counts_as_shown_when_the_liquid_crystal_has_settled(lab: Lab) ->
     assert len(lab.windows) == 1
 
 
-@pytest.mark.parametrize("fault", [broken, lambda: False])
+@pytest.mark.parametrize("fault", [Mock(side_effect=WorkerError("window", "nothing", "an answer")), lambda: False])
 @pytest.mark.parametrize("behind", [True, False])
 def test_a_window_that_fails_loses_a_page_and_is_opened_again(
     lab: Lab, fault: Callable[[], bool], behind: bool

@@ -1,7 +1,5 @@
 """The pulse generator is set up, read back, and fires only what was set up; its other channels move shutters."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

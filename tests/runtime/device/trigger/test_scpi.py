@@ -1,7 +1,5 @@
 """A serial line never gives an answer to the wrong message, comes back by itself, and many callers share it."""
 
-from __future__ import annotations
-
 import re
 import termios
 import threading

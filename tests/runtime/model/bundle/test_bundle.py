@@ -1,7 +1,5 @@
 """A bundle is loaded whole, unchanged and, with a key, signed, or not at all; its golden page is in few counts."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -9,6 +7,7 @@ import shutil
 import stat
 import zipfile
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -222,10 +221,7 @@ def test_a_bundle_is_never_overwritten(name: str, tmp_path: Path) -> None:
 
 
 def test_a_write_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
-        raise OSError("disk full")
-
-    monkeypatch.setattr(os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", Mock(side_effect=OSError("disk full")))
     for name in ("failed.zip", "failed"):
         with pytest.raises(BundleError, match="disk full"):
             toy.write_toy_bundle(tmp_path / name)

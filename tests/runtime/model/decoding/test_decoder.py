@@ -1,7 +1,5 @@
 """The decoder finds the symbols, says how sure it is, and refuses models and frames that are not its own."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path

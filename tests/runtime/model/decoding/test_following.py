@@ -1,7 +1,5 @@
 """The Python call that the package advertises, and the shipped bundle: its name, and that it follows its device."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The image's drift shows in the phases of pilots and safe decisions; pages that say nothing are left out."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

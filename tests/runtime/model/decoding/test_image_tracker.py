@@ -1,7 +1,5 @@
 """The tracker follows the image, finds it again, and gives out no page that its pilots do not confirm."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A smooth phase error is taken off without knowing the data, and nothing where there is nothing to know it by."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

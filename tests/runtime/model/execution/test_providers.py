@@ -1,12 +1,11 @@
 """What computes pages: names, options, refusals, tensors that stay where it computes; the share of cores and memory."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import onnxruntime
@@ -105,9 +104,7 @@ def test_models_behind_the_first_are_computed_where_it_is(tmp_path: Path, monkey
 
 
 def test_a_resource_that_is_short_is_no_fault_of_the_bundle(monkeypatch: pytest.MonkeyPatch) -> None:
-    def short(*_: object, **__: object) -> None:
-        raise RuntimeError("[ONNXRuntimeError] : 6 : RUNTIME_EXCEPTION : std::bad_alloc")
-
+    short = Mock(side_effect=RuntimeError("[ONNXRuntimeError] : 6 : RUNTIME_EXCEPTION : std::bad_alloc"))
     bound = BoundSession(open_session(toy.decoder_onnx(), "toy", 1), ON_CPU, {}, "toy")
     monkeypatch.setattr("onnxruntime.InferenceSession.run_with_iobinding", short)
     with pytest.raises(SurroundingsError, match=r"^toy: .*memory"):

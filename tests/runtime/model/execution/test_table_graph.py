@@ -1,7 +1,5 @@
 """Graphs cut behind what follows from their table: fewer inputs, the same answers."""
 
-from __future__ import annotations
-
 import numpy as np
 import onnx
 import onnx.parser

@@ -1,7 +1,5 @@
 """The exported twin answers as registration asks, in float64, and a foreign graph is refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

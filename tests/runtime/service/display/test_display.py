@@ -1,7 +1,5 @@
 """A controller uploads pages, shows them when they are wanted, and says so."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from collections.abc import AsyncIterator, Callable

@@ -1,7 +1,5 @@
 """The Open Inference Protocol: the same pages as by the service's own contract, and the same refusals."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Shared memory: frames in it are decoded as those that are sent, and what a client does there harms nobody."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import secrets
@@ -25,7 +23,7 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.frames.frames import PairReceiver
 from lightpage.runtime.service.shared_memory import Region, SharedMemory
 from tests.runtime import toy
-from tests.runtime.service.conftest import begun
+from tests.runtime.conftest import begun
 from tests.runtime.service.stage import Refused, Running, Start, a_page, header, refused
 from tests.waiting import eventually
 

@@ -1,7 +1,5 @@
 """Recalibrations as jobs over the wire: they survive their callers, and frames that are sent serve as a recording."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from collections.abc import Callable, Sequence
@@ -39,20 +37,13 @@ from lightpage.runtime.recalibration.recalibration import RefitResult
 from lightpage.runtime.service.jobs.job_calls import JobCalls
 from lightpage.runtime.service.limits import Limits
 from tests.runtime import toy
+from tests.runtime.recalibration.toy_worker import DRIFTED, known
 from tests.runtime.service.stage import Running, Start, raised, refused, until_told
 from tests.runtime.slow_fit import SlowFit
 from tests.waiting import eventually
 
-DRIFTED = (150.0, 62.0)
 Part = pb.RecalibrateFramesRequest
 Parts = Sequence[Part]
-
-
-def known(count: int = 3, levels: int = 16, offsets: tuple[float, float] = DRIFTED) -> KnownPages:
-    device = toy.ToyDevice(offsets)
-    symbols = toy.symbols_of(levels, 11, count)
-    pairs = tuple(device.page(page, levels, 0.3) for page in symbols)
-    return KnownPages(pairs, tuple(symbols), levels, device.references())
 
 
 def send(client: LightpageClient, pages: KnownPages, **options: object) -> JobInfo:
@@ -67,7 +58,7 @@ def header(**changes: object) -> Part:
     return Part(header=pb.RecalibrateFramesHeader(**given))  # type: ignore[arg-type]
 
 
-PAGES = known(2)
+PAGES = known(count=2)
 assert PAGES.references is not None
 REFERENCE = Part(reference=PAGES.references.in_phase.tobytes() + PAGES.references.quadrature.tobytes())
 SYMBOLS = [Part(symbols=page.tobytes()) for page in PAGES.symbols]
@@ -157,7 +148,7 @@ def test_a_job_that_ends_badly_says_why_as_a_call_would(start: Start, tmp_path: 
     end = service.last(service.client.jobs.start(recording="short.h5", count=3))
     assert (end.state, end.pages_of) == (JobState.FAILED, "recording short.h5")
     assert isinstance(end.error, InvalidInputError)
-    pages = known(3)
+    pages = known(count=3)
     wrong = KnownPages(pages.pairs, tuple(15 - page for page in pages.symbols), 16, pages.references)
     end = service.last(send(service.client, wrong))
     assert (end.state, type(end.error)) == (JobState.REFUSED, RecalibrationRefusedError)
@@ -216,7 +207,7 @@ def test_the_black_level_is_taken_off_all_frames(start: Start) -> None:
         seen.append(pages)
         return toy.fit_references(bundle, pages, *rest)  # type: ignore[arg-type]
 
-    service, pages = start(source=None, fit=fit), known(2, offsets=(125.0, 82.0))
+    service, pages = start(source=None, fit=fit), known((125.0, 82.0), 2)
     assert pages.references is not None
     brighter = KnownPages(
         tuple(raised(pair, 20) for pair in pages.pairs), pages.symbols, 16, raised(pages.references, 20)
@@ -228,7 +219,7 @@ def test_the_black_level_is_taken_off_all_frames(start: Start) -> None:
 
 
 def test_dark_frames_are_left_out_and_too_many_are_the_callers_fault(start: Start) -> None:
-    service, pages = start(), known(4)
+    service, pages = start(), known(count=4)
     dark = FramePair(*2 * (np.zeros(toy.SHAPE, np.uint8),))
     one_dark = KnownPages((pages.pairs[0], dark, *pages.pairs[2:]), pages.symbols, 16, pages.references)
     done = service.last(send(service.client, one_dark)).result
@@ -310,7 +301,7 @@ def test_what_comes_counts_against_the_memory_until_the_job_has_ended(start: Sta
     assert service.plane.received.used == 2 * PAIR_BYTES
     service.plane.received.give_back(2 * PAIR_BYTES)
     with pytest.raises(LimitError) as error:  # waiting would not help
-        send(service.client, known(4))
+        send(service.client, known(count=4))
     assert error.value.subject == "frames to recalibrate with"
 
 

@@ -1,7 +1,5 @@
 """Jobs are told apart, kept over a restart whatever ended the service, and cost nobody more than their record."""
 
-from __future__ import annotations
-
 import logging
 import sqlite3
 import threading
@@ -9,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -223,12 +222,8 @@ def test_the_end_of_the_service_interrupts_the_job_and_the_next_start_knows(make
 
 def test_a_thread_that_cannot_be_started_leaves_nothing_that_runs(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     recalibrator = make()
-
-    def none(self: threading.Thread) -> None:
-        raise RuntimeError("can't start new thread")
-
     with monkeypatch.context() as patch:
-        patch.setattr(threading.Thread, "start", none)
+        patch.setattr(threading.Thread, "start", Mock(side_effect=RuntimeError("can't start new thread")))
         with pytest.raises(RuntimeError):
             recalibrator.start(recalibrator.source_pages(2))
     assert recalibrator.jobs.all()[0].state == pb.JOB_STATE_FAILED

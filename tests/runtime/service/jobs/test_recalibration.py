@@ -1,7 +1,5 @@
 """Recalibration over the endpoint: what it brings, what it refuses, and that nothing is lost or changed meanwhile."""
 
-from __future__ import annotations
-
 import json
 import threading
 from collections.abc import Callable
@@ -23,7 +21,6 @@ from lightpage.errors import (
     RecalibrationRefusedError,
     RecordingError,
     SourceError,
-    StoppingError,
 )
 from lightpage.metrics.measures import measure
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
@@ -31,7 +28,7 @@ from lightpage.runtime.device.acquisition.source import Shot, open_source
 from lightpage.runtime.recalibration.recalibration import RefitResult
 from lightpage.runtime.service.models.models import KEPT_MODELS
 from tests.runtime import toy
-from tests.runtime.service.stage import Running, Start, a_page, refused
+from tests.runtime.service.stage import Running, Start, refused
 from tests.runtime.slow_fit import SlowFit
 from tests.waiting import eventually
 
@@ -154,21 +151,6 @@ def test_recordings_on_the_server(start: Start, tmp_path: Path) -> None:
 # ---- beside other things ------------------------------------------------------------------------------------------
 
 
-def test_one_runs_at_a_time_beside_decoding_and_the_end_of_the_service_cuts_it_off(start: Start) -> None:
-    fit = SlowFit()
-    service = start(fit=fit)
-    with ThreadPoolExecutor(1) as pool:
-        first = pool.submit(service.client.jobs.recalibrate, count=2)
-        assert fit.entered.wait(60)
-        assert (service.client.frames.decode(a_page()[1], 16).symbols == a_page()[0]).all()
-        service.server.stop(20.0)
-        with pytest.raises(StoppingError):
-            first.result(60)
-    assert fit.ended.is_set()
-    with pytest.raises(StoppingError):
-        service.recalibrator.check_start()
-
-
 def test_the_service_ends_beside_one_that_does_not_stop_and_it_changes_nothing_any_more(start: Start) -> None:
     entered, go = threading.Event(), threading.Event()
 
@@ -186,6 +168,12 @@ def test_the_service_ends_beside_one_that_does_not_stop_and_it_changes_nothing_a
     go.set()
     eventually(lambda: service.count("lightpage_recalibrations_total", result="dropped") == 1)
     assert [model.version for model in service.plane.models.loaded] == ["toy-1"]
+
+
+def test_who_asked_for_a_change_is_written_down(start: Start, tmp_path: Path) -> None:
+    file = tmp_path / "audit.jsonl"
+    start(audit=file).client.jobs.recalibrate(count=2)
+    assert json.loads(file.read_text("utf-8"))["who"].startswith("ipv4:127.0.0.1:")
 
 
 def test_a_caller_who_leaves_ends_it(start: Start) -> None:
@@ -229,9 +217,3 @@ def test_a_model_that_changes_meanwhile_makes_its_result_out_of_date(start: Star
     with pytest.raises(OtherModelError):
         service.client.jobs.recalibrate(count=2, expected_version="toy-1+r2")
     assert service.version == "toy-1"
-
-
-def test_who_asked_for_a_change_is_written_down(start: Start, tmp_path: Path) -> None:
-    file = tmp_path / "audit.jsonl"
-    start(audit=file).client.jobs.recalibrate(count=2)
-    assert json.loads(file.read_text("utf-8"))["who"].startswith("ipv4:127.0.0.1:")

@@ -117,7 +117,11 @@ def test_a_new_model_starts_anew_and_pages_of_the_old_one_say_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "usual", "drifted"), [("trust", 0.97, 0.8), ("share", 1.0, 0.9), ("air_bits", 7, 6.8)]
+    ("name", "usual", "drifted"),
+    [
+        *[("trust", 0.97, 0.8), ("share", 1.0, 0.9), ("air_bits", 7, 6.8)],
+        *[("stroke_relative", -0.001, -0.004), ("stroke_relative", -0.001, 0.002)],
+    ],
 )
 def test_pilots_tell_where_no_bytes_are_read(name: str, usual: float, drifted: float) -> None:
     monitor = Monitor()
@@ -149,8 +153,9 @@ def found(loss: Loss | None, margin: float) -> PageBytes:
 
 def test_what_a_page_says_of_the_device(page: DecodedPage) -> None:
     figures = PageFigures()
-    told = figures.of(observation(replace(page, piston_rad=3.0, image=ImagePosition(3.0, -4.0))))
-    assert told["shift_px"] == 5
+    there = replace(page, piston_rad=3.0, image=ImagePosition(3.0, -4.0), stroke_relative=-0.01)
+    told = figures.of(observation(there))
+    assert (told["shift_px"], told["stroke_relative"]) == (5, -0.01)
     assert told["share"] == page.check.share
     assert told["page_due"] == 0
     assert not {"margin_bits", "piston_walk_rad"} & told.keys()

@@ -1,17 +1,15 @@
 """The history of models: back, forward, elsewhere, and only a few of them loaded."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
 from lightpage.errors import BundleError, CalibrationError, ModelExistsError, OtherModelError, StoreError
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.model.decoding.tracking import NoTracker
 from lightpage.runtime.service.caller import NOBODY
 from lightpage.runtime.service.models.history import HISTORY
 from lightpage.runtime.service.models.loader import Loader
@@ -148,10 +146,7 @@ def test_other_devices_and_bundles_that_cannot_be_tracked_are_refused(decoder: D
     manifest = decoder.bundle.manifest.model_copy(update={"camera_bit_depth": 10})
     deep = Decoder(replace(decoder.bundle, manifest=manifest), 1, decoder.graph)
     same = Decoder.load(toy.write_toy_bundle(tmp_path / "toy-2.zip", version="toy-2"), 1)
-
-    def tracker(made: Decoder) -> NoTracker:
-        raise CalibrationError("calibration", "no table", "a calibration document")
-
+    tracker = Mock(side_effect=CalibrationError("calibration", "no table", "a calibration document"))
     with pytest.raises(BundleError, match="calibration"):
         Loader(tracker).tracked(same, decoder)
     with pytest.raises(BundleError, match="got 10 bits"):

@@ -1,13 +1,12 @@
 """The models over the endpoint: listed, rolled back and forward, uploaded, put in service, pinned."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import threading
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import click
 import pytest
@@ -218,10 +217,7 @@ def test_a_disk_that_fails_during_an_upload_leaves_nothing(
     stored: Start, new: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     service = stored()
-
-    def full(*_: object, **__: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
+    full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
     with monkeypatch.context() as patch:
         patch.setattr("lightpage.runtime.service.models.uploads.give_new_name", full)
         with pytest.raises(StoreError):

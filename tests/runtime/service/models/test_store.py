@@ -1,7 +1,5 @@
 """The store: what it remembers, whom it keeps out, what it sweeps, what it says when it is not well or hangs."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import itertools

@@ -1,7 +1,5 @@
 """Bundles that come from a folder or as uploads: what is whole, good and signed goes to the store, all else is said."""
 
-from __future__ import annotations
-
 import logging
 import os
 import signal

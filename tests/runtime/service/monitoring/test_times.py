@@ -27,7 +27,7 @@ from lightpage.runtime.service.monitoring.logs import MOST_TEXT
 from lightpage.runtime.service.monitoring.traces import MOST_PAGES, Traces
 from lightpage.runtime.service.stages import Stage
 from tests.runtime import coded, toy
-from tests.runtime.service.conftest import begun
+from tests.runtime.conftest import begun
 from tests.runtime.service.frames.test_inference import infer, request_of, stub_of
 from tests.runtime.service.stage import Running, Start, a_page, parts, refused
 from tests.waiting import eventually

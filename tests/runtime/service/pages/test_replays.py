@@ -1,10 +1,9 @@
 """What callers send again or leave behind is bounded: answers by request id, and the memory of pairs."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from unittest.mock import Mock
 
 import grpc
 import numpy as np
@@ -83,10 +82,7 @@ def test_what_failed_before_a_shot_is_tried_again(failure: LightpageError) -> No
 
 def test_the_oldest_go_where_the_budget_is_full() -> None:
     replays = Replays(600, 20_000)
-
-    def lost() -> bytes:
-        raise LostShotError("page 1", "no frame", "one", Reason.MISSING_FRAME)
-
+    lost = Mock(side_effect=LostShotError("page 1", "no frame", "one", Reason.MISSING_FRAME))
     for number in range(200):
         with pytest.raises(LostShotError):
             replays.once(str(number), bytes(number), Caller(), lost)

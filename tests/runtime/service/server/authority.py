@@ -1,7 +1,5 @@
 """An authority that issues certificates for tests."""
 
-from __future__ import annotations
-
 import inspect
 import ipaddress
 from collections.abc import Sequence

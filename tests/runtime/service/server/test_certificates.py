@@ -1,7 +1,5 @@
 """Certificates count anew without a restart, and are named where they are no good; what they say of who calls."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import ssl
@@ -14,7 +12,7 @@ import pytest
 from analysis.attacks.identity import commands_of, documented
 from lightpage.errors import InvalidInputError, NotAllowedError
 from lightpage.runtime.client.wire.channel import TlsFiles
-from lightpage.runtime.service.caller import LOCAL, Identity, Role
+from lightpage.runtime.service.caller import Role
 from lightpage.runtime.service.frames.inference_calls import INFERENCE, PREFIX
 from lightpage.runtime.service.server.certificates import Certificates, identity_of
 from lightpage.runtime.service.server.dispatcher import SERVICE
@@ -146,15 +144,6 @@ def test_a_certificate_says_who_and_what(tmp_path: Path) -> None:
     files = Authority(tmp_path).caller("controller 1", ["decode", "recalibrate", "king"])
     identity = identity_of(files.certificate.read_bytes())
     assert (identity.name, identity.roles) == ("controller 1", {Role.DECODE, Role.RECALIBRATE})
-
-
-def test_a_role_is_itself_and_may_look() -> None:
-    for role in Role:
-        allowed = {other for other in Role if Identity("one", frozenset([role])).may(other)}
-        assert allowed == (set(Role) if role is Role.ADMIN else {Role.READ, role})
-    assert all(LOCAL.may(role) for role in Role)
-    with pytest.raises(NotAllowedError, match="call X"):
-        Identity("nobody", frozenset()).check(Role.READ, "call X", 0.0)
 
 
 def test_a_certificate_that_ends_while_connected_is_refused(tmp_path: Path) -> None:

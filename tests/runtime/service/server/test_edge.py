@@ -1,7 +1,5 @@
 """The service towards many callers, and bad ones: it stays right, polite and small."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from collections.abc import Iterator
@@ -28,7 +26,7 @@ from lightpage.runtime.service.pages.page_calls import PageCalls
 from lightpage.runtime.service.server.dispatcher import SERVICE
 from tests.clock import HandClock
 from tests.runtime import toy
-from tests.runtime.service.conftest import begun
+from tests.runtime.conftest import begun
 from tests.runtime.service.stage import Remembering, Running, Start, a_page, header, parts, refused, refused_as
 from tests.waiting import eventually
 

@@ -1,7 +1,5 @@
 """Health checks are answered whatever the service is busy with, and fail when it does not do its work."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

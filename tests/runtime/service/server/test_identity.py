@@ -1,7 +1,5 @@
 """Callers with certificates: each may do what its roles say, and nobody else gets in."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Iterator

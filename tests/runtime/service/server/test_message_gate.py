@@ -1,7 +1,5 @@
 """What is on its way to the server is bounded: the size of a message, their number, and a sender's pauses."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import AsyncIterator, Coroutine
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """The contract: committed stubs, what earlier clients know; messages with frames, written and read without copies."""
 
-from __future__ import annotations
-
 import random
 import subprocess
 import sys

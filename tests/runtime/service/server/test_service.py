@@ -1,7 +1,5 @@
 """The running service: what it answers, what it refuses, and that it keeps nothing behind."""
 
-from __future__ import annotations
-
 import errno
 import tempfile
 import threading
@@ -9,6 +7,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import grpc
 import h5py
@@ -99,19 +98,6 @@ def test_what_is_asked_of_a_pair_is_done_and_no_more_is_sent(service: Running) -
     for level in (255, 256):
         answer = sent(service, beginning(black_level=level))
         assert (answer.code, answer.subject) == (INVALID, "black_level")
-
-
-def test_pages_are_read_from_the_source_in_turn_or_by_number(start: Start) -> None:
-    client = start().client
-    pages = [client.pages.read(want_written=True), client.pages.read(want_written=True), client.pages.read(9)]
-    assert [page.page for page in pages] == [0, 1, 9]
-    for page in pages[:2]:
-        assert page.written is not None
-        assert page.pilot_mask is not None
-        assert (page.symbols == page.written).all()
-        assert (page.pilot_mask == pilot_mask(toy.PROFILE)).all()
-    assert pages[2].written is None
-    assert client.pages.read(1, 8).levels == 8
 
 
 # ---- refusals -----------------------------------------------------------------------------------------------------
@@ -272,9 +258,7 @@ def test_a_server_is_found_where_it_is_and_says_what_it_lacks(service: Running, 
 def test_a_recalibration_without_any_folder_is_refused_before_it_begins(
     start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def none(*_: object, **__: object) -> str:
-        raise FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp']")
-
+    none = Mock(side_effect=FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp']"))
     service = start()
     monkeypatch.setattr(tempfile, "mkdtemp", none)
     with pytest.raises(StoreError):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,9 +17,9 @@ from lightpage.calibration.coherence import page_coherence
 from lightpage.calibration.known_pages import known_pages
 from lightpage.calibration.parameters import NAMES, as_dict, as_vector
 from lightpage.calibration.samplers import FieldSampler
-from lightpage.calibration.sampling_table import registration_coefficients
+from lightpage.calibration.sampling_table import cameras_apart, registration_coefficients, stand_apart
 from lightpage.device.profile import Profile
-from lightpage.device.state import Device, draw_device
+from lightpage.device.state import Device
 from lightpage.errors import CalibrationError
 from lightpage.page.symbols import random_symbols, symbol_phases
 from lightpage.recording.frame_pair import FramePair
@@ -45,6 +46,8 @@ class Outcome:
     oracle_coherence: float | None = None
     ratio: float | None = None
     seconds: float | None = None
+    verdict: str | None = None
+    bits_lost: float | None = None
     parameters: dict[str, float] | None = None
     failure: str | None = None
 
@@ -56,28 +59,29 @@ class Outcome:
             f"{self.seed:>6} {self.angle_deg:>+9.4f} {show(self.angle_error_deg, '>9.4f')} "
             f"{show(self.turn_error_deg, '>9.2f')} {show(self.relation_error_px, '>8.2f')} "
             f"{show(self.coherence, '>9.4f')} {show(self.oracle_coherence, '>9.4f')} "
-            f"{show(self.ratio, '>7.3f')} {show(self.seconds, '>7.1f')}"
+            f"{show(self.ratio, '>7.3f')} {show(self.seconds, '>7.1f')} {self.verdict or '-':>8} "
+            f"{show(self.bits_lost, '>6.3f')}"
         )
         return f"{text}  {self.failure}" if self.failure else text
 
 
 HEADER = (
     f"{'seed':>6} {'angle':>9} {'error':>9} {'Q phase':>9} {'relation':>8} "
-    f"{'coherence':>9} {'oracle':>9} {'ratio':>7} {'seconds':>7}"
+    f"{'coherence':>9} {'oracle':>9} {'ratio':>7} {'seconds':>7} {'verdict':>8} {'lost':>6}"
 )
 
 
 class Bench:
     """The nominal device with its twin and field solver, which every device shares."""
 
-    def __init__(self, profile: Profile, pages: int) -> None:
-        self.profile, self.pages = profile, pages
+    def __init__(self, profile: Profile, pages: int, draw: Callable[[np.random.Generator], Device]) -> None:
+        self.profile, self.pages, self._draw = profile, pages, draw
         self.twin = TorchTwin(RayTwin(profile))
         self.solve = TorchFieldSolver(FieldRecovery(profile))
 
     def own(self, seed: int) -> Outcome:
         """Draw, simulate and calibrate a device of the project's simulator."""
-        device = draw_device(np.random.default_rng(seed))
+        device = self._draw(np.random.default_rng(seed))
         simulator = Simulator(self.profile, device, LEVELS, seed)
         references = simulator.references()
         symbols = random_symbols(self.profile, LEVELS, self.pages, np.random.default_rng([seed, 3]))
@@ -129,6 +133,8 @@ class Bench:
             oracle_coherence=oracle,
             ratio=found.coherence_after / oracle if oracle else None,
             seconds=seconds,
+            verdict=found.goodness.verdict if found.goodness else None,
+            bits_lost=found.goodness.bits_lost if found.goodness else None,
             parameters=as_dict(found.parameters),
         )
 
@@ -155,6 +161,7 @@ class Bench:
     ) -> float:
         registration = registration_coefficients(self.twin, parameters, self.profile)
         homodyne = np.array([np.cos(quadrature_phase), np.sin(quadrature_phase)], dtype=np.float32)
-        field, _ = self.solve(page.pair, references, registration, homodyne)
+        apart = cameras_apart(parameters, self.profile) if stand_apart(parameters) else None
+        field, _ = self.solve(page.pair, references, registration, homodyne, apart)
         sampler = FieldSampler(field, field_grid(self.profile))
         return page_coherence(sampler, self.twin, parameters, self.profile, page.symbols)

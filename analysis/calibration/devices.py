@@ -1,15 +1,17 @@
-"""Calibration from nominal on devices drawn over the whole capture range: angle errors, coherence, time.
+"""Calibration from nominal on drawn devices: angle errors, coherence, verdict, time.
 
-    python -m analysis.comparison.calibration --devices 20 --first-seed 1000 --pages 2 --json F
-    python -m analysis.comparison.calibration --devices 3 --foreign --json F
-    python -m analysis.comparison.calibration --symbol-size 2 --devices 3 --json F
+    python -m analysis.calibration.devices --devices 20 --first-seed 1000 --pages 2 --json F
+    python -m analysis.calibration.devices --devices 50 --draw rough --json F
+    python -m analysis.calibration.devices --devices 3 --foreign --json F
+    python -m analysis.calibration.devices --symbol-size 2 --devices 3 --json F
 
-The coherence of the calibrated geometry is put in ratio to that of the true one (the oracle), fields recovered with
-the true cameras and turn, the image's drift included. The cameras' relation is how far the quadrature camera is placed
-wrong against the in-phase one, root mean square over the page: the field that is recovered from both depends on it. A
-foreign device comes from a simulator that shares nothing with this project; its true geometry has other parameters, so
-it has neither. An interrupted run goes on where it stopped: seeds that are in the JSON file are not computed again,
-failed ones are; a file of another format of runs (`lightpage.train.runs.FORMAT`) is refused.
+Devices are drawn over the whole capture range, or as they scatter on a bench (`rough`). The coherence of the calibrated
+geometry is put in ratio to that of the true one (the oracle), fields recovered with the true cameras and turn, the
+image's drift included. The cameras' relation is how far the quadrature camera is placed wrong against the in-phase
+one, root mean square over the page: the field that is recovered from both depends on it. A foreign device comes from a
+simulator that shares nothing with this project; its true geometry has other parameters, so it has neither. An
+interrupted run goes on where it stopped: seeds that are in the JSON file are not computed again, failed ones are; a
+file of another format of runs (`lightpage.train.runs.FORMAT`) is refused.
 """
 
 from __future__ import annotations
@@ -23,10 +25,11 @@ from pathlib import Path
 
 import click
 
-from analysis.comparison.calibration_bench import HEADER, Bench, Outcome
+from analysis.calibration.bench import HEADER, Bench, Outcome
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import load_profile
+from lightpage.device.state import draw_device, draw_rough
 from lightpage.errors import InvalidInputError
 from lightpage.files import write_json
 from lightpage.progress import track
@@ -34,6 +37,8 @@ from lightpage.train.runs import FORMAT
 
 WANTED_SHARE = 0.95
 """Of the oracle's coherence, for a device to count as found."""
+
+DRAWN = {"capture": draw_device, "rough": draw_rough}
 
 
 def summary(outcomes: list[Outcome]) -> dict[str, float | int | None]:
@@ -46,6 +51,7 @@ def summary(outcomes: list[Outcome]) -> dict[str, float | int | None]:
     ratios = [o.ratio for o in with_oracle if o.ratio is not None]
     return {
         "devices": len(outcomes),
+        "called_good": sum(o.verdict == "good" for o in outcomes),
         "calibrated": len(errors),
         "angle_error_deg_worst": max(errors, default=None),
         "angle_error_deg_median": statistics.median(errors) if errors else None,
@@ -85,6 +91,7 @@ def load(path: Path, settings: dict[str, object]) -> dict[int, Outcome]:
 @click.option("--devices", default=20, show_default=True, type=click.IntRange(1))
 @click.option("--first-seed", default=1000, show_default=True, type=click.IntRange(0))
 @click.option("--pages", default=2, show_default=True, type=click.IntRange(1, 4), help="Known pages a device.")
+@click.option("--draw", type=click.Choice(list(DRAWN)), default="capture", show_default=True)
 @click.option("--foreign", is_flag=True, help="Devices of the other simulator.")
 @click.option("--json", "json_path", required=True, type=OutputFile())
 def main(
@@ -93,6 +100,7 @@ def main(
     devices: int,
     first_seed: int,
     pages: int,
+    draw: str,
     foreign: bool,
     json_path: Path,
 ) -> None:
@@ -104,10 +112,10 @@ def main(
                 "--symbol-size", f"{symbol_size} with --foreign", "one of them: its pages are its own"
             )
         profile = profile.with_symbols_of(symbol_size)
-    settings: dict[str, object] = {"format": FORMAT, "pages": pages, "foreign": foreign}
+    settings: dict[str, object] = {"format": FORMAT, "pages": pages, "foreign": foreign, "draw": draw}
     settings |= {"profile": profile_name, "profile_sha256": hashlib.sha256(profile.to_toml().encode()).hexdigest()}
     done = {seed: o for seed, o in load(json_path, settings).items() if o.failure is None}
-    bench = Bench(profile, pages)
+    bench = Bench(profile, pages, DRAWN[draw])
     click.echo(HEADER)
     seeds = range(first_seed, first_seed + devices)
     for seed in track(seeds, "calibrate", unit="device"):
@@ -124,4 +132,4 @@ def main(
 
 
 if __name__ == "__main__":
-    sys.exit(run(main, name="python -m analysis.comparison.calibration"))
+    sys.exit(run(main, name="python -m analysis.calibration.devices"))

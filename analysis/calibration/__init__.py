@@ -1,0 +1,1 @@
+"""Calibrations from nominal, of drawn devices and of what cannot be right."""

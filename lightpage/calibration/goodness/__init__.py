@@ -1,0 +1,1 @@
+"""How well a calibration explains the light: a verdict, maps, and the likeliest cause."""

@@ -1,0 +1,46 @@
+"""The picture of how well a calibration explains the light of a known page."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+
+from lightpage.calibration.goodness.verdict import Goodness, Map
+
+_SIZE = (7.2, 3.1)
+"""Inches."""
+_MOST = 30.0
+"""Times the noise at the end of the colours."""
+
+
+def goodness_figure(goodness: Goodness) -> Figure:
+    """Draw the light that is left over what noise leaves, over the page and over the pipe's exit facet."""
+    figure = Figure(figsize=_SIZE, layout="constrained")
+    FigureCanvasAgg(figure)
+    page, facet = figure.subplots(1, 2, width_ratios=(1.5, 1))
+    _draw(page, goodness.by_page, "over the page", None)
+    shown = _draw(facet, goodness.by_facet, "over the exit facet", 1.0)
+    figure.colorbar(shown, ax=[page, facet], label="light that is left, over noise", extend="max")
+    what = f"{goodness.verdict}: about {goodness.bits_lost:.2f} bit a symbol lost"
+    figure.suptitle("\n".join(line for line in (what, goodness.cause) if line), fontsize=9)
+    return figure
+
+
+def _draw(axis: Axes, values: Map, title: str, box: float | None) -> AxesImage:
+    shown = axis.imshow(np.array(values), cmap="cividis", norm=LogNorm(1, _MOST), aspect="auto")
+    axis.set_title(title, fontsize=9)
+    axis.set_xticks([])
+    axis.set_yticks([])
+    axis.set_box_aspect(box or 0.64)
+    for row, line in enumerate(values):
+        for column, value in enumerate(line):
+            axis.text(column, row, f"{value:.2g}", ha="center", va="center", fontsize=6, color=_ink(value))
+    return shown
+
+
+def _ink(value: float) -> str:
+    return "white" if value < _MOST**0.5 else "black"

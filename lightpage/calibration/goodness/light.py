@@ -1,0 +1,242 @@
+"""The light of a known page as cameras saw it, and as fitted waves have it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from lightpage.calibration.calibrated_device import CalibratedDevice
+from lightpage.calibration.goodness.frame_noise import with_more_noise
+from lightpage.calibration.interfaces import Twin
+from lightpage.calibration.parameters import PARAMETERS, PRIORS, indices
+from lightpage.calibration.samplers import smooth_reference
+from lightpage.calibration.waves.wave_model import FittedWaves, illumination_terms, on_modulator
+from lightpage.recording.frame_pair import FramePair
+from lightpage.waves.geometry import couplings, facet_axis, on_facet
+from lightpage.waves.grid import field_grid, symbol_samples
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complexfloating]
+
+_FLOOR = 0.3
+"""Variance of an equation that does not grow with the light, over the shot noise of the reference alone."""
+_MORE_NOISE = 3.0
+"""Times the frames' own noise: rounding to whole counts, which adds some, then hardly counts."""
+_STRIDE, _ACCURACY = 4, 3 / 8
+"""Samples of the common grid from one to the next, and share of the splitting steps, for corrections of the model: few
+unknowns need few equations."""
+_EVERY = (slice(None, None, _STRIDE), slice(None, None, _STRIDE))
+_DIFFERENCE = 1e-2
+"""Finite difference of the derivatives, in standard deviations of the priors."""
+_SEEN_BY_CAMERAS = frozenset(indices("in_phase", "quadrature", "distortion", "keystone"))
+"""Parameters that say where the cameras see a place; all others change the light itself."""
+_LOSSES = (1, 2)
+"""Powers of R^2 in the light that is lost towards the edges of the entrance facet."""
+
+
+class SeenLight:
+    """The light of a known page as cameras saw it, and as the fitted waves have it.
+
+    Light of both cameras is [2, Gy, Gx], on the common grid.
+
+    Attributes:
+        waves: the fitted ones.
+        page: light on the modulator, [ny samples, nx samples].
+        fields: what either camera should see.
+        counts: what it saw beyond its reference, over twice that, [2, Gy, Gx].
+        references: counts of the references, [2, Gy, Gx].
+    """
+
+    def __init__(
+        self,
+        twin: Twin,
+        device: CalibratedDevice,
+        illumination: Complex,
+        pair: FramePair,
+        symbols: NDArray[np.complex128],
+    ) -> None:
+        self._twin, self._device, self._pair, profile = twin, device, pair, device.profile
+        self._samples, self._grid = symbol_samples(profile), field_grid(profile)
+        self.waves = FittedWaves(profile, device.parameters, self._samples, filled=True)
+        self._terms = np.stack(illumination_terms(self.waves.x, self.waves.y))
+        lit = np.tensordot(illumination, self._terms, 1)
+        self.page = on_modulator(device.modulation.light(np.angle(symbols)), self._samples) * lit
+        places = np.stack(np.meshgrid(self._grid.x_m, self._grid.y_m), axis=-1).reshape(-1, 2)
+        pixels = twin.pixels(device.parameters, places).reshape(2, *self._grid.shape, 2)
+        edge, size = len(self._grid.prefilter), np.array(pair.in_phase.shape[::-1])
+        self._seen = np.all((pixels > edge) & (pixels < size - edge), axis=(0, 3))
+        self._at = _rows_and_columns(pixels)
+        levels = [smooth_reference(each) for each in (device.references.in_phase, device.references.quadrature)]
+        self.references = _looked_at(levels, self._at)
+        amplitude = np.sqrt(self.references[0])
+        self._amplitude = amplitude / amplitude[self._seen].mean()
+        self._arms = np.exp(1j * np.array([0.0, device.quadrature_phase_rad]))[:, None, None]
+        self._images = self._filtered(pair, device.references)
+        self.counts = _looked_at(self._images, self._at) / (2 * self.references)
+        self.fields = self.waves.to_cameras(self.page)
+
+    @property
+    def left(self) -> Complex:
+        """What the model leaves, as light of both cameras that would mend it."""
+        return self._mending(self._lacking)
+
+    def seen_of(self, change: Complex) -> Complex:
+        """A small change of the light of both cameras as it comes back from their equations."""
+        return self._mending((change / self._amplitude * self._along.conj()).real)
+
+    def noise_of_frames(self) -> Complex:
+        """Noise like that of the frames, as light of both cameras."""
+        rng = np.random.default_rng(0)
+        frames, references = (
+            FramePair(*(with_more_noise(frame, _MORE_NOISE, rng) for frame in (pair.in_phase, pair.quadrature)))
+            for pair in (self._pair, self._device.references)
+        )
+        seen = _looked_at(self._filtered(frames, references), self._at) / (2 * self.references)
+        return self._mending((seen - self.counts) / _MORE_NOISE)
+
+    def noise_of_modulator(self) -> Complex:
+        """What a radian of phase noise, another in each sample, adds to what the cameras see, to first order."""
+        noise = np.random.default_rng(1).standard_normal(self.page.shape)
+        return self.seen_of(self.waves.to_cameras(1j * noise * self.page))
+
+    def to_exit(self, seen: Complex) -> Complex:
+        """Light of both cameras back to the exit facet."""
+        return self.waves.back_to_exit(seen)
+
+    def errors(self, leaving: Complex) -> Complex:
+        """Light on the exit facet as relative errors of the symbols, over the power of each, [ny, nx]."""
+        samples, (rows, columns) = self._samples, self._device.profile.page_shape
+        blocks = (rows, samples, columns, samples)
+        products = self.page.conj() * self.waves.back_to_page(leaving)
+        power = np.abs(self.page) ** 2
+        return np.asarray(products.reshape(blocks).sum(axis=(1, 3)) / power.reshape(blocks).sum(axis=(1, 3)))
+
+    def correct_amplitude(self) -> None:
+        """Give the model the illumination, and the loss towards the entrance facet's edges, that suit it best.
+
+        A blur of the modulator loses light there. A network learns both by itself.
+        """
+        terms, waves = len(self._terms), self.waves
+        lit = [self.coarse.to_cameras(self.page * term) for term in self._terms]
+        losses = [self.coarse.to_exit(self.page, radius2(self.coarse) ** power) for power in _LOSSES]
+        changes = [*lit, *(1j * each for each in lit), *map(self.coarse.from_exit, losses)]
+        columns = np.stack([*map(self.equations_of, changes)], axis=1)
+        found = np.linalg.lstsq(columns, self.left_of_equations, rcond=None)[0]
+        self.page = self.page * (1 + np.tensordot(found[:terms] + 1j * found[terms : 2 * terms], self._terms, 1))
+        passed = 1 + sum(
+            share * radius2(waves) ** power for share, power in zip(found[2 * terms :], _LOSSES, strict=True)
+        )
+        self.fields = waves.from_exit(waves.to_exit(self.page, passed))
+
+    def equations(self, left: Real) -> Real:
+        """Equations [2, Gy, Gx], or on the coarse grid, over their noise, on that grid; flat."""
+        if left.shape[1:] == self._seen.shape:
+            left = left[:, *_EVERY]
+        weighted = left / np.sqrt(self.brightness[:, *_EVERY] + _FLOOR)
+        return np.asarray(weighted[:, self._seen[_EVERY]].ravel())
+
+    def equations_of(self, change: Complex) -> Real:
+        """What a small change of the light does to the equations; light of both cameras on the coarse grid."""
+        return self.equations((change / self._amplitude[_EVERY] * self._along[:, *_EVERY].conj()).real)
+
+    def equations_of_fit(self) -> Iterator[Real]:
+        """What each parameter of the fit does to the equations."""
+        here = self.coarse.to_cameras(self.page)
+        places = np.stack(np.meshgrid(self._grid.x_m, self._grid.y_m), axis=-1)[_EVERY]
+        for index in range(len(PARAMETERS)):
+            moved = self._device.parameters.copy()
+            moved[index] += _DIFFERENCE * PRIORS[index]
+            if index in _SEEN_BY_CAMERAS:
+                at = _rows_and_columns(self._twin.pixels(moved, places.reshape(-1, 2)).reshape(2, *places.shape))
+                yield self.equations(
+                    _looked_at(self._images, at) / (2 * self.references[:, *_EVERY]) - self.counts[:, *_EVERY]
+                )
+            else:
+                yield self.equations_of(self.changed(moved).to_cameras(self.page) - here)
+
+    @property
+    def coarse_places(self) -> tuple[Real, Real]:
+        """Places (x, y) of the coarse grid over its half width and half height, to be spread over it."""
+        x, y = self._grid.x_m[::_STRIDE], self._grid.y_m[::_STRIDE]
+        return (x / self._grid.x_m[-1])[None, :], (y / self._grid.y_m[-1])[:, None]
+
+    @property
+    def brightness(self) -> Real:
+        """What the cameras should have counted, over the reference's counts, [2, Gy, Gx]."""
+        return np.abs(self._along) ** 2
+
+    @property
+    def left_of_equations(self) -> Real:
+        """What the model leaves of the equations, on the coarse grid, over their noise; flat."""
+        return self.equations(self._lacking)
+
+    @cached_property
+    def coarse(self) -> FittedWaves:
+        """The fitted waves on the coarse grid."""
+        return self.changed(self._device.parameters)
+
+    def changed(self, parameters: Real | None = None, **geometry: float) -> FittedWaves:
+        """The waves on the coarse grid with other parameters, or with another geometry."""
+        parameters = self._device.parameters if parameters is None else parameters
+        how: dict[str, Any] = {"filled": True, "stride": _STRIDE, "accuracy": _ACCURACY, "changed": geometry}
+        return FittedWaves(self._device.profile, parameters, self._samples, **how)
+
+    @property
+    def _lacking(self) -> Real:
+        """Counts that the model lacks, [2, Gy, Gx], over twice the reference's."""
+        field = self.fields / self._amplitude
+        return np.asarray(self.counts - (field * self._arms.conj()).real - np.abs(field) ** 2 / 2)
+
+    @property
+    def _along(self) -> Complex:
+        """Directions of the field along which the cameras' counts grow."""
+        return np.asarray(self._arms + self.fields / self._amplitude)
+
+    def _mending(self, left: Real) -> Complex:
+        """Light of both cameras that mends what is left of their equations, each weighted by its noise."""
+        along = self._along
+        return np.asarray(self._seen * self._amplitude * along * left / (self.brightness + _FLOOR))
+
+    def _filtered(self, pair: FramePair, references: FramePair) -> list[NDArray[np.float32]]:
+        """What either frame shows beyond its reference, filtered as a decoder filters it."""
+        images = []
+        for frame, reference in ((pair.in_phase, references.in_phase), (pair.quadrature, references.quadrature)):
+            beyond = frame.astype(np.float32) - reference
+            for axis in (0, 1):
+                beyond = scipy.ndimage.convolve1d(beyond, self._grid.prefilter, axis=axis)
+            images.append(beyond)
+        return images
+
+
+def places_on_facet(waves: FittedWaves) -> tuple[Real, Real]:
+    """Places (x, y) of the facets' samples, over half of the pipe's width, along the lens's axes."""
+    channel = waves.channel
+    half = channel.geometry.pipe_width_m / 2
+    down, across = (facet_axis(count, 2 * half) / half for count in channel.cells)
+    x, y = on_facet(couplings(channel.geometry), across, down[:, None])
+    return np.asarray(x), np.asarray(y)
+
+
+def radius2(waves: FittedWaves) -> Real:
+    """R^2 of the facets' samples, over the square of half of the pipe's width."""
+    x, y = places_on_facet(waves)
+    return x**2 + y**2
+
+
+def _rows_and_columns(pixels: Real) -> list[list[Real]]:
+    """Pixels (column, row) of both cameras, [2, ..., 2], as scipy takes them."""
+    return [[each[..., 1], each[..., 0]] for each in pixels]
+
+
+def _looked_at(images: Sequence[NDArray[np.float32]], at: Sequence[Sequence[Real]]) -> Real:
+    """Values of either camera's image at its pixels (row, column)."""
+    seen = [
+        scipy.ndimage.map_coordinates(one, pixels, order=1, mode="nearest")
+        for one, pixels in zip(images, at, strict=True)
+    ]
+    return np.stack(seen).astype(np.float64)

@@ -1,0 +1,123 @@
+"""How well a fitted device explains the light of a known page: in bits, by place, and what is likeliest to be wrong.
+
+What the cameras should have seen of the page, by the fitted waves, is taken off what they saw. The rest is sent back to
+the modulator, where it is an error of each symbol, as a decoder meets it that knows all others. Noise of the frames is
+measured by the frames themselves, and goes the same way. Noise of the modulator makes errors of phase, and few of
+amplitude; light that the model has in another place makes as much of the one as of the other. So the errors of
+amplitude, beyond what noise leaves, are those that a better model would not make.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from lightpage.calibration.calibrated_device import CalibratedDevice
+from lightpage.calibration.goodness.light import SeenLight
+from lightpage.calibration.goodness.suspects import likeliest
+from lightpage.calibration.goodness.verdict import GOOD, USABLE, Goodness, Map
+from lightpage.calibration.interfaces import Twin
+from lightpage.recording.frame_pair import FramePair
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complexfloating]
+
+_OWN_ERROR_RAD = 0.02
+"""Error of phase of a symbol that the standard decoder adds to that of noise, about: so bits that are lost come out as
+measured where light passes the pipe three times, or planes or tilts were not fitted."""
+_SMOOTHED = 9
+"""Symbols, side of the squares over whose mean a symbol's error does not count: a network learns what is smooth."""
+_EDGE = 2
+"""Symbols along the page's edges that are left out: part of their light may miss the cameras."""
+_BLOCKS = (6, 8)
+"""Rows and columns of the maps."""
+
+
+def measure_goodness(
+    twin: Twin,
+    device: CalibratedDevice,
+    illumination: Complex,
+    pair: FramePair,
+    symbols: NDArray[np.complex128],
+    progress: Callable[[float], None] = lambda share: None,
+) -> Goodness:
+    """Measure how well a fitted device explains the light of a known page.
+
+    Args:
+        twin: ray tracer of the nominal device.
+        device: as it was fitted.
+        illumination: coefficients [T] of the page's, as `WaveFitted` has them.
+        pair: frames of the page.
+        symbols: its unit phasors [ny, nx].
+        progress: told of the share that is behind.
+    """
+    light = SeenLight(twin, device, illumination, pair, symbols)
+    progress(0.2)
+    light.correct_amplitude()
+    progress(0.4)
+    at_exit = [light.to_exit(each) for each in (light.left, light.noise_of_frames(), light.noise_of_modulator())]
+    progress(0.6)
+    gain = _smooth(light.errors(light.to_exit(light.seen_of(light.fields))).real)
+    errors, of_frames, of_modulator = (_rough(light.errors(each) / gain) for each in at_exit)
+    errors, by_level = _without_levels(errors, np.angle(symbols))
+    progress(0.8)
+    # Of errors of amplitude and of phase: what a better model explains is in both, noise of the modulator in phase.
+    here, frames, modulator = (_powers(each) for each in (errors, of_frames, of_modulator))
+    amplitude, phase = np.maximum(here - frames, 0)
+    leak = modulator[0] / modulator[1]
+    unexplained = max(0.0, float((amplitude - leak * phase) / (1 - leak)))
+    amount = max(0.0, float(phase - unexplained)) / modulator[1]
+    noise = frames + amount * modulator
+    lost = float(np.log2(1 + (unexplained + by_level) / (noise[1] + _OWN_ERROR_RAD**2))) / 2
+    cause = "" if lost < GOOD else likeliest(light, errors, levels=by_level > unexplained)
+    return Goodness(
+        verdict="good" if lost < GOOD else "usable" if lost < USABLE else "wrong",
+        bits_lost=lost,
+        unexplained_relative=2 * unexplained + by_level,
+        noise_relative=float(noise.sum()),
+        modulator_noise_rad=float(np.sqrt(amount)),
+        by_page=_map(errors, of_frames, amount, of_modulator),
+        by_facet=_map(at_exit[0], at_exit[1], amount, at_exit[2]),
+        cause=cause,
+    )
+
+
+def _smooth(errors: NDArray[np.floating]) -> NDArray[np.floating]:
+    return np.asarray(scipy.ndimage.uniform_filter(errors, _SMOOTHED))
+
+
+def _rough(errors: Complex) -> Complex:
+    """Errors less what is smooth in them, the page's edges left out."""
+    rough = errors - _smooth(errors.real) - 1j * _smooth(errors.imag)
+    return np.asarray(rough[_EDGE:-_EDGE, _EDGE:-_EDGE])
+
+
+def _without_levels(errors: Complex, phases: Real) -> tuple[Complex, float]:
+    """Errors less the mean of their level, and the variance of phase of what those means are beyond chance."""
+    _, level = np.unique(np.round(phases[_EDGE:-_EDGE, _EDGE:-_EDGE].ravel(), 6), return_inverse=True)
+    count = np.bincount(level)
+    flat = errors.ravel()
+    mean = (np.bincount(level, flat.real) + 1j * np.bincount(level, flat.imag)) / count
+    several = count[level] > 1
+    left = np.where(several, (flat - mean[level]) * np.sqrt(count[level] / np.maximum(count[level] - 1, 1)), flat)
+    chance = np.mean(left.imag**2) * len(count) / len(flat)
+    return left.reshape(errors.shape), max(0.0, float(np.mean(mean.imag[level] ** 2) - chance))
+
+
+def _powers(errors: Complex) -> Real:
+    """Mean square of the errors of amplitude and of phase, [2]."""
+    return np.array([np.mean(errors.real**2), np.mean(errors.imag**2)])
+
+
+def _map(here: Complex, frames: Complex, amount: float, modulator: Complex) -> Map:
+    """Power of what is left over that of noise, in blocks."""
+
+    def blocks(light: Complex) -> Real:
+        rows = np.array_split(np.abs(light) ** 2, _BLOCKS[0], axis=0)
+        return np.array([[part.mean() for part in np.array_split(row, _BLOCKS[1], axis=1)] for row in rows])
+
+    ratio = blocks(here) / (blocks(frames) + amount * blocks(modulator))
+    return [[round(float(one), 3) for one in row] for row in ratio]

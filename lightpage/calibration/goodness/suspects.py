@@ -1,0 +1,102 @@
+"""What is likeliest to be wrong with a fit that leaves light unexplained."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from lightpage.calibration.goodness.light import SeenLight, places_on_facet, radius2
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complexfloating]
+
+_BENDS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
+"""Powers of (x, y) of phases over the page."""
+_STEP = 1e-4
+_RANK = 1e-4
+"""Singular values are dropped below this share of the largest."""
+_LOCAL = 0.3
+"""Share of what is left in a hundredth of the equations from which on it lies in few places; noise has 0.08."""
+_FOREIGN = 0.1
+"""Mean square of the symbols' relative errors from which on light belongs to other symbols."""
+_TELLING = 0.2
+"""Share of the unexplained light from which on a correction of the model is called the likeliest cause."""
+
+
+def likeliest(light: SeenLight, errors: Complex, *, levels: bool) -> str:
+    """What is likeliest to be wrong, in words.
+
+    Args:
+        light: of a known page.
+        errors: of its symbols, less what is smooth in them.
+        levels: whether most of what is wrong goes with the levels.
+    """
+    if levels:
+        return "levels whose phases no smooth curve tells: is the modulator's lookup table right?"
+    fitted = scipy.linalg.orth(_of_unit_length(list(light.equations_of_fit())), rcond=_RANK)
+    left = _beside(fitted, light.left_of_equations[:, None])[:, 0]
+
+    def share(columns: list[Real]) -> float:
+        matrix = _beside(fitted, _of_unit_length(columns))
+        found = np.linalg.lstsq(matrix, left, rcond=_RANK)[0]
+        return 1 - float(np.sum((left - matrix @ found) ** 2) / np.sum(left**2))
+
+    words, most = max(((words, share(columns)) for words, columns in _suspects(light)), key=lambda found: found[1])
+    if most > _TELLING:
+        return f"{words} ({most:.0%} of what is left)"
+    power = np.sort(left**2)
+    if power[-len(power) // 100 :].sum() > _LOCAL * power.sum():
+        return "light in few places: is there dust, are there hot pixels?"
+    if np.mean(np.abs(errors) ** 2) > _FOREIGN:
+        return "light of other symbols: are these the pages that were written, and is this their profile?"
+    return "nothing that the model knows: light comes by a way that it lacks, or not all symbols are as written"
+
+
+def _of_unit_length(columns: list[Real]) -> Real:
+    """Columns that are not zero, side by side."""
+    lengths = [float(np.linalg.norm(column)) for column in columns]
+    return np.stack([column / length for column, length in zip(columns, lengths, strict=True) if length > 0], axis=1)
+
+
+def _beside(fitted: Real, columns: Real) -> Real:
+    """What of the columns no parameter of the fit does, given as orthonormal columns."""
+    return np.asarray(columns - fitted @ (fitted.T @ columns))
+
+
+def _suspects(light: SeenLight) -> Iterator[tuple[str, list[Real]]]:
+    """What may be wrong, in words, and how it would change the equations."""
+    coarse, page = light.coarse, light.page
+    leaving, (across, up), squares = coarse.to_exit(page), places_on_facet(coarse), radius2(coarse)
+    one = np.array([1, 0])[:, None, None]
+
+    def at_exit(factor: Real) -> list[Real]:
+        """A phase over the exit facet, seen by either camera alone."""
+        change = coarse.from_exit(1j * leaving * factor)
+        return [light.equations_of(change * chosen) for chosen in (one, 1 - one)]
+
+    yield "a curvature over the exit facet: are the cameras in focus?", at_exit(squares)
+    slopes = [*at_exit(across), *at_exit(up)]
+    yield "a slope over the exit facet: do both cameras see the image where they did in the references?", slopes
+    yield (
+        "a saddle over the exit facet: is the second lens askew?",
+        [*at_exit(across**2 - up**2), *at_exit(across * up)],
+    )
+    entering = coarse.from_exit(coarse.to_exit(page, 1j * squares))
+    yield "a curvature over the entrance facet: is the modulator in focus?", [light.equations_of(entering)]
+    x, y = light.waves.x[None, :], light.waves.y[:, None]
+    bent = [light.equations_of(coarse.to_cameras(1j * page * x**i * y**j)) for i, j in _BENDS]
+    yield "a phase over the page: is the modulator flat?", bent
+    here = coarse.from_exit(leaving)
+    curved = coarse.from_exit(1j * leaving * squares)
+    tilted = [curved * place * chosen for place in light.coarse_places for chosen in (one, 1 - one)]
+    yield "a focus that changes over the image: are the cameras tilted?", [*map(light.equations_of, tilted)]
+    higher = light.changed(pipe_height_relative=_STEP).to_cameras(page) - here
+    yield "walls of the pipe that are not equally far apart in x and y", [light.equations_of(higher)]
+    length = light.waves.channel.geometry.pipe_length_m
+    ghost = light.changed(pipe_length_m=3 * length).to_cameras(page)
+    yield "light that passes the pipe three times", [light.equations_of(each) for each in (ghost, 1j * ghost)]
+    bright = light.references * light.brightness**2
+    yield "counts that are not in proportion to the light", [light.equations(bright * each) for each in (one, 1 - one)]

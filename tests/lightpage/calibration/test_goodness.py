@@ -1,0 +1,76 @@
+"""Claims about the verdict on a fit: a right one is good whatever the noise, a wrong one is not and says why."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lightpage.calibration.goodness.frame_noise import noise_variance, with_more_noise
+from lightpage.calibration.goodness.measure import measure_goodness
+from lightpage.calibration.goodness.verdict import Goodness
+from lightpage.calibration.waves.wave_fit import WaveFit
+from lightpage.device.state import Device
+from lightpage.page.symbols import symbol_phases
+from lightpage.simulator.simulator import Simulator
+from lightpage.simulator.true_optics import perfectly_calibrated
+from lightpage.train.models.twin import RayTwin, TorchTwin
+from tests.lightpage.small import small_profile
+
+PROFILE = small_profile()
+TWIN = TorchTwin(RayTwin(PROFILE))
+STILL = ("drift.shift_px=0",)
+
+
+def goodness_of(*settings: str, wrong_symbols: float = 0.0) -> Goodness:
+    """Of a device as a calibration would find it that knows all but what it has no parameter for."""
+    device = Device().with_settings([*STILL, *settings])
+    simulator = Simulator(PROFILE, device, seed=3)
+    rng = np.random.default_rng(3)
+    symbols = rng.integers(256, size=PROFILE.page_shape).astype(np.uint8)
+    pair, references = simulator.page(symbols), simulator.references()
+    replaced = rng.random(symbols.shape) < wrong_symbols
+    told = np.exp(1j * symbol_phases(np.where(replaced, rng.integers(256, size=symbols.shape), symbols), 256))
+    known = perfectly_calibrated(PROFILE, device, references)
+    fit = WaveFit(TWIN, PROFILE, pair, references, told)
+    lit = fit.fit(known.parameters, known.quadrature_phase_rad, ("camera_phase",), modulation=known.modulation)
+    assert lit.illumination is not None
+    return measure_goodness(TWIN, known, lit.illumination, pair, told)
+
+
+@pytest.mark.parametrize("settings", [(), ("slm.phase_noise_rad=0.3",), ("sensor.full_well_e=1000", "slm.blur_px=0.5")])
+def test_a_right_fit_is_good_whatever_the_noise(settings: tuple[str, ...]) -> None:
+    found = goodness_of(*settings)
+    assert (found.verdict, found.cause) == ("good", "")
+    assert np.median(found.by_page) == pytest.approx(1, abs=0.35)
+
+
+def test_the_modulators_noise_is_told_from_light_that_nothing_explains() -> None:
+    assert goodness_of("slm.phase_noise_rad=0.1").modulator_noise_rad == pytest.approx(0.1, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("settings", "wrong_symbols", "cause"),
+    [
+        (("geometry.ghost_relative=0.15",), 0.0, "three times"),
+        (("geometry.pipe_height_relative_error=0.003",), 0.0, "walls of the pipe"),
+        (("sensor.dust_specks=40", "sensor.hot_pixel_share=0.003"), 0.0, "few places"),
+        ((), 0.5, "other symbols"),
+    ],
+)
+def test_a_wrong_fit_says_what_is_likeliest(settings: tuple[str, ...], wrong_symbols: float, cause: str) -> None:
+    found = goodness_of(*settings, wrong_symbols=wrong_symbols)
+    assert found.verdict == "wrong"
+    assert cause in found.cause
+    assert np.max(found.by_facet) > 3
+
+
+def test_a_frames_noise_is_known_by_the_frame_itself() -> None:
+    rng = np.random.default_rng(0)
+    light = 120 + 80 * np.cos(np.arange(400) * 0.5)[:, None] * np.cos(np.arange(300) * 0.4)
+    frame = rng.normal(light, np.sqrt(2 + 0.05 * light)).round().astype(np.uint8)
+    frame[rng.random(frame.shape) < 1e-3] = 255
+    fixed, by_count = noise_variance(frame)
+    assert fixed + 120 * by_count == pytest.approx(8, rel=0.1)
+    more = with_more_noise(frame, 2.0, rng)
+    assert more.dtype == np.uint8
+    assert np.var(more.astype(float) - frame) == pytest.approx(4 * 8, rel=0.15)
