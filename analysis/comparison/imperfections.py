@@ -6,7 +6,8 @@
 
 Every device is recorded and calibrated from nominal. Decoder and oracle are the methods wave and oracle of
 `analysis.comparison.decoders`, with the same network, steps and pages. Interrupted, it goes on where it was; all lies
-in --out.
+in --out. The oracle's equations are linear: where cameras stand some 1.5 rad apart, they miss one of two numbers on a
+ring of the facet (`train/models/apart.py`), and it reads less than the decoder.
 """
 
 from __future__ import annotations
