@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.goodness.light import SeenLight
-from lightpage.calibration.goodness.suspects import likeliest
+from lightpage.calibration.goodness.suspects import LEVELS, NEIGHBOURS, likeliest
 from lightpage.calibration.goodness.verdict import GOOD, USABLE, Goodness, Map
 from lightpage.calibration.interfaces import Twin
 from lightpage.recording.frame_pair import FramePair
@@ -62,7 +62,9 @@ def measure_goodness(
     progress(0.6)
     gain = _smooth(light.errors(light.to_exit(light.seen_of(light.fields))).real)
     errors, of_frames, of_modulator = (_rough(light.errors(each) / gain) for each in at_exit)
-    errors, by_level = _without_levels(errors, np.angle(symbols))
+    phases = np.mod(np.angle(symbols), 2 * np.pi)
+    errors, by_neighbours = _without_neighbours(errors, phases)
+    errors, by_level = _without_levels(errors, phases)
     progress(0.8)
     # Of errors of amplitude and of phase: what a better model explains is in both, noise of the modulator in phase.
     here, frames, modulator = (_powers(each) for each in (errors, of_frames, of_modulator))
@@ -71,12 +73,17 @@ def measure_goodness(
     unexplained = max(0.0, float((amplitude - leak * phase) / (1 - leak)))
     amount = max(0.0, float(phase - unexplained)) / modulator[1]
     noise = frames + amount * modulator
-    lost = float(np.log2(1 + (unexplained + by_level) / (noise[1] + _OWN_ERROR_RAD**2))) / 2
-    cause = "" if lost < GOOD else likeliest(light, errors, levels=by_level > unexplained)
+    wrong = unexplained + by_level + by_neighbours
+    lost = float(np.log2(1 + wrong / (noise[1] + _OWN_ERROR_RAD**2))) / 2
+    cause = ""
+    if lost >= GOOD:
+        shares = {LEVELS: by_level, NEIGHBOURS: by_neighbours}
+        told = max(shares, key=lambda words: shares[words])
+        cause = told if shares[told] > wrong / 2 else likeliest(light, errors)
     return Goodness(
         verdict="good" if lost < GOOD else "usable" if lost < USABLE else "wrong",
         bits_lost=lost,
-        unexplained_relative=2 * unexplained + by_level,
+        unexplained_relative=2 * unexplained + by_level + by_neighbours,
         noise_relative=float(noise.sum()),
         modulator_noise_rad=float(np.sqrt(amount)),
         by_page=_map(errors, of_frames, amount, of_modulator),
@@ -105,6 +112,23 @@ def _without_levels(errors: Complex, phases: Real) -> tuple[Complex, float]:
     left = np.where(several, (flat - mean[level]) * np.sqrt(count[level] / np.maximum(count[level] - 1, 1)), flat)
     chance = np.mean(left.imag**2) * len(count) / len(flat)
     return left.reshape(errors.shape), max(0.0, float(np.mean(mean.imag[level] ** 2) - chance))
+
+
+def _without_neighbours(errors: Complex, phases: Real) -> tuple[Complex, float]:
+    """Errors less phases that go with the steps to the neighbouring symbols, and the variance of these beyond chance.
+
+    Fringing fields between the modulator's pixels make them. What such a step has of the symbol's own level is stroke
+    to the fit, which leaves the neighbours' phases.
+    """
+    columns = []
+    for axis in (0, 1):
+        beside = [np.roll(phases, shift, axis) for shift in (1, -1)]
+        columns += [sum(beside) - 2 * np.pi, sum(np.sin(each - phases) for each in beside)]
+    matrix = np.stack([column[_EDGE:-_EDGE, _EDGE:-_EDGE].ravel() for column in columns], axis=1)
+    explained = matrix @ np.linalg.lstsq(matrix, errors.imag.ravel(), rcond=None)[0]
+    left = errors - 1j * explained.reshape(errors.shape)
+    chance = len(columns) * np.mean(left.imag**2) / left.size
+    return left, max(0.0, float(np.mean(explained**2) - chance))
 
 
 def _powers(errors: Complex) -> Real:

@@ -26,16 +26,17 @@ _TELLING = 0.2
 """Share of the unexplained light from which on a correction of the model is called the likeliest cause."""
 
 
-def likeliest(light: SeenLight, errors: Complex, *, levels: bool) -> str:
-    """What is likeliest to be wrong, in words.
+LEVELS = "levels whose phases no smooth curve tells: is the modulator's lookup table right?"
+NEIGHBOURS = "phases that go with those of the symbols beside: is there crosstalk between the modulator's pixels?"
+
+
+def likeliest(light: SeenLight, errors: Complex) -> str:
+    """What of the light is likeliest to be wrong, in words.
 
     Args:
         light: of a known page.
         errors: of its symbols, less what is smooth in them.
-        levels: whether most of what is wrong goes with the levels.
     """
-    if levels:
-        return "levels whose phases no smooth curve tells: is the modulator's lookup table right?"
     fitted = scipy.linalg.orth(_of_unit_length(list(light.equations_of_fit())), rcond=_RANK)
     left = _beside(fitted, light.left_of_equations[:, None])[:, 0]
 

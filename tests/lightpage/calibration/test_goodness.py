@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from lightpage.calibration.goodness.frame_noise import noise_variance, with_more_noise
 from lightpage.calibration.goodness.measure import measure_goodness
 from lightpage.calibration.goodness.verdict import Goodness
-from lightpage.calibration.waves.wave_fit import WaveFit
+from lightpage.calibration.waves.wave_fit import LevelPrior, WaveFit
 from lightpage.device.state import Device
 from lightpage.page.symbols import symbol_phases
 from lightpage.simulator.simulator import Simulator
@@ -32,9 +34,15 @@ def goodness_of(*settings: str, wrong_symbols: float = 0.0) -> Goodness:
     told = np.exp(1j * symbol_phases(np.where(replaced, rng.integers(256, size=symbols.shape), symbols), 256))
     known = perfectly_calibrated(PROFILE, device, references)
     fit = WaveFit(TWIN, PROFILE, pair, references, told)
-    lit = fit.fit(known.parameters, known.quadrature_phase_rad, ("camera_phase",), modulation=known.modulation)
+    lit = fit.fit(
+        known.parameters,
+        known.quadrature_phase_rad,
+        ("camera_phase",),
+        modulation=known.modulation,
+        levels=LevelPrior(),
+    )
     assert lit.illumination is not None
-    return measure_goodness(TWIN, known, lit.illumination, pair, told)
+    return measure_goodness(TWIN, replace(known, modulation=lit.modulation), lit.illumination, pair, told)
 
 
 @pytest.mark.parametrize("settings", [(), ("slm.phase_noise_rad=0.3",), ("sensor.full_well_e=1000", "slm.blur_px=0.5")])
@@ -54,6 +62,7 @@ def test_the_modulators_noise_is_told_from_light_that_nothing_explains() -> None
         (("geometry.ghost_relative=0.15",), 0.0, "three times"),
         (("geometry.pipe_height_relative_error=0.003",), 0.0, "walls of the pipe"),
         (("sensor.dust_specks=40", "sensor.hot_pixel_share=0.003"), 0.0, "few places"),
+        (("slm.crosstalk_relative=0.2",), 0.0, "crosstalk"),
         ((), 0.5, "other symbols"),
     ],
 )
