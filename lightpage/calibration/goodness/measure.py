@@ -123,7 +123,7 @@ def _without_neighbours(errors: Complex, phases: Real) -> tuple[Complex, float]:
     columns = []
     for axis in (0, 1):
         beside = [np.roll(phases, shift, axis) for shift in (1, -1)]
-        columns += [sum(beside) - 2 * np.pi, sum(np.sin(each - phases) for each in beside)]
+        columns += [beside[0] + beside[1] - 2 * np.pi, np.sin(beside[0] - phases) + np.sin(beside[1] - phases)]
     matrix = np.stack([column[_EDGE:-_EDGE, _EDGE:-_EDGE].ravel() for column in columns], axis=1)
     explained = matrix @ np.linalg.lstsq(matrix, errors.imag.ravel(), rcond=None)[0]
     left = errors - 1j * explained.reshape(errors.shape)
