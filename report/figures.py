@@ -69,12 +69,14 @@ def maps(data: ReportData, centroids: Real) -> list[Picture]:
 
 
 def goodness(data: ReportData) -> list[Picture]:
-    """Where the light lies that the calibration leaves; none where that was not measured."""
+    """Where the light lies that the calibration does not explain; none where that was not measured."""
     found = data.calibration.goodness
     if found is None:
         return []
-    alt = f"Maps of the light that the calibration leaves, over page and exit facet: the fit is {found.verdict}"
-    caption = "Light that the fitted device leaves of a known page, over what noise leaves: 1 is noise alone."
+    alt = (
+        f"Maps of the light that the calibration does not explain, over page and exit facet: the fit is {found.verdict}"
+    )
+    caption = "Light of a known page that the fitted device does not explain, over noise: 1 is noise alone."
     return [as_picture(goodness_figure(found), alt, caption, image=True)]
 
 

@@ -88,7 +88,7 @@ def study(
         raise InvalidInputError(f"study {out}", "results of unknown origin", expected)
     begin(out, {"study": name, "results": RESULTS, **settings.key()})
     results_folder.mkdir(exist_ok=True)
-    cases, results = chosen.chosen(settings, only), []
+    cases, results = chosen.chosen(settings, only, results_folder), []
     with percent_bar() as progress:
         for number, case in enumerate(cases):
             results.append(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Self
 
@@ -12,7 +13,7 @@ import numpy as np
 import torch
 
 from lightpage.calibration.calibrated_device import CalibratedDevice
-from lightpage.calibration.document import Calibration
+from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.device.profile import Profile
 from lightpage.device.state import Device
 from lightpage.metrics.information import achievable_rate
@@ -128,11 +129,19 @@ def taught(
         if not path.exists():
             job.claim(force=True)
             job.run(teaching.pages)
+        kept = partial(_kept, folder / "calibration.toml", calibrate=calibration)
         with Recording.open(path) as recording:
             usable = usable_pages(recording)
             split = Split.of(recording, list(usable), _VALIDATION_SHARE, 0.0)
-            make_run(run, recording, profile, trainer, usable, split, lambda: calibration(recording))
+            make_run(run, recording, profile, trainer, usable, split, lambda: kept(recording))
     path.unlink()
     for features in ("features", "synthetic", "checkpoints"):
         shutil.rmtree(run / features, ignore_errors=True)
     return KeptDecoder.of(run)
+
+
+def _kept(path: Path, recording: Recording, calibrate: Callable[[Recording], Calibration]) -> Calibration:
+    """The calibration that is kept there; made and kept if it is not: made again, it would differ in a last digit."""
+    if not path.exists():
+        calibrate(recording).save(path)
+    return load_calibration(path)

@@ -76,8 +76,10 @@ class Study:
     trains: bool = False
     parts: bool = False
 
-    def chosen(self, settings: Settings, only: Sequence[str]) -> list[Case]:
-        """Return the cases whose names begin with one of some words, and those that are needed; all without a word.
+    def chosen(self, settings: Settings, only: Sequence[str], folder: Path) -> list[Case]:
+        """Return the cases whose names begin with one of some words, are needed, or have results in the folder.
+
+        All are chosen without a word.
 
         Raises:
             InvalidInputError: no name begins so.
@@ -86,7 +88,12 @@ class Study:
         for word in only:
             if not any(str(case["name"]).startswith(word) for case in cases):
                 raise InvalidInputError(f"--only {word}", "no such case", _names(cases))
-        return [c for c in cases if not only or c.get("needed") or str(c["name"]).startswith(tuple(only))]
+        there = {path.stem for path in folder.glob("*.json")}
+        return [
+            case
+            for case in cases
+            if not only or case.get("needed") or case["name"] in there or str(case["name"]).startswith(tuple(only))
+        ]
 
 
 def measured(study: Study, settings: Settings, case: Case, folder: Path, progress: Progress) -> Result:

@@ -73,7 +73,7 @@ class LightDrift:
         known = device.model_dump()
         paths = {name: name.split(".") for name in changes}
         values = {name: known[table][key] + share * changes[name] for name, (table, key) in paths.items()}
-        return device.with_settings([f"{name}={value!r}" for name, value in values.items()])
+        return device.with_values(values)
 
 
 def state(begun: Device, moment: float, pages: int, light: LightDrift) -> Device:

@@ -38,6 +38,8 @@ SOUND_SHARE = 0.85
 
 _NOISE_DEVIATIONS = 3.0
 """Standard deviations of the pilots' noise that are allowed for before a device is said to have changed."""
+_NOTHING = 1e-9
+"""Below it a sum of weights, or a mean square of radians, is rounding."""
 
 
 @dataclass(frozen=True)
@@ -288,7 +290,7 @@ def read_pilots(p: NDArray[np.floating], pilots: Pilots, gained_nats: float = 0.
 
 
 def stroke_error(phase: NDArray[np.floating], concentration: NDArray[np.floating], pilots: Pilots) -> float:
-    """How much longer the modulator's stroke is than its calibration says, relative: a slope over the pilots' phases.
+    """Relative error of the modulator's stroke against its calibration: a slope over the pilots' phases.
 
     Args:
         phase: radians, piston and smooth error removed, [ny, nx].
@@ -300,9 +302,9 @@ def stroke_error(phase: NDArray[np.floating], concentration: NDArray[np.floating
     """
     weight = concentration[pilots.mask].astype(np.float64)
     error = remove_piston(phase[pilots.mask], pilots.phases)
-    with np.errstate(invalid="ignore"):
-        away = pilots.phases - np.sum(weight * pilots.phases) / weight.sum()
-        return float(np.sum(weight * away * error) / np.sum(weight * away**2))
+    away = pilots.phases - np.sum(weight * pilots.phases) / max(float(weight.sum()), _NOTHING)
+    spread = float(np.sum(weight * away**2))
+    return float(np.sum(weight * away * error)) / spread if spread > _NOTHING * weight.sum() else np.nan
 
 
 def _errors(p: NDArray[np.floating], pilots: Pilots) -> NDArray[np.complex128]:

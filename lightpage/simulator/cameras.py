@@ -139,6 +139,7 @@ def expose(intensity: Real, electrons_per_unit: float, sensor: Sensor, rng: np.r
 def to_counts(electrons: Real, sensor: Sensor) -> NDArray[np.uint16]:
     """Electrons to counts: full scale is the full well."""
     if sensor.nonlinearity_relative:
+        electrons = np.minimum(electrons, sensor.full_well_e)
         electrons = electrons * (1 + sensor.nonlinearity_relative * electrons / sensor.full_well_e)
     top = 2**sensor.bit_depth - 1
     counts = np.clip(np.rint(electrons * (top / sensor.full_well_e)), 0, top)

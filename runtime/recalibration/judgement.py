@@ -20,9 +20,9 @@ from lightpage.runtime.recalibration.known_pages import KnownPages
 MIN_AIR_SHARE = 0.02
 """Share of log2 M below which a held-back page does not match its symbols at all: wrong pilots, wrong device."""
 
-DRIFTED_PX, DRIFTED_RAD = 1.0, 0.01
-"""Shift of the image and smooth phase error from which on a decoder has a drift to follow. A quiet bench device shows
-0.1 px and 0.002 rad; the monitor speaks of 4 px and 0.03 rad."""
+DRIFTED_PX, DRIFTED_RAD, DRIFTED_STROKE = 1.0, 0.01, 0.002
+"""Shift of the image, smooth phase error and error of the stroke from which on a decoder has a drift to follow. A quiet
+bench device shows 0.1 px and 0.002 rad; the monitor speaks of 4 px and 0.03 rad, and of that stroke."""
 
 GAIN_ERRORS = 2
 """Standard errors that a re-fit of a device that has not drifted must gain. It fits by one page a geometry that was
@@ -95,7 +95,7 @@ def judged_pages(
 
 
 def _drifted(page: DecodedPage) -> bool:
-    if page.image is None or page.residual_rad >= DRIFTED_RAD:
+    if page.image is None or page.residual_rad >= DRIFTED_RAD or abs(page.stroke_relative) >= DRIFTED_STROKE:
         return True
     return math.hypot(page.image.shift_x_px, page.image.shift_y_px) >= DRIFTED_PX
 

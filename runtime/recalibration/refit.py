@@ -99,7 +99,7 @@ def refit(
         )
     hashes = [hash_frames(pair) for pair in pages.pairs]
     fitted = earlier.followed_by(Calibration.from_registered(registered, profile, hashes))
-    if not earlier.is_wrong:
+    if earlier.goodness is not None and not earlier.is_wrong:
         fitted.check_good("re-fit, outcome", ": else calibrate anew")
     table = {
         "reference_in_phase": references.in_phase,

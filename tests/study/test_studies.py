@@ -133,7 +133,7 @@ def test_every_setting_of_a_device_has_a_knob_unless_it_is_known_why_not() -> No
 
 def test_tolerances_say_within_which_range_a_tenth_of_a_bit_is_lost() -> None:
     knob, settings = KNOBS["modulator-axial"], Settings(SMALL)
-    cases = tolerances.STUDY.chosen(settings, ["modulator-axial", "full-well"])
+    cases = tolerances.STUDY.chosen(settings, ["modulator-axial", "full-well"], Path("none"))
     assert [case["name"] for case in cases[:2]] == ["kept", "modulator-axial=-6"]
     lost = {1.5: 0.05, 3.0: 0.15, 6.0: 5.0, 1000.0: 0.02, 300.0: 0.18}
     airs = [6.3 - lost.get(case.get("value", 0), 0.0) for case in cases]

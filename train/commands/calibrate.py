@@ -45,7 +45,9 @@ MAX_PAGES = 4
     type=click.Choice(["profile", "any"]),
     help="any: take frames of a camera that shows the image mirrored or turned, each camera by itself.",
 )
-@click.option("--picture", type=OutputFile(), help="Draw to this PNG where the light lies that the fit leaves.")
+@click.option(
+    "--picture", type=OutputFile(), help="Draw to this PNG where the light lies that the fit does not explain."
+)
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def calibrate(
     profile_name: str,
@@ -58,8 +60,8 @@ def calibrate(
 ) -> None:
     """Find this device's geometry, from nominal, with the first pages of a recording that show light.
 
-    The fit is called good where a decoder loses at most 0.1 bit a symbol by what it leaves unexplained, usable up to
-    0.3, else wrong. A wrong one is written too, and ends the command with an error.
+    The fit is called good where a decoder loses less than 0.1 bit a symbol by what it leaves unexplained, usable
+    below 0.3, else wrong. A wrong one is written too, and ends the command with an error.
     """
     profile = load_profile(profile_name)
     start = time.perf_counter()
@@ -85,7 +87,9 @@ def calibrate(
         f"{calibration.pages_used} known pages, {seconds:.0f} s; written to {out}"
     )
     if found is not None:
-        click.echo(f"a {found.verdict} fit: about {found.bits_lost:.2f} bit a symbol lost to light that it leaves")
+        click.echo(
+            f"a {found.verdict} fit: about {found.bits_lost:.2f} bit a symbol lost to light that it does not explain"
+        )
     calibration.check_good(f"calibration {out}", "; the file is there to be looked at")
 
 

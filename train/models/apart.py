@@ -103,13 +103,14 @@ class CamerasApart(NamedTuple):
             field = band(self.gathered(state * half) - of_arms)
         return field * inverse_amplitude
 
-    def recovered_linearly(self, left: Tensor, arms: Tensor, band: Filter) -> Tensor:
+    def recovered_linearly(
+        self, left: Tensor, arms: Tensor, amplitude: Tensor, inverse_amplitude: Tensor, band: Filter
+    ) -> Tensor:
         """The field where |e|^2 is taken off both equations: descent from none.
 
         Args:
             left: sides of the equations, [2, ny, nx].
-            arms: of both cameras, [4, 1, 1].
-            band: filter of e to the pipe's band.
+            arms, amplitude, inverse_amplitude, band: as for `recovered`.
 
         Returns:
             e, [2, ny, nx]; on the ring of the determinant's zero, what one of two real numbers says of it.
@@ -117,10 +118,10 @@ class CamerasApart(NamedTuple):
         before = estimate = torch.zeros_like(left)
         for _ in range(_LINEAR_ROUNDS):
             ahead = estimate + _LINEAR_MOMENTUM * (estimate - before)
-            beyond = left - _by_camera(self.seen(ahead) * arms)
-            pull = self.gathered(_for_both_parts(beyond) * arms)
+            beyond = left - _by_camera(self.seen(ahead) * inverse_amplitude * arms)
+            pull = self.gathered(_for_both_parts(beyond) * amplitude * arms)
             before, estimate = estimate, ahead + band(_LINEAR_STEP * pull)
-        return estimate
+        return estimate * inverse_amplitude
 
 
 def _likely(light: Tensor, pulling: Tensor) -> Tensor:

@@ -243,7 +243,8 @@ class FieldRecovery(nn.Module):
         """
         a, b, cos, sin, amplitude, _, apart = measured
         if apart is not None and not self.with_signal_power:
-            return apart.recovered_linearly(torch.stack([a, b]), measured.arms, self.band)
+            both = torch.stack([a, b])
+            return apart.recovered_linearly(both, measured.arms, amplitude, inverse_amplitude, self.band)
         start = self.band(torch.stack([a, (b - cos * a) / sin]) * amplitude) * inverse_amplitude
         if not self.with_signal_power:
             return torch.as_tensor(start)

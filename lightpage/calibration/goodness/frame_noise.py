@@ -12,6 +12,8 @@ _SMOOTHED_PX = 3
 """Side of the squares of pixels whose mean stands for a pixel's expected count."""
 _CLASSES = 20
 """Of pixels of like counts, each with a variance of its own."""
+_ROUNDING = 1 / 12
+"""Variance that counts have as whole numbers."""
 _NORMAL = 0.6745
 """Median of the magnitude of normal noise, in standard deviations."""
 
@@ -35,10 +37,11 @@ def noise_variance(frame: NDArray[np.integer]) -> tuple[float, float]:
     for number, chosen in enumerate(np.array_split(order, _CLASSES)):
         level[number] = expected.ravel()[chosen].mean()
         variance[number] = (np.median(np.abs(noise.ravel()[chosen])) / _NORMAL) ** 2
-    # Errors of a variance grow with it.
-    weight = 1 / np.maximum(variance, 1e-6)
-    terms = np.stack([np.ones(_CLASSES), level], axis=1)
-    fixed, by_count = np.linalg.lstsq(terms * weight[:, None], variance * weight, rcond=None)[0]
+    # Clipped or flat classes say nothing; errors of a variance grow with it.
+    told = variance > 0
+    weight = 1 / np.maximum(variance[told], _ROUNDING)
+    terms = np.stack([np.ones(_CLASSES), level], axis=1)[told]
+    (fixed, by_count), _ = scipy.optimize.nnls(terms * weight[:, None], variance[told] * weight)
     return float(fixed), float(by_count)
 
 

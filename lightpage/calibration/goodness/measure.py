@@ -20,6 +20,7 @@ from lightpage.calibration.goodness.light import SeenLight
 from lightpage.calibration.goodness.suspects import LEVELS, NEIGHBOURS, likeliest
 from lightpage.calibration.goodness.verdict import GOOD, USABLE, Goodness, Map
 from lightpage.calibration.interfaces import Twin
+from lightpage.errors import CalibrationError
 from lightpage.recording.frame_pair import FramePair
 
 Real = NDArray[np.float64]
@@ -32,8 +33,13 @@ _SMOOTHED = 9
 """Symbols, side of the squares over whose mean a symbol's error does not count: a network learns what is smooth."""
 _EDGE = 2
 """Symbols along the page's edges that are left out: part of their light may miss the cameras."""
+_SEEN = 0.5
+"""Share of the usual gain from which on the cameras see a symbol."""
+_NOTHING = 1e-30
 _BLOCKS = (6, 8)
-"""Rows and columns of the maps."""
+"""Rows and columns of the maps, at most."""
+_MOST_RATIO = 1e6
+"""In the maps."""
 
 
 def measure_goodness(
@@ -61,7 +67,10 @@ def measure_goodness(
     at_exit = [light.to_exit(each) for each in (light.left, light.noise_of_frames(), light.noise_of_modulator())]
     progress(0.6)
     gain = _smooth(light.errors(light.to_exit(light.seen_of(light.fields))).real)
-    errors, of_frames, of_modulator = (_rough(light.errors(each) / gain) for each in at_exit)
+    seen = gain > _SEEN * max(float(np.median(gain)), _NOTHING)
+    if not seen.any():
+        raise CalibrationError("calibration, verdict", "no symbol whose light both cameras see", "some")
+    errors, of_frames, of_modulator = (_rough(light.errors(each), gain, seen) for each in at_exit)
     phases = np.mod(np.angle(symbols), 2 * np.pi)
     errors, by_neighbours = _without_neighbours(errors, phases)
     errors, by_level = _without_levels(errors, phases)
@@ -96,9 +105,13 @@ def _smooth(errors: NDArray[np.floating]) -> NDArray[np.floating]:
     return np.asarray(scipy.ndimage.uniform_filter(errors, _SMOOTHED))
 
 
-def _rough(errors: Complex) -> Complex:
-    """Errors less what is smooth in them, the page's edges left out."""
-    rough = errors - _smooth(errors.real) - 1j * _smooth(errors.imag)
+def _rough(errors: Complex, gain: Real, seen: NDArray[np.bool_]) -> Complex:
+    """Errors over their gain less what is smooth in them, the page's edges left out.
+
+    Symbols whose light the cameras do not see have none, and the others stand for them.
+    """
+    errors = np.where(seen, errors, 0) / np.where(seen, gain, 1)
+    rough = (errors - _smooth(errors.real) - 1j * _smooth(errors.imag)) * seen / np.sqrt(seen.mean())
     return np.asarray(rough[_EDGE:-_EDGE, _EDGE:-_EDGE])
 
 
@@ -140,8 +153,10 @@ def _map(here: Complex, frames: Complex, amount: float, modulator: Complex) -> M
     """Power of what is left over that of noise, in blocks."""
 
     def blocks(light: Complex) -> Real:
-        rows = np.array_split(np.abs(light) ** 2, _BLOCKS[0], axis=0)
-        return np.array([[part.mean() for part in np.array_split(row, _BLOCKS[1], axis=1)] for row in rows])
+        down, across = (min(most, size) for most, size in zip(_BLOCKS, light.shape, strict=True))
+        rows = np.array_split(np.abs(light) ** 2, down, axis=0)
+        return np.array([[part.mean() for part in np.array_split(row, across, axis=1)] for row in rows])
 
-    ratio = blocks(here) / (blocks(frames) + amount * blocks(modulator))
+    light, noise = blocks(here), blocks(frames) + amount * blocks(modulator)
+    ratio = light / np.maximum(noise, np.maximum(light / _MOST_RATIO, _NOTHING))
     return [[round(float(one), 3) for one in row] for row in ratio]

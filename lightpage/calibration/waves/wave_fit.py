@@ -43,8 +43,8 @@ _LEAST_OFF = 2.0
 """Mean square of the distances of a modulation's coefficients from the usual ones, over their deviations, from which on
 it is another one: a nominal device has 1 or less, and more than 2 in one of seventy fits."""
 _LEAST_STROKE = 2.0
-"""Deviations of the stroke alone from which on it is another one too: it drifts by itself, and on the bench device
-three of them cost a twentieth of a bit."""
+"""Deviations of the stroke alone from which on a modulation that was known is another one too: a stroke drifts by
+itself, and on the bench device three of them cost a twentieth of a bit."""
 _LARGEST_MOVE_PX = 1.5
 """A round's largest step: the model is linear in the displacement over about a speckle."""
 _EQUATIONS = 100_000
@@ -396,7 +396,7 @@ def _directions(light: Complex, *, bends: bool) -> Complex:
 def _told_apart(found: WaveFitted, usual: Modulation) -> WaveFitted:
     """A fit whose modulation is the usual one unless it differs from that by more than its deviations."""
     away = np.subtract(found.modulation.coefficients, usual.coefficients) / found.modulation_deviations
-    same = np.mean(away**2) < _LEAST_OFF and abs(away[0]) < _LEAST_STROKE
+    same = np.mean(away**2) < _LEAST_OFF and (usual.is_nominal or abs(away[0]) < _LEAST_STROKE)
     return replace(found, modulation=usual) if same else found
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from lightpage.codec.page_bytes import Loss
 from lightpage.errors import Reason
+from lightpage.runtime.recalibration.judgement import DRIFTED_STROKE
 from lightpage.runtime.service.caller import MOST_SESSIONS, Caller, Sessions
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.observation import Observation, Observer
@@ -108,7 +109,7 @@ SHIFT = Sign("shift_px", window=5, raise_by=4.0, clear_by=3.0, rises=True, absol
 """Distance of the image from where calibration saw it. It is followed, yet a search reaches 12 px: a third of that is
 left to a device's walk (0.9 px in a quiet week), the rest to a knock."""
 
-STROKE = Sign("stroke_relative", window=15, raise_by=0.002, clear_by=0.001, either=True)
+STROKE = Sign("stroke_relative", window=15, raise_by=DRIFTED_STROKE, clear_by=0.001, either=True)
 """Change of the modulator's stroke since calibration, as the pilots show it. A quiet bench page
 shows 0.0000 +- 0.0012, so 0.002 is five standard errors of the median; twice that costs a tenth of a bit."""
 

@@ -83,3 +83,6 @@ def test_a_frames_noise_is_known_by_the_frame_itself() -> None:
     more = with_more_noise(frame, 2.0, rng)
     assert more.dtype == np.uint8
     assert np.var(more.astype(float) - frame) == pytest.approx(4 * 8, rel=0.15)
+    frame[:100] = 255
+    fixed, by_count = noise_variance(frame)
+    assert fixed + 120 * by_count == pytest.approx(8, rel=0.1)

@@ -80,6 +80,8 @@ class TestExposure:
         sensor = Sensor(full_well_e=15_000, read_noise_e=0, bit_depth=bit_depth)
         counts = to_counts(np.array([-50.0, 0.0, 7500.0, 15_000.0, 1e9]), sensor)
         assert counts.tolist() == [0, 0, round(top / 2), top, top]
+        bent = to_counts(np.linspace(0, 45_000, 50), sensor.model_copy(update={"nonlinearity_relative": -0.3}))
+        assert np.all(np.diff(bent.astype(int)) >= 0)
 
 
 class TestPose:

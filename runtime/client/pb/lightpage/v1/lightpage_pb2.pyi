@@ -47,6 +47,7 @@ class RecalibrationReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     RECALIBRATION_REASON_PISTON: _ClassVar[RecalibrationReason]
     RECALIBRATION_REASON_OTHER: _ClassVar[RecalibrationReason]
     RECALIBRATION_REASON_PAGES: _ClassVar[RecalibrationReason]
+    RECALIBRATION_REASON_STROKE: _ClassVar[RecalibrationReason]
 
 class DataLoss(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -143,6 +144,7 @@ RECALIBRATION_REASON_SHIFT: RecalibrationReason
 RECALIBRATION_REASON_PISTON: RecalibrationReason
 RECALIBRATION_REASON_OTHER: RecalibrationReason
 RECALIBRATION_REASON_PAGES: RecalibrationReason
+RECALIBRATION_REASON_STROKE: RecalibrationReason
 DATA_LOSS_UNSPECIFIED: DataLoss
 DATA_LOSS_OPTICS: DataLoss
 DATA_LOSS_HEADER: DataLoss
