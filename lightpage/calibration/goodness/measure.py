@@ -105,13 +105,13 @@ def _smooth(errors: NDArray[np.floating]) -> NDArray[np.floating]:
     return np.asarray(scipy.ndimage.uniform_filter(errors, _SMOOTHED))
 
 
-def _rough(errors: Complex, gain: Real, seen: NDArray[np.bool_]) -> Complex:
+def _rough(errors: Complex, gain: NDArray[np.floating], seen: NDArray[np.bool_]) -> Complex:
     """Errors over their gain less what is smooth in them, the page's edges left out.
 
     Symbols whose light the cameras do not see have none, and the others stand for them.
     """
-    errors = np.where(seen, errors, 0) / np.where(seen, gain, 1)
-    rough = (errors - _smooth(errors.real) - 1j * _smooth(errors.imag)) * seen / np.sqrt(seen.mean())
+    relative = np.where(seen, errors, 0) / np.where(seen, gain, 1)
+    rough = (relative - _smooth(relative.real) - 1j * _smooth(relative.imag)) * seen / np.sqrt(seen.mean())
     return np.asarray(rough[_EDGE:-_EDGE, _EDGE:-_EDGE])
 
 
