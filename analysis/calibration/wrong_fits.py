@@ -34,7 +34,7 @@ LEVELS = 256
 
 @dataclass(frozen=True)
 class Taken:
-    """What a calibration is given: the profile, reference frames and known pages."""
+    """Input of a calibration: the profile, reference frames and known pages."""
 
     profile: Profile
     references: FramePair
@@ -43,7 +43,7 @@ class Taken:
 
 @dataclass(frozen=True)
 class Called:
-    """What came of it: a verdict or an error, with its words."""
+    """Outcome of a calibration: a verdict or an error, with its words."""
 
     name: str
     verdict: str
@@ -112,7 +112,7 @@ def wrong_fits(profile: Profile, seed: int) -> Iterator[tuple[str, Taken]]:
 
 
 def called(name: str, given: Taken) -> Called:
-    """What a calibration says of it."""
+    """Calibrate, and return the verdict or the error."""
     twin, solve = TorchTwin(RayTwin(given.profile)), TorchFieldSolver(FieldRecovery(given.profile))
     try:
         found = calibrate(twin, solve, given.profile, given.references, given.pages).goodness

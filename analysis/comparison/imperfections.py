@@ -1,4 +1,4 @@
-"""What a decoder of one pass reads on imperfect devices, beside an oracle that knows each of them.
+"""Compare a decoder of one pass with an oracle, on imperfect devices that the oracle knows.
 
     python -m analysis.comparison.imperfections --out runs/imperfections
     python -m analysis.comparison.imperfections --device axial --out runs/imperfections
@@ -75,7 +75,7 @@ _VALIDATED = 2
 
 @dataclass(frozen=True)
 class Row:
-    """One device. AIRs of held-out pages, bits a symbol; seconds of the decoder's features and training."""
+    """Figures of one device: AIRs of held-out pages, bits a symbol; seconds of the decoder's features and training."""
 
     device: str
     settings: list[str]

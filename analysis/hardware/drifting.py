@@ -89,7 +89,7 @@ def written_pages(decoder: Decoder, pages: int = PAGES, seed: int = 5) -> NDArra
 
 @dataclass(frozen=True)
 class Truth:
-    """What the simulator knows of a page.
+    """Facts that the simulator knows of a page.
 
     Attributes:
         symbols: that were written, uint8 [ny, nx].
@@ -174,7 +174,7 @@ class DriftingSource(FrameSource):
             return self._simulator.references()
 
     def truth(self, page: int) -> Truth:
-        """What the simulator knows of a page that was photographed lately."""
+        """Return what the simulator knows of a page that was photographed lately."""
         with self._lock:
             return self._truths[page]
 

@@ -66,19 +66,19 @@ class Photographed(FrameSource):
         self._references, self._next = source.references(), 0
 
     def shot(self, timeout_s: float = SHOT_S, page: int | None = None) -> Shot:
-        """One of the pages."""
+        """Return one of the pages."""
         if page is None:
             page, self._next = self._next, self._next + 1
         return self._shots[page % PAGES]
 
     def references(self) -> FramePair:
-        """Those of the source."""
+        """Return the source's reference frames."""
         return self._references
 
 
 @dataclass(frozen=True)
 class Taken:
-    """What a recalibration took; not a number where it failed.
+    """Costs of a recalibration; not a number where it failed.
 
     Attributes:
         seconds: from the call to the new model in service.

@@ -56,7 +56,7 @@ CALIBRATION_PAGES = (1_000_000, 1_000_001)
 
 @dataclass(frozen=True)
 class LightDrift:
-    """What changes in a week evenly, beside the geometry.
+    """Changes that go on evenly through a week, beside the geometry.
 
     Attributes:
         stroke_relative: of the modulator.
@@ -197,6 +197,6 @@ class Week:
 
 
 def _light_of(parameters: NDArray[np.float64], modulation: Modulation) -> dict[str, float]:
-    """What `LightDrift` changes of a device, by name."""
+    """Return what `LightDrift` changes of a device, by name."""
     names = [NAMES[index] for index in indices("axial")]
     return {"stroke_relative": modulation.coefficients[0], **{name: as_dict(parameters)[name] for name in names}}

@@ -103,7 +103,7 @@ class NodeFigures(Part):
 
     @classmethod
     def read(cls, path: Path) -> NodeFigures:
-        """Those of a file.
+        """Read the figures of a file.
 
         Raises:
             InvalidInputError: it does not hold them.

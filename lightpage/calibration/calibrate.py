@@ -93,13 +93,13 @@ class KnownPage:
     symbols: NDArray[np.complex128]
 
     def light(self, modulation: Modulation) -> NDArray[np.complex128]:
-        """What a modulator makes of the symbols, complex [ny, nx]."""
+        """Light that a modulator makes of the symbols, complex [ny, nx]."""
         return modulation.light(np.angle(self.symbols))
 
 
 @dataclass(frozen=True)
 class Registered:
-    """What registration found.
+    """Outcome of a registration.
 
     Attributes:
         parameters: [P] fitted vector.
@@ -127,7 +127,7 @@ class Registered:
 
 @dataclass(frozen=True)
 class _Stage:
-    """One round of measuring and fitting, distances in camera pixels."""
+    """Settings of a round of measuring and fitting, distances in camera pixels."""
 
     name: str
     reach_px: float
@@ -451,7 +451,7 @@ class _Registration:
         )
 
     def _goodness(self) -> Goodness | None:
-        """How well what was fitted explains the light of the first page."""
+        """Verdict on the fit, by the light of the first page."""
         if self.illumination is None:
             return None
         self._begin("unexplained light")

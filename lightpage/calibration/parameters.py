@@ -94,6 +94,10 @@ def indices(*groups: str) -> list[int]:
     return [i for i, p in enumerate(PARAMETERS) if p.group in groups]
 
 
+SEEN_BY_CAMERAS = frozenset(indices("in_phase", "quadrature", "distortion", "keystone"))
+"""Parameters that say where the cameras see a place; all others change the light itself."""
+
+
 def as_dict(parameters: Real) -> dict[str, float]:
     """A vector [P] as name -> value."""
     return {name: float(value) for name, value in zip(NAMES, parameters, strict=True)}

@@ -86,10 +86,8 @@ def calibrate(
         f"\ncoherence {calibration.coherence_before:.3f} -> {calibration.coherence_after:.3f}, "
         f"{calibration.pages_used} known pages, {seconds:.0f} s; written to {out}"
     )
-    if found is not None:
-        click.echo(
-            f"a {found.verdict} fit: about {found.bits_lost:.2f} bit a symbol lost to light that it does not explain"
-        )
+    if found is not None and found.verdict == "good":
+        click.echo(f"a good fit: about {found.bits_lost:.2f} bit a symbol lost to light that it does not explain")
     calibration.check_good(f"calibration {out}", "; the file is there to be looked at")
 
 

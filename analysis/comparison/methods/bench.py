@@ -33,7 +33,7 @@ HELD_OUT_SHARE = 0.05
 
 @dataclass(frozen=True)
 class Bench:
-    """What all methods share.
+    """Data that all methods share.
 
     Attributes:
         recording: open.
@@ -108,14 +108,14 @@ class Bench:
         return self.calibrated_device(method).modulation.page_levels(LEVELS)
 
     def extractor(self, method: str) -> FeatureExtractor:
-        """Of the calibrated device; the true one for an oracle's further pass, the signal's power left in."""
+        """Features of the calibrated device; of the true one for an oracle's further pass, the signal's power left in."""
         localizer = "coherent" if method in (ORACLE, FAST) else method
         return FeatureExtractor(
             self.calibrated_device(method), localizer, PRESETS[FAST].choices if method == FAST else None
         )
 
     def key(self, name: str) -> str:
-        """What the features of a method depend on, beside the recording."""
+        """Return what the features of a method depend on, beside the recording."""
         if name == ORACLE:
             return ""
         return self.fitted.to_toml() + (PRESETS[FAST].choices.first_pass if name == FAST else "")

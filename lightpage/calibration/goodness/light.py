@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.goodness.frame_noise import with_more_noise
 from lightpage.calibration.interfaces import Twin
-from lightpage.calibration.parameters import PARAMETERS, PRIORS, indices
+from lightpage.calibration.parameters import PARAMETERS, PRIORS, SEEN_BY_CAMERAS
 from lightpage.calibration.samplers import smooth_reference
+from lightpage.calibration.waves.wave_fit import READ_NOISE
 from lightpage.calibration.waves.wave_model import FittedWaves, illumination_terms, on_modulator
 from lightpage.recording.frame_pair import FramePair
 from lightpage.waves.geometry import couplings, facet_axis, on_facet
@@ -23,8 +24,6 @@ from lightpage.waves.grid import field_grid, symbol_samples
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
-_FLOOR = 0.3
-"""Variance of an equation that does not grow with the light, over the shot noise of the reference alone."""
 _MORE_NOISE = 3.0
 """Times the frames' own noise: rounding to whole counts, which adds some, then hardly counts."""
 _STRIDE, _ACCURACY = 4, 3 / 8
@@ -33,8 +32,6 @@ unknowns need few equations."""
 _EVERY = (slice(None, None, _STRIDE), slice(None, None, _STRIDE))
 _DIFFERENCE = 1e-2
 """Finite difference of the derivatives, in standard deviations of the priors."""
-_SEEN_BY_CAMERAS = frozenset(indices("in_phase", "quadrature", "distortion", "keystone"))
-"""Parameters that say where the cameras see a place; all others change the light itself."""
 _LOSSES = (1, 2)
 """Powers of R^2 in the light that is lost towards the edges of the entrance facet."""
 
@@ -137,7 +134,7 @@ class SeenLight:
         """Equations [2, Gy, Gx], or on the coarse grid, over their noise, on that grid; flat."""
         if left.shape[1:] == self._seen.shape:
             left = left[:, *_EVERY]
-        weighted = left / np.sqrt(self.brightness[:, *_EVERY] + _FLOOR)
+        weighted = left / np.sqrt(self.brightness[:, *_EVERY] + READ_NOISE)
         return np.asarray(weighted[:, self._seen[_EVERY]].ravel())
 
     def equations_of(self, change: Complex) -> Real:
@@ -151,7 +148,7 @@ class SeenLight:
         for index in range(len(PARAMETERS)):
             moved = self._device.parameters.copy()
             moved[index] += _DIFFERENCE * PRIORS[index]
-            if index in _SEEN_BY_CAMERAS:
+            if index in SEEN_BY_CAMERAS:
                 at = _rows_and_columns(self._twin.pixels(moved, places.reshape(-1, 2)).reshape(2, *places.shape))
                 yield self.equations(
                     _looked_at(self._images, at) / (2 * self.references[:, *_EVERY]) - self.counts[:, *_EVERY]
@@ -200,7 +197,7 @@ class SeenLight:
     def _mending(self, left: Real) -> Complex:
         """Light of both cameras that mends what is left of their equations, each weighted by its noise."""
         along = self._along
-        return np.asarray(self._seen * self._amplitude * along * left / (self.brightness + _FLOOR))
+        return np.asarray(self._seen * self._amplitude * along * left / (self.brightness + READ_NOISE))
 
     def _filtered(self, pair: FramePair, references: FramePair) -> list[NDArray[np.float32]]:
         """What either frame shows beyond its reference, filtered as a decoder filters it."""
@@ -224,8 +221,7 @@ def places_on_facet(waves: FittedWaves) -> tuple[Real, Real]:
 
 def radius2(waves: FittedWaves) -> Real:
     """R^2 of the facets' samples, over the square of half of the pipe's width."""
-    x, y = places_on_facet(waves)
-    return x**2 + y**2
+    return np.asarray(waves.channel.facet_radius2_m2 / (waves.channel.geometry.pipe_width_m / 2) ** 2, np.float64)
 
 
 def _rows_and_columns(pixels: Real) -> list[list[Real]]:

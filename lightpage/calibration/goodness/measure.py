@@ -1,10 +1,10 @@
-"""How well a fitted device explains the light of a known page: in bits, by place, and what is likeliest to be wrong.
+"""Measure how well a fitted device explains the light of a known page: in bits, by place, and the likeliest cause.
 
 What the cameras should have seen of the page, by the fitted waves, is taken off what they saw. The rest is sent back to
-the modulator, where it is an error of each symbol, as a decoder meets it that knows all others. Noise of the frames is
-measured by the frames themselves, and goes the same way. Noise of the modulator makes errors of phase, and few of
-amplitude; light that the model has in another place makes as much of the one as of the other. So the errors of
-amplitude, beyond what noise leaves, are those that a better model would not make.
+the modulator. There it is an error of each symbol, as a decoder meets it that knows all others. Noise of the frames is
+measured by the frames themselves, and is sent the same way. Noise of the modulator makes errors of phase, and few of
+amplitude. Light that the model puts in another place makes as much of either. So errors of amplitude, beyond those of
+noise, are errors that a better model would not make.
 """
 
 from __future__ import annotations

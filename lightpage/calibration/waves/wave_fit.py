@@ -17,7 +17,7 @@ import scipy
 from numpy.typing import NDArray
 
 from lightpage.calibration.interfaces import Twin
-from lightpage.calibration.parameters import NAMES, PARAMETERS, PRIORS, indices
+from lightpage.calibration.parameters import NAMES, PARAMETERS, PRIORS, SEEN_BY_CAMERAS, indices
 from lightpage.calibration.samplers import smooth_reference
 from lightpage.calibration.waves.wave_model import FittedWaves, illumination_terms, on_modulator
 from lightpage.device.profile import Profile
@@ -60,8 +60,6 @@ _AT_CAMERA = frozenset(indices("camera_phase"))
 """Parameters whose change of the light needs no propagation."""
 _OF_REAL_LENSES = (NAMES.index("lens_path_relative"),)
 """Parameters that do nothing where the profile's lenses are ideal."""
-_SEEN = frozenset(indices(*_CAMERAS, "distortion", "keystone"))
-"""Parameters that say where the cameras see a place; all others change the light itself."""
 
 
 @dataclass(frozen=True)
@@ -193,8 +191,8 @@ class WaveFit:
             levels: what is known of it beforehand where it is fitted too, None where it is held.
         """
         without_effect = _OF_REAL_LENSES if self._profile.ideal_lenses else ()
-        of_light = [index for index in indices(*groups) if index not in (*_SEEN, *without_effect)]
-        of_cameras = [index for index in indices(*groups) if index in _SEEN]
+        of_light = [index for index in indices(*groups) if index not in (*SEEN_BY_CAMERAS, *without_effect)]
+        of_cameras = [index for index in indices(*groups) if index in SEEN_BY_CAMERAS]
         free = of_light + of_cameras
         precision = 1 / (PRIORS * prior_scale)[free] ** 2
         centre = np.zeros(len(PARAMETERS)) if centre is None else centre
