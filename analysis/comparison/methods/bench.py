@@ -108,7 +108,7 @@ class Bench:
         return self.calibrated_device(method).modulation.page_levels(LEVELS)
 
     def extractor(self, method: str) -> FeatureExtractor:
-        """Features of the calibrated device; of the true one for an oracle's further pass, the signal's power left in."""
+        """Features of the calibrated device; of the true one for an oracle's further pass, signal power left in."""
         localizer = "coherent" if method in (ORACLE, FAST) else method
         return FeatureExtractor(
             self.calibrated_device(method), localizer, PRESETS[FAST].choices if method == FAST else None
