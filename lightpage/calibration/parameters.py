@@ -72,11 +72,15 @@ PARAMETERS: tuple[Parameter, ...] = (
         for camera in ("in_phase", "quadrature")
         for axis in "xy"
     ),
+    # how much larger that defocus is at the right and at the lower edge of the page than in its middle, as a tilted
+    # plane has it: the modulator's, and both cameras' on average
+    *(Parameter(f"{plane}_axial_{axis}_rad", 0.2, "tilt") for plane in ("modulator", "cameras") for axis in "xy"),
 )
 
 NAMES: tuple[str, ...] = tuple(p.name for p in PARAMETERS)
-KNOWN = (NAMES.index("modulator_axial_rad"), len(NAMES))
-"""Counts of parameters that twins know: those of bundles of before, which took planes for those of the profile; all."""
+KNOWN = (NAMES.index("modulator_axial_rad"), NAMES.index("modulator_axial_x_rad"), len(NAMES))
+"""Counts of parameters that twins know: those of bundles of before, which took planes for those of the profile, or knew
+their axial places alone; all."""
 PRIORS: Real = np.array([p.prior for p in PARAMETERS])
 
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.parameters import NAMES, as_dict, as_vector
 from lightpage.calibration.waves.wave_model import defocus, fitted_geometry
-from lightpage.device.lens_path import SeidelTerms
 from lightpage.device.profile import Profile
 from lightpage.device.state import CameraPose, Device, SlmDefects
 from lightpage.page.levels import MAX_LEVELS
@@ -34,6 +33,9 @@ in twenty thousand clips."""
 
 _GRID_MARGIN = 1.04
 """Computed camera plane over the sensor, so that rotated and shifted pixels still look inside."""
+
+_CAMERA_TILTS = "cameras_axial_x_rad", "cameras_axial_y_rad"
+"""Parameters of both cameras' tilt."""
 
 _RIPPLE = 1
 """The random stream of the reference's ripple; a simulator draws others from a seed of its own."""
@@ -257,20 +259,12 @@ def true_modulation(slm: SlmDefects) -> Modulation:
 
 def true_geometry(profile: Profile, device: Device, camera_tilt_rad: tuple[float, float]) -> WaveGeometry:
     """The geometry with all that the twin's parameters lack, and with cameras in their mean place, tilted like this."""
-    g, fitted = device.geometry, fitted_geometry(profile, as_dict(true_parameters(profile, device)))
-
-    def tilted(path: SeidelTerms, tilt_x_rad: float, tilt_y_rad: float) -> SeidelTerms:
-        tilt_x, tilt_y = (float(defocus(tilt, fitted.pipe_width_m)) for tilt in (tilt_x_rad, tilt_y_rad))
-        return path._replace(tilt_x=tilt_x / (profile.page_width_m / 2), tilt_y=tilt_y / (profile.page_height_m / 2))
-
+    g, tilts = device.geometry, dict(zip(_CAMERA_TILTS, camera_tilt_rad, strict=True))
     return replace(
-        fitted,
+        fitted_geometry(profile, as_dict(true_parameters(profile, device)) | tilts),
         focal_length_m=profile.lens.focal_length_m * (1 + g.focal_length_relative_error),
         pipe_height_relative=g.pipe_height_relative_error,
         pipe_taper=g.pipe_taper_relative,
-        lens_path=tilted(fitted.lens_path, g.modulator_tilt_x_rad, g.modulator_tilt_y_rad),
-        # a lens from camera plane to facet, whose adjoint is used
-        camera_path=tilted(fitted.camera_path, -camera_tilt_rad[0], -camera_tilt_rad[1]),
     )
 
 
@@ -293,7 +287,8 @@ def _like_taper(profile: Profile, device: Device) -> tuple[float, float, float]:
 def true_parameters(profile: Profile, device: Device) -> NDArray[np.float64]:
     """The truth as a ray twin's parameter vector [P] (see `lightpage.calibration.parameters`).
 
-    A taper is told by what it does to other parameters. Tilts, walls of two distances and ghosts have none.
+    A taper is told by what it does to other parameters, tilts of the cameras by their mean. Walls of two distances and
+    ghosts have none.
     """
     g, pitch = device.geometry, profile.slm.pitch_m
     longer, at_modulator, at_cameras = _like_taper(profile, device)
@@ -307,6 +302,8 @@ def true_parameters(profile: Profile, device: Device) -> NDArray[np.float64]:
         "page_centre_y_m": g.page_shift_y_px * pitch,
         "pipe_roll_rad": np.deg2rad(g.pipe_roll_deg),
         "modulator_axial_rad": g.modulator_axial_rad + at_modulator,
+        "modulator_axial_x_rad": g.modulator_tilt_x_rad,
+        "modulator_axial_y_rad": g.modulator_tilt_y_rad,
         "launch_defocus_rad": device.aberration.defocus_rad,
         "launch_astigmatism_0_rad": device.aberration.astigmatism_rad,
         "launch_coma_x_rad": device.aberration.coma_rad,
@@ -331,4 +328,6 @@ def true_parameters(profile: Profile, device: Device) -> NDArray[np.float64]:
             f"{camera}_keystone_x_relative": pose.keystone_x_relative,
             f"{camera}_keystone_y_relative": pose.keystone_y_relative,
         }
+    tilts = ((pose.tilt_x_rad, pose.tilt_y_rad) for pose in (device.in_phase_camera, device.quadrature_camera))
+    values |= zip(_CAMERA_TILTS, np.mean([*tilts], axis=0).tolist(), strict=True)
     return as_vector(values)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.parameters import as_dict
 from lightpage.calibration.phases import camera_phase, launch_phase
-from lightpage.device.lens_path import IDEAL
+from lightpage.device.lens_path import IDEAL, SeidelTerms
 from lightpage.device.profile import Profile
 from lightpage.waves.channel import WaveChannel
 from lightpage.waves.geometry import WaveGeometry, cells_for
@@ -27,9 +27,14 @@ _ILLUMINATION = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 def fitted_geometry(profile: Profile, value: Mapping[str, Any]) -> WaveGeometry:
     """The geometry of fitted parameters by name, numbers or tensors; its cameras stand where they do on average."""
     width = profile.pipe.width_m * (1 + value["pipe_width_relative"])
-    glass, cameras = profile.seidel_terms(1 + value["lens_path_relative"]), axial_of_cameras(value)[0]
-    if profile.ideal_lenses:
-        glass = IDEAL
+    edges = profile.page_width_m / 2, profile.page_height_m / 2
+    glass = IDEAL if profile.ideal_lenses else profile.seidel_terms(1 + value["lens_path_relative"])
+
+    def placed(path: SeidelTerms, axial_rad: Any, plane: str, sign: int) -> SeidelTerms:
+        tilts = (value[f"{plane}_axial_{axis}_rad"] for axis in "xy")
+        tilt_x, tilt_y = (sign * defocus(tilt, width) / edge for tilt, edge in zip(tilts, edges, strict=True))
+        return path._replace(defocus=sign * defocus(axial_rad, width), tilt_x=tilt_x, tilt_y=tilt_y)
+
     return WaveGeometry(
         wavelength_m=profile.light.wavelength_m,
         focal_length_m=profile.lens.focal_length_m * (1 + value["focal_length_relative"]),
@@ -38,8 +43,9 @@ def fitted_geometry(profile: Profile, value: Mapping[str, Any]) -> WaveGeometry:
         refractive_index=profile.pipe.refractive_index,
         pipe_angle=np.deg2rad(profile.pipe.angle_deg) + value["pipe_angle_rad"],
         pipe_roll=value["pipe_roll_rad"],
-        lens_path=glass._replace(defocus=defocus(value["modulator_axial_rad"], width)),
-        camera_path=glass.mirrored()._replace(defocus=-defocus(cameras, width)),
+        lens_path=placed(glass, value["modulator_axial_rad"], "modulator", 1),
+        # a lens from camera plane to facet, whose adjoint is used
+        camera_path=placed(glass.mirrored(), axial_of_cameras(value)[0], "cameras", -1),
     )
 
 

@@ -12,6 +12,7 @@ from lightpage.device.state import (
     CameraPose,
     Device,
     Drift,
+    Geometry,
     Homodyne,
     Reference,
     Sensor,
@@ -137,12 +138,13 @@ def test_held_parameters_keep_their_values_and_priors_hold_the_others() -> None:
     assert free.residual < held.residual
 
 
-def test_a_nominal_modulator_stays_nominal_and_axial_places_are_found_from_far_away() -> None:
-    pose, other = CameraPose(axial_rad=0.2), CameraPose(axial_rad=-0.1)
-    device = Device(in_phase_camera=pose, quadrature_camera=other, drift=Drift(shift_px=0))
+def test_a_nominal_modulator_stays_nominal_and_axial_places_and_tilts_are_found_from_far_away() -> None:
+    pose, other = CameraPose(axial_rad=0.2, tilt_x_rad=0.3), CameraPose(axial_rad=-0.1, tilt_x_rad=0.3, tilt_y_rad=-0.1)
+    tilted = Geometry(modulator_tilt_x_rad=-0.2, modulator_tilt_y_rad=0.4)
+    device = Device(geometry=tilted, in_phase_camera=pose, quadrature_camera=other, drift=Drift(shift_px=0))
     truth = true_parameters(PROFILE, device)
-    start, axial = truth.copy(), indices("axial")
-    start[axial] += [0.4, -0.2, 0.1]
+    start, axial = truth.copy(), indices("axial", "tilt")
+    start[axial] += [0.4, -0.2, 0.1, 0.2, -0.4, -0.3, 0.05]
     found = seen_by(device, 5).fit(start, device.homodyne.turn_rad, EVERY, levels=LevelPrior())
     assert found.modulation is NOMINAL
     assert all(found.modulation_deviations)
