@@ -24,6 +24,7 @@ GROUPS = {
     "quadrature": "Quadrature camera",
     "axial": "Axial places, as phases at the pipe's wall",
     "keystone": "Keystone, at the page's edges",
+    "tilt": "Tilts of modulator and cameras",
 }
 """Headings of the groups of `lightpage.calibration.parameters`."""
 

@@ -25,8 +25,8 @@ SamplingTable = dict[str, NDArray[Any]]
 _FIT_POINTS = 9
 _LEAST_APART_RAD = 0.06
 """Half of the distance of the cameras' axial places, as a phase at the facet's wall, from which on it is dealt with. A
-decoder loses 0.08 bit at 0.04 radian where it is not, four times that at twice as much; it loses 0.2 where it was trained
-without, and takes longer."""
+decoder loses 0.08 bit at 0.04 radian where it is not, and four times that at twice as much. It loses 0.2 bit where it
+was trained without, and takes longer."""
 _PLACE_BITS = 14
 """Fractional bits of places and gradients, grid samples. A float32 of thousands of samples has 12."""
 _PHASE_BITS = 16

@@ -120,6 +120,19 @@ class PageCodec:
         pages[:, self._body] = to_levels(label, upper, self.code.levels).reshape(len(headers), -1)
         return pages.reshape(len(headers), *self.pilots.shape)
 
+    def encode_again(self, found: PageBytes, pilots: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Symbols of a page that was read, uint8 [ny, nx].
+
+        Args:
+            found: what it gave; not lost.
+            pilots: as for `encode`.
+        """
+        assert found.header is not None
+        assert found.data is not None
+        assert found.file is not None
+        data = np.frombuffer(found.data, np.uint8)[None]
+        return np.asarray(self.encode([found.header], data, found.file, pilots)[0])
+
     def decode(
         self,
         phase: NDArray[np.floating],

@@ -150,7 +150,7 @@ def recalibrate(
         result = fit(decoder.bundle, fitted, partial(within, judged_count, judged_count + FIT_WORTH), decoder)
         judging = partial(within, judged_count + FIT_WORTH, whole - WRITING_WORTH, "judge by the held-back pages")
         judging(0.0)
-        refitted = decoder.of_bundle(_refitted(decoder.bundle, result))
+        refitted = decoder.of_bundle(refitted_bundle(decoder.bundle, result))
         after = judged_pages(tracker.refitted(refitted), refitted.bundle, held_back, judging)
     verdict = judge(before, after, pages.levels)
     within(whole - WRITING_WORTH, whole, "write the new bundle", 0.0)
@@ -200,7 +200,7 @@ def reading_share(pages: int) -> float:
     return pages / (pages + 2 * (pages - FIT_PAGES) + FIT_WORTH + WRITING_WORTH) if pages else 0.0
 
 
-def _refitted(bundle: Bundle, result: RefitResult) -> Bundle:
+def refitted_bundle(bundle: Bundle, result: RefitResult) -> Bundle:
     """The bundle with the re-fitted table and calibration, in memory; its golden page is still the earlier one's."""
     files = {**bundle.files, TABLE: npz(**{**bundle.table, **result.table})}
     manifest = bundle.manifest.model_copy(update={"calibration": result.calibration_toml})

@@ -59,9 +59,7 @@ def refit(
         among = f"{' or '.join(sorted(_REFITTED))} among them"
         expected = f"{among}: this decoder holds its geometry itself; calibrate, train and export anew"
         raise BundleError(f"{bundle.subject}: table inputs", sorted(decoder.graph.ports), expected)
-    references = pages.references or _kept_references(bundle)
-    if references is None:
-        raise CalibrationError("re-fit", "no reference frames", "reference-only frames taken with the known pages")
+    references = references_of(bundle, pages.references)
     twin = OnnxTwin(bundle) if twin is None else twin
     progress("find the image", 0.0)
     image = _find(decoder, twin, pages, references)
@@ -97,14 +95,29 @@ def refit(
             f"at least {LEAST_KEPT:.0%} of the {earlier.reference_coherence:.3f} when it was calibrated: this device, "
             "drifted a little; else calibrate anew",
         )
-    hashes = [hash_frames(pair) for pair in pages.pairs]
-    fitted = earlier.followed_by(Calibration.from_registered(registered, profile, hashes))
+    fitted = earlier.followed_by(Calibration.from_registered(registered, profile, [*map(hash_frames, pages.pairs)]))
     if earlier.goodness is not None and not earlier.is_wrong:
         fitted.check_good("re-fit, outcome", ": else calibrate anew")
+    return traced(decoder, twin, references, fitted, image)
+
+
+def traced(
+    decoder: Decoder, twin: Twin, references: FramePair, fitted: Calibration, image: ImagePosition | None = None
+) -> RefitResult:
+    """The table of a re-fitted geometry.
+
+    Args:
+        decoder: takes it.
+        twin: of the bundle's profile.
+        references: that the geometry was fitted with.
+        fitted: the geometry.
+        image: where its image was found, None where it was not.
+    """
+    profile = decoder.bundle.profile
     table = {
         "reference_in_phase": references.in_phase,
         "reference_quadrature": references.quadrature,
-        **sampling_table(twin, registered.parameters, registered.quadrature_phase, profile),
+        **sampling_table(twin, fitted.vector, fitted.turn_rad, profile),
     }
     return RefitResult(
         table=decoder.taken(table),
@@ -116,6 +129,20 @@ def refit(
             image=image,
         ),
     )
+
+
+def references_of(bundle: Bundle, taken: FramePair | None) -> FramePair:
+    """Reference-only frames that were taken with pages, else those that the bundle was fitted with.
+
+    Raises:
+        CalibrationError: there are none.
+    """
+    if taken is not None:
+        return taken
+    in_phase, quadrature = (bundle.table.get(name) for name in ("reference_in_phase", "reference_quadrature"))
+    if in_phase is None or quadrature is None:
+        raise CalibrationError("re-fit", "no reference frames", "reference-only frames taken with the known pages")
+    return FramePair(in_phase, quadrature)
 
 
 def _find(decoder: Decoder, twin: Twin, pages: KnownPages, references: FramePair) -> ImagePosition | None:
@@ -132,8 +159,3 @@ def _find(decoder: Decoder, twin: Twin, pages: KnownPages, references: FramePair
     found = BundleSearch(decoder, twin).find(pages.pairs[0], pilots, around, references)
     x, y = map(float, found.shift_px)
     return ImagePosition(x, y, searched=True, found=True) if found.found else None
-
-
-def _kept_references(bundle: Bundle) -> FramePair | None:
-    kept = [bundle.table.get(name) for name in ("reference_in_phase", "reference_quadrature")]
-    return None if kept[0] is None or kept[1] is None else FramePair(kept[0], kept[1])

@@ -3,77 +3,34 @@
 from __future__ import annotations
 
 import json
-import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 from scipy.stats import beta
 
 from lightpage.codec.code import Code, problems_of
-from lightpage.codec.page_bytes import LOSSES, Header, Loss, PageBytes
-from lightpage.codec.page_codec import PageCodec
-from lightpage.codec.volume import Successor, Volume
+from lightpage.codec.page_bytes import LOSSES, Loss
+from lightpage.codec.volume import Volume
 from lightpage.codec.volume_file import Restored, VolumeFiles, ranges
 from lightpage.errors import (
     InvalidInputError,
     LightpageError,
     LostDataError,
-    LostPageError,
     MissingResultsError,
     RecordingError,
-    StorageError,
 )
 from lightpage.progress import track
-from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording
-from lightpage.runtime.archives.recordings.coded_pages import air_bits
-from lightpage.runtime.archives.recordings.evaluation import check_recording, pilots_of
-from lightpage.runtime.archives.recordings.read_ahead import read_ahead
+from lightpage.runtime.archives.recordings.page_reader import PageReader, RecoveredPage
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.tracking import Tracker
 
 CONFIDENCE = 0.95
-
-
-@dataclass(frozen=True)
-class RecoveredPage:
-    """What became of one recorded page.
-
-    Attributes:
-        page: its number in the recording.
-        number: its number in its volume: as read, or of a lost page as its header claims it; None where unknown.
-        volume: the same of the volume.
-        loss: why it gave no bytes; None where it did.
-        reason: the same for people; empty where it did.
-        margin_bits: information of a symbol's coded bits beyond what the code needs; None where there was no light.
-        corrected: Reed-Solomon symbols that were mended.
-        failed_blocks: LDPC blocks that did not converge.
-        iterations: mean of the LDPC blocks.
-        air_bits: AIR of the page as delivered, bits a data symbol; None where its symbols are not known.
-        seconds: of the optical decode.
-        code_seconds: of the code.
-    """
-
-    page: int
-    number: int | None
-    volume: int | None
-    loss: Loss | None
-    reason: str
-    margin_bits: float | None = None
-    corrected: int = 0
-    failed_blocks: int = 0
-    iterations: float = 0.0
-    air_bits: float | None = None
-    seconds: float = 0.0
-    code_seconds: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -113,6 +70,11 @@ class Recovery:
         return tuple(page for page in self.pages if page.loss is not None)
 
     @property
+    def healed(self) -> tuple[RecoveredPage, ...]:
+        """Recorded pages that the model could not read before it was healed."""
+        return tuple(page for page in self.pages if page.healed_rounds is not None)
+
+    @property
     def failure_bound(self) -> float:
         """Rate of unread pages that is not exceeded with 95% confidence (Clopper and Pearson)."""
         failed, count = len(self.unread), len(self.pages)
@@ -128,6 +90,7 @@ class Recovery:
         return {
             "pages": len(self.pages),
             "pages_unread": len(self.unread),
+            "pages_healed": len(self.healed),
             "pages_restored": len(self.restored),
             "pages_lost": len(self.lost),
             "pages_missing": len(self.missing),
@@ -190,6 +153,7 @@ def recover(
     volume_id: int | None = None,
     checksum: int | None = None,
     holes: bool = False,
+    heals: bool = True,
 ) -> Recovery:
     """Read the file of one volume back; pages that storage does not give are unread, as those that are lost.
 
@@ -201,6 +165,7 @@ def recover(
         out: the file; written whole, or not at all: what is there stays then.
         volume_id, checksum: which volume; if left out, the recording must hold only one.
         holes: write zeros where data are lost, in place of no file.
+        heals: whether the model is re-fitted by pages that it does not read.
 
     Raises:
         RecordingError: another device's recording, or one of other levels or pilots.
@@ -211,8 +176,8 @@ def recover(
     reader = PageReader(decoder, recording, tracker, code)
     codec, mask = reader.codec, decoder.bundle.pilot_mask
     with VolumeFiles(out) as files:
-        read = track(read_ahead(recording.shown, range(recording.pages)), "recover", total=recording.pages)
-        pages = tuple(reader.read(index, shown, files.add) for index, shown in read)
+        read = reader.read(range(recording.pages), lambda index, found: files.add(found), heals=heals)
+        pages = tuple(sorted(track(read, "recover", total=recording.pages), key=lambda page: page.page))
         file = files.chosen(volume_id, checksum)
         done = Restored((), ()) if file is None else file.restore()
         if file is not None and (holes or not done.lost):
@@ -235,87 +200,6 @@ def recover(
             int(np.count_nonzero(~mask)),
             codec.blocks,
         )
-
-
-class PageReader:
-    """Reads the pages of a recording one after the other; knows which page of its volume should come next.
-
-    Args:
-        decoder, recording, tracker, code: see `recover`.
-        give_up: whether pages that storage does not give are unread, as those that are lost.
-
-    Raises:
-        RecordingError: another device's recording, or one of other levels or pilots.
-    """
-
-    def __init__(
-        self, decoder: Decoder, recording: Recording, tracker: Tracker, code: Code, *, give_up: bool = True
-    ) -> None:
-        check_recording(decoder, recording)
-        subject, mask = f"recording {recording.path}", decoder.bundle.pilot_mask
-        if recording.header.declared_levels not in (None, code.levels):
-            raise RecordingError(f"{subject}: levels", recording.levels, f"{code.levels}, as the code has")
-        if not np.array_equal(pilots_of(decoder, recording), mask):
-            raise RecordingError(f"{subject}: pilots", "other places", "those of the bundle")
-        self._levels = decoder.bundle.levels(code.levels)
-        self.codec = PageCodec(code, mask, self._levels)
-        self._bit_depth, self._tracker, self._give_up = recording.bit_depth, tracker, give_up
-        self._pilots = decoder.written_pilots(code.levels)
-        self._next = Successor()
-
-    def read(
-        self,
-        index: int,
-        shown: Future[tuple[FramePair, NDArray[np.uint8] | None]],
-        take: Callable[[PageBytes], Volume | None],
-    ) -> RecoveredPage:
-        """Read the next page.
-
-        Args:
-            index: of it in the recording.
-            shown: its frames and, where they are known, its symbols.
-            take: takes its bytes, and says which volume they belong to.
-
-        Raises:
-            StorageError: the frames could not be read, which says nothing of the page, and it is not given up.
-        """
-        expected = self._next.header
-        try:
-            frames, symbols = shown.result()
-            start = time.perf_counter()
-            page = self._tracker.decode(narrow(frames, self._bit_depth), self._levels.count, self._pilots)
-            decoded = time.perf_counter()
-            found = self.codec.decode(page.phase, page.concentration, expected)
-            read = time.perf_counter()
-        except (InvalidInputError, LostPageError, StorageError) as error:
-            of_storage = isinstance(error, StorageError)
-            if of_storage and not self._give_up:
-                raise
-            self._next = self._next.after()
-            loss = Loss.STORAGE if of_storage else Loss.OPTICS
-            return RecoveredPage(index, *_place(expected), loss, str(error))
-        own = take(found)
-        if own is not None and found.header is not None:
-            self._next = Successor(own, found.header)
-        self._next = self._next.after()
-        return RecoveredPage(
-            index,
-            *_place(found.header or expected),
-            found.loss,
-            "" if found.loss is None else LOSSES[found.loss],
-            found.margin_bits,
-            found.corrected,
-            found.failed_blocks,
-            found.iterations,
-            None if symbols is None else air_bits(page, symbols, ~self.codec.pilots, self._levels),
-            decoded - start,
-            read - decoded,
-        )
-
-
-def _place(header: Header | None) -> tuple[int | None, int | None]:
-    """Number and volume of a page."""
-    return (None, None) if header is None else (header.page, header.volume)
 
 
 def told_losses(pages: Sequence[RecoveredPage]) -> list[str]:

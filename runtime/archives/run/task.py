@@ -125,6 +125,7 @@ class Choices(Plain):
         range_pages: pages of a range.
         tracking: whether the image is followed within a range.
         symbols: whether decoding keeps symbols and confidences.
+        heals: whether the model is re-fitted by pages whose user bytes it does not read.
         code: of the pages whose user bytes are read; None for each recording's, or else its bundle's.
         provider: what pages are computed with.
         known_pages: that a device is recalibrated with; None for `KNOWN_PAGES`, or all of them with `fine_tuning`.
@@ -136,6 +137,7 @@ class Choices(Plain):
     range_pages: int = RANGE_PAGES
     tracking: bool = True
     symbols: bool = True
+    heals: bool = True
     code: Code | None = None
     provider: str = CPU
     known_pages: int | None = None

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -22,8 +21,9 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.evaluation import check_symbols, decode_unseen, pilots_of
+from lightpage.runtime.archives.recordings.page_reader import PageReader, RecoveredPage
 from lightpage.runtime.archives.recordings.read_ahead import read_ahead
-from lightpage.runtime.archives.recordings.recovery import PageReader, RecoveredPage, code_of
+from lightpage.runtime.archives.recordings.recovery import code_of
 from lightpage.runtime.archives.run.shard import SYMBOLS, Findings, PageRecord, PageState, with_end, write_user_bytes
 from lightpage.runtime.archives.run.task import Operation, Task
 from lightpage.runtime.model.decoding.decoder import Decoder
@@ -112,17 +112,15 @@ class PageRange:
         code = self.task.choices.code or code_of(self.recording, self.decoder.bundle)
         reader = PageReader(self.decoder, self.recording, self.tracker, code, give_up=self.task.give_up)
         kept: list[tuple[int, PageBytes]] = []
-        records: list[PageRecord] = []
 
         def take(page: int, found: PageBytes) -> Volume | None:
             if (volume := Volume.of_page(found)) is not None:
                 kept.append((page, found))
             return volume
 
-        for page, shown in read_ahead(self.recording.shown, self.task.pages):
-            records.append(_recovered_record(reader.read(page, shown, partial(take, page))))
-        write_user_bytes(self.task.shard, kept)
-        return Findings(pages=tuple(records))
+        records = [*map(_recovered_record, reader.read(self.task.pages, take, heals=self.task.choices.heals))]
+        write_user_bytes(self.task.shard, sorted(kept, key=lambda one: one[0]))
+        return Findings(pages=tuple(sorted(records, key=lambda record: record.page)))
 
     def _read(
         self, decode: Callable[[FramePair, Symbols | None], T], records: list[PageRecord]
@@ -157,8 +155,12 @@ def _read_record(page: int, found: DecodedPage, measures: PageMeasures | None) -
     return PageRecord(page=page, state=read, recalibration_due=due, confirmed_bits=confirmed, figures=figures)
 
 
+_RECOVERED = "number", "volume", "margin_bits", "corrected", "failed_blocks", "healed_rounds"
+"""Figures of a `RecoveredPage` that are kept under its names."""
+
+
 def _recovered_record(page: RecoveredPage) -> PageRecord:
     state = PageState.READ if page.loss is None else PageState.LOST
-    figures = {name: getattr(page, name) for name in ("number", "volume", "margin_bits", "corrected", "failed_blocks")}
+    figures = {name: getattr(page, name) for name in _RECOVERED}
     figures["air_bits_per_symbol"] = page.air_bits
     return PageRecord(page=page.page, state=state, loss=page.loss, reason=page.reason, figures=figures)

@@ -103,6 +103,7 @@ def decode(**asked: Any) -> None:
 @_options
 @_pages_options
 @click.option("--code", "code_path", type=_FILE, help="Code; the recordings' or the bundles'.")
+@click.option("--heal/--no-heal", "heals", default=None, help="Re-fit by pages that are not read; the default.")
 @click.option("--volume", metavar="ID[:CHECKSUM]", help="Write the file of this volume alone.")
 @click.option("--holes", is_flag=True, help="Where data are lost, write FILE.holes with zeros in their place.")
 def recover(code_path: Path | None, volume: str | None, holes: bool, **asked: Any) -> None:

@@ -27,6 +27,7 @@ from lightpage.runtime.model.decoding.tracking import NoTracker
 @click.option("--volume", metavar="ID[:CHECKSUM]", help="Which volume, where the recording holds several.")
 @click.option("--holes", is_flag=True, help="Write zeros where data are lost, in place of no file.")
 @click.option("--give-up", is_flag=True, help="Take pages that storage does not give for lost.")
+@click.option("--heal/--no-heal", default=True, show_default=True, help="Re-fit by pages that are not read.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 @click.option("--tracking/--no-tracking", default=True, show_default=True, help="Follow the image, and find it again.")
 def recover(
@@ -38,18 +39,21 @@ def recover(
     holes: bool,
     json_path: Path | None,
     give_up: bool,
+    heal: bool,
     tracking: bool,
 ) -> None:
     """Read a file back from recorded pages.
 
-    Pages that cannot be read are restored from parity pages. Where too many are lost, each is named, no file is written
-    and the exit status is 3. Where storage did not give some of them, it is 75: the same command tries again.
+    Where the device has changed so far that the model does not read its pages, the model is fitted to it again by these
+    pages alone, and reads them. Other pages that cannot be read are restored from parity pages. Where too many are
+    lost, each is named, no file is written and the exit status is 3. Where storage did not give some of them, it is 75:
+    the same command tries again.
     """
     decoder = load()
     with Recording.open(recording) as pages:
         code = code_of(pages, decoder.bundle) if code_path is None else load_code(code_path)
         tracker = tracker_for(decoder) if tracking else NoTracker(decoder)
-        result = recover_file(decoder, pages, tracker, code, out, *parse_volume(volume), holes=holes)
+        result = recover_file(decoder, pages, tracker, code, out, *parse_volume(volume), holes=holes, heals=heal)
     write_json(json_path, result.to_json())
     click.echo(describe(result))
     for line in told_losses(result.unread) if not result.lost and result.volume is not None else ():
@@ -67,6 +71,7 @@ def describe(result: Recovery) -> str:
     rows = [
         ("code", result.code.describe()),
         ("recorded pages", f"{len(result.pages)}, of which {len(result.unread)} gave no bytes"),
+        ("healed", _healed(result)),
         ("restored", f"data pages {ranges(result.restored)}" if result.restored else restored),
         ("lost", lost),
         ("volume", "unknown" if volume is None else f"{volume.id}: {volume.file_bytes} bytes on {volume.pages} pages"),
@@ -78,3 +83,11 @@ def describe(result: Recovery) -> str:
         ("time", f"{1e3 * figures['seconds_per_page']:.1f} ms a page (median)"),
     ]
     return "\n".join(f"{name:<20} {value}" for name, value in rows)
+
+
+def _healed(result: Recovery) -> str:
+    """Which pages a re-fitted model has read."""
+    if not result.healed:
+        return "none"
+    rounds = ", ".join(str(each) for each in sorted({page.healed_rounds or 0 for page in result.healed}))
+    return f"recorded pages {ranges([page.page for page in result.healed])}, in {rounds} rounds"

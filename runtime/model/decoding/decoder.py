@@ -181,12 +181,13 @@ class Decoder:
                 raise FrameError(name, f"type {frame.dtype}", dtype)
             check_light(name, frame, self.bundle.manifest.camera_bit_depth)
 
-    def infer(self, pair: FramePair, table: SamplingTable | None = None) -> Inference:
+    def infer(self, pair: FramePair, table: SamplingTable | None = None, *, doubtful: bool = False) -> Inference:
         """Run the graph on a checked pair.
 
         Args:
             pair: both frames, as `check` accepts them.
             table: tensors for this page alone, of `PAGE_INPUTS`; all others take `with_table`.
+            doubtful: whether frames that contradict the homodyne equations are taken too.
 
         Raises:
             InvalidInputError: a table that does not fit.
@@ -200,8 +201,8 @@ class Decoder:
         feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **table}
         p, phase, concentration, *rest = self.graph.run(self._outputs, feeds)
         limit, residual = self.bundle.manifest.residual_limit, float(np.max(rest[0])) if rest else 0.0
-        if limit is not None and not residual <= limit:
-            seen = np.isfinite(residual)
+        seen = np.isfinite(residual)
+        if limit is not None and not residual <= limit and not (doubtful and seen):
             got = f"frames that contradict each other (residual {residual:.3g})"
             raise (FramesDisagreeError if seen else FrameError)(
                 "frame pair",

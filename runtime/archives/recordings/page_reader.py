@@ -1,0 +1,225 @@
+"""Reads recorded pages for their user bytes, and heals the model where it no longer reads them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.codec.code import Code
+from lightpage.codec.page_bytes import LOSSES, Header, Loss, PageBytes
+from lightpage.codec.page_codec import PageCodec
+from lightpage.codec.volume import Successor, Volume
+from lightpage.errors import (
+    BundleError,
+    CalibrationError,
+    InvalidInputError,
+    LostPageError,
+    RecalibrationRefusedError,
+    RecordingError,
+    StorageError,
+)
+from lightpage.progress import note
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.layout import narrow
+from lightpage.recording.reader import Recording
+from lightpage.runtime.archives.recordings.coded_pages import air_bits
+from lightpage.runtime.archives.recordings.evaluation import check_recording, pilots_of
+from lightpage.runtime.archives.recordings.read_ahead import read_ahead
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.tracking import Tracker
+from lightpage.runtime.recalibration.healing import TOGETHER, LostPages, heal
+
+Shown = tuple[FramePair, NDArray[np.uint8] | None]
+Take = Callable[[int, PageBytes], Volume | None]
+
+_CURABLE = frozenset({Loss.OPTICS, Loss.HEADER, Loss.BODY, Loss.CHECKSUM})
+"""Losses that a model which fits the device may mend."""
+
+
+@dataclass(frozen=True)
+class RecoveredPage:
+    """What became of one recorded page.
+
+    Attributes:
+        page: its number in the recording.
+        number: its number in its volume: as read, or of a lost page as its header claims it; None where unknown.
+        volume: the same of the volume.
+        loss: why it gave no bytes; None where it did.
+        reason: the same for people; empty where it did.
+        margin_bits: information of a symbol's coded bits beyond what the code needs; None where there was no light.
+        corrected: Reed-Solomon symbols that were mended.
+        failed_blocks: LDPC blocks that did not converge.
+        iterations: mean of the LDPC blocks.
+        air_bits: AIR of the page as delivered, bits a data symbol; None where its symbols are not known.
+        seconds: of the optical decode.
+        code_seconds: of the code.
+        healed_rounds: rounds of the healing before which it gave no bytes; None where it needed none.
+    """
+
+    page: int
+    number: int | None
+    volume: int | None
+    loss: Loss | None
+    reason: str
+    margin_bits: float | None = None
+    corrected: int = 0
+    failed_blocks: int = 0
+    iterations: float = 0.0
+    air_bits: float | None = None
+    seconds: float = 0.0
+    code_seconds: float = 0.0
+    healed_rounds: int | None = None
+
+
+class PageReader:
+    """Reads pages of a recording, mostly one after the other; knows which page of its volume should come next.
+
+    Args:
+        decoder, recording, tracker, code: see `lightpage.runtime.archives.recordings.recovery.recover`.
+        give_up: whether pages that storage does not give are unread, as those that are lost.
+
+    Attributes:
+        codec: of the pages.
+
+    Raises:
+        RecordingError: another device's recording, or one of other levels or pilots.
+    """
+
+    def __init__(
+        self, decoder: Decoder, recording: Recording, tracker: Tracker, code: Code, *, give_up: bool = True
+    ) -> None:
+        check_recording(decoder, recording)
+        subject, mask = f"recording {recording.path}", decoder.bundle.pilot_mask
+        if recording.header.declared_levels not in (None, code.levels):
+            raise RecordingError(f"{subject}: levels", recording.levels, f"{code.levels}, as the code has")
+        if not np.array_equal(pilots_of(decoder, recording), mask):
+            raise RecordingError(f"{subject}: pilots", "other places", "those of the bundle")
+        self._recording, self._code, self._give_up = recording, code, give_up
+        self._next = Successor()
+        self._use(decoder, tracker)
+
+    def _use(self, decoder: Decoder, tracker: Tracker) -> None:
+        """Read with this model from now on."""
+        self._decoder, self._tracker, code = decoder, tracker, self._code
+        self._levels, self._pilots = decoder.bundle.levels(code.levels), decoder.written_pilots(code.levels)
+        self.codec = PageCodec(code, decoder.bundle.pilot_mask, self._levels)
+
+    def read(self, pages: Sequence[int], take: Take, *, heals: bool = True) -> Iterator[RecoveredPage]:
+        """Read pages, and heal the model by those that it does not read.
+
+        A page that is not read waits until `TOGETHER` of them do, or all others are read; then the model is re-fitted
+        by them and by the last page that was read, and they are read again. The re-fitted model reads the pages behind
+        them. Where it reads no more than before, the next pages wait for twice as many.
+
+        Args:
+            pages: their numbers in the recording.
+            take: takes a page's number in the recording and its bytes, and says which volume they belong to.
+            heals: whether models are healed.
+
+        Yields:
+            Every page once, those that were read again behind their neighbours.
+
+        Raises:
+            StorageError: frames could not be read, which says nothing of the page, and it is not given up.
+        """
+        waiting, right, together = list[tuple[RecoveredPage, Header | None]](), None, TOGETHER
+        for index, shown in read_ahead(self._recording.shown, pages):
+            expected = self._next.header
+            page = self._read(index, shown, expected, take)
+            if page.loss is None:
+                right = index
+            if heals and page.loss in _CURABLE:
+                waiting.append((page, expected))
+            else:
+                yield page
+            if len(waiting) == together:
+                found = self._healed(waiting, right, take)
+                together = TOGETHER if any(one.loss is None for one in found) else 2 * together
+                yield from found
+                waiting.clear()
+        yield from self._healed(waiting, right, take) if waiting else ()
+
+    def _healed(
+        self, waiting: Sequence[tuple[RecoveredPage, Header | None]], right: int | None, take: Take
+    ) -> list[RecoveredPage]:
+        """Pages that were not read, as a model reads them that is healed by them, or as they were if there is none."""
+        some = [(page.page, expected) for page, expected in waiting[:TOGETHER]]
+        if right is not None:
+            some = [(right, None), *some[: TOGETHER - 1]]
+        bits, frames = self._recording.bit_depth, self._recording.frames
+        lost = LostPages(
+            tuple(narrow(frames(index), bits) for index, _ in some),
+            self._code,
+            tuple(expected for _, expected in some),
+            narrow(self._recording.references(), bits),
+            self._tracker.image_px,
+        )
+        note(f"{len(waiting)} pages are not read: the model is fitted to the device by them")
+        try:
+            healed = heal(self._decoder, lost)
+        except (RecalibrationRefusedError, BundleError, CalibrationError) as error:
+            note(f"not healed: {error}")
+            return [page for page, _ in waiting]
+        note(f"healed in {healed.rounds} rounds, {healed.seconds:.0f} s: the pages are read again")
+        self._use(healed.decoder, self._tracker.refitted(healed.decoder))
+        found = []
+        for (page, expected), (index, shown) in zip(
+            waiting, read_ahead(self._recording.shown, [page.page for page, _ in waiting]), strict=True
+        ):
+            again = self._read(index, shown, expected, take)
+            found.append(page if again.loss else replace(again, healed_rounds=healed.rounds))
+        return found
+
+    def _read(self, index: int, shown: Future[Shown], expected: Header | None, take: Take) -> RecoveredPage:
+        """Read a page.
+
+        Args:
+            index: of it in the recording.
+            shown: its frames and, where they are known, its symbols.
+            expected: the page of its volume that it should be.
+            take: see `read`.
+
+        Raises:
+            StorageError: see `read`.
+        """
+        try:
+            frames, symbols = shown.result()
+            start = time.perf_counter()
+            page = self._tracker.decode(narrow(frames, self._recording.bit_depth), self._levels.count, self._pilots)
+            decoded = time.perf_counter()
+            found = self.codec.decode(page.phase, page.concentration, expected)
+            read = time.perf_counter()
+        except (InvalidInputError, LostPageError, StorageError) as error:
+            of_storage = isinstance(error, StorageError)
+            if of_storage and not self._give_up:
+                raise
+            self._next = self._next.after()
+            loss = Loss.STORAGE if of_storage else Loss.OPTICS
+            return RecoveredPage(index, *_place(expected), loss, str(error))
+        own = take(index, found)
+        if own is not None and found.header is not None:
+            self._next = Successor(own, found.header)
+        self._next = self._next.after()
+        return RecoveredPage(
+            index,
+            *_place(found.header or expected),
+            found.loss,
+            "" if found.loss is None else LOSSES[found.loss],
+            found.margin_bits,
+            found.corrected,
+            found.failed_blocks,
+            found.iterations,
+            None if symbols is None else air_bits(page, symbols, ~self.codec.pilots, self._levels),
+            decoded - start,
+            read - decoded,
+        )
+
+
+def _place(header: Header | None) -> tuple[int | None, int | None]:
+    """Number and volume of a page."""
+    return (None, None) if header is None else (header.page, header.volume)

@@ -1,0 +1,279 @@
+"""Heals a model that no longer reads its device by pages of user data that nobody knows.
+
+A round decodes some pages, takes off the smooth error that their pilots share, decides every symbol, and fits the
+geometry by the decisions of one page. As soon as the checksum of a page holds, all of its symbols are known, and the
+model is re-fitted by it as by any known page.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.calibration.calibrate import KnownPage, refine
+from lightpage.calibration.common_error import common_error
+from lightpage.calibration.document import Calibration
+from lightpage.calibration.interfaces import Twin
+from lightpage.calibration.parameters import as_dict
+from lightpage.calibration.sampling_table import moved_cameras
+from lightpage.codec.code import Code
+from lightpage.codec.page_bytes import Header, PageBytes
+from lightpage.codec.page_codec import PageCodec
+from lightpage.errors import CalibrationError, FrameError, RecalibrationRefusedError, raised_as
+from lightpage.page.pilots import LEAST_CONFIRMED_NATS, Pilots, read_pilots
+from lightpage.page.symbols import symbol_phases
+from lightpage.progress import Progress
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.layout import hash_frames
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.image_drift import BundleSearch
+from lightpage.runtime.model.decoding.image_position import ImagePosition
+from lightpage.runtime.model.decoding.page import Inference
+from lightpage.runtime.model.execution.twin import OnnxTwin
+from lightpage.runtime.recalibration.known_pages import KnownPages
+from lightpage.runtime.recalibration.recalibration import Refit, RefitResult, refitted_bundle
+from lightpage.runtime.recalibration.refit import refit, traced
+
+TOGETHER = 6
+"""Pages at most that one healing takes: the pilots of six show a smooth error as well as it can be shown."""
+
+MOST_ROUNDS = 5
+"""The bench device comes right in one to three, half a degree of the pipe's angle away in four."""
+
+_AROUND_PX = np.array([(x, y) for x in (-20.0, 0.0, 20.0) for y in (-20.0, 0.0, 20.0)])
+"""Where the image is looked for, beside where it was last seen: it is found within some thirty pixels."""
+
+
+_WANTED = "pages of this device that its drift, and nothing else, keeps from being read"
+
+
+@dataclass(frozen=True)
+class LostPages:
+    """Pages of one device that its model does not read.
+
+    Attributes:
+        pairs: frame pairs, one a page.
+        code: of the pages.
+        expected: the page of its volume that each should be, None where that is unknown; none for none of them.
+        references: reference-only frames taken with them, or None: then those that the model decodes with hold.
+        image_px: where the image was last seen against the model's calibration, (x, y), camera pixels.
+    """
+
+    pairs: tuple[FramePair, ...]
+    code: Code
+    expected: tuple[Header | None, ...] = ()
+    references: FramePair | None = None
+    image_px: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Healed:
+    """A model that reads its device again.
+
+    Attributes:
+        decoder: of the re-fitted bundle, which lies in memory.
+        result: what was re-fitted.
+        known: pages that came right, with their symbols.
+        rounds: of fits to decisions; 0 where only the image had moved.
+        seconds: that it took.
+    """
+
+    decoder: Decoder
+    result: RefitResult
+    known: KnownPages
+    rounds: int
+    seconds: float
+
+
+def heal(
+    decoder: Decoder,
+    pages: LostPages,
+    progress: Progress = lambda what, share: None,
+    fit: Refit = refit,
+    twin: Twin | None = None,
+) -> Healed:
+    """Find the device's geometry again, and with it the pages.
+
+    Args:
+        decoder: the model that does not read them; it is not touched.
+        pages: at most `TOGETHER` are taken, the first ones; repeated ones count once.
+        progress: told of every step. It may raise to stop the work.
+        fit: how to fit by known pages.
+        twin: of the bundle's profile; the bundle's own if left out.
+
+    Raises:
+        RecalibrationRefusedError: the frames do not show this device, or no page came right.
+        BundleError: the bundle holds a geometry that cannot be fitted.
+    """
+    start = time.perf_counter()
+    work = _Healing(decoder, pages, OnnxTwin(decoder.bundle) if twin is None else twin)
+    with raised_as(RecalibrationRefusedError, CalibrationError, FrameError):
+        model, rounds = work.model, 0
+        while (known := work.known(model)) is None:
+            if rounds == MOST_ROUNDS:
+                raise RecalibrationRefusedError("healing", work.unread(model), _WANTED)
+            rounds += 1
+            model = work.fitted(model, partial(_within, progress, rounds))
+        result = fit(decoder.bundle, known.part(slice(1)), partial(_within, progress, MOST_ROUNDS + 1), decoder)
+        by_known = _Model(decoder.of_bundle(refitted_bundle(decoder.bundle, result)), result)
+        # one more page is worth more than a little more of each
+        model = max(by_known, model, key=work.count)
+    return Healed(model.decoder, model.result, known, rounds, time.perf_counter() - start)
+
+
+class _Model(NamedTuple):
+    """A decoder whose bundle lies in memory, and what was re-fitted for it."""
+
+    decoder: Decoder
+    result: RefitResult
+
+
+def _within(progress: Progress, rounds: int, what: str, share: float) -> None:
+    """Tell of a step of a round, the fit to known pages being the last one."""
+    progress(what if rounds > MOST_ROUNDS else f"round {rounds}: {what}", (rounds - 1 + share) / (MOST_ROUNDS + 1))
+
+
+class _Healing:
+    """The pages of a healing, and what is done with them.
+
+    Args:
+        decoder, pages, twin: as for `heal`.
+
+    Attributes:
+        pairs: the pages that are taken.
+        model: the model with the image where it lies now.
+    """
+
+    def __init__(self, decoder: Decoder, pages: LostPages, twin: Twin) -> None:
+        self._decoder, self._pages, self._twin = decoder, pages, twin
+        bundle = decoder.bundle
+        lit = [(number, pair) for number, pair in enumerate(pages.pairs) if _shows_light(decoder, pair)]
+        distinct = {hash_frames(pair): number for number, pair in reversed(lit)}
+        taken = sorted(distinct.values())[:TOGETHER]
+        self.pairs = tuple(pages.pairs[number] for number in taken)
+        self._expected = tuple(pages.expected[number] if pages.expected else None for number in taken)
+        if not self.pairs:
+            raise RecalibrationRefusedError("healing", "no page with light", "at least one")
+        self._references = pages.references or decoder.references
+        self._levels = pages.code.levels
+        self._pilots = bundle.written_pilots(self._levels)
+        self._seen: dict[Decoder, tuple[list[Inference], tuple[PageBytes, ...]]] = {}
+        self._image = self._found()
+        moved = moved_cameras(bundle.calibration.vector, np.array([self._image.shift_x_px, self._image.shift_y_px]))
+        self._start = bundle.calibration.model_copy(update={"parameters": as_dict(moved)})
+        self.model = self._with(self._start)
+
+    def _found(self) -> ImagePosition:
+        """Where the image lies: where one page's pilots are found, or else where it was, if those of all agree there.
+
+        Raises:
+            RecalibrationRefusedError: no page shows it.
+        """
+        decoder = self._decoder
+        search, shown = BundleSearch(decoder, self._twin), Pilots(decoder.bundle.pilot_mask, self._phases(decoder))
+        around = np.concatenate([_AROUND_PX, [self._pages.image_px]])
+        for pair in self.pairs:
+            found = search.find(pair, shown, around, self._references)
+            if found.found:
+                x, y = map(float, found.shift_px)
+                return ImagePosition(x, y, searched=True, found=True)
+        checks = [decoder.post_process(one, self._levels, shown).check for one in self._looked(decoder)[0]]
+        told = sum(check.confirmed_bits * np.log(2) * check.pilots - check.gained_nats for check in checks)
+        if told >= LEAST_CONFIRMED_NATS:
+            return ImagePosition(0.0, 0.0, searched=True, found=False)
+        got = (
+            f"{len(self.pairs)} pages that do not show this device's pilots ({told:.1f} of {LEAST_CONFIRMED_NATS} nats)"
+        )
+        raise RecalibrationRefusedError("healing", got, _WANTED)
+
+    def _phases(self, decoder: Decoder) -> NDArray[np.float64]:
+        """Phases that a decoder expects of the pilots, radians."""
+        return decoder.bundle.modulation.phase(symbol_phases(self._pilots, self._levels))
+
+    def _with(self, calibration: Calibration) -> _Model:
+        """The model with another geometry."""
+        result = traced(self._decoder, self._twin, self._references, calibration)
+        return _Model(self._decoder.of_bundle(refitted_bundle(self._decoder.bundle, result)), result)
+
+    def _looked(self, decoder: Decoder) -> tuple[list[Inference], tuple[PageBytes, ...]]:
+        """What a decoder says of the pages, and what they give it."""
+        if decoder not in self._seen:
+            known, codec = Pilots(decoder.bundle.pilot_mask, self._phases(decoder)), self._codec(decoder)
+            inferences, read = list[Inference](), list[PageBytes]()
+            for pair, expected in zip(self.pairs, self._expected, strict=True):
+                inferences.append(decoder.infer(pair, doubtful=True))
+                page = decoder.post_process(inferences[-1], self._levels, known)
+                read.append(codec.decode(page.phase, page.concentration, expected))
+            self._seen[decoder] = inferences, tuple(read)
+        return self._seen[decoder]
+
+    def _codec(self, decoder: Decoder) -> PageCodec:
+        return PageCodec(self._pages.code, decoder.bundle.pilot_mask, decoder.bundle.levels(self._levels))
+
+    def count(self, model: _Model) -> int:
+        """How many pages a model reads."""
+        return sum(page.loss is None for page in self._looked(model.decoder)[1])
+
+    def unread(self, model: _Model) -> str:
+        """That no page is read, and how far the one is from it that is nearest."""
+        lacking = min(-page.margin_bits for page in self._looked(model.decoder)[1])
+        least = f"the nearest lacks {lacking:.2f} bit a symbol by its own claims"
+        return f"{len(self.pairs)} pages of which none is read after {MOST_ROUNDS} rounds; {least}"
+
+    def known(self, model: _Model) -> KnownPages | None:
+        """The pages that come right, the one with most to spare first; None if there is none."""
+        read = [
+            (page, pair)
+            for page, pair in zip(self._looked(model.decoder)[1], self.pairs, strict=True)
+            if page.loss is None
+        ]
+        if not read:
+            return None
+        read.sort(key=lambda one: -one[0].margin_bits)
+        codec = self._codec(model.decoder)
+        symbols = tuple(codec.encode_again(page, self._pilots) for page, _ in read)
+        image_px = self._image.shift_x_px, self._image.shift_y_px
+        pairs = tuple(pair for _, pair in read)
+        return KnownPages(pairs, symbols, self._levels, self._references, model.decoder.bundle.pilot_mask, image_px)
+
+    def fitted(self, model: _Model, progress: Progress) -> _Model:
+        """The model of a fit to what `model` decides, its smooth error off."""
+        progress("decide", 0.0)
+        inferences, bundle = self._looked(model.decoder)[0], model.decoder.bundle
+        mask, shown = bundle.pilot_mask, Pilots(bundle.pilot_mask, self._phases(model.decoder))
+        phases = np.stack([one.phase - read_pilots(one.p, shown).piston.angle_rad for one in inferences])
+        claimed = np.stack([one.concentration for one in inferences]).astype(np.float64)
+        written = symbol_phases(self._pilots, self._levels)
+        error = common_error(phases.astype(np.float64), claimed, mask, written, bundle.modulation)
+        page = int(np.argmax(np.median(claimed, axis=(1, 2))))
+        levels = error.modulation.page_levels(self._levels)
+        symbols = levels.nearest(phases[page] - error.phase - error.pistons[page])
+        symbols[mask] = self._pilots
+        earlier = self._start
+        registered = refine(
+            self._twin,
+            model.decoder.field_solver,
+            bundle.profile,
+            self._references,
+            [KnownPage(self.pairs[page], np.exp(1j * symbol_phases(symbols, self._levels)))],
+            start=earlier.vector,
+            quadrature_phase=earlier.turn_rad,
+            progress=progress,
+            modulation=earlier.modulator,
+        )
+        hashes = [hash_frames(self.pairs[page])]
+        return self._with(earlier.followed_by(Calibration.from_registered(registered, bundle.profile, hashes)))
+
+
+def _shows_light(decoder: Decoder, pair: FramePair) -> bool:
+    """Whether a decoder takes the frames."""
+    try:
+        decoder.check(pair)
+    except FrameError:
+        return False
+    return True

@@ -1,0 +1,70 @@
+"""Pages of user data that a drifted device's model does not read, and no page that anybody knows."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from lightpage.cli.simulate import simulate
+from lightpage.codec.code import Code
+from lightpage.errors import RecalibrationRefusedError
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording
+from lightpage.runtime.commands.archives.encode import encode
+from lightpage.runtime.commands.archives.recover import recover
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.recalibration.healing import LostPages, heal
+
+CODE = Code(levels=16, coded_bits=2, rate_per_mille=400, corrections=2)
+CONTENT = bytes(range(250)) * 3
+
+
+@pytest.fixture(scope="module")
+def drifted(small_bundle: Path, small_device: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a recording of a file's pages on the small device, its pipe turned by a fifth of a degree."""
+    folder = tmp_path_factory.mktemp("drifted")
+    (folder / "file").write_bytes(CONTENT)
+    CODE.save(folder / "code.toml")
+    named = ["--bundle", small_bundle, "--code", folder / "code.toml"]
+    run(encode, folder / "file", *named, "--parity-pages", 0, "--out", folder / "pages.h5")
+    turned = ["--set", "geometry.pipe_angle_deg=-0.4", "--seed", 5]
+    run(simulate, *small_device[:2], "--symbols", folder / "pages.h5", *turned, "--out", folder / "R.h5")
+    return folder
+
+
+def run(command: object, *words: object) -> str:
+    result = CliRunner().invoke(command, [*map(str, words)], catch_exceptions=False)  # type: ignore[arg-type]
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_a_file_that_no_page_gave_comes_back_by_itself(small_bundle: Path, drifted: Path) -> None:
+    asked = ["--bundle", small_bundle, "--code", drifted / "code.toml", "--recording", drifted / "R.h5"]
+    told = run(recover, *asked, "--out", drifted / "out", "--json", drifted / "recovery.json")
+    assert (drifted / "out").read_bytes() == CONTENT
+    figures = json.loads((drifted / "recovery.json").read_text())
+    assert figures["pages_healed"] == figures["pages"] == 3
+    assert {page["healed_rounds"] for page in figures["page_results"]} <= {1, 2, 3}
+    assert "recorded pages 0-2, in " in told
+
+
+def test_frames_that_do_not_show_the_device_are_refused_before_anything_is_fitted(
+    small_bundle: Path, drifted: Path
+) -> None:
+    decoder = Decoder.load(small_bundle, threads=1)
+    with Recording.open(drifted / "R.h5") as recording:
+        references, pair = recording.references(), recording.frames(0)
+    rng, frames = np.random.default_rng(0), (pair.in_phase, pair.quadrature)
+    shuffled = [FramePair(*(rng.permutation(f.ravel()).reshape(f.shape) for f in frames)) for _ in range(3)]
+    upside_down = FramePair(*(np.ascontiguousarray(frame[::-1]) for frame in frames))
+    with pytest.raises(RecalibrationRefusedError, match="pilots"):
+        heal(decoder, LostPages((*shuffled, upside_down), CODE, references=references), untouched)
+    dark = FramePair(*(np.zeros_like(frame) for frame in frames))
+    with pytest.raises(RecalibrationRefusedError, match="light"):
+        heal(decoder, LostPages((dark,), CODE, references=references), untouched)
+
+
+def untouched(what: str, share: float) -> None:
+    raise AssertionError(what)
