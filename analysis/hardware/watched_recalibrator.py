@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 
 from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
-from lightpage.runtime.service.jobs.recalibrator import Recalibrator, Step
+from lightpage.runtime.service.jobs.recalibrator import PagesToUse, Recalibrator, Step
 from lightpage.runtime.service.monitoring.monitor import Monitor
 
 
@@ -26,11 +26,13 @@ class WatchedRecalibrator(Recalibrator):
         self._lock = threading.Lock()
         self.running, self._pages = False, 0
 
-    def from_source(self, count: int, pages: Sequence[int], caller: Caller) -> Iterator[Step | RecalibrationOutcome]:
+    def follow(
+        self, pages: PagesToUse, caller: Caller, expected_version: str = "", correlation_id: str = ""
+    ) -> Iterator[Step | RecalibrationOutcome]:
         """See `Recalibrator`."""
         self.running, self._pages, end = True, 0, "done"
         try:
-            yield from super().from_source(count, pages, caller)
+            yield from super().follow(pages, caller, expected_version, correlation_id)
         except Exception as error:
             end = type(error).__name__
             raise

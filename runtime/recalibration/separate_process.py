@@ -18,6 +18,7 @@ from lightpage.helper_process import HelperProcess, same_packages
 from lightpage.progress import Progress
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.tracking import Tracker
+from lightpage.runtime.recalibration.healing import LostPages
 from lightpage.runtime.recalibration.known_pages import KnownPages
 from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome
 
@@ -40,7 +41,7 @@ _SUBJECT = "recalibration"
 def recalibrate_apart(
     decoder: Decoder,
     tracker: Tracker,
-    pages: KnownPages,
+    pages: KnownPages | LostPages,
     out: Path,
     version: str,
     progress: Progress,
@@ -49,14 +50,14 @@ def recalibrate_apart(
     worker: str = WORKER,
     clock: Callable[[], float] = time.monotonic,
 ) -> RecalibrationOutcome:
-    """Recalibrate in a process of its own; see `lightpage.runtime.recalibration.recalibration.recalibrate`.
+    """Recalibrate in a process of its own; see `recalibrate`, and `recalibrate_by_lost` for lost pages.
 
     Whatever ends it early, the process and what it has written of the new bundle are gone.
 
     Args:
         decoder: the model in service.
         tracker: of the service; the worker goes on from what it has learnt.
-        pages: pages with known symbols.
+        pages: pages with known symbols, or pages that the model does not read.
         out: a new path.
         version: of the new bundle.
         progress: told of every step.

@@ -16,6 +16,7 @@ from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.decoding.tracking import NoTracker, TrackerMemory
+from lightpage.runtime.recalibration.healing import LostPages, recalibrate_by_lost
 from lightpage.runtime.recalibration.known_pages import KnownPages
 from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome, Refit, recalibrate
 from lightpage.runtime.recalibration.refit import refit
@@ -84,13 +85,15 @@ class RecalibrationWorker(Helper):
     def recalibrate(
         self,
         bundle: Bundle,
-        pages: KnownPages,
+        pages: KnownPages | LostPages,
         out: Path,
         version: str,
         memory: TrackerMemory | None,
         progress: Progress,
     ) -> RecalibrationOutcome:
-        """Recalibrate a model whose tracker has learnt so much; see `lightpage.runtime.recalibration.recalibration`."""
+        """Recalibrate a model whose tracker has learnt so much; see `recalibrate` and `recalibrate_by_lost`."""
         decoder = Decoder(bundle, THREADS)
         tracker = NoTracker(decoder) if memory is None else tracker_for(decoder, memory)
+        if isinstance(pages, LostPages):
+            return recalibrate_by_lost(decoder, pages, out, version, self.fit, progress, tracker)
         return recalibrate(decoder, pages, out, version, self.fit, progress, tracker)

@@ -20,6 +20,7 @@ from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.decoding.tracking import NoTracker
 from lightpage.runtime.model.execution.providers import Provider
 from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.jobs.kept_pages import KeptPages
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 from lightpage.runtime.service.models.audit import AuditLog
 from lightpage.runtime.service.models.loader import Loader
@@ -43,12 +44,14 @@ class Assembly:
         plane: its logic.
         recalibrator: of its models.
         monitor: of its device.
+        kept: the last pages of its device, where it recalibrates itself by them; else None.
         source_name: for people.
     """
 
     plane: DataPlane
     recalibrator: Recalibrator
     monitor: Monitor
+    kept: KeptPages | None
     source_name: str
 
 
@@ -69,7 +72,9 @@ def assembled(settings: ServiceSettings, observer: Observer) -> Iterator[Assembl
     base = Decoder(Bundle.open(bundle_path(service.bundle), key=key), service.threads, provider=provider)
     metrics = ServiceMetrics()
     monitor = Monitor(metrics=metrics)
-    observers = [observer, PageLog()]
+    own = settings.self_calibration
+    kept = KeptPages(settings.limits.kept_bytes) if own.is_on and not own.pages else None
+    observers = [observer, PageLog(), *([] if kept is None else [kept])]
     with ExitStack() as stack:
         source = None
         store = stack.enter_context(Store(service.store, base.bundle))
@@ -95,7 +100,7 @@ def assembled(settings: ServiceSettings, observer: Observer) -> Iterator[Assembl
             recalibrator.check_start()
         except LightpageError as error:
             _log.warning("recalibrations will be refused: %s", error)
-        yield Assembly(plane, recalibrator, monitor, "no source" if source is None else source.name)
+        yield Assembly(plane, recalibrator, monitor, kept, "no source" if source is None else source.name)
 
 
 def checked_source(name: str, pages_file: Path | None, base: Decoder) -> FrameSource:

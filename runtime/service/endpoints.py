@@ -70,5 +70,5 @@ def listening(settings: ServiceSettings, assembly: Assembly, certificates: Certi
         if service.incoming is not None:
             stack.enter_context(Incoming(plane.models, plane.limits.model_bytes, plane.uploads, service.incoming))
         if (own := settings.self_calibration).is_on:
-            stack.enter_context(SelfCalibration(plane, assembly.monitor, recalibrator, own))
+            stack.enter_context(SelfCalibration(plane, assembly.monitor, recalibrator, own, kept=assembly.kept))
         yield Endpoints(server.target, health)

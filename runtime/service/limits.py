@@ -72,6 +72,8 @@ class Limits(SettingsTable):
     """Wait for a free slot where the caller set no deadline of its own."""
     recalibration_pages: _Count = 16
     """Pages that one recalibration reads into memory."""
+    kept_bytes: _MemoryBytes = 512 << 20
+    """Frames of the last pages that a service keeps to recalibrate itself by: eight full-size pairs of 16 bits."""
     recalibration_s: _Seconds = 300.0
     """One recalibration in its own process. On two cores a bench device's takes 8 s beside an idle service, and 90 s
     beside reads without a pause on both cores, since its priority leaves it what they do not use and a tenth of a

@@ -1,4 +1,4 @@
-"""Cameras that stand apart on the axis: what each sees of one field, and the field that both have seen.
+"""What each of two cameras sees of one field, apart on the axis or not, and the field that both have seen.
 
 Against the mean of both places the in-phase camera sees D e and the quadrature camera D* e, with D = exp(i phi) over
 the facet and phi growing as the square of the frequency (`lightpage.waves.defocus`). Without |e|^2, and for a turn of
@@ -70,39 +70,6 @@ class CamerasApart(NamedTuple):
         ny, nx = both.shape[1:]
         return _along_rows(_along_columns(_in_blocks(both), self.back), self.added)[:, :ny, :nx]
 
-    def recovered(
-        self,
-        start: Tensor,
-        brightness: Tensor,
-        arms: Tensor,
-        amplitude: Tensor,
-        inverse_amplitude: Tensor,
-        band: Filter,
-    ) -> Tensor:
-        """The field that both cameras have seen.
-
-        Args:
-            start: estimate of e, [2, ny, nx].
-            brightness: measured |1 + D e|^2 and |arm + D* e|^2, [2, ny, nx].
-            arms: of both cameras, [4, 1, 1].
-            amplitude, inverse_amplitude: by which e becomes E, which defocus and band are about, and back, [ny, nx].
-            band: filter of E to the pipe's band.
-
-        Returns:
-            e, [2, ny, nx].
-        """
-        pulling = 8 * _WEIGHT * _STIFF * torch.clamp(brightness, min=0)
-        half = amplitude / 2
-        of_arms = self.gathered(arms * half)
-        field = start * amplitude
-        state = light = self.seen(field) * inverse_amplitude + arms
-        for number in range(ROUNDS):
-            if number:
-                light = self.seen(field) * inverse_amplitude + arms
-            state = state + _RELAXATION * (_likely(2 * light - state, pulling) - light)
-            field = band(self.gathered(state * half) - of_arms)
-        return field * inverse_amplitude
-
     def recovered_linearly(
         self, left: Tensor, arms: Tensor, amplitude: Tensor, inverse_amplitude: Tensor, band: Filter
     ) -> Tensor:
@@ -110,7 +77,7 @@ class CamerasApart(NamedTuple):
 
         Args:
             left: sides of the equations, [2, ny, nx].
-            arms, amplitude, inverse_amplitude, band: as for `recovered`.
+            arms, amplitude, inverse_amplitude, band: as for `reflected`.
 
         Returns:
             e, [2, ny, nx]; on the ring of the determinant's zero, what one of two real numbers says of it.
@@ -122,6 +89,55 @@ class CamerasApart(NamedTuple):
             pull = self.gathered(_for_both_parts(beyond) * amplitude * arms)
             before, estimate = estimate, ahead + band(_LINEAR_STEP * pull)
         return estimate * inverse_amplitude
+
+
+class CamerasTogether:
+    """Cameras that see the same plane."""
+
+    def seen(self, field: Tensor) -> Tensor:
+        """See `CamerasApart`."""
+        return torch.cat([field, field])
+
+    def gathered(self, both: Tensor) -> Tensor:
+        """See `CamerasApart`."""
+        return both[:2] + both[2:]
+
+
+def reflected(
+    cameras: CamerasApart | CamerasTogether,
+    rounds: int,
+    start: Tensor,
+    brightness: Tensor,
+    arms: Tensor,
+    amplitude: Tensor,
+    inverse_amplitude: Tensor,
+    band: Filter,
+) -> Tensor:
+    """The field that both cameras have seen.
+
+    Args:
+        cameras: what each sees of a field.
+        rounds: of averaged reflections.
+        start: estimate of e, [2, ny, nx].
+        brightness: measured |1 + D e|^2 and |arm + D* e|^2, [2, ny, nx].
+        arms: of both cameras, [4, 1, 1].
+        amplitude, inverse_amplitude: by which e becomes E, which defocus and band are about, and back, [ny, nx].
+        band: filter of E to the pipe's band.
+
+    Returns:
+        e, [2, ny, nx].
+    """
+    pulling = 8 * _WEIGHT * _STIFF * torch.clamp(brightness, min=0)
+    half = amplitude / 2
+    of_arms = cameras.gathered(arms * half)
+    field = start * amplitude
+    state = light = cameras.seen(field) * inverse_amplitude + arms
+    for number in range(rounds):
+        if number:
+            light = cameras.seen(field) * inverse_amplitude + arms
+        state = state + _RELAXATION * (_likely(2 * light - state, pulling) - light)
+        field = band(cameras.gathered(state * half) - of_arms)
+    return field * inverse_amplitude
 
 
 def _likely(light: Tensor, pulling: Tensor) -> Tensor:

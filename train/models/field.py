@@ -23,7 +23,8 @@ from lightpage.calibration.waves.wave_fit import READ_NOISE
 from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError
 from lightpage.recording.frame_pair import FramePair
-from lightpage.train.models.apart import CamerasApart
+from lightpage.train.models.apart import ROUNDS as ROUNDS_APART
+from lightpage.train.models.apart import CamerasApart, CamerasTogether, reflected
 from lightpage.train.models.filters import BLOCK, SeparableFilter
 from lightpage.waves.defocus import resampled_taps
 from lightpage.waves.grid import GRID_STEP_PX, FieldGrid, field_grid
@@ -123,6 +124,8 @@ class FieldRecovery(nn.Module):
         with_signal_power: whether the frames hold |E|^2; an oracle takes it off beforehand, and the equations are then
             linear.
         rounds: of descent.
+        reflections: rounds of averaged reflections in place of descent; none for descent. Where cameras stand apart,
+            reflections serve in any case.
         binning: camera pixels along each axis whose mean is sampled; one filters the frames first instead, which takes
             longer and loses less.
         grid: the common grid, where it is not the usual one.
@@ -137,13 +140,15 @@ class FieldRecovery(nn.Module):
         *,
         with_signal_power: bool = True,
         rounds: int = ROUNDS,
+        reflections: int = 0,
         binning: int = 1,
         grid: FieldGrid | None = None,
     ) -> None:
         super().__init__()
         if binning < 1 or _REFERENCE_BLOCK_PX % binning:
             raise InvalidInputError("binning, camera pixels", binning, f"a divisor of {_REFERENCE_BLOCK_PX}")
-        self.with_signal_power, self.rounds, self.binning = with_signal_power, rounds, binning
+        self.with_signal_power, self.binning = with_signal_power, binning
+        self.rounds, self.reflections = rounds, reflections
         grid = grid or field_grid(profile)
         self.grid = grid
         self.rows_px, self.columns_px = profile.frame_shape
@@ -238,8 +243,8 @@ class FieldRecovery(nn.Module):
         """Solve the two equations for e, [2, ny, nx]; `inverse_amplitude` is zero where the amplitude is, [ny, nx].
 
         Each sample alone is a quadratic with two roots, which meet where the signal outshines the reference. So: the
-        closed root nearer to the linear estimate, then descent with momentum towards the most likely field in the
-        pipe's band. Where the cameras stand apart, that is but a start (`CamerasApart.recovered`).
+        closed root nearer to the linear estimate; from there averaged reflections (`reflected`), or descent with
+        momentum towards the most likely field in the pipe's band. Where the cameras stand apart, descent gets stuck.
         """
         a, b, cos, sin, amplitude, _, apart = measured
         if apart is not None and not self.with_signal_power:
@@ -257,9 +262,11 @@ class FieldRecovery(nn.Module):
         root = torch.sqrt(torch.clamp(discriminant, min=0)) / quadratic
         real = middle + torch.where(start[0] < middle, -root, root)
         before = estimate = self.band(torch.stack([real, slope * real - offset]) * amplitude) * inverse_amplitude
-        if apart is not None:
+        if apart is not None or self.reflections:
+            cameras, rounds = (CamerasTogether(), self.reflections) if apart is None else (apart, ROUNDS_APART)
             brightness = 1 + 2 * torch.stack([a, b])
-            return apart.recovered(estimate, brightness, measured.arms, amplitude, inverse_amplitude, self.band)
+            light = brightness, measured.arms, amplitude, inverse_amplitude
+            return reflected(cameras, rounds, estimate, *light, self.band)
         for _ in range(self.rounds):
             ahead = estimate + _MOMENTUM * (estimate - before)
             step = measured.pull(ahead, READ_NOISE, _STEP)

@@ -24,7 +24,7 @@ class Hyperparameters:
     Attributes:
         channels, blocks, depth: size of the network, see `SymbolUNet`.
         refinements: further passes of the decoder, see `lightpage.train.trainers.refinement`.
-        field_rounds, binning: of the field's recovery, see `lightpage.train.models.field.FieldRecovery`.
+        field_rounds, reflections, binning: of the field's recovery, see `lightpage.train.models.field.FieldRecovery`.
         field_step: pitch of the common grid, camera pixels.
         samples, interpolation: see `CoherentLocalizer`.
         steps: optimiser steps.
@@ -41,6 +41,7 @@ class Hyperparameters:
     depth: int = 0
     refinements: int = 0
     field_rounds: int = ROUNDS
+    reflections: int = 0
     binning: int = 1
     field_step: int = GRID_STEP_PX
     samples: int = 0
@@ -56,7 +57,9 @@ class Hyperparameters:
     @property
     def first_pass(self) -> str:
         """What the features of the first pass depend on."""
-        return f"{self.field_rounds} {self.binning} {self.field_step} {self.samples} {self.interpolation}"
+        reflections = f"{self.reflections} reflections " if self.reflections else ""
+        rest = f"{self.binning} {self.field_step} {self.samples} {self.interpolation}"
+        return f"{reflections}{self.field_rounds} {rest}"
 
     def grid(self, profile: Profile) -> FieldGrid:
         """The common grid of these choices."""
@@ -68,6 +71,7 @@ class Hyperparameters:
             profile,
             with_signal_power=with_signal_power,
             rounds=self.field_rounds,
+            reflections=self.reflections,
             binning=self.binning,
             grid=self.grid(profile),
         )

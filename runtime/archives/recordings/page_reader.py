@@ -113,8 +113,8 @@ class PageReader:
         """Read pages, and heal the model by those that it does not read.
 
         A page that is not read waits until `TOGETHER` of them do, or all others are read; then the model is re-fitted
-        by them and by the last page that was read, and they are read again. The re-fitted model reads the pages behind
-        them. Where it reads no more than before, the next pages wait for twice as many.
+        by them, and by the last page that was read among them, and they are read again. The re-fitted model reads the
+        pages behind them. Where it reads no more than before, the next pages wait for twice as many.
 
         Args:
             pages: their numbers in the recording.
@@ -131,7 +131,7 @@ class PageReader:
         for index, shown in read_ahead(self._recording.shown, pages):
             expected = self._next.header
             page = self._read(index, shown, expected, take)
-            if page.loss is None:
+            if page.loss is None and waiting:
                 right = index
             if heals and page.loss in _CURABLE:
                 waiting.append((page, expected))
@@ -142,6 +142,7 @@ class PageReader:
                 together = TOGETHER if any(one.loss is None for one in found) else 2 * together
                 yield from found
                 waiting.clear()
+                right = None
         yield from self._healed(waiting, right, take) if waiting else ()
 
     def _healed(

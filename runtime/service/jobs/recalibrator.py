@@ -33,6 +33,7 @@ from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.device.acquisition.source import FrameSource, own_fault
 from lightpage.runtime.model.bundle.archive import check_name
 from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.recalibration.healing import LostPages, recalibrate_by_lost
 from lightpage.runtime.recalibration.known_pages import KnownPages, read_recorded
 from lightpage.runtime.recalibration.recalibration import (
     RecalibrationOutcome,
@@ -45,6 +46,7 @@ from lightpage.runtime.recalibration.separate_process import recalibrate_apart
 from lightpage.runtime.service.caller import NOBODY, Actor, Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.jobs import Jobs, RunningJob
+from lightpage.runtime.service.jobs.kept_pages import KeptPages
 from lightpage.runtime.service.limits import GRACE_S
 from lightpage.runtime.service.models.loader import Model
 
@@ -82,7 +84,7 @@ class PagesToUse:
     """
 
     of: str
-    read: Callable[[Callable[[], None], Caller], KnownPages]
+    read: Callable[[Callable[[], None], Caller], KnownPages | LostPages]
     count: int = 0
     own: bool = True
     release: Callable[[], None] = _nothing
@@ -147,6 +149,15 @@ class Recalibrator:
                     return read_recorded(recording, range(count or recording.pages), heard)
 
         return PagesToUse(f"recording {name}", read, count)
+
+    def kept_pages(self, kept: KeptPages) -> PagesToUse | None:
+        """The last pages of the device, those that were read or else those that were lost; None if none are kept."""
+        model = self._plane.models.current
+        pages = kept.pages(model.decoder, model.tracker.image_px)
+        if pages is None:
+            return None
+        what = "lost pages" if isinstance(pages, LostPages) else "pages that were read"
+        return PagesToUse(what, lambda heard, caller: pages)
 
     def sent_pages(self, pages: KnownPages, release: Callable[[], None] = _nothing) -> PagesToUse:
         """Pages whose frames a caller has sent, checked.
@@ -291,7 +302,7 @@ class Recalibrator:
         self,
         running: RunningJob,
         task: PagesToUse,
-        pages: KnownPages,
+        pages: KnownPages | LostPages,
         progress: Progress,
         check: Callable[[], None],
         expected_version: str,
@@ -299,15 +310,18 @@ class Recalibrator:
         models = self._plane.models
         model, folder = models.current, models.store.folder
         _check_version(model, expected_version)  # it may have changed while pages were read
-        with own_fault() if task.own else nullcontext():
-            pages = pages.lit(model.decoder.bundle.manifest.camera_bit_depth)
-            pages.check(model.decoder)
+        if isinstance(pages, KnownPages):
+            with own_fault() if task.own else nullcontext():
+                pages = pages.lit(model.decoder.bundle.manifest.camera_bit_depth)
+                pages.check(model.decoder)
         version = next_version(model.version, models.versions())
         path = folder.bundle(version)
         # Judged against what is in service now: the model with what its tracker has learnt.
         if self._fit is None:
             limit_s = self._plane.limits.recalibration_s
             outcome = recalibrate_apart(model.decoder, model.tracker, pages, path, version, progress, check, limit_s)
+        elif isinstance(pages, LostPages):
+            outcome = recalibrate_by_lost(model.decoder, pages, path, version, self._fit, progress, model.tracker)
         else:
             outcome = recalibrate(model.decoder, pages, path, version, self._fit, progress, model.tracker)
         try:

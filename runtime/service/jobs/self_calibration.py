@@ -22,7 +22,8 @@ from lightpage.runtime.recalibration.known_pages import MIN_PAGES
 from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome
 from lightpage.runtime.service.caller import Actor, Caller
 from lightpage.runtime.service.dataplane import DataPlane
-from lightpage.runtime.service.jobs.recalibrator import Recalibrator
+from lightpage.runtime.service.jobs.kept_pages import KeptPages
+from lightpage.runtime.service.jobs.recalibrator import PagesToUse, Recalibrator
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.table import Rule, Seconds, SettingsTable, Text
 
@@ -45,8 +46,8 @@ class SelfCalibrationSettings(SettingsTable):
     pages: tuple[Annotated[int, Field(ge=0, le=2**32 - 1)], ...] = Field(
         (),
         strict=False,
-        description="Number of a page of the source whose symbols are known; repeat it. Without, the next two pages "
-        "serve.",
+        description="Number of a page of the source whose symbols are known; repeat it. Without, the last pages that "
+        "were read serve, or those that were lost, or the next two.",
     )
     least_s: Seconds = 60.0
     """Shortest time between two recalibrations: a device that drifts faster needs a mechanic."""
@@ -81,6 +82,7 @@ class SelfCalibration:
         recalibrator: of the service.
         settings: when and with what.
         clock: by which it waits.
+        kept: the last pages of the device; None where none are kept.
     """
 
     def __init__(
@@ -90,8 +92,9 @@ class SelfCalibration:
         recalibrator: Recalibrator,
         settings: SelfCalibrationSettings | None = None,
         clock: Clock = SYSTEM,
+        kept: KeptPages | None = None,
     ) -> None:
-        self._plane, self._monitor, self._recalibrator = plane, monitor, recalibrator
+        self._plane, self._monitor, self._recalibrator, self._kept = plane, monitor, recalibrator, kept
         self._settings, self._clock = settings or SelfCalibrationSettings(), clock
         _check_pages(plane, self._settings.pages)
         self._interval_s, self._not_before = self._settings.least_s, -float("inf")
@@ -146,9 +149,8 @@ class SelfCalibration:
         self._pinned = False
         reasons = "; ".join(self._monitor.state().reasons) or "the monitor says so"
         _log.info("self-calibration: begins, since %s", reasons)
-        pages = self._settings.pages
         try:
-            *_, outcome = self._recalibrator.from_source(len(pages) or MIN_PAGES, pages, self._caller)
+            *_, outcome = self._recalibrator.follow(self._pages(), self._caller)
         except (CallerLeft, StoppingError):
             _log.info("self-calibration: dropped, the service stops")
             self._wait(self._settings.busy_s)
@@ -159,6 +161,8 @@ class SelfCalibration:
             self._back_off(error)
         else:
             assert isinstance(outcome, RecalibrationOutcome)  # the last thing that it tells
+            if self._kept is not None:
+                self._kept.clear()
             cured = outcome.air_after - outcome.air_before >= WORTH_BITS
             least_s, longest_s = self._settings.least_s, self._settings.longest_s
             self._interval_s = least_s if cured else min(2 * self._interval_s, longest_s)
@@ -170,6 +174,16 @@ class SelfCalibration:
                 outcome.air_after,
                 outcome.air_before,
             )
+
+    def _pages(self) -> PagesToUse:
+        """What to recalibrate with: pages that are named, or else those that are kept, or else the source's next ones.
+
+        Raises:
+            SourceError: there is none of them.
+        """
+        named = self._settings.pages
+        kept = self._recalibrator.kept_pages(self._kept) if self._kept is not None and not named else None
+        return kept or self._recalibrator.source_pages(len(named) or MIN_PAGES, named)
 
     def _back_off(self, error: Exception) -> None:
         self._interval_s = min(2 * self._interval_s, self._settings.longest_s)

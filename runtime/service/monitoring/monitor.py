@@ -31,7 +31,7 @@ _MAD_DEVIATIONS = 1.4826
 _MEDIAN_ERROR = 1.25
 """Standard error of a median of many normal values over that of their mean."""
 
-_OPTICAL = (Reason.PILOTS_DISAGREE, Reason.IMAGE_NOT_FOUND, Reason.TOO_FEW_PILOTS, Reason.UNSPECIFIED)
+SHOWS_DEVICE = (Reason.PILOTS_DISAGREE, Reason.IMAGE_NOT_FOUND, Reason.TOO_FEW_PILOTS, Reason.UNSPECIFIED)
 """Losses that say something of the device's calibration, frames that contradict each other among them; a lost shot does
 not."""
 
@@ -245,7 +245,7 @@ class PageFigures:
 
     def of(self, observation: Observation) -> dict[str, float]:
         """What a page says of the device; empty where it says nothing."""
-        if observation.lost is not None and not (observation.tells and observation.lost in _OPTICAL):
+        if observation.lost is not None and not (observation.tells and observation.lost in SHOWS_DEVICE):
             return {}
         data, page = observation.user_data, observation.page
         unreadable = data is not None and data.loss in _UNREADABLE

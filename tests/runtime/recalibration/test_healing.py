@@ -1,6 +1,7 @@
 """Pages of user data that a drifted device's model does not read, and no page that anybody knows."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +10,18 @@ from click.testing import CliRunner
 
 from lightpage.cli.simulate import simulate
 from lightpage.codec.code import Code
-from lightpage.errors import RecalibrationRefusedError
+from lightpage.errors import Reason, RecalibrationRefusedError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
 from lightpage.runtime.commands.archives.encode import encode
 from lightpage.runtime.commands.archives.recover import recover
+from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.recalibration.healing import LostPages, heal
+from lightpage.runtime.recalibration.healing import LostPages, heal, recalibrate_by_lost
+from lightpage.runtime.recalibration.known_pages import KnownPages
+from lightpage.runtime.recalibration.refit import refit
+from lightpage.runtime.service.jobs.kept_pages import KeptPages
+from lightpage.runtime.service.monitoring.observation import Observation
 
 CODE = Code(levels=16, coded_bits=2, rate_per_mille=400, corrections=2)
 CONTENT = bytes(range(250)) * 3
@@ -48,6 +54,34 @@ def test_a_file_that_no_page_gave_comes_back_by_itself(small_bundle: Path, drift
     assert figures["pages_healed"] == figures["pages"] == 3
     assert {page["healed_rounds"] for page in figures["page_results"]} <= {1, 2, 3}
     assert "recorded pages 0-2, in " in told
+
+
+def test_a_service_recalibrates_by_the_pages_that_it_keeps(small_bundle: Path, drifted: Path, tmp_path: Path) -> None:
+    bundle = Bundle.open(small_bundle)
+    manifest = bundle.manifest.model_copy(update={"code": CODE.to_toml()})
+    decoder, kept = Decoder(replace(bundle, manifest=manifest), threads=1), KeptPages(most_bytes=1 << 30)
+    assert kept.pages(decoder, (0.0, 0.0)) is None
+    with Recording.open(drifted / "R.h5") as recording:
+        pairs = [recording.frames(page) for page in range(recording.pages)]
+        symbols = [recording.symbols(page) for page in range(recording.pages)]
+    for pair in pairs:
+        shown = Observation("page", 0, "small-1", 0.0, 0.1, Reason.PILOTS_DISAGREE, pair=pair)
+        kept.observe(replace(shown, of_device=False))
+        kept.observe(shown)
+    lost = kept.pages(decoder, (0.0, 0.0))
+    assert isinstance(lost, LostPages)
+    assert len(lost.pairs) == len(pairs)
+    out = tmp_path / "healed.zip"
+    outcome = recalibrate_by_lost(decoder, lost, out, "small-1+r1", refit, lambda what, share: None)
+    assert outcome.air_before < outcome.air_after - 0.5
+    assert outcome.report.angle_deg == pytest.approx(-0.4, abs=0.01)
+    healed = Decoder.load(out, threads=1)
+    for pair in pairs:
+        page = healed.post_process(healed.infer(pair), CODE.levels, healed.written_pilots(CODE.levels))
+        kept.observe(Observation("page", 0, "small-1+r1", 0.0, 0.1, pair=pair, page=page))
+    known = kept.pages(healed, (0.0, 0.0))
+    assert isinstance(known, KnownPages)
+    np.testing.assert_array_equal(known.symbols[0], symbols[-1])
 
 
 def test_frames_that_do_not_show_the_device_are_refused_before_anything_is_fitted(

@@ -1,0 +1,94 @@
+"""Keeps the last pages of the device, to recalibrate by: no page need be shown for that whose symbols are known."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.codec.page_bytes import Loss, PageBytes
+from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.recalibration.healing import TOGETHER, LostPages
+from lightpage.runtime.recalibration.known_pages import MIN_PAGES, KnownPages
+from lightpage.runtime.service.monitoring.monitor import SHOWS_DEVICE
+from lightpage.runtime.service.monitoring.observation import Observation
+
+_KEPT = TOGETHER + 2
+"""Pages at most, the last ones."""
+
+_USED = 3
+"""Pages that were read of which a recalibration takes the last ones: one to fit, two to judge by."""
+
+
+class KeptPages:
+    """The frames of the last pages of the service's own device that say something of it, an `Observer`.
+
+    Pages that were read are known: encoded again, their bytes give their symbols. What is kept of a page is its frames
+    and what was decoded, some 2 MB of a bench device and 50 MB of a full-size one.
+
+    Args:
+        most_bytes: of all frames; older ones go first.
+    """
+
+    def __init__(self, most_bytes: int) -> None:
+        self._most_bytes, self._lock = most_bytes, threading.Lock()
+        self._pages: deque[Observation] = deque(maxlen=_KEPT)
+
+    def observe(self, observation: Observation) -> None:
+        """See `Observer`."""
+        pair, lost = observation.pair, observation.lost
+        says_nothing = lost is not None and not (observation.tells and lost in SHOWS_DEVICE)
+        if not observation.of_device or pair is None or says_nothing:
+            return
+        own = FramePair(pair.in_phase.copy(), pair.quadrature.copy())  # the caller's memory may be used again
+        kept = Observation(**{**vars(observation), "pair": own})
+        with self._lock:
+            self._pages.append(kept)
+            while len(self._pages) > 1 and sum(map(_bytes, self._pages)) > self._most_bytes:
+                self._pages.popleft()
+
+    def clear(self) -> None:
+        """Forget all of them: another model has been fitted by them."""
+        with self._lock:
+            self._pages.clear()
+
+    def pages(self, decoder: Decoder, image_px: tuple[float, float]) -> KnownPages | LostPages | None:
+        """What to recalibrate by: the last pages that were read, or else those that were lost; None if there are none.
+
+        Args:
+            decoder: in service.
+            image_px: where its image was last seen.
+        """
+        if (code := decoder.bundle.code) is None:
+            return None
+        with self._lock:
+            kept = [*self._pages]
+        pilots, codec = decoder.bundle.written_pilots(code.levels), decoder.page_codec
+        known, lost = list[tuple[FramePair, NDArray[np.uint8]]](), list[FramePair]()
+        for one in reversed(kept):
+            found, pair = _found(one, decoder), one.pair
+            assert pair is not None
+            if found is not None and found.loss is None:
+                known.append((pair, codec.encode_again(found, pilots)))
+            elif found is None or found.loss is not Loss.CODE:
+                lost.append(pair)
+        if len(known) >= MIN_PAGES:
+            pairs, symbols = zip(*known[:_USED], strict=True)
+            return KnownPages(pairs, symbols, code.levels, None, decoder.bundle.pilot_mask, image_px)
+        if not lost:
+            return None
+        return LostPages(tuple(lost[:TOGETHER]), code, image_px=image_px)
+
+
+def _found(kept: Observation, decoder: Decoder) -> PageBytes | None:
+    """The bytes of a page, read now where nobody asked for them; None of one that its pilots did not confirm."""
+    if kept.user_data is not None or kept.lost is not None or kept.page is None:
+        return kept.user_data
+    return decoder.page_codec.decode(kept.page.phase, kept.page.concentration)
+
+
+def _bytes(kept: Observation) -> int:
+    return 0 if kept.pair is None else kept.pair.in_phase.nbytes + kept.pair.quadrature.nbytes
