@@ -5,9 +5,9 @@
     python -m analysis.comparison.imperfections --set slm.stroke_relative_error=-0.03 --out runs/stroke
 
 Every device is recorded and calibrated from nominal. Decoder and oracle are the methods wave and oracle of
-`analysis.comparison.decoders`, with the same network, steps and pages. Interrupted, it goes on where it was; all lies
-in --out. The oracle's equations are linear: where cameras stand some 1.5 rad apart, they miss one of two numbers on a
-ring of the facet (`train/models/apart.py`), and it reads less than the decoder.
+`analysis.comparison.decoders`, with the network of the preset `standard`, the same steps and pages. Interrupted, it
+goes on where it was; all lies in --out. The oracle's equations are linear: where cameras stand some 1.5 rad apart, they
+miss one of two numbers on a ring of the facet (`train/models/apart.py`), and it reads less than the decoder.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from lightpage.device.state import Device
 from lightpage.files import write_json
 from lightpage.train.fitting.memory import keep_freed_memory
 from lightpage.train.models.decoder import WAVE
-from lightpage.train.models.hyperparameters import Hyperparameters
+from lightpage.train.models.presets import PRESETS, STANDARD
 from lightpage.train.runs import sole_writer
 
 
@@ -109,7 +109,7 @@ def measured(name: str, settings: list[str], profile: Profile, pages: int, steps
             validation=range(last - _VALIDATED, last),
             unseen=range(last, pages),
         )
-        choices = Hyperparameters(steps=steps)
+        choices = replace(PRESETS[STANDARD].choices, steps=steps)
         size = f"{choices.channels}x{choices.blocks}x{choices.depth}"
         decoder, oracle = (symbol_method(bench, method, size, choices) for method in (WAVE, ORACLE))
         off_deg = bench.fitted.angle_deg(profile) - device.geometry.pipe_angle_deg

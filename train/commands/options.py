@@ -121,9 +121,17 @@ CHOICES = (
         of_preset=True,
     ),
     Choice(
+        "--reflections",
+        click.IntRange(min=0, max=20),
+        "Rounds of averaged reflections to the field; with 0, --field-rounds of descent.",
+        PRESETS[ACCURATE].choices.reflections,
+        localizers=LOCALIZERS,
+        of_preset=True,
+    ),
+    Choice(
         "--field-rounds",
         click.IntRange(min=0, max=20),
-        "Of descent to the field: fewer are faster, and lose most where the light is bright.",
+        "Of descent to the field, with --reflections 0: fewer are faster, and lose most where the light is bright.",
         localizers=LOCALIZERS,
         of_preset=True,
     ),

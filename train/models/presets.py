@@ -8,6 +8,9 @@ from lightpage.train.models.decoder import COHERENT, WAVE
 from lightpage.train.models.hyperparameters import Hyperparameters
 from lightpage.train.models.localizers.coherent import BILINEAR
 
+REFLECTIONS = 4
+"""Rounds to the field: as quick as six of descent, and a decoder by waves reads 0.19 bit more; 6 and 14 rounds bring
+0.02 more."""
 FAST, STANDARD, ACCURATE = "fast", "standard", "accurate"
 
 
@@ -29,8 +32,8 @@ PRESETS = {
         COHERENT,
         Hyperparameters(channels=48, field_rounds=0, binning=2, field_step=3, samples=3, interpolation=BILINEAR),
     ),
-    STANDARD: Preset(WAVE, Hyperparameters()),
-    ACCURATE: Preset(COHERENT, Hyperparameters(refinements=1)),
+    STANDARD: Preset(WAVE, Hyperparameters(reflections=REFLECTIONS)),
+    ACCURATE: Preset(COHERENT, Hyperparameters(reflections=REFLECTIONS, refinements=1)),
 }
 """One quick pass, one pass, two passes.
 

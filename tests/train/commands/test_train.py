@@ -28,7 +28,7 @@ from lightpage.train.fitting.curves import curves_of
 from lightpage.train.fitting.modules import SymbolTraining
 from lightpage.train.fitting.provenance import provenance_of
 from lightpage.train.models.hyperparameters import Hyperparameters
-from lightpage.train.models.presets import PRESETS
+from lightpage.train.models.presets import PRESETS, REFLECTIONS
 from lightpage.train.published.training import PublishedChoices
 from lightpage.train.runs import FORMAT, begin, check_begun, load_run, sole_writer
 from lightpage.train.trainers.whole_run import own_pilots
@@ -70,12 +70,14 @@ def options(*words: str) -> tuple[str, Any]:
 
 
 def test_a_preset_is_what_it_says_and_single_options_change_it() -> None:
-    assert options() == ("coherent", PRESETS["accurate"].choices) == ("coherent", Hyperparameters(refinements=1))
-    assert options("--preset", "standard") == ("wave", Hyperparameters())
-    assert options("--preset", "standard", "--localizer", "coherent") == ("coherent", Hyperparameters())
+    plain = Hyperparameters(reflections=REFLECTIONS)
+    assert options() == ("coherent", PRESETS["accurate"].choices) == ("coherent", replace(plain, refinements=1))
+    assert options("--preset", "standard") == ("wave", plain)
+    assert options("--preset", "standard", "--localizer", "coherent") == ("coherent", plain)
     assert options("--preset", "fast", "--channels", "8") == ("coherent", replace(PRESETS["fast"].choices, channels=8))
     assert options("--depth", "2")[1].depth == 2
-    assert options("--field-rounds", "0") == ("coherent", Hyperparameters(refinements=1, field_rounds=0))
+    by_descent = options("--reflections", "0", "--field-rounds", "0")
+    assert by_descent == ("coherent", Hyperparameters(refinements=1, field_rounds=0))
     assert options("--localizer", "ray", "--channels", "8")[1] == PublishedChoices(channels=(8, 16))
 
 

@@ -18,6 +18,7 @@ from lightpage.simulator.cameras import resample
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import TrueOptics, true_parameters
 from lightpage.train.models.field import ROUNDS, FieldRecovery, TorchFieldSolver
+from lightpage.train.models.presets import REFLECTIONS
 from lightpage.waves.grid import field_grid
 from tests.lightpage.small import small_profile
 
@@ -138,6 +139,14 @@ class TestAccuracy:
         dim, grid = record(full_well_e=32), field_grid(PROFILE, step_px)
         field = recovered(dim, FieldRecovery(PROFILE, rounds=rounds, binning=binning, grid=grid))
         assert error_db(field, dim.truth) == pytest.approx(expected_db, abs=0.5)
+
+    @pytest.mark.parametrize(("full_well_e", "expected_db"), [(15_000, -29.0), (32, -12.2)])
+    def test_reflections_come_as_near_as_descent(
+        self, full_well_e: float, expected_db: float, recorded: Recorded
+    ) -> None:
+        page = recorded if full_well_e > 1000 else record(full_well_e=full_well_e)
+        found = error_db(recovered(page, FieldRecovery(PROFILE, reflections=REFLECTIONS)), page.truth)
+        assert found == pytest.approx(expected_db, abs=0.5)
 
     @pytest.mark.parametrize(
         ("full_well_e", "step_px", "expected_db"), [(15_000, 2, -25.6), (15_000, 3, -15.6), (32, 2, -9.0)]
