@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -31,21 +30,13 @@ from lightpage.page.symbols import symbol_phases
 from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import hash_frames
-from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_drift import BundleSearch
 from lightpage.runtime.model.decoding.image_position import ImagePosition
 from lightpage.runtime.model.decoding.page import Inference
-from lightpage.runtime.model.decoding.tracking import Tracker
 from lightpage.runtime.model.execution.twin import OnnxTwin
-from lightpage.runtime.recalibration.known_pages import MIN_PAGES, KnownPages
-from lightpage.runtime.recalibration.recalibration import (
-    RecalibrationOutcome,
-    Refit,
-    RefitResult,
-    recalibrate,
-    refitted_bundle,
-)
+from lightpage.runtime.recalibration.known_pages import KnownPages
+from lightpage.runtime.recalibration.recalibration import Refit, RefitResult, refitted_bundle
 from lightpage.runtime.recalibration.refit import refit, traced
 
 TOGETHER = 6
@@ -58,8 +49,6 @@ _AROUND_PX = np.array([(x, y) for x in (-20.0, 0.0, 20.0) for y in (-20.0, 0.0, 
 """Where the image is looked for, beside where it was last seen: it is found within some thirty pixels."""
 
 
-_HEALING_SHARE = 0.8
-"""Of the time that a recalibration by lost pages takes, judging and writing the rest."""
 _WANTED = "pages of this device that its drift, and nothing else, keeps from being read"
 
 
@@ -136,39 +125,6 @@ def heal(
         model = max(by_known, model, key=work.count)
         known = work.known(model) or known
     return Healed(model.decoder, model.result, known, rounds, time.perf_counter() - start)
-
-
-def recalibrate_by_lost(
-    decoder: Decoder,
-    pages: LostPages,
-    out: Path,
-    version: str,
-    fit: Refit,
-    progress: Progress,
-    tracker: Tracker | None = None,
-) -> RecalibrationOutcome:
-    """Heal a model, and write it as a new bundle, judged by pages that came right and were not fitted on.
-
-    Args:
-        pages: that the model does not read.
-        decoder, out, version, fit, progress, tracker: as for `recalibrate`.
-
-    Raises:
-        RecalibrationRefusedError: fewer than two pages came right, or as `heal` and `recalibrate` raise.
-        BundleError: as they raise.
-    """
-    healed = heal(decoder, pages, lambda what, share: progress(what, _HEALING_SHARE * share), fit)
-    if (count := len(healed.known.pairs)) < MIN_PAGES:
-        got = f"{count} page that came right after {healed.rounds} rounds"
-        raise RecalibrationRefusedError("healing", got, f"at least {MIN_PAGES}: one to fit, one to judge by")
-
-    def judging(what: str, share: float) -> None:
-        progress(what, _HEALING_SHARE + (1 - _HEALING_SHARE) * share)
-
-    def fitted(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decoder) -> RefitResult:
-        return healed.result
-
-    return recalibrate(decoder, healed.known, out, version, fitted, judging, tracker)
 
 
 class _Model(NamedTuple):

@@ -16,7 +16,8 @@ from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.decoding.tracking import NoTracker, TrackerMemory
-from lightpage.runtime.recalibration.healing import LostPages, recalibrate_by_lost
+from lightpage.runtime.recalibration.healed_bundle import recalibrate_by_lost
+from lightpage.runtime.recalibration.healing import LostPages
 from lightpage.runtime.recalibration.known_pages import KnownPages
 from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome, Refit, recalibrate
 from lightpage.runtime.recalibration.refit import refit

@@ -33,7 +33,8 @@ from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.device.acquisition.source import FrameSource, own_fault
 from lightpage.runtime.model.bundle.archive import check_name
 from lightpage.runtime.model.bundle.bundle import Bundle
-from lightpage.runtime.recalibration.healing import LostPages, recalibrate_by_lost
+from lightpage.runtime.recalibration.healed_bundle import recalibrate_by_lost
+from lightpage.runtime.recalibration.healing import LostPages
 from lightpage.runtime.recalibration.known_pages import KnownPages, read_recorded
 from lightpage.runtime.recalibration.recalibration import (
     RecalibrationOutcome,

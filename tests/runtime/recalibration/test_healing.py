@@ -17,7 +17,8 @@ from lightpage.runtime.commands.archives.encode import encode
 from lightpage.runtime.commands.archives.recover import recover
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.recalibration.healing import LostPages, heal, recalibrate_by_lost
+from lightpage.runtime.recalibration.healed_bundle import recalibrate_by_lost
+from lightpage.runtime.recalibration.healing import LostPages, heal
 from lightpage.runtime.recalibration.known_pages import KnownPages
 from lightpage.runtime.recalibration.refit import refit
 from lightpage.runtime.service.jobs.kept_pages import KeptPages
