@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from lightpage.errors import RecalibrationRefusedError
@@ -47,4 +48,5 @@ def recalibrate_by_lost(
     def fitted(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decoder) -> RefitResult:
         return healed.result
 
-    return recalibrate(decoder, healed.known, out, version, fitted, judging, tracker)
+    outcome = recalibrate(decoder, healed.known, out, version, fitted, judging, tracker)
+    return replace(outcome, seconds=outcome.seconds + healed.seconds)
