@@ -66,12 +66,12 @@ def wrong_fits(profile: Profile, seed: int) -> Iterator[tuple[str, Taken]]:
     right, rng = taken(profile, seed), np.random.default_rng(seed)
     lens, pipe = profile.lens, profile.pipe
     longer = {
-        "lens": lens.model_copy(update={"focal_length_m": 1.06 * lens.focal_length_m}),
-        "pipe": pipe.model_copy(update={"length_m": 1.06 * pipe.length_m}),
+        "lens": lens.model_copy(update={"focal_length_m": 1.2 * lens.focal_length_m}),
+        "pipe": pipe.model_copy(update={"length_m": 1.2 * pipe.length_m}),
     }
     for part, changed in longer.items():
         yield (
-            f"profile of another device: {part} 6% longer",
+            f"profile of another device: {part} a fifth longer",
             replace(right, profile=profile.model_copy(update={part: changed})),
         )
 

@@ -1,17 +1,23 @@
-"""Recalibrates by pages that a model has lost: heals it, and writes what was found as a bundle."""
+"""Recalibrates by pages that a model has lost, or by recorded ones: heals it, and writes what was found as a bundle."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
+from lightpage.calibration.known_pages import first_lit_pages, lit_pages
+from lightpage.codec.code import Code
 from lightpage.errors import RecalibrationRefusedError
-from lightpage.progress import Progress
+from lightpage.progress import Progress, warn
+from lightpage.recording.layout import narrow
+from lightpage.recording.reader import Recording
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.tracking import Tracker
-from lightpage.runtime.recalibration.healing import LostPages, heal
-from lightpage.runtime.recalibration.known_pages import MIN_PAGES, KnownPages
+from lightpage.runtime.recalibration.healing import TOGETHER, LostPages, heal
+from lightpage.runtime.recalibration.known_pages import MIN_PAGES, KnownPages, read_recorded
 from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome, Refit, RefitResult, recalibrate
 
 _HEALING_SHARE = 0.8
@@ -50,3 +56,35 @@ def recalibrate_by_lost(
 
     outcome = recalibrate(decoder, healed.known, out, version, fitted, judging, tracker)
     return replace(outcome, seconds=outcome.seconds + healed.seconds)
+
+
+def recalibrate_by_recording(
+    decoder: Decoder,
+    recording: Recording,
+    count: int,
+    code: Callable[[], Code],
+    out: Path,
+    version: str,
+    fit: Refit,
+    progress: Progress,
+) -> RecalibrationOutcome:
+    """Recalibrate by the first recorded pages that show light.
+
+    Args:
+        recording: of pages with their symbols, or else of user data.
+        count: pages with symbols that are taken; of others at most `TOGETHER`.
+        code: gives that of user data.
+        decoder, out, version, fit, progress: as for `recalibrate`.
+
+    Raises:
+        RecordingError: unreadable.
+        RecalibrationRefusedError, BundleError, FrameError, InvalidInputError, PageError: as `recalibrate` and
+            `recalibrate_by_lost` raise, or `code`.
+    """
+    if recording.has_symbols:
+        known = read_recorded(recording, first_lit_pages(recording, count, warn))
+        return recalibrate(decoder, known, out, version, fit, progress)
+    own, bits = code(), recording.bit_depth
+    pairs = tuple(narrow(frames, bits) for _, frames in islice(lit_pages(recording, warn), TOGETHER))
+    lost = LostPages(pairs, own, references=narrow(recording.references(), bits))
+    return recalibrate_by_lost(decoder, lost, out, version, fit, progress)

@@ -5,19 +5,20 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
-from lightpage.calibration.known_pages import first_lit_pages
 from lightpage.errors import CalibrationError, FrameError, InvalidInputError, RecalibrationRefusedError
-from lightpage.progress import State, reporting, warn
+from lightpage.progress import State, reporting
 from lightpage.recording.reader import Recording
+from lightpage.runtime.archives.recordings.recovery import code_of
 from lightpage.runtime.archives.run.shard import BUNDLE, LOG, TRAINING, Findings, PageRecord, PageState, with_end
 from lightpage.runtime.archives.run.task import Step, Task
 from lightpage.runtime.archives.workers.fine_tuning import DeepRecalibration
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.recalibration.known_pages import read_recorded
-from lightpage.runtime.recalibration.recalibration import Refit, next_version, recalibrate
+from lightpage.runtime.recalibration.healed_bundle import recalibrate_by_recording
+from lightpage.runtime.recalibration.recalibration import Refit, next_version
 
 T = TypeVar("T")
 
@@ -57,8 +58,8 @@ def recalibrated(
     out.unlink(missing_ok=True)  # of a worker that was killed before it wrote the record
     try:
         if tuning is None:
-            known = read_recorded(recording, first_lit_pages(recording, pages, warn))
-            outcome = recalibrate(decoder, known, out, next_version(decoder.version), fit, lambda *_: None)
+            code, version = partial(code_of, recording, decoder.bundle), next_version(decoder.version)
+            outcome = recalibrate_by_recording(decoder, recording, pages, code, out, version, fit, lambda *_: None)
         else:
             if task.run is None:
                 expected = "the training run that its bundle was made from"

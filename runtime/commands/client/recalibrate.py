@@ -18,6 +18,7 @@ from lightpage.files import write_json
 from lightpage.progress import Progress, warn
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.evaluation import check_recording
+from lightpage.runtime.archives.recordings.recovery import code_of
 from lightpage.runtime.client.answers import JobInfo, Recalibrated
 from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.client.jobs import RECALIBRATION_S
@@ -27,9 +28,9 @@ from lightpage.runtime.commands.client.connection import TARGET, with_tls
 from lightpage.runtime.model.bundle.manifest import check_version
 from lightpage.runtime.model.bundle.shipped import bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.recalibration.healed_bundle import recalibrate_by_recording
 from lightpage.runtime.recalibration.known_pages import read_recorded
 from lightpage.runtime.recalibration.recalibration import next_version
-from lightpage.runtime.recalibration.recalibration import recalibrate as recalibrate_bundle
 from lightpage.runtime.recalibration.refit import refit
 from lightpage.runtime.service.jobs.messages import result_message
 
@@ -75,9 +76,11 @@ def recalibrate(
     Less is what exceeds the standard error of the comparison on pages that were not fitted to. Where nothing has
     drifted, it is kept only if it reads more by twice that.
 
-    Offline with --bundle, --recording and --out; over the endpoint with --target, from the service's source or, with
-    --recording, from a file in its recordings folder, or with --send from a file here. The recalibration of a service
-    ends with this command, unless it is told to --detach; `lightpage jobs` then tells how it goes.
+    Offline with --bundle, --recording and --out. A recording without symbols serves too, where its pages are of user
+    data: pilots, decisions and the pages' checksums then show the geometry. Over the endpoint with --target, from the
+    service's source or, with --recording, from a file in its recordings folder, or with --send from a file here. The
+    recalibration of a service ends with this command, unless it is told to --detach; `lightpage jobs` then tells how it
+    goes.
     """
     start = time.perf_counter()
     if target is not None:
@@ -175,12 +178,11 @@ def _offline(bundle: str, recording: str, out: Path, pages: int, version: str | 
     if version is not None:
         check_version(version, "--version")
     decoder = Decoder.load(bundle_path(bundle))
-    with percent_bar() as progress:
-        with Recording.open(recording) as file:
-            check_recording(decoder, file)
-            known = read_recorded(file, first_lit_pages(file, pages, warn))
+    with percent_bar() as progress, Recording.open(recording) as file:
+        check_recording(decoder, file)
         new = next_version(decoder.version) if version is None else version
-        outcome = recalibrate_bundle(decoder, known, out, new, refit, progress)
+        code = partial(code_of, file, decoder.bundle)
+        outcome = recalibrate_by_recording(decoder, file, pages, code, out, new, refit, progress)
     return answer_of(Recalibrated, result_message(outcome))
 
 
