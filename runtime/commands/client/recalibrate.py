@@ -181,8 +181,9 @@ def _offline(bundle: str, recording: str, out: Path, pages: int, version: str | 
     with percent_bar() as progress, Recording.open(recording) as file:
         check_recording(decoder, file)
         new = next_version(decoder.version) if version is None else version
-        code = partial(code_of, file, decoder.bundle)
-        outcome = recalibrate_by_recording(decoder, file, pages, code, out, new, refit, progress)
+        outcome = recalibrate_by_recording(
+            decoder, file, pages, lambda: code_of(file, decoder.bundle), out, new, refit, progress
+        )
     return answer_of(Recalibrated, result_message(outcome))
 
 
