@@ -165,9 +165,6 @@ class DataPlane:
         self.received = ReceiveBudget(self.limits.receive_bytes)
         self.shared: SharedMemory | None = None
         """Memory that clients share with the service."""
-        self.heal: Callable[[Caller], bool] | None = None
-        """Heals the model by pages that it has lost, and says whether another one is in service; None where none does.
-        """
         self.heart = Heart(self.limits.decode_s, clock.now)
         self.decodes = Slots(self.limits.concurrent_decodes, "decodes", self.limits.deadline_s, clock)
         self.ranges = Slots(self.limits.concurrent_ranges, "ranges of pages", self.limits.deadline_s, clock)

@@ -101,22 +101,17 @@ class SelfCalibration:
         self._wake, self._stopping = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="lightpage-self-calibration", daemon=True)
         self._caller = Caller(actor=Actor("self-calibration"))
-        self._trying = threading.Lock()
-        """Held by whoever recalibrates."""
         self._pinned = False
         """Whether it was said that the model in service is pinned."""
         monitor.listen(self._wake.set)
 
     def __enter__(self) -> Self:
         self._thread.start()
-        if self._kept is not None:
-            self._plane.heal = self.heal
         return self
 
     def __exit__(self, *_: object) -> None:
         """Drop a recalibration that runs, and end the thread, which is waited for as calls are."""
         wait_s = self._plane.limits.grace_s
-        self._plane.heal = None
         self._stopping.set()
         self._caller.leave()
         self._wake.set()
@@ -134,26 +129,8 @@ class SelfCalibration:
 
     def look(self) -> None:
         """Recalibrate if the monitor says that it is due, and the last time was long enough ago."""
-        if self._monitor.due:
-            with self._trying:
-                self._try_once()
-
-    def heal(self, caller: Caller) -> bool:
-        """Recalibrate by the pages that are kept, without waiting for the monitor; whether another model is in service.
-
-        Args:
-            caller: waits for it. Where it leaves, the work goes on.
-        """
-        version = self._plane.models.current.version
-        if self._trying.acquire(timeout=max(0.0, min(caller.seconds_left(), threading.TIMEOUT_MAX))):
-            try:
-                model = self._plane.models.current
-                there = self._kept is not None and self._recalibrator.kept_pages(self._kept) is not None
-                if model.version == version and there:
-                    self._try_once()
-            finally:
-                self._trying.release()
-        return self._plane.models.current.version != version
+        if self._monitor.due and self._clock.now() >= self._not_before:
+            self._try_once()
 
     def _pause_s(self) -> float:
         """How long to sleep where nobody wakes: until it is looked again where a try is due, else for ever."""
@@ -161,9 +138,7 @@ class SelfCalibration:
         return min(left, self._settings.busy_s) if self._monitor.due else threading.TIMEOUT_MAX
 
     def _try_once(self) -> None:
-        """Recalibrate if the last time was long enough ago; not while the model in service is pinned."""
-        if self._clock.now() < self._not_before:
-            return
+        """Recalibrate, and decide when the next time may be; not while the model in service is pinned."""
         now = self._plane.models.now
         if now.state.known(now.current.version).pinned:
             if not self._pinned:

@@ -9,22 +9,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.codec.page_bytes import Header, Loss, PageBytes
+from lightpage.codec.page_bytes import Header, PageBytes
 from lightpage.codec.volume import Successor, Volume, restore_group
 from lightpage.errors import LightpageError, LostPageError, PageError, SourceError
 from lightpage.page.pilots import Pilots
 from lightpage.runtime.device.acquisition.source import FrameSource, Shot, own_fault
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import Answer, DataPlane, Seen, levels_for, observed
-from lightpage.runtime.service.monitoring.monitor import SHOWS_DEVICE
 from lightpage.runtime.service.stages import Stage, Stages
 
 GROUPS = 4
 """Groups whose pages are held: pages of a few files may take turns. A group of full-size pages is 40 MB."""
-
-
-_CURABLE = frozenset({Loss.HEADER, Loss.BODY, Loss.CHECKSUM})
-"""Losses of pages that were decoded, which a model that fits the device may mend."""
 
 
 @dataclass(frozen=True)
@@ -149,8 +144,6 @@ def read_data(
 ) -> Iterator[DataPage]:
     """Read pages `first` to `first + count - 1` of the source, or to its last one.
 
-    Where the service heals its model, lost pages come last: once more with the healed one, or as they are.
-
     Args:
         plane: reads and decodes.
         first, count: of the source's pages.
@@ -163,79 +156,38 @@ def read_data(
         PageError: there is no page `first`.
     """
     _ = plane.source, plane.models.current.decoder.page_codec  # they are there
-    volumes, successor, lost, again = _Groups(), Successor(), list[DataPage](), list[int]()
+    groups: dict[tuple[Volume, int], _Group] = {}
+    successor = Successor()
     for index in range(first, first + count):
+        stages = timed()
         try:
-            page = _data_page(plane, index, successor.header, caller, timed())
+            answer = read_page(
+                plane, index, None, caller, user_data=True, expected=successor.header, stages=stages
+            ).answer
+        except (LostPageError, SourceError) as error:
+            successor = successor.after()
+            stages.begin(Stage.RESPOND)
+            yield DataPage(index, None, error, stages=stages)
+            continue
         except PageError:
             if index == first:
                 raise
             break
-        yield from volumes.add(page)
-        if page.found is not None and (volume := Volume.of_page(page.found)) is not None:
-            successor = Successor(volume, page.found.header)
+        found = answer.user_data
+        assert found is not None  # it was asked for
+        volume = Volume.of_page(found)
+        if volume is not None and found.header is not None and found.data is not None:
+            key = volume, found.header.page // volume.group_pages
+            if key not in groups and len(groups) == GROUPS:
+                yield from groups.pop(next(iter(groups))).restored()
+            group = groups.pop(key, None) or _Group(*key, found, answer.model_version)
+            groups[key] = group  # the one used last is the last to go
+            group.last, group.model_version = found, answer.model_version
+            group.pages[found.header.page] = found.data
+            if len(group.pages) == len(volume.numbers_in(group.number)):
+                del groups[key]  # nothing is missing
+            successor = Successor(volume, found.header)
         successor = successor.after()
-        if plane.heal is not None and _curable(page):
-            lost.append(page)
-            again.append(index)
-        else:
-            yield page
-    if lost and plane.heal is not None and plane.heal(caller):
-        for index in again:
-            page = _data_page(plane, index, None, caller, timed())
-            yield from volumes.add(page)
-            yield page
-    else:
-        yield from lost
-    yield from volumes.restored()
-
-
-def _curable(page: DataPage) -> bool:
-    """Whether a model that fits the device may read a page that was not read."""
-    if page.found is not None:
-        return page.found.loss in _CURABLE
-    return isinstance(page.error, SourceError) or (
-        isinstance(page.error, LostPageError) and page.error.reason in SHOWS_DEVICE
-    )
-
-
-def _data_page(plane: DataPlane, index: int, expected: Header | None, caller: Caller, stages: Stages) -> DataPage:
-    """Read a page of a range.
-
-    Raises:
-        PageError: there is none.
-    """
-    try:
-        answer = read_page(plane, index, None, caller, user_data=True, expected=expected, stages=stages).answer
-    except (LostPageError, SourceError) as error:
-        stages.begin(Stage.RESPOND)
-        return DataPage(index, None, error, stages=stages)
-    return DataPage(index, answer.user_data, model_version=answer.model_version, stages=stages)
-
-
-class _Groups:
-    """The groups of the pages of a range."""
-
-    def __init__(self) -> None:
-        self._groups: dict[tuple[Volume, int], _Group] = {}
-
-    def add(self, page: DataPage) -> Iterator[DataPage]:
-        """Take in a page; yields those that are restored of a group that is let go of for it."""
-        found = page.found
-        volume = None if found is None else Volume.of_page(found)
-        if volume is None or found is None or found.header is None or found.data is None:
-            return
-        key = volume, found.header.page // volume.group_pages
-        if key not in self._groups and len(self._groups) == GROUPS:
-            yield from self._groups.pop(next(iter(self._groups))).restored()
-        group = self._groups.pop(key, None) or _Group(*key, found, page.model_version)
-        self._groups[key] = group  # the one used last is the last to go
-        group.last, group.model_version = found, page.model_version
-        group.pages[found.header.page] = found.data
-        if len(group.pages) == len(volume.numbers_in(group.number)):
-            del self._groups[key]  # nothing is missing
-
-    def restored(self) -> Iterator[DataPage]:
-        """Pages that are restored of all groups."""
-        for group in self._groups.values():
-            yield from group.restored()
+        yield DataPage(index, found, model_version=answer.model_version, stages=stages)
+    for group in groups.values():
+        yield from group.restored()

@@ -10,25 +10,19 @@ from click.testing import CliRunner
 
 from lightpage.cli.simulate import simulate
 from lightpage.codec.code import Code
-from lightpage.errors import RecalibrationRefusedError
+from lightpage.errors import Reason, RecalibrationRefusedError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
 from lightpage.runtime.commands.archives.encode import encode
 from lightpage.runtime.commands.archives.recover import recover
-from lightpage.runtime.device.acquisition.source import open_source
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.recalibration.healed_bundle import recalibrate_by_lost
 from lightpage.runtime.recalibration.healing import LostPages, heal
 from lightpage.runtime.recalibration.known_pages import KnownPages
 from lightpage.runtime.recalibration.refit import refit
-from lightpage.runtime.service.caller import Caller
-from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.kept_pages import KeptPages
-from lightpage.runtime.service.jobs.recalibrator import Recalibrator
-from lightpage.runtime.service.jobs.self_calibration import SelfCalibration
-from lightpage.runtime.service.models.models import Models
-from lightpage.runtime.service.monitoring.monitor import Monitor
-from lightpage.runtime.service.pages.reading import read_data
+from lightpage.runtime.service.monitoring.observation import Observation
 
 CODE = Code(levels=16, coded_bits=2, rate_per_mille=400, corrections=2)
 CONTENT = bytes(range(250)) * 3
@@ -63,24 +57,32 @@ def test_a_file_that_no_page_gave_comes_back_by_itself(small_bundle: Path, drift
     assert "recorded pages 0-2, in " in told
 
 
-def test_a_service_heals_itself_by_the_pages_that_it_has_lost(small_bundle: Path, drifted: Path) -> None:
-    bundle, kept, monitor = Bundle.open(small_bundle), KeptPages(most_bytes=1 << 30), Monitor()
+def test_a_service_recalibrates_by_the_pages_that_it_keeps(small_bundle: Path, drifted: Path, tmp_path: Path) -> None:
+    bundle = Bundle.open(small_bundle)
     manifest = bundle.manifest.model_copy(update={"code": CODE.to_toml()})
-    decoder = Decoder(replace(bundle, manifest=manifest), threads=1)
+    decoder, kept = Decoder(replace(bundle, manifest=manifest), threads=1), KeptPages(most_bytes=1 << 30)
     assert kept.pages(decoder, (0.0, 0.0)) is None
-    with open_source(f"recording:{drifted / 'R.h5'}") as source:
-        plane = DataPlane(Models(decoder), source, monitor=monitor, observers=[kept])
-        before = [*read_data(plane, 0, 3, Caller())]
-        assert not any(page.found and page.found.data for page in before)
-        assert isinstance(kept.pages(decoder, (0.0, 0.0)), LostPages)
-        with SelfCalibration(plane, monitor, Recalibrator(plane, refit), kept=kept):
-            pages = [*read_data(plane, 0, 3, Caller())]
-        assert b"".join(page.found.data for page in pages if page.found and page.found.data)[: len(CONTENT)] == CONTENT
-        assert {page.model_version for page in pages} == {"small-1+r1"}
-        known = kept.pages(plane.models.current.decoder, (0.0, 0.0))
-        assert isinstance(known, KnownPages)
-        np.testing.assert_array_equal(known.symbols[0], source.shot(1.0, 2).symbols)
-        assert not plane.heal
+    with Recording.open(drifted / "R.h5") as recording:
+        pairs = [recording.frames(page) for page in range(recording.pages)]
+        symbols = [recording.symbols(page) for page in range(recording.pages)]
+    for pair in pairs:
+        shown = Observation("page", 0, "small-1", 0.0, 0.1, Reason.PILOTS_DISAGREE, pair=pair)
+        kept.observe(replace(shown, of_device=False))
+        kept.observe(shown)
+    lost = kept.pages(decoder, (0.0, 0.0))
+    assert isinstance(lost, LostPages)
+    assert len(lost.pairs) == len(pairs)
+    out = tmp_path / "healed.zip"
+    outcome = recalibrate_by_lost(decoder, lost, out, "small-1+r1", refit, lambda what, share: None)
+    assert outcome.air_before < outcome.air_after - 0.5
+    assert outcome.report.angle_deg == pytest.approx(-0.4, abs=0.01)
+    healed = Decoder.load(out, threads=1)
+    for pair in pairs:
+        page = healed.post_process(healed.infer(pair), CODE.levels, healed.written_pilots(CODE.levels))
+        kept.observe(Observation("page", 0, "small-1+r1", 0.0, 0.1, pair=pair, page=page))
+    known = kept.pages(healed, (0.0, 0.0))
+    assert isinstance(known, KnownPages)
+    np.testing.assert_array_equal(known.symbols[0], symbols[-1])
 
 
 def test_frames_that_do_not_show_the_device_are_refused_before_anything_is_fitted(
