@@ -29,7 +29,7 @@ from lightpage.device.state import Device
 from lightpage.files import write_json
 from lightpage.train.fitting.memory import keep_freed_memory
 from lightpage.train.models.decoder import WAVE
-from lightpage.train.models.presets import PRESETS, STANDARD
+from lightpage.train.models.presets import PRESETS, REFLECTIONS, STANDARD
 from lightpage.train.runs import sole_writer
 
 
@@ -108,10 +108,12 @@ def measured(name: str, settings: list[str], profile: Profile, pages: int, steps
             training=range(last - _VALIDATED),
             validation=range(last - _VALIDATED, last),
             unseen=range(last, pages),
+            reflections=REFLECTIONS,
         )
         choices = replace(PRESETS[STANDARD].choices, steps=steps)
         size = f"{choices.channels}x{choices.blocks}x{choices.depth}"
-        decoder, oracle = (symbol_method(bench, method, size, choices) for method in (WAVE, ORACLE))
+        decoder = symbol_method(bench, WAVE, size, choices)
+        oracle = symbol_method(bench, ORACLE, size, replace(choices, reflections=0))  # its equations are linear
         off_deg = bench.fitted.angle_deg(profile) - device.geometry.pipe_angle_deg
     seconds = decoder.preparing_seconds + decoder.training_seconds
     return Row(name, settings, decoder.air, oracle.air, decoder.air / oracle.air, off_deg, seconds)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.polynomial.legendre import legvander2d
 from numpy.typing import NDArray
 
+from lightpage.errors import CalibrationError
 from lightpage.page import modulation as modulations
 from lightpage.page.modulation import Modulation
 
@@ -65,7 +66,12 @@ def common_error(
         mask: where the pilots are, bool [ny, nx].
         written: nominal phases of the pilots, radians, one a True in `mask` in row order.
         modulation: as it was calibrated.
+
+    Raises:
+        CalibrationError: phases or claims that are not finite.
     """
+    if not (np.isfinite(phases).all() and np.isfinite(concentrations).all()):
+        raise CalibrationError("pilots", "NaN or infinity", "finite phases and concentrations")
     pages, (ny, nx) = len(phases), mask.shape
     smooth, order = _polynomials(ny, nx)
     levels = modulations.basis(written).T

@@ -72,7 +72,7 @@ def recalibrate_by_recording(
 
     Args:
         recording: of pages with their symbols, or else of user data.
-        count: pages with symbols that are taken; of others at most `TOGETHER`.
+        count: pages with symbols that are taken; of others `TOGETHER` are.
         code: gives that of user data.
         decoder, out, version, fit, progress: as for `recalibrate`.
 

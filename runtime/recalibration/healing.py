@@ -24,7 +24,14 @@ from lightpage.calibration.sampling_table import moved_cameras
 from lightpage.codec.code import Code
 from lightpage.codec.page_bytes import Header, PageBytes
 from lightpage.codec.page_codec import PageCodec
-from lightpage.errors import CalibrationError, FrameError, RecalibrationRefusedError, raised_as
+from lightpage.errors import (
+    CalibrationError,
+    FrameError,
+    InvalidInputError,
+    PageError,
+    RecalibrationRefusedError,
+    raised_as,
+)
 from lightpage.page.pilots import LEAST_CONFIRMED_NATS, Pilots, read_pilots
 from lightpage.page.symbols import symbol_phases
 from lightpage.progress import Progress
@@ -50,6 +57,7 @@ _AROUND_PX = np.array([(x, y) for x in (-20.0, 0.0, 20.0) for y in (-20.0, 0.0, 
 
 
 _WANTED = "pages of this device that its drift, and nothing else, keeps from being read"
+"""What a healing is for."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +86,7 @@ class Healed:
     Attributes:
         decoder: of the re-fitted bundle, which lies in memory.
         result: what was re-fitted.
-        known: pages that came right, with their symbols.
+        known: pages that came right by decisions, with their symbols; the first one was fitted.
         rounds: of fits to decisions; 0 where only the image had moved.
         seconds: that it took.
     """
@@ -107,23 +115,28 @@ def heal(
         twin: of the bundle's profile; the bundle's own if left out.
 
     Raises:
-        RecalibrationRefusedError: the frames do not show this device, or no page came right.
-        BundleError: the bundle holds a geometry that cannot be fitted.
+        RecalibrationRefusedError: the frames do not show this device, no page came right, or the bundle has no
+            calibration to start from.
+        BundleError: the bundle holds a geometry that cannot be fitted, or no graph that shows the field.
     """
     start = time.perf_counter()
-    work = _Healing(decoder, pages, OnnxTwin(decoder.bundle) if twin is None else twin)
-    with raised_as(RecalibrationRefusedError, CalibrationError, FrameError):
+    with raised_as(RecalibrationRefusedError, CalibrationError, FrameError, InvalidInputError, PageError):
+        work = _Healing(decoder, pages, OnnxTwin(decoder.bundle) if twin is None else twin)
         model, rounds = work.model, 0
         while (known := work.known(model)) is None:
             if rounds == MOST_ROUNDS:
                 raise RecalibrationRefusedError("healing", work.unread(model), _WANTED)
             rounds += 1
             model = work.fitted(model, partial(_within, progress, rounds))
+    try:
         result = fit(decoder.bundle, known.part(slice(1)), partial(_within, progress, MOST_ROUNDS + 1), decoder)
+    except CalibrationError as error:
+        if not rounds:
+            raise RecalibrationRefusedError(error.subject, error.got, error.expected) from error
+    else:
         by_known = _Model(decoder.of_bundle(refitted_bundle(decoder.bundle, result)), result)
         # one more page is worth more than a little more of each
         model = max(by_known, model, key=work.count)
-        known = work.known(model) or known
     return Healed(model.decoder, model.result, known, rounds, time.perf_counter() - start)
 
 
@@ -160,6 +173,8 @@ class _Healing:
         self._expected = tuple(pages.expected[number] if pages.expected else None for number in taken)
         if not self.pairs:
             raise RecalibrationRefusedError("healing", "no page with light", "at least one")
+        if pages.references is not None:
+            decoder.check(pages.references, "reference: ")
         self._references = pages.references or decoder.references
         self._levels = pages.code.levels
         self._pilots = bundle.written_pilots(self._levels)
@@ -272,9 +287,10 @@ class _Healing:
 
 
 def _shows_light(decoder: Decoder, pair: FramePair) -> bool:
-    """Whether a decoder takes the frames."""
+    """Whether a decoder takes the frames, and finds the light of a page on them."""
     try:
         decoder.check(pair)
+        decoder.infer(pair, doubtful=True)
     except FrameError:
         return False
     return True

@@ -123,7 +123,7 @@ CHOICES = (
     Choice(
         "--reflections",
         click.IntRange(min=0, max=20),
-        "Rounds of averaged reflections to the field; with 0, --field-rounds of descent.",
+        "Rounds of averaged reflections to the field; 0 for descent.",
         PRESETS[ACCURATE].choices.reflections,
         localizers=LOCALIZERS,
         of_preset=True,
@@ -131,7 +131,7 @@ CHOICES = (
     Choice(
         "--field-rounds",
         click.IntRange(min=0, max=20),
-        "Of descent to the field, with --reflections 0: fewer are faster, and lose most where the light is bright.",
+        "Of descent to the field, in place of --reflections: fewer are faster, and lose most in bright light.",
         localizers=LOCALIZERS,
         of_preset=True,
     ),
@@ -255,6 +255,8 @@ def chosen_trainer(
     preset = given.pop("preset", ACCURATE)
     if preset == FAST and localizer not in _COHERENT:
         raise InvalidInputError(f"--preset {FAST}", f"--localizer {localizer}", f"--localizer {' or '.join(_COHERENT)}")
+    if "field_rounds" in given:
+        given.setdefault("reflections", 0)
     choices = replace(PRESETS[preset].choices, **given)
     choices.grid(profile)
     trainer = SymbolTrainer(localizer, choices, synthetic, start)

@@ -24,6 +24,7 @@ from lightpage.recording.reader import Recording
 from lightpage.simulator.true_optics import perfectly_calibrated
 from lightpage.train.data.feature_store import FeatureStore
 from lightpage.train.data.features import FeatureExtractor, PageFeatures
+from lightpage.train.models.hyperparameters import Hyperparameters
 from lightpage.train.models.presets import FAST, PRESETS
 from lightpage.train.runs import begin
 
@@ -44,6 +45,7 @@ class Bench:
         levels: numbers of levels of further recordings, on which confidences are judged.
         seed: of the recording; theirs follow.
         kept: of this data set.
+        reflections: rounds to the field, of methods that are not `fast`; see `Hyperparameters`.
     """
 
     recording: Recording
@@ -57,6 +59,7 @@ class Bench:
     levels: tuple[int, ...]
     seed: int
     kept: WeightStore
+    reflections: int = 0
 
     @classmethod
     def of(
@@ -110,15 +113,15 @@ class Bench:
     def extractor(self, method: str) -> FeatureExtractor:
         """Features of the calibrated device; of the true one for an oracle's further pass, signal power left in."""
         localizer = "coherent" if method in (ORACLE, FAST) else method
-        return FeatureExtractor(
-            self.calibrated_device(method), localizer, PRESETS[FAST].choices if method == FAST else None
-        )
+        choices = PRESETS[FAST].choices if method == FAST else Hyperparameters(reflections=self.reflections)
+        return FeatureExtractor(self.calibrated_device(method), localizer, choices)
 
     def key(self, name: str) -> str:
         """Return what the features of a method depend on, beside the recording."""
         if name == ORACLE:
             return ""
-        return self.fitted.to_toml() + (PRESETS[FAST].choices.first_pass if name == FAST else "")
+        reflections = f"{self.reflections} reflections" if self.reflections else ""
+        return self.fitted.to_toml() + (PRESETS[FAST].choices.first_pass if name == FAST else reflections)
 
     def features_of(
         self, name: str, recording: Recording, pages: Sequence[int], start: int, shift: tuple[float, float]

@@ -16,7 +16,6 @@ from lightpage.codec.page_codec import PageCodec
 from lightpage.codec.volume import Successor, Volume
 from lightpage.errors import (
     BundleError,
-    CalibrationError,
     InvalidInputError,
     LostPageError,
     RecalibrationRefusedError,
@@ -131,7 +130,7 @@ class PageReader:
         for index, shown in read_ahead(self._recording.shown, pages):
             expected = self._next.header
             page = self._read(index, shown, expected, take)
-            if page.loss is None and waiting:
+            if page.loss is None and waiting:  # one from before may be from before a knock
                 right = index
             if heals and page.loss in _CURABLE:
                 waiting.append((page, expected))
@@ -149,32 +148,41 @@ class PageReader:
         self, waiting: Sequence[tuple[RecoveredPage, Header | None]], right: int | None, take: Take
     ) -> list[RecoveredPage]:
         """Pages that were not read, as a model reads them that is healed by them, or as they were if there is none."""
+        note(f"{len(waiting)} pages are not read: the model is fitted to the device by them")
+        try:
+            healed = heal(self._decoder, self._lost(waiting, right))
+        except (RecalibrationRefusedError, BundleError, RecordingError, InvalidInputError) as error:
+            note(f"not healed: {error}")
+            return [page for page, _ in waiting]
+        following, before, found = self._next, (self._decoder, self._tracker), list[RecoveredPage]()
+        self._use(healed.decoder, self._tracker.refitted(healed.decoder))
+        shown = read_ahead(self._recording.shown, [page.page for page, _ in waiting])
+        for (page, expected), (index, frames) in zip(waiting, shown, strict=True):
+            again = self._read(index, frames, expected, take)
+            found.append(page if again.loss else replace(again, healed_rounds=healed.rounds))
+        self._next, read = following, sum(page.loss is None for page in found)
+        note(f"{read} of them are read after {healed.rounds} rounds, {healed.seconds:.0f} s")
+        if not read:
+            self._use(*before)
+        return found
+
+    def _lost(self, waiting: Sequence[tuple[RecoveredPage, Header | None]], right: int | None) -> LostPages:
+        """Frames of pages that were not read, and of one among them that was.
+
+        Raises:
+            RecordingError, StorageError: unreadable.
+        """
         some = [(page.page, expected) for page, expected in waiting[:TOGETHER]]
         if right is not None:
             some = [(right, None), *some[: TOGETHER - 1]]
-        bits, frames = self._recording.bit_depth, self._recording.frames
-        lost = LostPages(
-            tuple(narrow(frames(index), bits) for index, _ in some),
+        bits, recording = self._recording.bit_depth, self._recording
+        return LostPages(
+            tuple(narrow(recording.frames(index), bits) for index, _ in some),
             self._code,
             tuple(expected for _, expected in some),
-            narrow(self._recording.references(), bits),
+            narrow(recording.references(), bits),
             self._tracker.image_px,
         )
-        note(f"{len(waiting)} pages are not read: the model is fitted to the device by them")
-        try:
-            healed = heal(self._decoder, lost)
-        except (RecalibrationRefusedError, BundleError, CalibrationError) as error:
-            note(f"not healed: {error}")
-            return [page for page, _ in waiting]
-        note(f"healed in {healed.rounds} rounds, {healed.seconds:.0f} s: the pages are read again")
-        self._use(healed.decoder, self._tracker.refitted(healed.decoder))
-        found = []
-        for (page, expected), (index, shown) in zip(
-            waiting, read_ahead(self._recording.shown, [page.page for page, _ in waiting]), strict=True
-        ):
-            again = self._read(index, shown, expected, take)
-            found.append(page if again.loss else replace(again, healed_rounds=healed.rounds))
-        return found
 
     def _read(self, index: int, shown: Future[Shown], expected: Header | None, take: Take) -> RecoveredPage:
         """Read a page.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +45,7 @@ class KeptPages:
         if not observation.of_device or pair is None or says_nothing:
             return
         own = FramePair(pair.in_phase.copy(), pair.quadrature.copy())  # the caller's memory may be used again
-        kept = Observation(**{**vars(observation), "pair": own})
+        kept = replace(observation, pair=own)
         with self._lock:
             self._pages.append(kept)
             while len(self._pages) > 1 and sum(map(_bytes, self._pages)) > self._most_bytes:
@@ -58,6 +59,8 @@ class KeptPages:
     def pages(self, decoder: Decoder, image_px: tuple[float, float]) -> KnownPages | LostPages | None:
         """What to recalibrate by: the last pages that were read, or else those that were lost; None if there are none.
 
+        Pages count that the model in service has decoded, at the levels of its code.
+
         Args:
             decoder: in service.
             image_px: where its image was last seen.
@@ -65,12 +68,17 @@ class KeptPages:
         if (code := decoder.bundle.code) is None:
             return None
         with self._lock:
-            kept = [*self._pages]
+            kept = [one for one in self._pages if one.model_version == decoder.version]
         pilots, codec = decoder.bundle.written_pilots(code.levels), decoder.page_codec
         known, lost = list[tuple[FramePair, NDArray[np.uint8]]](), list[FramePair]()
         for one in reversed(kept):
-            found, pair = _found(one, decoder), one.pair
-            assert pair is not None
+            pair = one.pair
+            if pair is None or one.levels not in (None, code.levels):
+                continue
+            if one.symbols is not None:
+                known.append((pair, one.symbols))
+                continue
+            found = _found(one, decoder)
             if found is not None and found.loss is None:
                 known.append((pair, codec.encode_again(found, pilots)))
             elif found is None or found.loss is not Loss.CODE:

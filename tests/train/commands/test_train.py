@@ -76,8 +76,7 @@ def test_a_preset_is_what_it_says_and_single_options_change_it() -> None:
     assert options("--preset", "standard", "--localizer", "coherent") == ("coherent", plain)
     assert options("--preset", "fast", "--channels", "8") == ("coherent", replace(PRESETS["fast"].choices, channels=8))
     assert options("--depth", "2")[1].depth == 2
-    by_descent = options("--reflections", "0", "--field-rounds", "0")
-    assert by_descent == ("coherent", Hyperparameters(refinements=1, field_rounds=0))
+    assert options("--field-rounds", "0") == ("coherent", Hyperparameters(refinements=1, field_rounds=0))
     assert options("--localizer", "ray", "--channels", "8")[1] == PublishedChoices(channels=(8, 16))
 
 
