@@ -122,14 +122,14 @@ def export_run(
         residual_limit=limit,
         provenance=Provenance(**run.provenance),
     )
+    field = {}
+    if isinstance(graph, DecoderGraph):
+        recovers = FieldGraph(profile, graph.recovery.reflections, apart=APART in defaults)
+        field = {FIELD: field_onnx(recovers, frame_dtype, defaults)}
     files = {
         DECODER: decoder,
         TWIN: twin_onnx(twin),
-        **(
-            {FIELD: field_onnx(FieldGraph(profile, apart=APART in defaults), frame_dtype, defaults)}
-            if isinstance(graph, DecoderGraph)
-            else {}
-        ),
+        **field,
         GOLDEN: npz(in_phase=pair.in_phase, quadrature=pair.quadrature, p=expected["p"]),
         PILOTS: npz(**{name: kept[key] for name, key in PILOT_ARRAYS.items() if key in kept}),
     }

@@ -71,14 +71,15 @@ class FieldGraph(nn.Module):
 
     Args:
         profile: the nominal device.
+        reflections: rounds, see `FieldRecovery`.
         apart: whether the cameras stand apart.
     """
 
     outputs = ("field", "unexplained")
 
-    def __init__(self, profile: Profile, *, apart: bool = False) -> None:
+    def __init__(self, profile: Profile, reflections: int = 0, *, apart: bool = False) -> None:
         super().__init__()
-        self.recovery = FieldRecovery(profile)
+        self.recovery = FieldRecovery(profile, reflections=reflections)
         self.table_inputs = (*TABLE_INPUTS, *((APART,) if apart else ()))
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:

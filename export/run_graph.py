@@ -46,7 +46,7 @@ def golden_of(
     answer = torch_answer(graph, pair, defaults)
     limit, coarse = _residual_limit(graph, pair, defaults, answer), in_few_counts(pair, bit_depth)
     to_coarse = torch_answer(graph, coarse, defaults)
-    if limit is not None and not shows_page(float(to_coarse["residual"]), float(answer["residual"]), limit):
+    if limit is not None and not shows_page(float(to_coarse["residual"]), limit):
         return limit, pair, answer
     return limit, coarse, to_coarse
 

@@ -182,7 +182,7 @@ def _golden(decoder: Decoder, pair: FramePair) -> tuple[FramePair, NDArray[np.fl
         to_coarse = decoder.infer(coarse)
     except FrameError:
         return pair, answer.p
-    if limit is not None and not shows_page(to_coarse.residual, answer.residual, limit):
+    if limit is not None and not shows_page(to_coarse.residual, limit):
         return pair, answer.p
     return coarse, to_coarse.p
 

@@ -26,7 +26,7 @@ DEVICE = Device()
 
 def test_with_the_drifted_devices_table_it_decodes_the_drifted_device(small_bundle: Path) -> None:
     profile, decoder = small_profile(), Decoder.load(small_bundle)
-    drifted = DEVICE.with_settings([f"geometry.pipe_angle_deg={DEVICE.geometry.pipe_angle_deg + 0.12}"])
+    drifted = DEVICE.with_settings([f"geometry.pipe_angle_deg={DEVICE.geometry.pipe_angle_deg + 0.15}"])
     symbols = random_symbols(profile, 256, 1, np.random.default_rng(9))[0]
     pair = Simulator(profile, drifted, seed=9).page(symbols)
     twin, parameters = TorchTwin(RayTwin(profile)), true_parameters(profile, drifted)

@@ -121,7 +121,7 @@ def test_the_fields_own_graph_shows_the_decoders_field(
 def test_a_fields_graph_takes_the_defocus_of_cameras_that_stand_apart(
     exported: Bundle, small_run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("lightpage.train.models.apart.ROUNDS", 2)  # of many alike
+    monkeypatch.setattr("lightpage.train.models.field.ROUNDS_APART", 2)  # of many alike
     profile, parameters, pair = small_profile(), nominal(), exported.golden.pair
     parameters[[NAMES.index(f"{camera}_axial_rad") for camera in ("in_phase", "quadrature")]] = 0.8, -0.7
     table = sampling_table(TorchTwin(RayTwin(profile)), parameters, np.pi / 2, profile)

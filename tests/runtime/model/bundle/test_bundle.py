@@ -273,7 +273,7 @@ def test_frames_at_full_scale_and_black_ones_stay_within_a_cameras_counts() -> N
 
 @pytest.mark.parametrize(("coarse", "shows"), [(0.0014, True), (0.0019, False), (float("nan"), False)])
 def test_a_golden_page_must_stay_clear_of_the_limit(coarse: float, shows: bool) -> None:
-    assert shows_page(coarse, 0.001, 0.003) is shows
+    assert shows_page(coarse, 0.003) is shows
 
 
 def _pem(key: ec.EllipticCurvePublicKey | ed25519.Ed25519PublicKey) -> bytes:
