@@ -86,7 +86,7 @@ class Healed:
     Attributes:
         decoder: of the re-fitted bundle, which lies in memory.
         result: what was re-fitted.
-        known: pages that came right by decisions, with their symbols; the first one was fitted.
+        known: pages that come right, with their symbols; where one of them was fitted, it is the first.
         rounds: of fits to decisions; 0 where only the image had moved.
         seconds: that it took.
     """
@@ -134,17 +134,18 @@ def heal(
         if not rounds:
             raise RecalibrationRefusedError(error.subject, error.got, error.expected) from error
     else:
-        by_known = _Model(decoder.of_bundle(refitted_bundle(decoder.bundle, result)), result)
+        by_known = _Model(decoder.of_bundle(refitted_bundle(decoder.bundle, result)), result, known.pairs[0])
         # one more page is worth more than a little more of each
         model = max(by_known, model, key=work.count)
-    return Healed(model.decoder, model.result, known, rounds, time.perf_counter() - start)
+    return Healed(model.decoder, model.result, work.known(model) or known, rounds, time.perf_counter() - start)
 
 
 class _Model(NamedTuple):
-    """A decoder whose bundle lies in memory, and what was re-fitted for it."""
+    """A decoder whose bundle lies in memory, what was re-fitted for it, and by which page; None for the first one."""
 
     decoder: Decoder
     result: RefitResult
+    fitted: FramePair | None = None
 
 
 def _within(progress: Progress, rounds: int, what: str, share: float) -> None:
@@ -211,10 +212,10 @@ class _Healing:
         """Phases that a decoder expects of the pilots, radians."""
         return decoder.bundle.modulation.phase(symbol_phases(self._pilots, self._levels))
 
-    def _with(self, calibration: Calibration) -> _Model:
-        """The model with another geometry."""
+    def _with(self, calibration: Calibration, fitted: FramePair | None = None) -> _Model:
+        """The model with another geometry, and by which page that was fitted."""
         result = traced(self._decoder, self._twin, self._references, calibration)
-        return _Model(self._decoder.of_bundle(refitted_bundle(self._decoder.bundle, result)), result)
+        return _Model(self._decoder.of_bundle(refitted_bundle(self._decoder.bundle, result)), result, fitted)
 
     def _looked(self, decoder: Decoder) -> tuple[list[Inference], tuple[PageBytes, ...]]:
         """What a decoder says of the pages, and what they give it."""
@@ -242,7 +243,7 @@ class _Healing:
         return f"{len(self.pairs)} pages of which none is read after {MOST_ROUNDS} rounds; {least}"
 
     def known(self, model: _Model) -> KnownPages | None:
-        """The pages that come right, the one with most to spare first; None if there is none."""
+        """The pages that come right, the fitted one first, then by what they have to spare; None if none does."""
         read = [
             (page, pair)
             for page, pair in zip(self._looked(model.decoder)[1], self.pairs, strict=True)
@@ -250,7 +251,7 @@ class _Healing:
         ]
         if not read:
             return None
-        read.sort(key=lambda one: -one[0].margin_bits)
+        read.sort(key=lambda one: (one[1] is not model.fitted, -one[0].margin_bits))
         codec = self._codec(model.decoder)
         symbols = tuple(codec.encode_again(page, self._pilots) for page, _ in read)
         image_px = self._image.shift_x_px, self._image.shift_y_px
@@ -283,7 +284,8 @@ class _Healing:
             modulation=earlier.modulator,
         )
         hashes = [hash_frames(self.pairs[page])]
-        return self._with(earlier.followed_by(Calibration.from_registered(registered, bundle.profile, hashes)))
+        found = earlier.followed_by(Calibration.from_registered(registered, bundle.profile, hashes))
+        return self._with(found, self.pairs[page])
 
 
 def _shows_light(decoder: Decoder, pair: FramePair) -> bool:

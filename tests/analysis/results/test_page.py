@@ -7,6 +7,7 @@ from click.testing import CliRunner, Result
 
 from analysis.results.measurements import Measurement, kept_measurements
 from analysis.results.page import PAGE, ROOT, Results, main, render
+from lightpage.codec.code import Code
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.shipped import bundle_path
 
@@ -78,7 +79,8 @@ def test_the_readme_says_what_the_kept_figures_say() -> None:
 def test_the_ledger_is_that_of_the_shipped_code() -> None:
     shipped = Bundle.open(bundle_path("bench")).code
     assert shipped is not None
-    assert kept_measurements()["ledger"].figures["bright"]["code"] == shipped.model_dump()
+    # what the code needs is measured anew with every choice, and stands on no page
+    assert Code(**kept_measurements()["ledger"].figures["bright"]["code"]).id == shipped.id
 
 
 # ---- collecting -----------------------------------------------------------------------------------------------------
