@@ -104,7 +104,7 @@ class _Bench:
 
     @cached_property
     def symbols(self) -> np.ndarray:
-        """What is written, uint8 [pages, ny, nx]; the last ones are not healed by."""
+        """Symbols that are written, uint8 [pages, ny, nx]; the last pages are not healed by."""
         codec, count, code = self.decoder.page_codec, self.pages + _JUDGED, self.decoder.page_codec.code
         data = np.random.default_rng(_SEED).integers(0, 256, (count, codec.user_bytes), dtype=np.uint8)
         headers = [Header(code.id, _SEED, page, count * codec.user_bytes) for page in range(count)]

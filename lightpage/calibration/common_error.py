@@ -40,7 +40,7 @@ _STROKE_DEVIATIONS = 3.0
 
 @dataclass(frozen=True)
 class CommonError:
-    """What is to be taken off the phases of some pages.
+    """Error that is to be taken off the phases of some pages.
 
     Attributes:
         phase: radians [ny, nx], on all of them.

@@ -151,7 +151,9 @@ class PageReader:
         note(f"{len(waiting)} pages are not read: the model is fitted to the device by them")
         try:
             healed = heal(self._decoder, self._lost(waiting, right))
-        except (RecalibrationRefusedError, BundleError, RecordingError, InvalidInputError) as error:
+        except (RecalibrationRefusedError, BundleError, RecordingError, InvalidInputError, StorageError) as error:
+            if isinstance(error, StorageError) and not self._give_up:
+                raise
             note(f"not healed: {error}")
             return [page for page, _ in waiting]
         following, before, found = self._next, (self._decoder, self._tracker), list[RecoveredPage]()
