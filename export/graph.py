@@ -63,7 +63,7 @@ class DecoderGraph(nn.Module):
         measured = self.recovery.measure(*tensors[:seen])
         table = dict(zip(self.decoder.table_inputs, tensors[seen:], strict=True))
         p, field, left = self.decoder(self.recovery, measured, table)
-        return *_answers(p * self.kappa_scale), relative_power(left, field), field, left
+        return *answers(p * self.kappa_scale), relative_power(left, field), field, left
 
 
 class FieldGraph(nn.Module):
@@ -105,12 +105,13 @@ class PublishedGraph(nn.Module):
     def forward(self, in_phase: Tensor, quadrature: Tensor, grid: Tensor, levels: Tensor) -> tuple[Tensor, ...]:
         """Decode one pair: `ANSWERS`, from where `grid` [2, h, w, 2] looks; the references there are `levels`."""
         seen = sample_frames(torch.stack([in_phase.to(torch.float32), quadrature.to(torch.float32)])[None], grid[None])
-        return _answers(self.decoder.read(seen, levels[None])[0] * self.kappa_scale)
+        return answers(self.decoder.read(seen, levels[None])[0] * self.kappa_scale)
 
 
-def _answers(p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """p [2, ny, nx], its angle and its length."""
-    return p, angle(p[0], p[1]), torch.sqrt((p * p).sum(0))
+def answers(p: Tensor, axis: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    """p with its two numbers along an axis, its angle and its length."""
+    x, y = p.unbind(axis)
+    return p, angle(x, y), torch.sqrt(x * x + y * y)
 
 
 def angle(x: Tensor, y: Tensor) -> Tensor:

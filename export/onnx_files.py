@@ -46,8 +46,8 @@ def decoder_onnx(
     frame = torch.from_numpy(np.zeros(frame_shape, dtype=frame_dtype))
     # torch.export takes one tensor given twice for one input, hence the clone below
     tensors = [torch.from_numpy(np.ascontiguousarray(value)) for value in defaults.values()]
-    model = _export(graph, (frame, frame.clone(), *tensors), (*FRAME_INPUTS, *defaults), graph.outputs, None)
-    _halve(model, tuple(f"decoder.{name}." for name in HALVED))
+    model = exported(graph, (frame, frame.clone(), *tensors), (*FRAME_INPUTS, *defaults), graph.outputs, None)
+    halved(model, tuple(f"decoder.{name}." for name in HALVED))
     for name, value in defaults.items():
         model.graph.initializer.append(numpy_helper.from_array(np.ascontiguousarray(value), name))
     onnx.checker.check_model(model)
@@ -59,7 +59,7 @@ def field_onnx(graph: FieldGraph, frame_dtype: str, tensors: dict[str, NDArray[n
     frame = torch.from_numpy(np.zeros(tensors["reference_in_phase"].shape, dtype=frame_dtype))
     names = graph.table_inputs
     chosen = [torch.from_numpy(np.ascontiguousarray(tensors[name])) for name in names]
-    model = _export(graph, (frame, frame.clone(), *chosen), (*FRAME_INPUTS, *names), graph.outputs, None)
+    model = exported(graph, (frame, frame.clone(), *chosen), (*FRAME_INPUTS, *names), graph.outputs, None)
     onnx.checker.check_model(model)
     return bytes(model.SerializeToString())
 
@@ -70,18 +70,25 @@ def twin_onnx(twin: RayTwin) -> bytes:
     points, places = torch.export.Dim("points", min=1), torch.export.Dim("camera_points", min=1)
     shapes: tuple[dict[int, Any], ...] = ({}, {0: points}, {0: points}, {0: places})
     inputs = (torch.from_numpy(nominal()), example, example.clone(), torch.zeros(5, 2, dtype=torch.float64))
-    model = _export(twin, inputs, TWIN_INPUTS, TWIN_OUTPUTS, shapes)
+    model = exported(twin, inputs, TWIN_INPUTS, TWIN_OUTPUTS, shapes)
     onnx.checker.check_model(model)
     return bytes(model.SerializeToString())
 
 
-def _export(
+def exported(
     module: nn.Module,
     inputs: tuple[torch.Tensor, ...],
     names: tuple[str, ...],
     outputs: tuple[str, ...],
-    shapes: tuple[dict[int, Any], ...] | None,
+    shapes: tuple[Any, ...] | None,
 ) -> onnx.ModelProto:
+    """A module as an ONNX model.
+
+    Args:
+        module, inputs: it, and tensors to trace it with.
+        names, outputs: of inputs and outputs.
+        shapes: free dimensions of every input; None where there are none.
+    """
     # it tells of every optional package that the graphs have no use for
     logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
     with warnings.catch_warnings():
@@ -102,10 +109,10 @@ def _export(
         # all that pays of the exporter's optimiser, whose rewriter takes minutes over a pipe's unrolled steps
         optimizer.fold_constants(program.model, output_size_limit=_FOLDED)
         optimizer.remove_unused_nodes(program.model)
-    return _anonymous(_sharing(program.model_proto))
+    return anonymous(sharing(program.model_proto))
 
 
-def _sharing(model: onnx.ModelProto) -> onnx.ModelProto:
+def sharing(model: onnx.ModelProto) -> onnx.ModelProto:
     """The model with each large constant once: both ways of a wave model have many that are alike."""
     graph, instead = model.graph, dict[str, str]()
     first: dict[tuple[int, tuple[int, ...], bytes], str] = {}
@@ -122,7 +129,7 @@ def _sharing(model: onnx.ModelProto) -> onnx.ModelProto:
     return model
 
 
-def _halve(model: onnx.ModelProto, prefixes: tuple[str, ...]) -> None:
+def halved(model: onnx.ModelProto, prefixes: tuple[str, ...]) -> None:
     """Keep the initializers with these prefixes as float16: a runtime folds the casts back when it loads the graph."""
     casts = []
     for held in model.graph.initializer:
@@ -141,7 +148,7 @@ def _module_of(node: onnx.NodeProto) -> list[str]:
     return scopes[-2].split(".") if len(scopes) > 1 and scopes[-2] else []
 
 
-def _anonymous(model: onnx.ModelProto) -> onnx.ModelProto:
+def anonymous(model: onnx.ModelProto) -> onnx.ModelProto:
     """The model without the exporter's notes, which name the files of the machine that exported it.
 
     Nodes are named after the module that they come from.

@@ -9,7 +9,7 @@ from torch import nn
 
 from lightpage.errors import BundleError, InvalidInputError
 from lightpage.export.half import check_deviation, in_half, rounded
-from lightpage.export.onnx_files import _export
+from lightpage.export.onnx_files import exported
 from lightpage.runtime.model.execution.session import open_session
 
 GRAPH = """<ir_version: 10, opset_import: ["" : 20]>
@@ -90,7 +90,7 @@ class TwoWays(nn.Module):
 
 def test_a_large_constant_is_kept_once_and_the_answer_is_the_same() -> None:
     module, light = TwoWays(), torch.eye(40)
-    model = _export(module, (light,), ("light",), ("seen",), None)
+    model = exported(module, (light,), ("light",), ("seen",), None)
     onnx.checker.check_model(model)
     held = [numpy_helper.to_array(one) for one in model.graph.initializer if np.prod(one.dims) == 1600]
     assert len(held) == 2

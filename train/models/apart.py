@@ -23,10 +23,10 @@ from torch.nn import functional
 from lightpage.train.models.filters import BLOCK, block_weights
 
 ROUNDS = 14
-_WEIGHT = 0.75
+WEIGHT = 0.75
 """Of the likelihood against staying: a larger one takes fewer rounds and, in dim light, lets more noise in."""
-_STIFF = 1 + 2 * _WEIGHT
-_RELAXATION = 1.4
+STIFF = 1 + 2 * WEIGHT
+RELAXATION = 1.4
 """Of a round's step; below 2."""
 _DARK = 1e-9
 _LINEAR_ROUNDS = 30
@@ -127,7 +127,7 @@ def reflected(
     Returns:
         e, [2, ny, nx].
     """
-    pulling = 8 * _WEIGHT * _STIFF * torch.clamp(brightness, min=0)
+    pulling = 8 * WEIGHT * STIFF * torch.clamp(brightness, min=0)
     half = amplitude / 2
     of_arms = cameras.gathered(arms * half)
     field = start * amplitude
@@ -135,7 +135,7 @@ def reflected(
     for number in range(rounds):
         if number:
             light = cameras.seen(field) * inverse_amplitude + arms
-        state = state + _RELAXATION * (_likely(2 * light - state, pulling) - light)
+        state = state + RELAXATION * (_likely(2 * light - state, pulling) - light)
         field = band(cameras.gathered(state * half) - of_arms)
     return field * inverse_amplitude
 
@@ -151,7 +151,7 @@ def _likely(light: Tensor, pulling: Tensor) -> Tensor:
         pulling: 8 weight stiff times the brightness, [2, ny, nx].
     """
     longer = 1 + torch.sqrt(1 + pulling / (_by_camera(light * light) + _DARK))
-    return light * _for_both_parts(longer / (2 * _STIFF))
+    return light * _for_both_parts(longer / (2 * STIFF))
 
 
 def _by_camera(parts: Tensor) -> Tensor:

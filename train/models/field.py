@@ -31,9 +31,9 @@ from lightpage.waves.grid import GRID_STEP_PX, FieldGrid, field_grid
 
 ROUNDS = 6
 """Of descent; beyond these the band filter's ripple adds up."""
-_STEP = 0.9
+STEP = 0.9
 """Along the weighted gradient: the weights bound the curvature by 2, and step times curvature must stay below 2."""
-_MOMENTUM = 0.5
+MOMENTUM = 0.5
 _CUBIC = 3
 _REFERENCE_BLOCK_PX = 4
 """Side of the blocks of pixels whose mean stands for a reference."""
@@ -116,6 +116,21 @@ class Measured(NamedTuple):
         return self._replace(a=a, b=b, amplitude=amplitude, lit=lit)
 
 
+class References(NamedTuple):
+    """What the references and the registration say of the common grid.
+
+    Attributes:
+        where: places in both frames for grid_sample, [2, ny, nx, 2].
+        reference: counts, at least a floor, [2, ny, nx].
+        amplitude, lit: see `Measured`.
+    """
+
+    where: Tensor
+    reference: Tensor
+    amplitude: Tensor
+    lit: Tensor
+
+
 class FieldRecovery(nn.Module):
     """Frames and references to the field on the common grid.
 
@@ -192,22 +207,31 @@ class FieldRecovery(nn.Module):
             apart: kernel of the in-phase camera's defocus on the usual grid, see
                 `lightpage.calibration.sampling_table.cameras_apart`; None where both cameras see the same plane.
         """
-        frames = _block_means(_stacked(in_phase, quadrature), self.binning)
-        references = _block_means(_stacked(reference_in_phase, reference_quadrature), self.binning)
+        references = self.in_blocks(reference_in_phase, reference_quadrature)
+        seen = self.references(references, registration)
+        beyond = self.filtered(self.in_blocks(in_phase, quadrature) - references)
+        a, b = seen.lit * sampled(beyond, seen.where) / (2 * seen.reference)
+        defocus = None if apart is None else CamerasApart.of(apart @ self.to_taps.T)
+        return Measured(a, b, homodyne[0], homodyne[1], seen.amplitude, seen.lit, defocus)
+
+    def in_blocks(self, in_phase: Tensor, quadrature: Tensor) -> Tensor:
+        """Two frames in blocks of pixels, [2, rows, columns]."""
+        return _block_means(_stacked(in_phase, quadrature), self.binning)
+
+    def filtered(self, blocks: Tensor) -> Tensor:
+        """Both frames as they are sampled, [2, rows, columns]."""
+        return torch.as_tensor(self.prefilter(blocks)) if self.binning == 1 else blocks
+
+    def references(self, blocks: Tensor, registration: Tensor) -> References:
+        """What the references alone say, of both in blocks."""
         where = self._where(registration, self.binning)
-        beyond = frames - references
-        if self.binning == 1:
-            beyond = self.prefilter(beyond)
-        gained = _sampled(beyond, where)
-        reference = self._reference(references, registration)
-        floor = _FLOOR * references.mean(dim=(1, 2))[:, None, None]
+        reference = self._reference(blocks, registration)
+        floor = _FLOOR * blocks.mean(dim=(1, 2))[:, None, None]
         seen = (where.abs().amax(dim=-1) <= self._edge) & (reference > floor)
         lit = (seen[0] & seen[1]).to(torch.float32)
         reference = torch.maximum(reference, floor)
-        a, b = lit * gained / (2 * reference)
         amplitude = torch.sqrt(reference[0])
-        defocus = None if apart is None else CamerasApart.of(apart @ self.to_taps.T)
-        return Measured(a, b, homodyne[0], homodyne[1], amplitude / amplitude.mean(), lit, defocus)
+        return References(where, reference, amplitude / amplitude.mean(), lit)
 
     def solve(self, measured: Measured) -> tuple[Tensor, Tensor]:
         """Solve what was measured.
@@ -268,8 +292,8 @@ class FieldRecovery(nn.Module):
             light = brightness, measured.arms, amplitude, inverse_amplitude
             return reflected(cameras, rounds, estimate, *light, self.band)
         for _ in range(self.rounds):
-            ahead = estimate + _MOMENTUM * (estimate - before)
-            step = measured.pull(ahead, READ_NOISE, _STEP)
+            ahead = estimate + MOMENTUM * (estimate - before)
+            step = measured.pull(ahead, READ_NOISE, STEP)
             before, estimate = estimate, self.band((ahead + step) * amplitude) * inverse_amplitude
         return torch.as_tensor(estimate)
 
@@ -296,7 +320,7 @@ class FieldRecovery(nn.Module):
         """Binned references on the grid, [2, ny, nx]: beams are smooth, so few places are looked at."""
         coarse = self._where(registration, _REFERENCE_BLOCK_PX, _REFERENCE_STEP)
         blocks = _block_means(references, _REFERENCE_BLOCK_PX // self.binning)
-        seen = _sampled(blocks, coarse)
+        seen = sampled(blocks, coarse)
         ny, nx = self.grid.shape
         rows = _interpolated(seen.transpose(1, 2), ny).transpose(1, 2)
         return _interpolated(rows, nx)
@@ -314,7 +338,7 @@ def _block_means(images: Tensor, side: int) -> Tensor:
     return functional.avg_pool2d(images[:, None], side, ceil_mode=True, count_include_pad=False)[:, 0]
 
 
-def _sampled(images: Tensor, where: Tensor) -> Tensor:
+def sampled(images: Tensor, where: Tensor) -> Tensor:
     """Images [2, H, W] interpolated where `FieldRecovery._where` says, [2, ny, nx]."""
     seen = functional.grid_sample(images[:, None], where, mode="bilinear", padding_mode="border", align_corners=False)
     return seen[:, 0]

@@ -58,11 +58,16 @@ class PositionModulation(nn.Module):
 
         Of a part of a page, the centroids come `with_page_coordinates`.
         """
+        scale, shift = self.of_places(positions)
+        return x * scale + shift
+
+    def of_places(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """Factor and summand of each channel, [N, C, ny, nx] both."""
         if positions.shape[1] == 2:
             whole = tuple(positions.shape[-2:])
             positions = with_page_coordinates(positions, whole, (slice(None), slice(None)))
         scale, shift = self.outer(functional.gelu(self.inner(self._conditions(positions)))).chunk(2, dim=1)
-        return torch.as_tensor(x * (1 + scale) + shift)
+        return 1 + scale, shift
 
     @staticmethod
     def _conditions(positions: Tensor) -> Tensor:
@@ -155,7 +160,10 @@ class SymbolUNet(nn.Module):
 
     def outputs(self, light: Tensor, positions: Tensor) -> Tensor:
         """What `estimate` makes p of, [N, 3, ny, nx]; light and exit centroids as for p itself."""
-        x = self.where(self.stem(light), positions)
+        return self.behind_places(self.where(self.stem(light), positions))
+
+    def behind_places(self, x: Tensor) -> Tensor:
+        """The same of features that are scaled and shifted by where they lie, [N, C, ny, nx]."""
         kept = []
         for inward, down in zip(self.inward, self.down, strict=True):
             x = inward(x)
@@ -186,6 +194,11 @@ class Refiner(nn.Module):
 
     def forward(self, light: Tensor, positions: Tensor, earlier: Tensor) -> Tensor:
         """Unexplained light, exit centroids and the earlier p, [N, 2, ny, nx], to p: see `SymbolUNet`."""
-        kappa = torch.sqrt(earlier.square().sum(1, keepdim=True) + 1e-12)
-        known = torch.cat([light, earlier / kappa, torch.log(kappa) - _TYPICAL_LOG_KAPPA], dim=1)
+        known = torch.cat([light, *self.known(earlier)], dim=1)
         return estimate(self.unet.outputs(known, positions), self.trust * earlier)
+
+    @staticmethod
+    def known(earlier: Tensor) -> tuple[Tensor, Tensor]:
+        """What the network is told of an earlier p [N, 2, ny, nx]: its direction, and the logarithm of its length."""
+        kappa = torch.sqrt(earlier.square().sum(1, keepdim=True) + 1e-12)
+        return earlier / kappa, torch.log(kappa) - _TYPICAL_LOG_KAPPA

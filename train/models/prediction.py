@@ -42,7 +42,7 @@ class Prediction(nn.Module):
         self._half_width, self._half_height = profile.page_width_m / 2, profile.page_height_m / 2
         self.illumination: Tensor
         self.floor: Tensor
-        even = torch.zeros(2, len(self._terms()))
+        even = torch.zeros(2, len(self.terms()))
         even[0, 0] = 1
         self.register_buffer("illumination", even)
         self.register_buffer("floor", torch.ones(()))
@@ -55,10 +55,11 @@ class Prediction(nn.Module):
     def field(self, at: WaveMatrices, p: Tensor) -> Tensor:
         """Expected field on the common grid, [2, Gy, Gx], of an estimated page p [2, ny, nx]; its scale is open."""
         written = expected_phasors(p)
-        illumination = torch.tensordot(self.illumination, torch.stack(self._terms()), 1)
+        illumination = torch.tensordot(self.illumination, torch.stack(self.terms()), 1)
         return self.waves.to_camera(at, torch.stack(multiply(parts(written), parts(illumination))))
 
-    def _terms(self) -> list[Tensor]:
+    def terms(self) -> list[Tensor]:
+        """Factors of the illumination, see `illumination_terms`."""
         return illumination_terms(self.waves.x_m / self._half_width, self.waves.y_m / self._half_height)
 
     def forward(

@@ -79,12 +79,12 @@ class TiledLens(nn.Module):
         super().__init__()
         wave = geometry.wavelength_m * geometry.focal_length_m / geometry.pipe_width_m
         self.shape = len(plane[1]), len(plane[0])
-        self._tiles = tuple(max(1, round(float(np.ptp(axis)) / wave / WAVES_A_TILE)) for axis in plane)
-        self._sides = tuple(-(-len(axis) // tiles) for axis, tiles in zip(plane, self._tiles, strict=True))
+        self.tiles = tuple(max(1, round(float(np.ptp(axis)) / wave / WAVES_A_TILE)) for axis in plane)
+        self.sides = tuple(-(-len(axis) // tiles) for axis, tiles in zip(plane, self.tiles, strict=True))
         pitches = [float(axis[1] - axis[0]) for axis in plane]
-        offsets = [(np.arange(side) - (side - 1) / 2) * pitch for side, pitch in zip(self._sides, pitches, strict=True)]
+        offsets = [(np.arange(side) - (side - 1) / 2) * pitch for side, pitch in zip(self.sides, pitches, strict=True)]
         inside = [
-            (np.arange(tiles) * side + (side - 1) / 2) for tiles, side in zip(self._tiles, self._sides, strict=True)
+            (np.arange(tiles) * side + (side - 1) / 2) for tiles, side in zip(self.tiles, self.sides, strict=True)
         ]
         centres = [axis[0] + at * pitch for axis, at, pitch in zip(plane, inside, pitches, strict=True)]
         units = [np.arange(1, count) / count - 0.5 for count in reversed(cells)]
@@ -105,7 +105,7 @@ class TiledLens(nn.Module):
         self.weights: Tensor
         self.on_x: Tensor
         self.on_y: Tensor
-        tiled = (*self._tiles, *terms.nodes.shape[1:])
+        tiled = (*self.tiles, *terms.nodes.shape[1:])
         for name, value in {
             "offset_x": offsets[0],
             "offset_y": offsets[1],
@@ -120,7 +120,7 @@ class TiledLens(nn.Module):
             "on_y": terms.axes[0],
         }.items():
             self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(value)).float(), persistent=False)
-        weights = terms.weights.reshape(*self._tiles, *terms.weights.shape[1:])
+        weights = terms.weights.reshape(*self.tiles, *terms.weights.shape[1:])
         self.register_buffer("weights", stacked(weights), persistent=False)
 
     @property
@@ -174,7 +174,7 @@ class TiledLens(nn.Module):
         """Field on the plane [ny, nx] to the facet's grid [fy, fx]."""
         split = [self._split(part) for part in field]
         total: Parts | None = None
-        for number in range(self._tiles[0]):
+        for number in range(self.tiles[0]):
             one = _strip(lens, number)
             terms = multiply(one.plane, (split[0][number], split[1][number]))
             terms = multiply(one.x.behind(terms), one.between)
@@ -189,7 +189,7 @@ class TiledLens(nn.Module):
     def to_plane(self, lens: LensMatrices, field: Parts) -> Parts:
         """The adjoint: a field on the facet's grid to the plane."""
         strips: list[Parts] = []
-        for number in range(self._tiles[0]):
+        for number in range(self.tiles[0]):
             one = _strip(lens, number)
             light = self._across(multiply(field, conjugate(one.strip)), self.up_x.T)
             light = multiply((light[0][None], light[1][None]), conjugate(one.tile))
@@ -208,7 +208,7 @@ class TiledLens(nn.Module):
 
     def _split(self, part: Tensor) -> Tensor:
         """[ny, nx] to tiles [Tx, Ty, 1, ny, nx], with zeros where they reach beyond."""
-        (tiles_x, tiles_y), (side_x, side_y) = self._tiles, self._sides
+        (tiles_x, tiles_y), (side_x, side_y) = self.tiles, self.sides
         part = functional.pad(part, (0, tiles_x * side_x - self.shape[1], 0, tiles_y * side_y - self.shape[0]))
         return part.reshape(tiles_y, side_y, tiles_x, side_x).permute(2, 0, 1, 3)[:, :, None]
 

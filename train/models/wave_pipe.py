@@ -51,7 +51,6 @@ class TiledPipe(nn.Module):
     def __init__(self, geometry: WaveGeometry, cells: tuple[int, int], error: float) -> None:
         super().__init__()
         self._cells = cells
-        width, nk = geometry.pipe_width_m, geometry.refractive_index * geometry.wave_number
         sheared = abs(geometry.pipe_angle) > 0
         counts = [cell // 2 for cell in cells]
         edges = [
@@ -62,10 +61,7 @@ class TiledPipe(nn.Module):
         blocks = []
         for y in pairwise(edges[0]):
             for x in pairwise(edges[1]):
-                turn = (
-                    abs(geometry.pipe_angle) * _mean_wave(y, width) * _mean_wave(x, width) * geometry.pipe_length_m / nk
-                )
-                steps = max(_FEWEST_STEPS, math.ceil(_STEPS * math.sqrt(turn) / error ** (2 / 3))) if sheared else 1
+                steps = splitting_steps(geometry, (y, x), error)
                 blocks.append(_Block(geometry, cells, (y, x), rims, steps, counts))
         self.blocks = nn.ModuleList(blocks)
         self._across = len(edges[1]) - 1
@@ -175,6 +171,18 @@ def _times(modes: Tensor, phasors: Parts) -> Tensor:
 def _reversed(stack: Tensor) -> Tensor:
     """A stack in the opposite order: taken up by index, whole pieces of memory are copied."""
     return stack.index_select(0, torch.arange(len(stack) - 1, -1, -1, device=stack.device))
+
+
+def splitting_steps(
+    geometry: WaveGeometry, modes: tuple[tuple[int, int], tuple[int, int]], error: float
+) -> int:
+    """Steps in which modes of each parity along (y', x), from one to before another, are followed; see `TiledPipe`."""
+    if not abs(geometry.pipe_angle) > 0:
+        return 1
+    nk = geometry.refractive_index * geometry.wave_number
+    y, x = (_mean_wave(some, geometry.pipe_width_m) for some in modes)
+    turn = abs(geometry.pipe_angle) * y * x * geometry.pipe_length_m / nk
+    return max(_FEWEST_STEPS, math.ceil(_STEPS * math.sqrt(turn) / error ** (2 / 3)))
 
 
 def _mean_wave(modes: tuple[int, int], width: float) -> float:

@@ -101,10 +101,12 @@ class Waves(nn.Module):
             for axis, frequency in zip((grid.x_m, grid.y_m), highest, strict=True)
         ]
         common = cells, _ROLL_MARGIN, fidelity.lenses
-        self._launch = TiledLens(geometry, geometry.lens_path, (x + centre[0], y + centre[1]), *common)
-        self._delaunch = TiledLens(geometry, geometry.camera_path, (sparse[0], sparse[1]), *common)
+        self.geometry, self.cells, self.fidelity = geometry, cells, fidelity
+        self.planes = (x + centre[0], y + centre[1]), (sparse[0], sparse[1])
+        self.launch = TiledLens(geometry, geometry.lens_path, self.planes[0], *common)
+        self.delaunch = TiledLens(geometry, geometry.camera_path, self.planes[1], *common)
         self._pipe = TiledPipe(geometry, cells, fidelity.pipe)
-        self._profile, self._envelope_m = profile, profile.symbol_pitch_m / samples if filled else 0.0
+        self.profile, self.envelope_m = profile, profile.symbol_pitch_m / samples if filled else 0.0
         self.x_m: Tensor
         self.y_m: Tensor
         self.grid_x_m: Tensor
@@ -127,6 +129,7 @@ class Waves(nn.Module):
         across, down = (
             interpolation(axis, few, OVERSAMPLING) for axis, few in zip((grid.x_m, grid.y_m), sparse, strict=True)
         )
+        self.interpolations = down, across
         self._down, self._across = Banded(down), Banded(across)
         self._up, self._back = Banded(down.T), Banded(across.T)
         self.default: Tensor
@@ -135,21 +138,21 @@ class Waves(nn.Module):
     def matrices(self, parameters: Tensor | None = None) -> WaveMatrices:
         """What the two ways need, of parameters [P]; of those that the model was made with if left out."""
         value = dict(zip(NAMES, (self.default if parameters is None else parameters).unbind(), strict=True))
-        geometry = fitted_geometry(self._profile, value)
+        geometry = fitted_geometry(self.profile, value)
         x = self.x_m + value["page_centre_x_m"], self.y_m + value["page_centre_y_m"]
         grid = self.grid_x_m, self.grid_y_m
         facet = self.facet_x * geometry.pipe_width_m, self.facet_y * geometry.pipe_width_m
-        window = entrance_window(geometry, *facet, self._envelope_m, xp=torch)
-        at_launch = fitted_launch_phase(self._profile, value, geometry, self.x_m[None, :], self.y_m[:, None])
-        at_camera = fitted_camera_phase(self._profile, value, geometry, grid[0][None, :], grid[1][:, None])
+        window = entrance_window(geometry, *facet, self.envelope_m, xp=torch)
+        at_launch = fitted_launch_phase(self.profile, value, geometry, self.x_m[None, :], self.y_m[:, None])
+        at_camera = fitted_camera_phase(self.profile, value, geometry, grid[0][None, :], grid[1][:, None])
         path, mirrored = geometry.lens_path, geometry.camera_path
         at_launch = at_launch + path.of_field(x[0][None, :], x[1][:, None])
         at_camera = at_camera - mirrored.of_field(grid[0][None, :], grid[1][:, None])
         start = x[0][0], x[1][0]
         sparse = self.sparse_x_m[0], self.sparse_y_m[0]
         return WaveMatrices(
-            self._launch.matrices(geometry, path, start, facet, window),
-            self._delaunch.matrices(geometry, mirrored, sparse, facet, torch.ones_like(window[:1, :1])),
+            self.launch.matrices(geometry, path, start, facet, window),
+            self.delaunch.matrices(geometry, mirrored, sparse, facet, torch.ones_like(window[:1, :1])),
             phasor(at_launch),
             phasor(at_camera),
             self._pipe.matrices(geometry),
@@ -157,9 +160,9 @@ class Waves(nn.Module):
 
     def to_camera(self, at: WaveMatrices, page: Tensor) -> Tensor:
         """Field on the modulator [2, ny samples, nx samples] to the common grid [2, Gy, Gx], against the reference."""
-        entrance = self._launch.to_facet(at.launch, multiply(parts(page), at.at_launch))
+        entrance = self.launch.to_facet(at.launch, multiply(parts(page), at.at_launch))
         leaving = self._pipe(entrance, at.pipe, backwards=False)
-        sparse = torch.stack(self._delaunch.to_plane(at.delaunch, leaving))
+        sparse = torch.stack(self.delaunch.to_plane(at.delaunch, leaving))
         light = self._across(self._down(sparse).transpose(-1, -2)).transpose(-1, -2)
         return torch.stack(multiply(parts(light), at.against_reference))
 
@@ -167,8 +170,8 @@ class Waves(nn.Module):
         """Field on the common grid [2, Gy, Gx] back to the modulator, by the adjoint."""
         light = torch.stack(multiply(parts(field), conjugate(at.against_reference)))
         sparse = self._back(self._up(light).transpose(-1, -2)).transpose(-1, -2)
-        leaving = self._delaunch.to_facet(at.delaunch, parts(sparse))
-        page = self._launch.to_plane(at.launch, self._pipe(leaving, at.pipe, backwards=True))
+        leaving = self.delaunch.to_facet(at.delaunch, parts(sparse))
+        page = self.launch.to_plane(at.launch, self._pipe(leaving, at.pipe, backwards=True))
         return torch.stack(multiply(page, conjugate(at.at_launch)))
 
 

@@ -65,6 +65,18 @@ class CoherentLocalizer(nn.Module):
         """
         if tuple(field.shape[-2:]) != self.grid_shape:
             raise ValueError(f"field: got {tuple(field.shape[-2:])}, wanted the localizer's grid {self.grid_shape}")
+        (where, phase), (ny, nx) = self.looks(places, gradients, phases), self.page_shape
+        sampled = functional.grid_sample(
+            field[None], where, mode=self.interpolation, padding_mode="zeros", align_corners=True
+        ).reshape(2, len(BRANCHES), self.samples**2, ny, nx)
+        cos, sin = torch.cos(phase), torch.sin(phase)
+        scale = torch.rsqrt((field * field).mean() * 2 + 1e-12)
+        real = (sampled[0] * cos + sampled[1] * sin) * scale
+        imaginary = (sampled[1] * cos - sampled[0] * sin) * scale
+        return torch.stack([real, imaginary])
+
+    def looks(self, places: Tensor, gradients: Tensor, phases: Tensor) -> tuple[Tensor, Tensor]:
+        """Where samples are looked for, [1, B S ny, nx, 2] for grid_sample, and their phases, [B, S, ny, nx] radians."""
         x, y = self.offset_x, self.offset_y
         column = places[:, 0:1] + gradients[:, 0:1] * x + gradients[:, 1:2] * y
         row = places[:, 1:2] + gradients[:, 2:3] * x + gradients[:, 3:4] * y
@@ -72,12 +84,4 @@ class CoherentLocalizer(nn.Module):
         phase = value + along_x * x + along_y * y + xx * x * x / 2 + xy * x * y + yy * y * y / 2
         (last_row, last_column), (height, width) = self._last, self._span
         where = torch.stack([(2 * column - last_column) / width, (2 * row - last_row) / height], dim=-1)
-        ny, nx = self.page_shape
-        sampled = functional.grid_sample(
-            field[None], where.reshape(1, -1, nx, 2), mode=self.interpolation, padding_mode="zeros", align_corners=True
-        ).reshape(2, len(BRANCHES), self.samples**2, ny, nx)
-        cos, sin = torch.cos(phase), torch.sin(phase)
-        scale = torch.rsqrt((field * field).mean() * 2 + 1e-12)
-        real = (sampled[0] * cos + sampled[1] * sin) * scale
-        imaginary = (sampled[1] * cos - sampled[0] * sin) * scale
-        return torch.stack([real, imaginary])
+        return where.reshape(1, -1, self.page_shape[1], 2), phase

@@ -1,0 +1,202 @@
+"""The field on the common grid for many pages: `lightpage.train.models.field` in products and few passes over planes.
+
+Everything is held times the reference's amplitude r, so that no plane is multiplied by it and by its inverse in each
+round: L = r (1 + e) is the light at the in-phase camera, L' = r (exp(i turn) + e) at the other one, E = r e the field,
+and r^2 times each camera's brightness, |L|^2 and |L'|^2, is what was measured.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from lightpage.calibration.waves.wave_fit import READ_NOISE
+from lightpage.train.models.apart import RELAXATION, STIFF, WEIGHT
+from lightpage.train.models.batched.products import Tables, padded, sizes, turned_product
+from lightpage.train.models.field import MOMENTUM, STEP, FieldRecovery, References
+from lightpage.train.models.parts import Parts
+
+_DARK = 2.0**-14
+"""Least brightness, so that its quotient with the light is infinite at worst, and no zero over zero."""
+_STEEPEST = 60_000.0
+"""Largest such quotient: float16 ends at 65,504."""
+_LOUDER = 16.0
+"""Factor on what is left of the equations, whose squares are small numbers for float16."""
+
+
+class Seen(NamedTuple):
+    """Squared amplitudes that both cameras measured, r^2 times brightness, [B, ny, nx] of whole multiples."""
+
+    in_phase: Tensor
+    quadrature: Tensor
+
+
+class BatchedField(nn.Module):
+    """Recovers fields as a `FieldRecovery` does: by averaged reflections, by descent, or by the closed root alone.
+
+    The band filter is a product with its Toeplitz matrix along either axis.
+
+    Args:
+        recovery: of the device, for cameras that see the same plane.
+    """
+
+    def __init__(self, recovery: FieldRecovery) -> None:
+        super().__init__()
+        self.recovery = recovery
+        self.taps: Tensor
+        self.register_buffer("taps", torch.from_numpy(recovery.grid.band), persistent=False)
+
+    def tables(self, seen: References, homodyne: Tensor) -> Tables:
+        """Constants of what the references say, and of the turn's cosine and sine [2], float64."""
+        ny, nx = self.recovery.grid.shape
+        cos, sin = homodyne.double().unbind()
+        amplitude = padded(seen.amplitude.double(), -1, -2)
+        lit = padded(seen.lit.double(), -1, -2)
+        inverse = padded(1 / seen.amplitude.double(), -1, -2)
+        band_y, band_x = (padded(self._toeplitz(count), -1, -2) for count in (ny, nx))
+        slope, half = (1 - cos) / sin, turned_product(turned_product(amplitude / 2, band_y), band_x)
+        return {
+            "band_y": band_y,
+            "band_x": band_x,
+            "amplitude": amplitude[None],
+            "cos_amplitude": (cos * amplitude)[None],
+            "sin_amplitude": (sin * amplitude)[None],
+            "half_inverse": (inverse / 2)[None],
+            "lit": lit[None],
+            "slope_amplitude": (slope * amplitude)[None],
+            "difference": (inverse / (2 * sin))[None],
+            "start": (amplitude - half)[None],
+            "curvature": 1 + slope * slope,
+            "slope": slope,
+            "slope_over": slope / (1 + slope * slope),
+            "over": 1 / (1 + slope * slope),
+            "arms": ((1 - RELAXATION) / 2 * (1 + cos)) * amplitude[None],
+            "arms_sin": ((1 - RELAXATION) / 2 * sin) * amplitude[None],
+        }
+
+    def forward(self, seen: Seen, tables: Tables) -> Parts:
+        """The field E inside the pipe's band, real and imaginary part, [B, ny, nx] each of whole multiples."""
+        field = self._root(seen, tables)
+        if self.recovery.reflections:
+            return self._reflected(seen, field, tables)
+        before = field
+        for number in range(self.recovery.rounds):
+            ahead = field
+            if number:
+                real, imaginary = (now + MOMENTUM * (now - was) for now, was in zip(field, before, strict=True))
+                ahead = real, imaginary
+            pull = self.pull(seen, ahead, tables, READ_NOISE, STEP)
+            before, field = field, self._band((ahead[0] + pull[0], ahead[1] + pull[1]), tables)
+        return field
+
+    def pull(self, seen: Seen, field: Parts, tables: Tables, floor: Tensor | float, share: float = 1.0) -> Parts:
+        """How the measurements pull at a field: see `lightpage.train.models.field.Measured.pull`, times the amplitude.
+
+        With r^2 for the floor's unit, a weight's numerator and denominator are both held times r^2.
+        """
+        at_floor = torch.clamp(floor * tables["amplitude"] * tables["amplitude"], min=_DARK)
+        pulls = []
+        for measured, light in zip(seen, self._lights(field, tables), strict=True):
+            bright = light[0] * light[0] + light[1] * light[1] + at_floor
+            weight = (share / 2) * (measured + at_floor) / bright - share / 2
+            pulls.append((weight * light[0], weight * light[1]))
+        return pulls[0][0] + pulls[1][0], pulls[0][1] + pulls[1][1]
+
+    def innovation(self, seen: Seen, field: Parts, tables: Tables, floor: Tensor | float) -> Parts:
+        """See `FieldRecovery.innovation`."""
+        real, imaginary = self.pull(seen, field, tables, floor)
+        return self._band((tables["lit"] * real, tables["lit"] * imaginary), tables)
+
+    def left(self, seen: Seen, field: Parts, tables: Tables) -> Parts:
+        """What is left of the two equations inside the band, times the amplitude."""
+        left = []
+        for measured, light in zip(seen, self._lights(field, tables), strict=True):
+            left.append((measured - light[0] * light[0] - light[1] * light[1]) * tables["half_inverse"])
+        return self._band((left[0], left[1]), tables)
+
+    def residual(self, seen: Seen, field: Parts, power: Tensor, tables: Tables) -> Tensor:
+        """Power of what is left over the field's `power` [B], as `relative_power` has it, [B] float32."""
+        real, imaginary = self.left(seen, field, tables)
+        return self.power((_LOUDER * real, _LOUDER * imaginary)) / (power * _LOUDER**2)
+
+    def power(self, field: Parts) -> Tensor:
+        """Mean of the squares of both parts over the grid, [B] float32: sums of rows are products."""
+        ny, nx = self.recovery.grid.shape
+        ones = field[0].new_full((sizes(field[0])[2], 8), 1 / nx)
+        rows = [(part * part) @ ones for part in field]
+        return (rows[0] + rows[1])[..., 0].to(torch.float32).sum(1) * (0.5 / ny)
+
+    def _lights(self, field: Parts, tables: Tables) -> tuple[Parts, Parts]:
+        """L and L' of a field E."""
+        real, imaginary = field
+        other = real + tables["cos_amplitude"], imaginary + tables["sin_amplitude"]
+        return (real + tables["amplitude"], imaginary), other
+
+    def _root(self, seen: Seen, tables: Tables) -> Parts:
+        """The closed root nearer to the linear estimate, inside the band.
+
+        L lies on a circle, |L|^2 = r^2 A, and by the difference of the equations on a line, Im L = slope Re L - g.
+        """
+        a, b = seen
+        offset = (a - b) * tables["difference"] + tables["slope_amplitude"]
+        root = torch.sqrt(torch.clamp(tables["curvature"] * a - offset * offset, min=0)) * tables["over"]
+        middle = tables["slope_over"] * offset
+        linear = self._along(a * tables["half_inverse"], tables) + tables["start"]
+        real = middle + torch.where(linear < middle, -root, root)
+        imaginary = tables["slope"] * real - offset
+        return self._band((real - tables["amplitude"], imaginary), tables)
+
+    def _reflected(self, seen: Seen, field: Parts, tables: Tables) -> Parts:
+        """See `lightpage.train.models.apart.reflected`.
+
+        With U for twice a camera's light less its state, the state S becomes (2 - relaxation) L + f U, where f is a
+        function of what was measured over |U|^2 alone. Of S only N = S - 2 r arm is kept: then U = 2 E - N.
+        """
+        weight = RELAXATION / (2 * STIFF)
+        stays = 2 - RELAXATION
+        pulling = [torch.clamp(8 * WEIGHT * STIFF * weight**2 * each, min=_DARK) for each in seen]
+        states: list[Parts] = []
+        for number in range(self.recovery.reflections):
+            twice = 2 * field[0], 2 * field[1]
+            reflected = self._lights(field, tables) if not number else [
+                (twice[0] - state[0], twice[1] - state[1]) for state in states
+            ]
+            moved = []
+            for (real, imaginary), measured in zip(reflected, pulling, strict=True):
+                quotient = torch.clamp(measured / (real * real + imaginary * imaginary), max=_STEEPEST)
+                factor = torch.sqrt(quotient + weight**2) + (weight - 1)
+                moved.append((factor * real, factor * imaginary))
+            still = stays * field[0], stays * field[1]
+            if number + 1 < self.recovery.reflections:
+                states = [
+                    (
+                        moved[0][0] + (still[0] - RELAXATION * tables["amplitude"]),
+                        moved[0][1] + still[1],
+                    ),
+                    (
+                        moved[1][0] + (still[0] - RELAXATION * tables["cos_amplitude"]),
+                        moved[1][1] + (still[1] - RELAXATION * tables["sin_amplitude"]),
+                    ),
+                ]
+            real = 0.5 * (moved[0][0] + moved[1][0]) + (still[0] + tables["arms"])
+            imaginary = 0.5 * (moved[0][1] + moved[1][1]) + (still[1] + tables["arms_sin"])
+            field = self._band((real, imaginary), tables)
+        return field
+
+    def _band(self, planes: Parts, tables: Tables) -> Parts:
+        return self._along(planes[0], tables), self._along(planes[1], tables)
+
+    @staticmethod
+    def _along(plane: Tensor, tables: Tables) -> Tensor:
+        """A plane [B, ny, nx] filtered along both axes."""
+        return turned_product(turned_product(plane, tables["band_y"]), tables["band_x"])
+
+    def _toeplitz(self, count: int) -> Tensor:
+        """The band filter along an axis, symmetric [count, count]."""
+        places = torch.arange(count)
+        apart = places[:, None] - places
+        reach = len(self.taps) // 2
+        within = self.taps[torch.clamp(apart + reach, 0, 2 * reach)]
+        return torch.where(apart.abs() <= reach, within, torch.zeros_like(within))
