@@ -191,14 +191,17 @@ class Unexplained(nn.Module):
         written = (p / (0.5 + torch.sqrt(p.square().sum(1, keepdim=True) + 2.25))).to(dtype)
         lit = _multiplied(written, tables["illumination"])
         expected = self.there(lit, of_part(tables, "there"))  # on the sparse samples
-        known = self.back.sparse(field, back)
-        turned = _multiplied(known, torch.cat([expected[:, :1], -expected[:, 1:]], 1))
-        ones = turned.new_full((sizes(turned)[-1], 8), 1 / sizes(turned)[-1])
-        both = (turned @ ones)[..., 0].to(torch.float32).mean(-1)  # [B, 2]
-        gain = (both / (2 * _mean_square(expected) + 1e-12)[:, None]).to(dtype)[..., None, None]
-        expected = _multiplied(expected, gain)
         planes = [turned_product(turned_product(expected[:, part], tables["up"]), tables["wide"]) for part in (0, 1)]
-        left = solver.innovation(seen, (planes[0], planes[1]), of_field, tables["floor"])
+        # sums over the grid: beyond it there are sparse samples too, but known light has none there
+        turned = _multiplied(self.back.sparse(field, back), torch.cat([expected[:, :1], -expected[:, 1:]], 1))
+        rows, columns = sizes(turned)[-2:]
+        both = (turned @ turned.new_full((columns, 8), 1 / columns))[..., 0].to(torch.float32).mean(-1)
+        ny, nx = solver.recovery.grid.shape
+        share = rows * columns / (2 * ny * nx)
+        real, imaginary = (share * both / (solver.power((planes[0], planes[1])) + 1e-12)[:, None]).to(dtype).unbind(1)
+        a, b = real[:, None, None], imaginary[:, None, None]
+        scaled = a * planes[0] - b * planes[1], a * planes[1] + b * planes[0]
+        left = solver.innovation(seen, scaled, of_field, tables["floor"])
         return torch.as_tensor(self.back(left, back))
 
 
