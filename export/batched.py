@@ -7,21 +7,25 @@ as to that for one page, and no start computes more than the constants.
 from __future__ import annotations
 
 import io
+import math
 import warnings
 
 import numpy as np
 import onnx
 import torch
 from numpy.typing import NDArray
+from onnx import TensorProto, numpy_helper
 from torch import Tensor, nn
 
 from lightpage.export.graph import ANSWERS, APART, FRAME_INPUTS, DecoderGraph, answers
-from lightpage.export.onnx_files import OPSET, anonymous, sharing
+from lightpage.export.onnx_files import OPSET, SHARED, anonymous, sharing
 from lightpage.train.models.batched.decoder import BatchedDecoder
 
 PAGES = "pages"
 """Name of the axis of pages, which a session may be opened with a number for."""
 OUTPUTS = (*ANSWERS, "residual")
+_MATRIX = 20_000
+"""Numbers of a constant that is a whole matrix."""
 _EXAMPLE = 2
 """Pages that the exporter is shown: one of them would be taken for a constant."""
 
@@ -123,6 +127,39 @@ def traced(
             output_names=list(outputs),
             dynamic_axes={name: {0: PAGES} for name in of_pages},
         )
-    model = anonymous(sharing(onnx.load_from_string(file.getvalue())))
+    model = onnx.load_from_string(file.getvalue())
+    _hold(model)
+    _halve(anonymous(sharing(model)))
     onnx.checker.check_model(model)
     return model
+
+
+def _hold(model: onnx.ModelProto) -> None:
+    """Turn large constants within nodes into initializers, of which those that are alike are kept once."""
+    kept = []
+    for node in model.graph.node:
+        value = node.attribute[0].t if node.op_type == "Constant" and node.attribute[0].name == "value" else None
+        if value is not None and math.prod(value.dims) >= SHARED:
+            held = model.graph.initializer.add()
+            held.CopyFrom(value)
+            held.name = node.output[0]
+        else:
+            kept.append(node)
+    del model.graph.node[:]
+    model.graph.node.extend(kept)
+
+
+def _halve(model: onnx.ModelProto) -> None:
+    """Keep whole matrices as float16: modes, filters and weights, which end in products of such numbers.
+
+    Places along an axis are few, and stay as they are.
+    """
+    casts = []
+    for held in model.graph.initializer:
+        if math.prod(held.dims) >= _MATRIX and held.data_type in (TensorProto.FLOAT, TensorProto.DOUBLE):
+            name, kind = held.name, held.data_type
+            values = numpy_helper.to_array(held).astype(np.float16)
+            held.CopyFrom(numpy_helper.from_array(values, f"{name}.half"))
+            casts.append(onnx.helper.make_node("Cast", [held.name], [name], f"{name}/cast", to=kind))
+    for cast in reversed(casts):
+        model.graph.node.insert(0, cast)

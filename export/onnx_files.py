@@ -24,7 +24,7 @@ from lightpage.train.models.twin import RayTwin
 OPSET = 20
 _FOLDED = 20_000
 """Largest constant, elements, that folding may leave in a file: a runtime folds the rest when it loads the graph."""
-_SHARED = 1_000
+SHARED = 1_000
 """Smallest constant, elements, that is kept once where several are alike."""
 _SCOPES = "pkg.torch.onnx.name_scopes"
 """The exporter's note of a node's modules, the outermost first, and last the node itself."""
@@ -117,7 +117,7 @@ def sharing(model: onnx.ModelProto) -> onnx.ModelProto:
     graph, instead = model.graph, dict[str, str]()
     first: dict[tuple[int, tuple[int, ...], bytes], str] = {}
     for held in graph.initializer:
-        if math.prod(held.dims) >= _SHARED:
+        if math.prod(held.dims) >= SHARED:
             content = held.data_type, tuple(held.dims), hashlib.sha256(numpy_helper.to_array(held).tobytes()).digest()
             if (name := first.setdefault(content, held.name)) != held.name:
                 instead[held.name] = name

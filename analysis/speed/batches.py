@@ -300,7 +300,8 @@ def measured(kept: Kept, machine: Machine, form: Form, scene: Scene, batches: tu
 @click.option("--batch", "batches", multiple=True, type=int, default=(8, 1), show_default=True, help="Pages a batch.")
 @click.option("--provider", default=CUDA, show_default=True, type=click.Choice([CUDA, "cpu"]))
 @click.option("--seconds", default=480.0, show_default=True, help="No form is begun after that time.")
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="Folder for pages and gpu.json.")
+@click.option("--pages", "simulated", type=click.Path(path_type=Path), help="Folder for simulated pages; --out's.")
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="Folder for gpu.json.")
 def main(
     folder: Path,
     presets: tuple[str, ...],
@@ -308,11 +309,13 @@ def main(
     batches: tuple[int, ...],
     provider: str,
     seconds: float,
+    simulated: Path | None,
     out: Path,
 ) -> None:
     """Measure the batched forms of kept decoders."""
     begun = time.perf_counter()
     out.mkdir(parents=True, exist_ok=True)
+    (simulated or out).mkdir(parents=True, exist_ok=True)
     machine = Machine.of(provider)
     if provider == CUDA:
         import onnxruntime
@@ -324,7 +327,7 @@ def main(
     command = f"python -m analysis.speed.batches {' '.join(sys.argv[1:])}"
     kept = Kept(out / "gpu.json", {"card": card, "command": command, "commit": os.environ.get("COMMIT", commit)})
     kept.part("ceilings", lambda: ceilings(machine))
-    scene = scene_of(folder, out)
+    scene = scene_of(folder, simulated or out)
     for form in forms(folder, scene, presets, reflections, machine.device):
         if time.perf_counter() - begun > seconds:
             break

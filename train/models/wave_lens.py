@@ -29,6 +29,8 @@ OVERSAMPLING = 1.1
 """Of light on sparse samples: an error of 0.003."""
 WAVES_A_TILE = 170
 """Waves that a tile of the lens is wide, about: more need more samples of the facet, fewer need more tiles."""
+ROLL_MARGIN = np.deg2rad(0.05)
+"""Roll to either side of the fitted one that the terms of the lenses' expansions still serve."""
 _PLACES = 3
 """Places along an axis that are asked how fast the phase varies."""
 
@@ -65,6 +67,7 @@ class TiledLens(nn.Module):
         cells: sample intervals of the pipe along (y', x).
         roll_margin: radians of roll to either side that are to be served.
         tolerance: error of the expansion.
+        waves_a_tile: `WAVES_A_TILE`, or another number.
     """
 
     def __init__(
@@ -75,11 +78,13 @@ class TiledLens(nn.Module):
         cells: tuple[int, int],
         roll_margin: float,
         tolerance: float,
+        waves_a_tile: float | None = None,
     ) -> None:
         super().__init__()
+        waves_a_tile = waves_a_tile or WAVES_A_TILE
         wave = geometry.wavelength_m * geometry.focal_length_m / geometry.pipe_width_m
         self.shape = len(plane[1]), len(plane[0])
-        self.tiles = tuple(max(1, round(float(np.ptp(axis)) / wave / WAVES_A_TILE)) for axis in plane)
+        self.tiles = tuple(max(1, round(float(np.ptp(axis)) / wave / waves_a_tile)) for axis in plane)
         self.sides = tuple(-(-len(axis) // tiles) for axis, tiles in zip(plane, self.tiles, strict=True))
         pitches = [float(axis[1] - axis[0]) for axis in plane]
         offsets = [(np.arange(side) - (side - 1) / 2) * pitch for side, pitch in zip(self.sides, pitches, strict=True)]

@@ -22,7 +22,7 @@ from lightpage.calibration.waves.wave_model import (
 )
 from lightpage.device.profile import Profile
 from lightpage.train.models.parts import Parts, conjugate, multiply, parts, phasor
-from lightpage.train.models.wave_lens import OVERSAMPLING, LensMatrices, TiledLens
+from lightpage.train.models.wave_lens import OVERSAMPLING, ROLL_MARGIN, LensMatrices, TiledLens
 from lightpage.train.models.wave_pipe import BlockMatrices, TiledPipe
 from lightpage.waves.geometry import cells_for, highest_frequencies
 from lightpage.waves.grid import FieldGrid, field_grid, symbol_samples
@@ -30,9 +30,6 @@ from lightpage.waves.lens import entrance_window
 from lightpage.waves.sinc_interpolation import interpolation, sparse_axis
 
 Real = NDArray[np.float64]
-
-_ROLL_MARGIN = np.deg2rad(0.05)
-"""Roll to either side of the fitted one that the terms of the lenses' expansions still serve."""
 
 
 class Fidelity(NamedTuple):
@@ -100,7 +97,7 @@ class Waves(nn.Module):
             sparse_axis(axis, frequency, OVERSAMPLING)
             for axis, frequency in zip((grid.x_m, grid.y_m), highest, strict=True)
         ]
-        common = cells, _ROLL_MARGIN, fidelity.lenses
+        common = cells, ROLL_MARGIN, fidelity.lenses
         self.geometry, self.cells, self.fidelity = geometry, cells, fidelity
         self.planes = (x + centre[0], y + centre[1]), (sparse[0], sparse[1])
         self.launch = TiledLens(geometry, geometry.lens_path, self.planes[0], *common)
