@@ -7,27 +7,28 @@ as to that for one page, and no start computes more than the constants.
 from __future__ import annotations
 
 import io
-import math
+import re
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import onnx
 import torch
 from numpy.typing import NDArray
-from onnx import TensorProto, numpy_helper
 from torch import Tensor, nn
 
 from lightpage.export.graph import ANSWERS, APART, FRAME_INPUTS, DecoderGraph, answers
-from lightpage.export.onnx_files import OPSET, SHARED, anonymous, sharing
+from lightpage.export.onnx_files import OPSET, anonymous, halved, sharing
 from lightpage.train.models.batched.decoder import BatchedDecoder
 
 PAGES = "pages"
 """Name of the axis of pages, which a session may be opened with a number for."""
 OUTPUTS = (*ANSWERS, "residual")
-_MATRIX = 20_000
-"""Numbers of a constant that is a whole matrix."""
-_EXAMPLE = 2
-"""Pages that the exporter is shown: one of them would be taken for a constant."""
+_MATRICES = re.compile(r"\.(sine_.|up_.|down|across|network\.\S*weight|unet\.\S*weight)$")
+"""Names of buffers that are factors of products in float16 anyway; the pipe's bases stay, whose products must be unitary."""
+_EXAMPLE = 1
+"""Pages that the exporter is shown."""
 
 
 class ConstantsGraph(nn.Module):
@@ -114,7 +115,7 @@ def traced(
         of_pages: which of them have the axis of pages first.
     """
     file = io.BytesIO()
-    with warnings.catch_warnings():
+    with _named(module), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.onnx.export(
             module,
@@ -127,39 +128,20 @@ def traced(
             output_names=list(outputs),
             dynamic_axes={name: {0: PAGES} for name in of_pages},
         )
-    model = onnx.load_from_string(file.getvalue())
-    _hold(model)
-    _halve(anonymous(sharing(model)))
+    model = anonymous(sharing(onnx.load_from_string(file.getvalue())))
+    halved(model, _MATRICES)
     onnx.checker.check_model(model)
     return model
 
 
-def _hold(model: onnx.ModelProto) -> None:
-    """Turn large constants within nodes into initializers, of which those that are alike are kept once."""
-    kept = []
-    for node in model.graph.node:
-        value = node.attribute[0].t if node.op_type == "Constant" and node.attribute[0].name == "value" else None
-        if value is not None and math.prod(value.dims) >= SHARED:
-            held = model.graph.initializer.add()
-            held.CopyFrom(value)
-            held.name = node.output[0]
-        else:
-            kept.append(node)
-    del model.graph.node[:]
-    model.graph.node.extend(kept)
-
-
-def _halve(model: onnx.ModelProto) -> None:
-    """Keep whole matrices as float16: modes, filters and weights, which end in products of such numbers.
-
-    Places along an axis are few, and stay as they are.
-    """
-    casts = []
-    for held in model.graph.initializer:
-        if math.prod(held.dims) >= _MATRIX and held.data_type in (TensorProto.FLOAT, TensorProto.DOUBLE):
-            name, kind = held.name, held.data_type
-            values = numpy_helper.to_array(held).astype(np.float16)
-            held.CopyFrom(numpy_helper.from_array(values, f"{name}.half"))
-            casts.append(onnx.helper.make_node("Cast", [held.name], [name], f"{name}/cast", to=kind))
-    for cast in reversed(casts):
-        model.graph.node.insert(0, cast)
+@contextmanager
+def _named(module: nn.Module) -> Iterator[None]:
+    """While it is exported, all buffers of a module stay tensors of the file by their names, and are not computed with."""
+    kept = {part: set(part._non_persistent_buffers_set) for part in module.modules()}
+    for part in kept:
+        part._non_persistent_buffers_set.clear()
+    try:
+        yield
+    finally:
+        for part, names in kept.items():
+            part._non_persistent_buffers_set.update(names)

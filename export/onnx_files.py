@@ -6,6 +6,7 @@ import ast
 import hashlib
 import logging
 import math
+import re
 import warnings
 from typing import Any
 
@@ -24,7 +25,7 @@ from lightpage.train.models.twin import RayTwin
 OPSET = 20
 _FOLDED = 20_000
 """Largest constant, elements, that folding may leave in a file: a runtime folds the rest when it loads the graph."""
-SHARED = 1_000
+_SHARED = 1_000
 """Smallest constant, elements, that is kept once where several are alike."""
 _SCOPES = "pkg.torch.onnx.name_scopes"
 """The exporter's note of a node's modules, the outermost first, and last the node itself."""
@@ -47,7 +48,7 @@ def decoder_onnx(
     # torch.export takes one tensor given twice for one input, hence the clone below
     tensors = [torch.from_numpy(np.ascontiguousarray(value)) for value in defaults.values()]
     model = exported(graph, (frame, frame.clone(), *tensors), (*FRAME_INPUTS, *defaults), graph.outputs, None)
-    halved(model, tuple(f"decoder.{name}." for name in HALVED))
+    halved(model, re.compile(rf"^decoder\.({'|'.join(HALVED)})\."))
     for name, value in defaults.items():
         model.graph.initializer.append(numpy_helper.from_array(np.ascontiguousarray(value), name))
     onnx.checker.check_model(model)
@@ -117,7 +118,7 @@ def sharing(model: onnx.ModelProto) -> onnx.ModelProto:
     graph, instead = model.graph, dict[str, str]()
     first: dict[tuple[int, tuple[int, ...], bytes], str] = {}
     for held in graph.initializer:
-        if math.prod(held.dims) >= SHARED:
+        if math.prod(held.dims) >= _SHARED:
             content = held.data_type, tuple(held.dims), hashlib.sha256(numpy_helper.to_array(held).tobytes()).digest()
             if (name := first.setdefault(content, held.name)) != held.name:
                 instead[held.name] = name
@@ -129,11 +130,11 @@ def sharing(model: onnx.ModelProto) -> onnx.ModelProto:
     return model
 
 
-def halved(model: onnx.ModelProto, prefixes: tuple[str, ...]) -> None:
-    """Keep the initializers with these prefixes as float16: a runtime folds the casts back when it loads the graph."""
+def halved(model: onnx.ModelProto, named: re.Pattern[str]) -> None:
+    """Keep the initializers with such names as float16: a runtime folds the casts back when it loads the graph."""
     casts = []
     for held in model.graph.initializer:
-        if held.name.startswith(prefixes) and held.data_type == onnx.TensorProto.FLOAT:
+        if named.search(held.name) and held.data_type == onnx.TensorProto.FLOAT:
             name = held.name
             held.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(held).astype(np.float16), f"{name}.half"))
             casts.append(onnx.helper.make_node("Cast", [held.name], [name], to=onnx.TensorProto.FLOAT))

@@ -47,15 +47,16 @@ class BatchedField(nn.Module):
         self.recovery = recovery
         self.taps: Tensor
         self.register_buffer("taps", torch.from_numpy(recovery.grid.band), persistent=False)
+        for name, count in zip(("rows", "columns"), recovery.grid.shape, strict=True):
+            self.register_buffer(name, torch.arange(count, dtype=torch.float32), persistent=False)
 
     def tables(self, seen: References, homodyne: Tensor) -> Tables:
         """Constants of what the references say, and of the turn's cosine and sine [2], float64."""
-        ny, nx = self.recovery.grid.shape
         cos, sin = homodyne.double().unbind()
         amplitude = padded(seen.amplitude.double(), -1, -2)
         lit = padded(seen.lit.double(), -1, -2)
         inverse = padded(1 / seen.amplitude.double(), -1, -2)
-        band_y, band_x = (padded(self._toeplitz(count), -1, -2) for count in (ny, nx))
+        band_y, band_x = (padded(self._toeplitz(axis), -1, -2) for axis in ("rows", "columns"))
         slope, half = (1 - cos) / sin, turned_product(turned_product(amplitude / 2, band_y), band_x)
         return {
             "band_y": band_y,
@@ -193,10 +194,9 @@ class BatchedField(nn.Module):
         """A plane [B, ny, nx] filtered along both axes."""
         return turned_product(turned_product(plane, tables["band_y"]), tables["band_x"])
 
-    def _toeplitz(self, count: int) -> Tensor:
+    def _toeplitz(self, axis: str) -> Tensor:
         """The band filter along an axis, symmetric [count, count]."""
-        places = torch.arange(count)
+        places, reach = self.get_buffer(axis), len(self.taps) // 2
         apart = places[:, None] - places
-        reach = len(self.taps) // 2
-        within = self.taps[torch.clamp(apart + reach, 0, 2 * reach)]
+        within = self.taps[(torch.clamp(apart, -reach, reach) + reach).long()]
         return torch.where(apart.abs() <= reach, within, torch.zeros_like(within))

@@ -24,15 +24,13 @@ from lightpage.train.models.batched.products import (
     with_phasor,
 )
 from lightpage.train.models.parts import Parts, adjoint, conjugate, matmul, multiply, phasor, scaled
-from lightpage.train.models.wave_lens import OVERSAMPLING, ROLL_MARGIN, TiledLens
+from lightpage.train.models.wave_lens import OVERSAMPLING, TiledLens
 from lightpage.waves.geometry import WaveGeometry, couplings, on_facet, sine_matrix
 from lightpage.waves.lens import LensPath
 from lightpage.waves.pipe import modes_by_parity
 from lightpage.waves.sinc_interpolation import interpolation, sparse_axis
 
 Real = NDArray[np.floating]
-_WAVES_A_TILE = 80
-"""Smaller tiles than one page's decoder has: fewer terms serve them, and planes of all terms are what takes time."""
 _EDGES = 5
 """Places along an axis of the facet that are asked how fast the phase varies."""
 
@@ -58,7 +56,8 @@ class BatchedLens(nn.Module):
     first half step are then one matrix along either axis.
 
     Args:
-        geometry, path, plane, cells, tolerance: as of the tiled lens.
+        geometry, path, plane, cells: as of the tiled lens.
+        tiled: which has the terms of the lens's rest.
         to_plane: whether light goes from the pipe to the plane, by the adjoint.
     """
 
@@ -68,13 +67,12 @@ class BatchedLens(nn.Module):
         path: SeidelTerms,
         plane: tuple[Real, Real],
         cells: tuple[int, int],
-        tolerance: float,
+        tiled: TiledLens,
         *,
         to_plane: bool,
     ) -> None:
         super().__init__()
-        self.tiled = tiled = TiledLens(geometry, path, plane, cells, ROLL_MARGIN, tolerance, _WAVES_A_TILE)
-        self.backwards = to_plane
+        self.tiled, self.backwards = tiled, to_plane
         self.shape, self.tiles, self.sides = tiled.shape, tiled.tiles, tiled.sides
         units = [np.arange(1, count) / count - 0.5 for count in reversed(cells)]
         highest = _highest(geometry, path, plane, self.tiles, self.sides)

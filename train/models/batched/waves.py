@@ -28,8 +28,8 @@ class BatchedWaves(nn.Module):
         self.model, self.to_page = waves, to_page
         geometry = waves.geometry
         page, sparse = waves.planes
-        launch = geometry, geometry.lens_path, page, waves.cells, waves.fidelity.lenses
-        camera = geometry, geometry.camera_path, sparse, waves.cells, waves.fidelity.lenses
+        launch = geometry, geometry.lens_path, page, waves.cells, waves.launch
+        camera = geometry, geometry.camera_path, sparse, waves.cells, waves.delaunch
         first, last = (camera, launch) if to_page else (launch, camera)
         self.first = BatchedLens(*first, to_plane=False)
         self.pipe = BatchedPipe(geometry, waves.cells, waves.fidelity.pipe, backwards=to_page)
