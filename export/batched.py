@@ -14,12 +14,14 @@ from contextlib import contextmanager
 
 import numpy as np
 import onnx
+import onnx_ir
 import torch
 from numpy.typing import NDArray
+from onnxscript import optimizer
 from torch import Tensor, nn
 
 from lightpage.export.graph import ANSWERS, APART, FRAME_INPUTS, DecoderGraph, answers
-from lightpage.export.onnx_files import OPSET, anonymous, halved, sharing
+from lightpage.export.onnx_files import FOLDED, OPSET, anonymous, halved, sharing
 from lightpage.train.models.batched.decoder import BatchedDecoder
 
 PAGES = "pages"
@@ -128,7 +130,10 @@ def traced(
             output_names=list(outputs),
             dynamic_axes={name: {0: PAGES} for name in of_pages},
         )
-    model = anonymous(sharing(onnx.load_from_string(file.getvalue())))
+    traced_model = onnx_ir.from_proto(onnx.load_from_string(file.getvalue()))
+    optimizer.fold_constants(traced_model, output_size_limit=FOLDED)
+    optimizer.remove_unused_nodes(traced_model)
+    model = anonymous(sharing(onnx_ir.to_proto(traced_model)))
     halved(model, _MATRICES)
     onnx.checker.check_model(model)
     return model

@@ -30,6 +30,12 @@ from lightpage.train.runs import load_run
     show_default=True,
     help="Of network and waves; float16 pays on a GPU alone.",
 )
+@click.option(
+    "--batches/--no-batches",
+    default=True,
+    show_default=True,
+    help="Hold the decoder for many pages too, which a GPU runs.",
+)
 @click.option(ACCEPT, "accept_wrong_fit", is_flag=True, help="Export a run whose calibration is a wrong fit too.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def export(
@@ -39,6 +45,7 @@ def export(
     version: str | None,
     recording: Path | None,
     precision: Precision,
+    batches: bool,
     accept_wrong_fit: bool,
     json_path: Path | None,
 ) -> None:
@@ -50,7 +57,7 @@ def export(
     if not accept_wrong_fit:
         load_run(run).calibration.check_good(f"run {run}, calibration", f", or {ACCEPT}")
     with percent_bar() as progress:
-        bundle, error = export_run(run, out, name, version, progress, recording, precision)
+        bundle, error = export_run(run, out, name, version, progress, recording, precision, batches=batches)
     if bundle.code is None:
         how = "see `lightpage code`" if recording is not None else "export with --recording, or see `lightpage code`"
         note(f"the bundle has no code for user bytes: {how}")

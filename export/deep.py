@@ -17,7 +17,7 @@ from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.run.task import FineTuning
 from lightpage.runtime.archives.workers.fine_tuning import DeepRecalibration
 from lightpage.runtime.model.bundle.bundle import Bundle, write_bundle
-from lightpage.runtime.model.bundle.manifest import Manifest, Provenance
+from lightpage.runtime.model.bundle.manifest import BATCH, Manifest, Provenance
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.recalibration.judgement import JudgedPage, Verdict, judge, judged_pages
@@ -87,7 +87,10 @@ class TorchRecalibration:
         unproven = out.with_name(f".{out.stem}-tuned{out.suffix}")
         unproven.unlink(missing_ok=True)
         try:
-            made, _ = export_run(folder / _RUN, unproven, None, version, progress, precision=precision)
+            batches = BATCH in bundle.files
+            made, _ = export_run(
+                folder / _RUN, unproven, None, version, progress, precision=precision, batches=batches
+            )
             progress("judge by the held-back pages", 0.0)
             after = _judged(Decoder(made, decoder.threads), held_back)
         finally:

@@ -8,13 +8,16 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
 
 from lightpage.errors import BundleError, InvalidInputError
+from lightpage.export.batched import batched_onnx
 from lightpage.export.graph import APART, FRAME_INPUTS, DecoderGraph, FieldGraph
 from lightpage.export.half import LARGEST_DEVIATION, check_deviation, in_half, rounded
 from lightpage.export.onnx_files import decoder_onnx, field_onnx, twin_onnx
 from lightpage.export.parity import check_parity
-from lightpage.export.run_graph import golden_of, graph_of
+from lightpage.export.run_graph import Tensors, golden_of, graph_of
 from lightpage.progress import Progress, note, warn
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import narrow
@@ -23,6 +26,8 @@ from lightpage.runtime.archives.recordings.coded_pages import choose_code
 from lightpage.runtime.archives.recordings.evaluation import check_recording
 from lightpage.runtime.model.bundle.bundle import Bundle, npz, write_bundle
 from lightpage.runtime.model.bundle.manifest import (
+    BATCH,
+    CONSTANTS,
     DECODER,
     FIELD,
     FLOAT16,
@@ -56,6 +61,8 @@ def export_run(
     progress: Progress = lambda step, share: None,
     recording: Path | None = None,
     precision: Precision = FLOAT32,
+    *,
+    batches: bool = False,
 ) -> tuple[Bundle, float]:
     """Write the bundle of a run.
 
@@ -66,6 +73,8 @@ def export_run(
         progress: told of every step.
         recording: with pages that the run has not seen, to choose the code of user bytes by; no code without.
         precision: of network and waves, one of `PRECISIONS`.
+        batches: whether the bundle holds the decoder for many pages too. It is left out, with a warning, for a device
+            that it cannot decode, and where it does not say what the decoder for one page says.
 
     Returns:
         The bundle as opened again, and the relative error of p against torch on the golden page.
@@ -133,10 +142,33 @@ def export_run(
         GOLDEN: npz(in_phase=pair.in_phase, quadrature=pair.quadrature, p=expected["p"]),
         PILOTS: npz(**{name: kept[key] for name, key in PILOT_ARRAYS.items() if key in kept}),
     }
+    if batches and isinstance(graph, DecoderGraph):
+        progress("decoder for many pages to ONNX", 0.7)
+        files |= _for_batches(graph, frame_dtype, defaults, pair, expected["p"], str(out))
     progress("load the bundle as the service does", 0.8)
     manifest = _proven(out, manifest, files, recording, progress)
     write_bundle(out, manifest, files)
     return Bundle.open(out), error
+
+
+def _for_batches(
+    graph: DecoderGraph, frame_dtype: str, defaults: Tensors, pair: FramePair, expected: NDArray[np.float32], out: str
+) -> dict[str, bytes]:
+    """Files of the decoder for many pages, proven on the golden page; none where there is no such decoder."""
+    made = batched_onnx(graph, frame_dtype, defaults, torch.float16)
+    if made is None:
+        warn("no decoder for many pages: the cameras of this device stand apart")
+        return {}
+    first, second = (open_session(model, f"{out}: {name}", pages=1) for model, name in zip(made, (CONSTANTS, BATCH)))
+    names = [node.name for node in first.get_outputs()]
+    constants = dict(zip(names, first.run(names, {node.name: defaults[node.name] for node in first.get_inputs()})))
+    (answer,) = second.run(["p"], constants | {"in_phase": pair.in_phase[None], "quadrature": pair.quadrature[None]})
+    try:
+        check_parity(expected, answer[0], f"{out}, {BATCH}", GOLDEN_TOLERANCE[FLOAT16])
+    except BundleError as differing:
+        warn(f"no decoder for many pages: {differing}")
+        return {}
+    return dict(zip((CONSTANTS, BATCH), made, strict=True))
 
 
 def _proven(

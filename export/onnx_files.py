@@ -23,7 +23,7 @@ from lightpage.export.graph import FRAME_INPUTS, HALVED, FieldGraph, Graph
 from lightpage.train.models.twin import RayTwin
 
 OPSET = 20
-_FOLDED = 20_000
+FOLDED = 20_000
 """Largest constant, elements, that folding may leave in a file: a runtime folds the rest when it loads the graph."""
 _SHARED = 1_000
 """Smallest constant, elements, that is kept once where several are alike."""
@@ -108,7 +108,7 @@ def exported(
         )
         assert program is not None
         # all that pays of the exporter's optimiser, whose rewriter takes minutes over a pipe's unrolled steps
-        optimizer.fold_constants(program.model, output_size_limit=_FOLDED)
+        optimizer.fold_constants(program.model, output_size_limit=FOLDED)
         optimizer.remove_unused_nodes(program.model)
     return anonymous(sharing(program.model_proto))
 

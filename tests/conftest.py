@@ -72,7 +72,7 @@ def small_bundle(small_run: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     def make(out: Path) -> None:
         from lightpage.export.from_run import export_run
 
-        export_run(small_run, out, version="small-1")
+        export_run(small_run, out, version="small-1", batches=True)
 
     return _made_once(tmp_path_factory, "small.zip", make)
 

@@ -19,8 +19,11 @@ FIELD = "field.onnx"
 GOLDEN = "golden.npz"
 TABLE = "table.npz"
 PILOTS = "pilots.npz"
+CONSTANTS = "constants.onnx"
+BATCH = "batch.onnx"
+"""The decoder for many pages: what follows from the table alone, and frames with that to p. Both are there or neither."""
 REQUIRED_FILES = frozenset({DECODER, TWIN, GOLDEN})
-OPTIONAL_FILES = frozenset({FIELD, TABLE, PILOTS})
+OPTIONAL_FILES = frozenset({FIELD, TABLE, PILOTS, CONSTANTS, BATCH})
 Precision = Literal["float32", "float16"]
 FLOAT32: Precision = "float32"
 FLOAT16: Precision = "float16"

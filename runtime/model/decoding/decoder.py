@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -29,7 +30,7 @@ from lightpage.page.pilots import Pilots, read_pilots, remove_piston, stroke_err
 from lightpage.recording.exposure import check_light
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.bundle import Bundle
-from lightpage.runtime.model.bundle.manifest import DECODER, FIELD, FLOAT16, FLOAT32, GOLDEN
+from lightpage.runtime.model.bundle.manifest import DECODER, FIELD, FLOAT16, FLOAT32, GOLDEN, Precision
 from lightpage.runtime.model.decoding.page import DecodedPage, Inference, Timings
 from lightpage.runtime.model.decoding.phase_refit import PhaseRefit
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
@@ -200,16 +201,8 @@ class Decoder:
             raise InvalidInputError("table of a page", ", ".join(sorted(others)), f"only {', '.join(PAGE_INPUTS)}")
         feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **table}
         p, phase, concentration, *rest = self.graph.run(self._outputs, feeds)
-        limit, residual = self.bundle.manifest.residual_limit, float(np.max(rest[0])) if rest else 0.0
-        seen = np.isfinite(residual)
-        if limit is not None and not residual <= limit and not (doubtful and seen):
-            got = f"frames that contradict each other (residual {residual:.3g})"
-            raise (FramesDisagreeError if seen else FrameError)(
-                "frame pair",
-                got if seen else "no light of a page over the reference beam",
-                f"an in-phase and a quadrature frame of one shot, not swapped, cameras and exposure as they were "
-                f"calibrated (residual up to {limit:.3g}; where frames are right, recalibrate)",
-            )
+        residual = float(np.max(rest[0])) if rest else 0.0
+        check_residual(residual, self.bundle.manifest.residual_limit, doubtful=doubtful)
         return Inference(p, phase, concentration, residual)
 
     @cached_property
@@ -316,19 +309,45 @@ class Decoder:
             raise BundleError(f"{subject}: output {manifest.residual_output}", "nothing", "a scalar residual")
 
     def _check_golden(self) -> None:
-        golden, subject = self.bundle.golden, f"{self.bundle.subject}: {GOLDEN}"
-        try:
-            self.check(golden.pair)
-            p = self.infer(golden.pair).p
-        except (BundleError, ProviderError, SurroundingsError):
-            raise
-        except Exception as error:  # onnxruntime's errors share no base class
-            raise short_resource(subject, error) or BundleError(subject, error, "a golden page that decodes") from None
-        if golden.p.shape != p.shape:
-            raise BundleError(f"{subject}: p", f"shape {golden.p.shape}", f"shape {p.shape}")
-        error_norm = float(np.linalg.norm(p - golden.p) / max(float(np.linalg.norm(golden.p)), 1e-30))
-        if not error_norm <= (tolerance := GOLDEN_TOLERANCE[self.bundle.manifest.precision]):
-            raise BundleError(subject, f"an answer off by {error_norm:.3g} of its norm", f"p within {tolerance:g}")
+        self.check(self.bundle.golden.pair)
+        check_golden(self.bundle, lambda pair: self.infer(pair).p, self.bundle.manifest.precision)
+
+
+def check_residual(residual: float, limit: float | None, *, doubtful: bool = False) -> None:
+    """Check how badly a pair of frames fits the homodyne equations; see `Decoder.infer`.
+
+    Raises:
+        FrameError: as said there.
+    """
+    seen = np.isfinite(residual)
+    if limit is not None and not residual <= limit and not (doubtful and seen):
+        got = f"frames that contradict each other (residual {residual:.3g})"
+        raise (FramesDisagreeError if seen else FrameError)(
+            "frame pair",
+            got if seen else "no light of a page over the reference beam",
+            f"an in-phase and a quadrature frame of one shot, not swapped, cameras and exposure as they were "
+            f"calibrated (residual up to {limit:.3g}; where frames are right, recalibrate)",
+        )
+
+
+def check_golden(bundle: Bundle, answer: Callable[[FramePair], NDArray[np.float32]], precision: Precision) -> None:
+    """Check what a graph of a bundle says to the golden page.
+
+    Raises:
+        BundleError: something else than the bundle says, or nothing.
+    """
+    golden, subject = bundle.golden, f"{bundle.subject}: {GOLDEN}"
+    try:
+        p = answer(golden.pair)
+    except (BundleError, ProviderError, SurroundingsError):
+        raise
+    except Exception as error:  # onnxruntime's errors share no base class
+        raise short_resource(subject, error) or BundleError(subject, error, "a golden page that decodes") from None
+    if golden.p.shape != p.shape:
+        raise BundleError(f"{subject}: p", f"shape {golden.p.shape}", f"shape {p.shape}")
+    error_norm = float(np.linalg.norm(p - golden.p) / max(float(np.linalg.norm(golden.p)), 1e-30))
+    if not error_norm <= (tolerance := GOLDEN_TOLERANCE[precision]):
+        raise BundleError(subject, f"an answer off by {error_norm:.3g} of its norm", f"p within {tolerance:g}")
 
 
 class BundleFieldSolver:

@@ -57,19 +57,21 @@ class Provider:
         """Where its tensors lie, as ONNX Runtime calls it."""
         return "cpu" if self.name == CPU else "cuda"
 
-    def chain(self, version: str) -> list[tuple[str, dict[str, Any]]]:
+    def chain(self, version: str, *, rounded: bool = False) -> list[tuple[str, dict[str, Any]]]:
         """ONNX Runtime's names with their options, the preferred one first; a node goes to the first that has it.
 
         Single precision stays single: a GPU would round the factors of a product to eleven bits unless it is told not
         to. A bundle in half precision has chosen that itself.
 
         Args:
+            rounded: whether the model holds no product that must be exact. A GPU's convolutions of float16 are fast only
+                where those of float32 may be rounded too.
             version: of the model. TensorRT finds an engine by the model's names alone, whatever its weights are.
         """
         cpu: tuple[str, dict[str, Any]] = (_NAMES[CPU], {})
         if self.name == CPU:
             return [cpu]
-        cuda: tuple[str, dict[str, Any]] = (_NAMES[CUDA], {"device_id": self.device, "use_tf32": 0})
+        cuda: tuple[str, dict[str, Any]] = (_NAMES[CUDA], {"device_id": self.device, "use_tf32": int(rounded)})
         if self.name == CUDA:
             return [cuda, cpu]
         options: dict[str, Any] = {"device_id": self.device}

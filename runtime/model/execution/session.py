@@ -66,6 +66,7 @@ def open_session(
     once: bool = False,
     profile: Path | None = None,
     provider: Provider = ON_CPU,
+    pages: int | None = None,
 ) -> Session:
     """Open an ONNX model held in memory.
 
@@ -76,6 +77,7 @@ def open_session(
         once: whether it will run a single time: then it is not worth while to prepare much.
         profile: beginning of the path of a file in which the runtime notes how long each node takes.
         provider: what it runs on.
+        pages: of a graph for batches, how many it will decode in a run; such a graph's products may be rounded.
 
     Raises:
         BundleError: the bytes are no ONNX model that this onnxruntime can run.
@@ -90,6 +92,8 @@ def open_session(
     options.add_session_config_entry("session.force_spinning_stop", "1")
     # A plan of its memory saves one run in forty of a page's time, and takes a quarter more of it.
     options.enable_mem_pattern = False
+    if pages is not None:
+        options.add_free_dimension_override_by_name("pages", pages)
     if once:
         options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
         options.enable_cpu_mem_arena = False
@@ -105,7 +109,8 @@ def open_session(
     try:
         with running(subject, provider):
             # by default it would print the cause, and compute elsewhere
-            session = onnxruntime.InferenceSession(model, options, providers=provider.chain(version), enable_fallback=0)
+            chain = provider.chain(version, rounded=pages is not None)
+            session = onnxruntime.InferenceSession(model, options, providers=chain, enable_fallback=0)
     except (ProviderError, SurroundingsError):
         raise
     except Exception as error:  # onnxruntime's errors share no base class

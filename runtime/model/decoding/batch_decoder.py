@@ -1,0 +1,63 @@
+"""Many pages in one run of a bundle's graph for batches."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lightpage.errors import BundleError, InvalidInputError
+from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.model.bundle.manifest import BATCH, CONSTANTS, FLOAT16
+from lightpage.runtime.model.decoding.decoder import OUTPUTS, Decoder, check_golden, check_residual
+from lightpage.runtime.model.decoding.page import Inference
+from lightpage.runtime.model.execution.session import BoundSession, Session, open_session, running
+
+
+class BatchDecoder:
+    """A decoder's graph for many pages, with the decoder's table, threads and provider. It never changes.
+
+    Args:
+        decoder: of a bundle that has such a graph.
+        pages: of a run; fewer take as long.
+        like: of the same bundle and as many pages, with another table: what runs is shared with it, and its golden page
+            is not looked at again.
+
+    Raises:
+        BundleError: the bundle has no such graph, or the golden page comes out differently.
+        ProviderError: there is no such provider here.
+    """
+
+    def __init__(self, decoder: Decoder, pages: int, like: BatchDecoder | None = None) -> None:
+        bundle, graph = decoder.bundle, decoder.graph
+        if missing := {CONSTANTS, BATCH} - bundle.files.keys():
+            raise BundleError(f"{bundle.subject}: files", f"no {', '.join(sorted(missing))}", "a graph for batches")
+        self.decoder, self.pages, subject = decoder, pages, f"{bundle.subject}: {BATCH}"
+        first = open_session(bundle.files[CONSTANTS], f"{bundle.subject}: {CONSTANTS}", decoder.threads, once=True)
+        names = [node.name for node in first.get_outputs()]
+        with running(subject):
+            made = first.run(names, {node.name: graph.value(node.name) for node in first.get_inputs()})
+        self._session: Session = (
+            like._session
+            if like is not None
+            else open_session(bundle.files[BATCH], subject, decoder.threads, provider=graph.provider, pages=pages)
+        )
+        self._bound = BoundSession(self._session, graph.provider, dict(zip(names, made, strict=True)), subject)
+        if like is None:
+            check_golden(bundle, lambda pair: self.infer([pair])[0].p, FLOAT16)
+
+    def infer(self, pairs: Sequence[FramePair], *, doubtful: bool = False) -> list[Inference]:
+        """Run the graph on checked pairs, as `Decoder.infer` does on one; it raises for the first that is refused.
+
+        Raises:
+            InvalidInputError: no pair, or more than a run's.
+        """
+        if not 0 < len(pairs) <= self.pages:
+            raise InvalidInputError("pages of a batch", len(pairs), f"1 to {self.pages}")
+        filled = [*pairs, *[pairs[-1]] * (self.pages - len(pairs))]
+        feeds = {name: np.stack([getattr(pair, name) for pair in filled]) for name in ("in_phase", "quadrature")}
+        *answers, residuals = self._bound.run([*OUTPUTS, "residual"], feeds)
+        limit = self.decoder.bundle.manifest.residual_limit
+        for residual in residuals[: len(pairs)]:
+            check_residual(float(residual), limit, doubtful=doubtful)
+        return [Inference(*(each[page] for each in answers), float(residuals[page])) for page in range(len(pairs))]
