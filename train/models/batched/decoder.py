@@ -117,11 +117,13 @@ class WaysBack(nn.Module):
 
     def tables(self, parameters: Tensor) -> Tables:
         """Constants of a device."""
-        return {"down": padded(self.down, -2), "across": padded(self.across, -2)} | self.waves.tables(parameters)
+        lens = self.waves.first
+        down, across = lens.laid_out(self.down, "y"), lens.laid_out(self.across, "x")
+        return {"down": padded(down, -2), "across": padded(across, -2)} | self.waves.tables(parameters)
 
     def forward(self, field: Parts, tables: Tables) -> Tensor:
         """E, [B, ny, nx] each of whole multiples, to [B, 2 S, ny, nx] over the light's root mean square."""
-        page = self.waves(self.sparse(field, tables), tables)
+        page = self.waves.last.cropped(self.waves(self.sparse(field, tables), tables))
         rows, columns = (count // self.samples for count in sizes(page)[-2:])
         scale = torch.rsqrt(_mean_square(page) * 2 + 1e-12).to(page.dtype)[:, None, None, None]
         split = (page * scale).reshape(-1, 2, rows, self.samples, columns, self.samples)
@@ -129,7 +131,7 @@ class WaysBack(nn.Module):
 
     @staticmethod
     def sparse(field: Parts, tables: Tables) -> Tensor:
-        """A field on the common grid, by the adjoint of interpolation, on its sparse samples, [B, 2, sy, sx]."""
+        """A field on the common grid, by the adjoint of interpolation, on its sparse samples as the lens has them."""
         return torch.stack(
             [turned_product(turned_product(part, tables["down"]), tables["across"]) for part in field], 1
         )
@@ -180,8 +182,11 @@ class Unexplained(nn.Module):
         there, back = self.there.tables(parameters), self.back.tables(parameters)
         made = {f"there.{name}": value for name, value in there.items()}
         made |= {f"back.{name}": value for name, value in back.items()}
-        up, wide = back["down"].transpose(-1, -2), back["across"].transpose(-1, -2)
-        return made | {"up": up, "wide": wide, "illumination": self.illumination, "floor": self.floor}
+        page, camera = self.there.first, self.there.last
+        for axis, count, grid in zip("yx", sizes(self.illumination)[-2:], (self.back.down, self.back.across), strict=True):
+            made[f"page_{axis}"] = page.laid_out(torch.eye(count), axis)
+            made[f"up_{axis}"] = padded(camera.laid_out(grid, axis), -2).transpose(-1, -2)
+        return made | {"illumination": self.illumination, "floor": self.floor}
 
     def forward(
         self, solver: BatchedField, seen: Seen, field: Parts, p: Tensor, tables: Tables, of_field: Tables
@@ -190,8 +195,10 @@ class Unexplained(nn.Module):
         dtype, back = field[0].dtype, of_part(tables, "back")
         written = (p / (0.5 + torch.sqrt(p.square().sum(1, keepdim=True) + 2.25))).to(dtype)
         lit = _multiplied(written, tables["illumination"])
+        lit = turned_product(turned_product(lit, tables["page_y"]), tables["page_x"])
         expected = self.there(lit, of_part(tables, "there"))  # on the sparse samples
-        planes = [turned_product(turned_product(expected[:, part], tables["up"]), tables["wide"]) for part in (0, 1)]
+        up_y, up_x = tables["up_y"], tables["up_x"]
+        planes = [turned_product(turned_product(expected[:, part], up_y), up_x) for part in (0, 1)]
         # sums over the grid: beyond it there are sparse samples too, but known light has none there
         turned = _multiplied(self.back.sparse(field, back), torch.cat([expected[:, :1], -expected[:, 1:]], 1))
         rows, columns = sizes(turned)[-2:]

@@ -78,8 +78,8 @@ class BatchedFrames(nn.Module):
             return means[:, 0]
         height, width = sizes(frames)[1:]
         missing = -width % BLOCK
-        if missing:  # no GPU pads bytes
-            frames = functional.pad(frames.to(self.dtype), (0, missing))
+        if missing:
+            frames = torch.cat([frames, 0 * frames[..., :missing]], -1)
         split = frames.reshape(-1, height, (width + missing) // BLOCK, BLOCK).permute(0, 3, 1, 2).to(self.dtype)
         filtered = functional.conv2d(split, self.weights, padding=(self.reach, _NEIGHBOURS // 2))
         filtered = filtered.permute(0, 2, 3, 1).reshape(-1, height, width + missing)

@@ -134,18 +134,10 @@ class BatchedLens(nn.Module):
         self, to_x: Parts, between: Parts, to_y: Parts, facet: Parts, plane: Parts, y: Parts, x: Parts, way: Any
     ) -> Tables:
         """Constants of the way from the plane."""
-        y, x = _by_parity(way[0], y, (1, -1)), _by_parity(way[1], x, None)  # [tiles, 2, K, few]
-        ty, _, modes_y, few_y = y[0].shape
-        tx, _, modes_x, few_x = x[0].shape
+        y, x = _by_parity(way[0], y, odd=True), _by_parity(way[1], x, odd=False)  # [tiles, 2, K, few]
+        ty, few_y = sizes(y[0])[0], sizes(y[0])[-1]
         along_y = real_form((_columns(y[0]), _columns(y[1]))).reshape(2, ty, few_y, -1)  # [r, ty, few, (r', p, k)]
-        return {
-            "plane": _pair(plane, -2)[:, None, :, :, :, None],
-            "x": with_phasor(to_x),
-            "between": _pair(_transposed(between), -2)[:, None, None, :, :, None],
-            "y": torch.cat(
-                [with_phasor(_transposed(to_y)), with_phasor(_times_i(_transposed(to_y)))], -1
-            ),  # columns (t, r, few)
-            "facet": _pair(_transposed(facet), -2)[:, None, :, :, :, None],
+        return _between(plane, to_x, _transposed(between), _transposed(to_y), _transposed(facet)) | {
             "modes_y": along_y.permute(1, 0, 2, 3).reshape(ty * 2 * few_y, -1),
             "modes_x": real_form((_columns(x[0]), _columns(x[1])), "kr"),
         }
@@ -163,32 +155,16 @@ class BatchedLens(nn.Module):
                     made = _times_i(made)  # light odd along y' is held times -i
                 columns = made[0].permute(2, 0, 1).flatten(1), made[1].permute(2, 0, 1).flatten(1)
                 tables[f"modes_{name}_{parity}"] = real_form(columns, "kr")
-        from_x = conjugate(_transposed(to_x))
-        return tables | {
-            "facet": _pair(conjugate(_transposed(facet)), -2)[:, None, :, :, :, None],
-            "y": with_phasor(conjugate(to_y)),
-            "between": _pair(conjugate(between), -2)[:, None, None, :, :, None],
-            "x": torch.cat([with_phasor(from_x), with_phasor(_times_i(from_x))], -1),
-            "plane": _pair(conjugate(plane), -2)[:, None, :, :, :, None],
-        }
+        near, far = conjugate(_transposed(facet)), conjugate(plane)
+        return tables | _between(near, conjugate(to_y), conjugate(between), conjugate(_transposed(to_x)), far)
 
     def to_modes(self, field: Tensor, tables: Tables) -> Light:
-        """Field on the plane [B, 2, ny, nx] to light in the pipe."""
-        (tx, ty), (side_x, side_y) = self.tiles, self.sides
-        count, _, terms, rows, _, _, columns = sizes(tables["plane"])
-        few_x, few_y = sizes(tables["facet"])[3::3]
-        missing_y, missing_x = ty * side_y - self.shape[0], tx * side_x - self.shape[1]
-        if missing_y or missing_x:
-            field = functional.pad(field, (0, missing_x, 0, missing_y))
-        field = field.reshape(-1, 2, ty, side_y, tx, side_x).permute(4, 2, 0, 3, 1, 5)
-        if rows > side_y or columns > side_x:
-            field = functional.pad(field, (0, columns - side_x, 0, 0, 0, rows - side_y))
-        field = field.reshape(count, -1, 1, rows, 1, 2, columns)
-        light = (field * tables["plane"]).reshape(count, -1, 4 * columns) @ tables["x"]  # [T, (B, R, ny), (r, few x)]
-        light = light.reshape(count, -1, terms, rows, 2, few_x).permute(0, 1, 2, 5, 4, 3)
-        light = light.unsqueeze(4) * tables["between"]  # [T, B, R, few x, t, r, ny]
-        light = light.reshape(count, -1, 4 * rows) @ tables["y"]  # [T, (B, R, few x), (t, r, few y)]
-        light = _terms(light.reshape(count, -1, terms, few_x, 2, 2, few_y), tables["facet"])
+        """Field on the plane, `laid_out`, [B, 2, Ty ny, Tx nx], to light in the pipe."""
+        tx, ty = self.tiles
+        _, _, rows, _, _, columns = sizes(tables["near_0"])
+        field = field.reshape(-1, 2, ty, rows, tx, columns).permute(4, 2, 0, 3, 1, 5)
+        light = _from_near(field.reshape(tx * ty, -1, rows, 1, 2, columns), tables)  # [T, B, few x, r, few y]
+        few_x, few_y = sizes(tables["far_0_0"])[2::2]
         light = light.reshape(tx, ty, -1, few_x, 2, few_y).permute(2, 0, 3, 1, 4, 5)
         light = light.reshape(-1, tx * few_x, ty * 2 * few_y) @ tables["modes_y"]  # [B, (tx, few x), (r, p, ky)]
         modes_y, modes_x = (sizes(tables[f"modes_{axis}"])[1] // 4 for axis in "yx")
@@ -197,10 +173,9 @@ class BatchedLens(nn.Module):
         return [split[:, p, :, q] for p in (0, 1) for q in (0, 1)]
 
     def to_plane(self, light: Light, tables: Tables) -> Tensor:
-        """Light in the pipe to a field on the plane [B, 2, ny, nx]."""
-        (tx, ty), (side_x, side_y) = self.tiles, self.sides
-        count, _, terms, rows, _, _, columns = sizes(tables["plane"])
-        few_x, few_y = sizes(tables["facet"])[3::3]
+        """Light in the pipe to a field on the plane, `laid_out`, [B, 2, Ty ny, Tx nx]."""
+        tx, ty = self.tiles
+        _, _, few_x, _, _, few_y = sizes(tables["near_0"])
         total: Tensor | None = None
         for q in (0, 1):
             modes = sizes(light[q])[-1]
@@ -210,14 +185,24 @@ class BatchedLens(nn.Module):
             total = one if total is None else total + one
         assert total is not None
         facet = total.reshape(-1, ty, few_y, 2, tx, few_x).permute(4, 1, 0, 5, 3, 2)
-        tiled = facet.reshape(count, -1, 1, few_x, 1, 2, few_y) * tables["facet"]
-        tiled = tiled.reshape(count, -1, 4 * few_y) @ tables["y"]  # [T, (B, R, few x), (r, ny)]
-        tiled = tiled.reshape(count, -1, terms, few_x, 2, rows).permute(0, 1, 2, 5, 4, 3)
-        tiled = tiled.unsqueeze(4) * tables["between"]  # [T, B, R, ny, t, r, few x]
-        tiled = tiled.reshape(count, -1, 4 * few_x) @ tables["x"]  # [T, (B, R, ny), (t, r, nx)]
-        tiled = _terms(tiled.reshape(count, -1, terms, rows, 2, 2, columns), tables["plane"])
-        field = tiled.reshape(tx, ty, -1, rows, 2, columns)[:, :, :, :side_y, :, :side_x].permute(2, 4, 1, 3, 0, 5)
-        return field.reshape(-1, 2, ty * side_y, tx * side_x)[:, :, : self.shape[0], : self.shape[1]]
+        tiled = _from_near(facet.reshape(tx * ty, -1, few_x, 1, 2, few_y), tables)  # [T, B, ny, r, nx]
+        rows, columns = sizes(tables["far_0_0"])[2::2]
+        field = tiled.reshape(tx, ty, -1, rows, 2, columns).permute(2, 4, 1, 3, 0, 5)
+        return field.reshape(-1, 2, ty * rows, tx * columns)
+
+    def laid_out(self, matrix: Tensor, axis: str) -> Tensor:
+        """Columns of a matrix [m, n], one a sample of the plane along an axis, tile by tile, [m, T n] with zeros."""
+        number = "xy".index(axis)
+        tiles, side = self.tiles[number], self.sides[number]
+        whole = functional.pad(matrix, (0, tiles * side - matrix.shape[1]))
+        return padded(whole.reshape(-1, tiles, side), -1).flatten(1)
+
+    def cropped(self, field: Tensor) -> Tensor:
+        """What is `laid_out`, [B, 2, Ty ny, Tx nx], as the plane has it, [B, 2, ny, nx]."""
+        (tx, ty), (side_x, side_y) = self.tiles, self.sides
+        rows, columns = (count // tiles for count, tiles in zip(sizes(field)[-2:], (ty, tx), strict=True))
+        tiled = field.reshape(-1, 2, ty, rows, tx, columns)[:, :, :, :side_y, :, :side_x]
+        return tiled.reshape(-1, 2, ty * side_y, tx * side_x)[:, :, : self.shape[0], : self.shape[1]]
 
     def _axis(self, name: str) -> Tensor:
         """A buffer as float64."""
@@ -242,16 +227,46 @@ class BatchedLens(nn.Module):
         return real, imaginary
 
 
-def _terms(light: Tensor, factor: Tensor) -> Tensor:
-    """Sum over R and t of light [T, B, R, n, t, r, m] times a factor [T, 1, R, n, t, 1, m], [T, B, n, r, m].
+def _between(near: Parts, along: Parts, between: Parts, across: Parts, far: Parts) -> Tables:
+    """Constants of `_from_near`.
 
-    Term by term, since a GPU's kernels that sum along an axis of planes are slow.
+    Args:
+        near: the terms where light comes from, [T, R, n, m].
+        along: [T, m, k].
+        between: [T, k, n].
+        across: [T, n, j].
+        far: the terms where it goes to, [T, R, k, j].
     """
-    total: Tensor | None = None
-    for term in range(sizes(light)[2]):
+    tables = {
+        "along": with_phasor(along),
+        "between": _pair(between, -2)[:, None, :, :, None],
+        "across_0": with_phasor(across),
+        "across_1": with_phasor(_times_i(across)),
+    }
+    for term in range(sizes(near[0])[1]):
+        tables[f"near_{term}"] = _pair((near[0][:, term], near[1][:, term]), -2)[:, None, :, :, None]
         for part in (0, 1):
-            one = light[:, :, term, :, part] * factor[:, :, term, :, part]
-            total = one if total is None else total + one
+            tables[f"far_{term}_{part}"] = far[part][:, term, None, :, None]
+    return tables
+
+
+def _from_near(light: Tensor, tables: Tables) -> Tensor:
+    """Light of each tile, [T, B, n, 1, r, m], through the terms to the other plane, [T, B, k, r, j].
+
+    Term by term: a GPU's kernels that sum along an axis of planes are slow, and so are those that take one out of many.
+    A product's two outcomes are one that is multiplied by a phasor's real part, and one by its imaginary part.
+    """
+    count, _, rows, _, _, columns = sizes(tables["near_0"])
+    inner = sizes(tables["between"])[2]
+    total: Tensor | None = None
+    for term in range(sum(name.startswith("near_") for name in tables)):
+        one = (light * tables[f"near_{term}"]).reshape(count, -1, 4 * columns) @ tables["along"]
+        one = one.reshape(count, -1, rows, 2, inner).permute(0, 1, 4, 3, 2)  # [T, B, k, r, n]
+        one = (one.unsqueeze(3) * tables["between"]).reshape(count, -1, 4 * rows)
+        for part in (0, 1):
+            ended = one @ tables[f"across_{part}"]
+            ended = ended.reshape(count, -1, inner, 2, sizes(ended)[-1] // 2) * tables[f"far_{term}_{part}"]
+            total = ended if total is None else total + ended
     assert total is not None
     return total
 
@@ -273,10 +288,10 @@ def _columns(modes: Tensor) -> Tensor:
     return modes.permute(0, 3, 1, 2).flatten(2).flatten(0, 1)
 
 
-def _by_parity(way: Parts, modes: Parts, odd: tuple[int, int] | None) -> Parts:
+def _by_parity(way: Parts, modes: Parts, *, odd: bool) -> Parts:
     """A matrix of either parity [2, K, K] times sine modes [tiles, 2, K, few]; those of the odd one times -i if asked."""
     real, imaginary = matmul(way, modes)
-    if odd is None:
+    if not odd:
         return real, imaginary
     return torch.stack([real[:, 0], imaginary[:, 1]], 1), torch.stack([imaginary[:, 0], -real[:, 1]], 1)
 
