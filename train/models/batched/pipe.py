@@ -47,7 +47,9 @@ class BatchedPipe(nn.Module):
     def __init__(self, geometry: WaveGeometry, cells: tuple[int, int], error: float, *, backwards: bool) -> None:
         super().__init__()
         y_modes, x_modes = ((0, count // 2) for count in cells)
-        self.steps = splitting_steps(geometry, (y_modes, x_modes), error)
+        self.sheared = abs(geometry.pipe_angle) > 0
+        # the rest of the detuning comes between two steps
+        self.steps = max(2, splitting_steps(geometry, (y_modes, x_modes), error))
         self.sign = -1 if backwards else 1
         width, nk = geometry.pipe_width_m, geometry.refractive_index * geometry.wave_number
         lag = geometry.pipe_length_m / self.steps * (np.pi / width) ** 2 / (2 * nk)
@@ -84,7 +86,10 @@ class BatchedPipe(nn.Module):
         shear: Any = geometry.pipe_angle
         couplings = self.y_couplings.double()[:, None] * self.x_couplings.double()
         turn = step / nk * torch.sin(shear) / width**2 * couplings
-        tables = {"cos": padded(torch.cos(turn), -1, -2)[:, None], "sin": padded(self.sign * torch.sin(turn), -1, -2)[:, None]}
+        tables = {
+            "cos": padded(torch.cos(turn), -1, -2)[:, None],
+            "sin": padded(self.sign * torch.sin(turn), -1, -2)[:, None],
+        }
         middle = padded_parts(phasor(self.sign * geometry.pipe_length_m * rest), -1, -2)
         for p in (0, 1):
             for q in (0, 1):
@@ -115,7 +120,8 @@ class BatchedPipe(nn.Module):
     def forward(self, light: Light, tables: Tables) -> Light:
         """Light half a step of detuning behind where it comes in, to half a step before where it leaves."""
         for step in range(self.steps):
-            light = self._rotated(light, tables)
+            if self.sheared:
+                light = self._rotated(light, tables)
             if step == self.steps - 1:
                 break
             if step != (self.steps - 1) // 2:

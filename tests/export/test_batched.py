@@ -1,0 +1,167 @@
+"""The decoder for many pages in a bundle: it reads as that for one page does, and a GPU has nothing slow to do."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from lightpage.calibration.sampling_table import sampling_table
+from lightpage.device.state import Device
+from lightpage.errors import BundleError, FrameError, InvalidInputError
+from lightpage.export.batched import batched_onnx
+from lightpage.export.graph import DecoderGraph, table_tensors
+from lightpage.export.half import deviation
+from lightpage.export.operators.batches import BatchFile
+from lightpage.export.operators.check import fallbacks
+from lightpage.metrics.measures import measure
+from lightpage.page.pilots import Pilots
+from lightpage.page.symbols import random_symbols
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording
+from lightpage.runtime.model.bundle.manifest import BATCH, CONSTANTS
+from lightpage.runtime.model.decoding.batch_decoder import BatchDecoder
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.simulator.simulator import Simulator
+from lightpage.simulator.true_optics import true_parameters
+from lightpage.train.models.decoder import SymbolDecoder
+from lightpage.train.models.network import SymbolUNet
+from lightpage.train.models.presets import ACCURATE, FAST, PRESETS, STANDARD
+from lightpage.train.models.twin import RayTwin, TorchTwin
+from tests.lightpage.small import small_profile
+
+PROFILE = small_profile()
+PAGES = 3
+
+
+@pytest.fixture(scope="module")
+def decoder(small_bundle: Path) -> Decoder:
+    return Decoder.load(small_bundle)
+
+
+@pytest.fixture(scope="module")
+def batches(decoder: Decoder) -> BatchDecoder:
+    return BatchDecoder(decoder, PAGES)
+
+
+@pytest.fixture(scope="module")
+def shown(small_device: list[str]) -> list[tuple[FramePair, np.ndarray]]:
+    """Pages and their symbols."""
+    with Recording.open(small_device[3]) as recording:
+        pages = [(recording.frames(page), recording.symbols(page)) for page in range(PAGES)]
+    return [(pair, symbols) for pair, symbols in pages if symbols is not None]
+
+
+def test_pages_of_a_batch_are_read_as_each_alone(
+    decoder: Decoder, batches: BatchDecoder, shown: list[tuple[FramePair, np.ndarray]]
+) -> None:
+    mask = decoder.bundle.pilot_mask
+    for (pair, symbols), found in zip(shown, batches.infer([pair for pair, _ in shown]), strict=True):
+        expected = decoder.infer(pair)
+        assert deviation(expected.p, found.p) < 0.03
+        assert found.residual == pytest.approx(expected.residual, rel=0.08)
+        known = Pilots.of_symbols(mask, symbols, 256)
+        pages = [decoder.post_process(each, 256, known) for each in (expected, found)]
+        rates = [
+            measure(page.phase[~mask], page.concentration[~mask], symbols[~mask], 256).air_bits_per_symbol
+            for page in pages
+        ]
+        assert rates[1] == pytest.approx(rates[0], abs=0.01)
+
+
+def test_fewer_pages_are_read_too_and_more_are_refused(
+    batches: BatchDecoder, shown: list[tuple[FramePair, np.ndarray]]
+) -> None:
+    pairs = [pair for pair, _ in shown]
+    alone, together = batches.infer(pairs[1:2])[0], batches.infer(pairs)[1]
+    np.testing.assert_allclose(alone.p, together.p, rtol=1e-3, atol=1e-3 * float(np.abs(together.p).max()))
+    for wrong in ([], [*pairs, pairs[0]]):
+        with pytest.raises(InvalidInputError):
+            batches.infer(wrong)
+
+
+def test_a_page_that_contradicts_itself_is_refused_within_a_batch(
+    batches: BatchDecoder, shown: list[tuple[FramePair, np.ndarray]]
+) -> None:
+    right = shown[0][0]
+    with pytest.raises(FrameError):
+        batches.infer([right, FramePair(right.quadrature, right.in_phase)])
+
+
+def test_other_numbers_in_the_table_reach_both_forms(decoder: Decoder, batches: BatchDecoder) -> None:
+    drifted = Device().with_settings([f"geometry.pipe_angle_deg={Device().geometry.pipe_angle_deg + 0.15}"])
+    pair = Simulator(PROFILE, drifted, seed=9).page(random_symbols(PROFILE, 256, 1, np.random.default_rng(9))[0])
+    parameters = true_parameters(PROFILE, drifted)
+    table = sampling_table(TorchTwin(RayTwin(PROFILE)), parameters, drifted.homodyne.turn_rad, PROFILE)
+    refitted = decoder.with_table(decoder.taken(table))
+    found = BatchDecoder(refitted, PAGES, like=batches).infer([pair])[0]
+    before = batches.infer([pair])[0]
+    expected = refitted.infer(pair)
+    assert deviation(expected.p, found.p) < 0.04 < deviation(expected.p, before.p)
+
+
+def test_a_bundle_without_the_graph_is_refused_and_serves_pages(
+    decoder: Decoder, shown: list[tuple[FramePair, np.ndarray]]
+) -> None:
+    files = {name: data for name, data in decoder.bundle.files.items() if name not in (BATCH, CONSTANTS)}
+    earlier = Decoder(replace(decoder.bundle, files=files), graph=decoder.graph)
+    assert earlier.infer(shown[0][0]).p.shape == (2, *PROFILE.page_shape)
+    with pytest.raises(BundleError):
+        BatchDecoder(earlier, PAGES)
+
+
+def graph_for_batches(preset: str) -> BatchFile:
+    """That of an untrained decoder of a preset."""
+    torch.manual_seed(0)
+    device, chosen = Device(), PRESETS[preset]
+    parameters = true_parameters(PROFILE, device)
+    decoder = SymbolDecoder(PROFILE, parameters, chosen.localizer, chosen.choices)
+    for part in decoder.modules():
+        for value in part.head.parameters() if isinstance(part, SymbolUNet) else ():
+            nn.init.normal_(value, std=0.01)
+    graph = DecoderGraph(PROFILE, decoder, 1.0).eval()
+    table = sampling_table(TorchTwin(RayTwin(PROFILE)), parameters, device.homodyne.turn_rad, PROFILE)
+    defaults = table_tensors(graph, table, Simulator(PROFILE, device, seed=1).references())
+    made = batched_onnx(graph, "uint8", defaults, torch.float16)
+    assert made is not None
+    return BatchFile(made[1], 8)
+
+
+@pytest.mark.parametrize(
+    ("preset", "kernels", "megabytes"), [(STANDARD, 1000, 150), (FAST, 250, 60), (ACCURATE, 1800, 250)]
+)
+def test_a_gpu_has_nothing_slow_to_do(preset: str, kernels: int, megabytes: float) -> None:
+    file = graph_for_batches(preset)
+    assert file.left_constants() == []
+    assert file.reduced_planes() == []
+    assert file.wide_planes(PROFILE.page_shape) == []
+    assert fallbacks(file.model.SerializeToString(), "cuda") == []
+    cost = file.cost()
+    assert cost.kernels < kernels
+    assert cost.bytes_a_page < 1e6 * megabytes
+    assert cost.flops_a_page > 1e7  # all shapes are known, or it would count none
+
+
+@pytest.mark.parametrize(
+    ("told", "spoil"),
+    [
+        ("left_constants", lambda light, constant: constant @ light),
+        ("reduced_planes", lambda light, constant: (light @ constant).sum(-1, keepdim=True) + light),
+    ],
+    ids=["a constant on the left", "a sum over planes"],
+)
+def test_what_is_slow_is_found(told: str, spoil: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]) -> None:
+    from lightpage.export.batched import traced
+
+    class Slow(nn.Module):
+        def forward(self, in_phase: torch.Tensor, constant: torch.Tensor) -> torch.Tensor:
+            return spoil(in_phase, constant)
+
+    inputs = torch.zeros(1, 40, 40), torch.zeros(40, 40)
+    model = traced(Slow(), inputs, ("in_phase", "constant"), ("p",), ("in_phase", "p"))
+    file = BatchFile(model.SerializeToString(), 4)
+    assert len(getattr(file, told)()) == 1
+    assert file.wide_planes((1, 1))
