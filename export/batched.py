@@ -6,11 +6,12 @@ as to that for one page, and no start computes more than the constants.
 
 from __future__ import annotations
 
-import io
 import re
+import tempfile
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import onnx
@@ -28,7 +29,8 @@ PAGES = "pages"
 """Name of the axis of pages, which a session may be opened with a number for."""
 OUTPUTS = (*ANSWERS, "residual")
 _MATRICES = re.compile(r"\.(sine_.|up_.|down|across|network\.\S*weight|unet\.\S*weight)$")
-"""Names of buffers that are factors of products in float16 anyway; the pipe's bases stay, whose products must be unitary."""
+"""Names of buffers that are factors of products in float16 anyway. The pipe's bases stay exact: their products must be
+unitary."""
 _EXAMPLE = 1
 """Pages that the exporter is shown."""
 
@@ -116,8 +118,8 @@ def traced(
         names, outputs: of inputs and outputs.
         of_pages: which of them have the axis of pages first.
     """
-    file = io.BytesIO()
-    with _named(module), warnings.catch_warnings():
+    with _named(module), warnings.catch_warnings(), tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "traced.onnx"
         warnings.simplefilter("ignore")
         torch.onnx.export(
             module,
@@ -130,7 +132,7 @@ def traced(
             output_names=list(outputs),
             dynamic_axes={name: {0: PAGES} for name in of_pages},
         )
-    traced_model = onnx_ir.from_proto(onnx.load_from_string(file.getvalue()))
+        traced_model = onnx_ir.from_proto(onnx.load(file))
     optimizer.fold_constants(traced_model, output_size_limit=FOLDED)
     optimizer.remove_unused_nodes(traced_model)
     model = anonymous(sharing(onnx_ir.to_proto(traced_model)))
@@ -141,7 +143,7 @@ def traced(
 
 @contextmanager
 def _named(module: nn.Module) -> Iterator[None]:
-    """While it is exported, all buffers of a module stay tensors of the file by their names, and are not computed with."""
+    """While it is exported, a module's buffers stay tensors of the file by their names, and are not computed with."""
     kept = {part: set(part._non_persistent_buffers_set) for part in module.modules()}
     for part in kept:
         part._non_persistent_buffers_set.clear()

@@ -88,9 +88,7 @@ class TorchRecalibration:
         unproven.unlink(missing_ok=True)
         try:
             batches = BATCH in bundle.files
-            made, _ = export_run(
-                folder / _RUN, unproven, None, version, progress, precision=precision, batches=batches
-            )
+            made, _ = export_run(folder / _RUN, unproven, None, version, progress, precision=precision, batches=batches)
             progress("judge by the held-back pages", 0.0)
             after = _judged(Decoder(made, decoder.threads), held_back)
         finally:

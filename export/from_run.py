@@ -159,16 +159,19 @@ def _for_batches(
     if made is None:
         warn("no decoder for many pages: the cameras of this device stand apart")
         return {}
-    first, second = (open_session(model, f"{out}: {name}", pages=1) for model, name in zip(made, (CONSTANTS, BATCH)))
-    names = [node.name for node in first.get_outputs()]
-    constants = dict(zip(names, first.run(names, {node.name: defaults[node.name] for node in first.get_inputs()})))
-    (answer,) = second.run(["p"], constants | {"in_phase": pair.in_phase[None], "quadrature": pair.quadrature[None]})
+    names = CONSTANTS, BATCH
+    first, second = (open_session(model, f"{out}: {name}", pages=1) for model, name in zip(made, names, strict=True))
+    outputs = [node.name for node in first.get_outputs()]
+    table = {node.name: defaults[node.name] for node in first.get_inputs()}
+    feeds = dict(zip(outputs, first.run(outputs, table), strict=True))
+    feeds |= {"in_phase": pair.in_phase[None], "quadrature": pair.quadrature[None]}
+    (answer,) = second.run(["p"], feeds)
     try:
         check_parity(expected, answer[0], f"{out}, {BATCH}", GOLDEN_TOLERANCE[FLOAT16])
     except BundleError as differing:
         warn(f"no decoder for many pages: {differing}")
         return {}
-    return dict(zip((CONSTANTS, BATCH), made, strict=True))
+    return dict(zip(names, made, strict=True))
 
 
 def _proven(

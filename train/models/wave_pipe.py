@@ -173,16 +173,15 @@ def _reversed(stack: Tensor) -> Tensor:
     return stack.index_select(0, torch.arange(len(stack) - 1, -1, -1, device=stack.device))
 
 
-def splitting_steps(
-    geometry: WaveGeometry, modes: tuple[tuple[int, int], tuple[int, int]], error: float
-) -> int:
+def splitting_steps(geometry: WaveGeometry, modes: tuple[tuple[int, int], tuple[int, int]], error: float) -> int:
     """Steps in which modes of each parity along (y', x), from one to before another, are followed; see `TiledPipe`."""
     if not abs(geometry.pipe_angle) > 0:
         return 1
     nk = geometry.refractive_index * geometry.wave_number
     y, x = (_mean_wave(some, geometry.pipe_width_m) for some in modes)
-    turn = abs(geometry.pipe_angle) * y * x * geometry.pipe_length_m / nk
-    return max(_FEWEST_STEPS, math.ceil(_STEPS * math.sqrt(turn) / error ** (2 / 3)))
+    turn = float(abs(geometry.pipe_angle) * y * x * geometry.pipe_length_m / nk)
+    wanted: float = _STEPS * math.sqrt(turn) / error ** (2 / 3)
+    return max(_FEWEST_STEPS, math.ceil(wanted))
 
 
 def _mean_wave(modes: tuple[int, int], width: float) -> float:

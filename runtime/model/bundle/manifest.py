@@ -21,7 +21,7 @@ TABLE = "table.npz"
 PILOTS = "pilots.npz"
 CONSTANTS = "constants.onnx"
 BATCH = "batch.onnx"
-"""The decoder for many pages: what follows from the table alone, and frames with that to p. Both are there or neither."""
+"""The decoder for many pages: what follows from the table alone, and frames with that to p; both or neither."""
 REQUIRED_FILES = frozenset({DECODER, TWIN, GOLDEN})
 OPTIONAL_FILES = frozenset({FIELD, TABLE, PILOTS, CONSTANTS, BATCH})
 Precision = Literal["float32", "float16"]

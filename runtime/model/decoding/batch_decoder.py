@@ -56,8 +56,8 @@ class BatchDecoder:
             raise InvalidInputError("pages of a batch", len(pairs), f"1 to {self.pages}")
         filled = [*pairs, *[pairs[-1]] * (self.pages - len(pairs))]
         feeds = {name: np.stack([getattr(pair, name) for pair in filled]) for name in ("in_phase", "quadrature")}
-        *answers, residuals = self._bound.run([*OUTPUTS, "residual"], feeds)
-        limit = self.decoder.bundle.manifest.residual_limit
-        for residual in residuals[: len(pairs)]:
-            check_residual(float(residual), limit, doubtful=doubtful)
-        return [Inference(*(each[page] for each in answers), float(residuals[page])) for page in range(len(pairs))]
+        answers = zip(*self._bound.run([*OUTPUTS, "residual"], feeds), strict=True)
+        read = [Inference(p, phase, length, float(residual)) for p, phase, length, residual in answers][: len(pairs)]
+        for page in read:
+            check_residual(page.residual, self.decoder.bundle.manifest.residual_limit, doubtful=doubtful)
+        return read

@@ -64,9 +64,8 @@ class Provider:
         to. A bundle in half precision has chosen that itself.
 
         Args:
-            rounded: whether the model holds no product that must be exact. A GPU's convolutions of float16 are fast only
-                where those of float32 may be rounded too.
             version: of the model. TensorRT finds an engine by the model's names alone, whatever its weights are.
+            rounded: whether no product of the model must be exact. Only then is a GPU fast at those of float16 too.
         """
         cpu: tuple[str, dict[str, Any]] = (_NAMES[CPU], {})
         if self.name == CPU:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
@@ -183,6 +183,14 @@ class BoundSession:
                 for name, value in fixed.items()
             }
 
+    def binding(self, without: Container[str] = ()) -> Any:
+        """onnxruntime's binding of the tensors that lie there, but for some."""
+        binding = self.session.io_binding()
+        for name, value in self._fixed.items():
+            if name not in without:
+                binding.bind_ortvalue_input(name, value)
+        return binding
+
     def run(self, outputs: Iterable[str], feeds: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
         """Outputs of the names asked for; `feeds` holds the other inputs, and may stand in for constants.
 
@@ -191,10 +199,7 @@ class BoundSession:
             SurroundingsError: memory or threads are short.
         """
         with running(self._subject, self._provider):
-            binding = self.session.io_binding()
-            for name, value in self._fixed.items():
-                if name not in feeds:
-                    binding.bind_ortvalue_input(name, value)
+            binding = self.binding(feeds)
             for name, array in feeds.items():
                 binding.bind_cpu_input(name, np.asarray(array, order="C"))
             for name in outputs:

@@ -43,108 +43,78 @@ def knocked() -> np.ndarray:
     return parameters
 
 
-class TestWaves:
-    """Both ways, of a device that deviates in all that a calibration fits."""
-
-    @pytest.fixture(params=[knocked, lambda: true_parameters(PROFILE, Device()) * 0], ids=["sheared", "square"])
-    def waves(self, request: pytest.FixtureRequest) -> tuple[Waves, FittedWaves]:
-        """The form for one page, and the simulation."""
-        parameters = request.param()
-        profile = PROFILE.model_copy(update={"lens_path": THICK})
-        return Waves(profile, parameters, 4, EXACT), FittedWaves(profile, parameters, 4)
-
-    def test_fields_come_back_to_the_page(self, waves: tuple[Waves, FittedWaves]) -> None:
-        usual, fitted = waves
-        rng = np.random.default_rng(0)
-        page = np.exp(2j * np.pi * rng.random(fitted.launch.shape)).astype(np.complex64)
-        field = stacked(fitted.to_camera(page))
-        back = WaysBack(usual)
-        with torch.no_grad():
-            tables = {name: value.float() for name, value in back.tables(usual.default).items()}
-            two = torch.nn.functional.pad(torch.stack([field, 0.5 * field]), _missing(field))
-            found = back.waves(back.sparse((two[:, 0], two[:, 1]), tables), tables)
-            cropped = back.waves.last.cropped(found)
-            expected = usual.to_page(usual.matrices(), field)
-        assert relative(cropped[0], expected) < 0.006
-        assert relative(2 * cropped[1], expected) < 0.006
-        assert relative(cropped[0], stacked(fitted.to_page(fitted.to_camera(page)))) < 0.02
-
-    def test_pages_light_the_cameras(self, waves: tuple[Waves, FittedWaves]) -> None:
-        usual, fitted = waves
-        rng = np.random.default_rng(1)
-        page = stacked(np.exp(2j * np.pi * rng.random(fitted.launch.shape)).astype(np.complex64))
-        there = BatchedWaves(usual, to_page=False)
-        down, across = (torch.from_numpy(each).float() for each in usual.interpolations)
-        with torch.no_grad():
-            tables = {name: value.float() for name, value in there.tables(usual.default).items()}
-            sides = zip("yx", page.shape[1:], strict=True)
-            spread_y, spread_x = (there.first.laid_out(torch.eye(count), axis) for axis, count in sides)
-            sparse = there.last.cropped(there((spread_y.T @ page @ spread_x)[None], tables))[0]
-            expected = usual.to_camera(usual.matrices(), page)
-        assert relative(down @ sparse @ across.T, expected) < 0.006
-
-
-def _missing(field: torch.Tensor) -> tuple[int, ...]:
-    return (0, -field.shape[-1] % 8, 0, -field.shape[-2] % 8)
-
-
-class TestField:
-    """From frames to the field, by each way that a decoder may recover it."""
-
-    @staticmethod
-    @cache
-    def shown() -> tuple[FramePair, FramePair, dict[str, torch.Tensor]]:
-        """A page, the references and the device's table."""
-        device = Device()
-        simulator = Simulator(PROFILE, device, seed=2)
-        page = simulator.page(random_symbols(PROFILE, 256, 1, np.random.default_rng(1))[0])
-        parameters = true_parameters(PROFILE, device)
-        table = sampling_table(TorchTwin(RayTwin(PROFILE)), parameters, device.homodyne.turn_rad, PROFILE)
-        chosen = {name: torch.from_numpy(table[name]) for name in ("registration", "homodyne")}
-        return page, simulator.references(), chosen
-
-    @pytest.mark.parametrize(
-        "recovery",
-        [
-            FieldRecovery(PROFILE, reflections=4),
-            FieldRecovery(PROFILE),
-            FieldRecovery(PROFILE, rounds=0, binning=2, grid=field_grid(PROFILE, 3)),
-        ],
-        ids=["reflections", "descent", "closed root"],
-    )
-    @pytest.mark.parametrize(
-        ("dtype", "bits", "error"),
-        [(torch.float32, 8, 1e-4), (torch.float16, 8, 3e-3), (torch.float16, 16, 3e-3)],
-        ids=["float32", "float16", "float16 of 16 bits"],
-    )
-    def test_the_field_is_that_of_one_page(
-        self,
-        recovery: FieldRecovery,
-        dtype: torch.dtype,
-        bits: int,
-        error: float,
-    ) -> None:
-        shown, counts = self.shown(), 1 if bits == 8 else 16
-        page, references = (
-            [torch.from_numpy(counts * frame.astype(f"uint{bits}")) for frame in (pair.in_phase, pair.quadrature)]
-            for pair in shown[:2]
+@pytest.mark.parametrize("shear", [1.0, 0.0], ids=["sheared", "square"])
+def test_waves_go_both_ways_as_those_of_one_page(shear: float) -> None:
+    profile, parameters = PROFILE.model_copy(update={"lens_path": THICK}), knocked()
+    parameters[NAMES.index("pipe_angle_rad")] *= shear
+    usual, fitted = Waves(profile, parameters, 4, EXACT), FittedWaves(profile, parameters, 4)
+    light = np.exp(2j * np.pi * np.random.default_rng(0).random(fitted.launch.shape)).astype(np.complex64)
+    page, field = stacked(light), stacked(fitted.to_camera(light))
+    back, there = WaysBack(usual), BatchedWaves(usual, to_page=False)
+    down, across = (torch.from_numpy(each).float() for each in usual.interpolations)
+    with torch.no_grad():
+        tables = _typed(back.tables(usual.default), torch.float32)
+        missing = 0, -field.shape[-1] % 8, 0, -field.shape[-2] % 8
+        two = torch.nn.functional.pad(torch.stack([field, 0.5 * field]), missing)
+        found = back.waves.last.cropped(back.waves(back.sparse((two[:, 0], two[:, 1]), tables), tables))
+        expected = usual.to_page(usual.matrices(), field)
+        spread_y, spread_x = (
+            there.first.laid_out(torch.eye(count), axis) for axis, count in zip("yx", page.shape[1:], strict=True)
         )
-        table = shown[2]
-        with torch.no_grad():
-            measured = recovery.measure(*page, *references, table["registration"], table["homodyne"])
-            expected, left = recovery.solve(measured)
-            blocks = recovery.in_blocks(*references)
-            seen = recovery.references(blocks, table["registration"])
-            frames, field = BatchedFrames(recovery, bits, dtype), BatchedField(recovery)
-            tables = _typed({**frames.tables(blocks, seen), **field.tables(seen, table["homodyne"])}, dtype)
-            both = Seen(*(frames(torch.stack([each, each]), tables, camera) for camera, each in enumerate(page)))
-            found = field(both, tables)
-            residual = field.residual(both, found, field.power(found), tables)
-        ny, nx = recovery.grid.shape
-        for number in (0, 1):
-            assert relative(torch.stack([part[number, :ny, :nx] for part in found]), expected) < error
-        wanted = float(left.square().mean() / expected.square().mean())
-        np.testing.assert_allclose(residual.numpy(), wanted, rtol=0.08)
+        tables = _typed(there.tables(usual.default), torch.float32)
+        sparse = there.last.cropped(there((spread_y.T @ page @ spread_x)[None], tables))[0]
+    for number, factor in enumerate((1, 2)):
+        assert relative(factor * found[number], expected) < 0.006
+    assert relative(found[0], stacked(fitted.to_page(fitted.to_camera(light)))) < 0.02
+    seen = down @ sparse @ across.T
+    assert relative(seen, usual.to_camera(usual.matrices(), page)) < 0.006
+    assert relative(seen, field) < 0.02
+
+
+@cache
+def shown() -> tuple[FramePair, FramePair, dict[str, torch.Tensor]]:
+    """A page, the references and the device's table."""
+    device = Device()
+    simulator = Simulator(PROFILE, device, seed=2)
+    page = simulator.page(random_symbols(PROFILE, 256, 1, np.random.default_rng(1))[0])
+    parameters = true_parameters(PROFILE, device)
+    table = sampling_table(TorchTwin(RayTwin(PROFILE)), parameters, device.homodyne.turn_rad, PROFILE)
+    return page, simulator.references(), {name: torch.from_numpy(table[name]) for name in ("registration", "homodyne")}
+
+
+@pytest.mark.parametrize(
+    "recovery",
+    [
+        FieldRecovery(PROFILE, reflections=4),
+        FieldRecovery(PROFILE),
+        FieldRecovery(PROFILE, rounds=0, binning=2, grid=field_grid(PROFILE, 3)),
+    ],
+    ids=["reflections", "descent", "closed root"],
+)
+@pytest.mark.parametrize(
+    ("dtype", "bits", "error"),
+    [(torch.float32, 8, 1e-4), (torch.float16, 8, 3e-3), (torch.float16, 16, 3e-3)],
+    ids=["float32", "float16", "float16 of 16 bits"],
+)
+def test_the_field_is_that_of_one_page(recovery: FieldRecovery, dtype: torch.dtype, bits: int, error: float) -> None:
+    pair, empty, table = shown()
+    page, references = (
+        [torch.from_numpy((bits - 7) * frame.astype(f"uint{bits}")) for frame in (each.in_phase, each.quadrature)]
+        for each in (pair, empty)
+    )
+    with torch.no_grad():
+        expected, left = recovery(*page, *references, table["registration"], table["homodyne"])
+        blocks = recovery.in_blocks(*references)
+        seen = recovery.references(blocks, table["registration"])
+        frames, field = BatchedFrames(recovery, bits, dtype), BatchedField(recovery)
+        tables = _typed({**frames.tables(blocks, seen), **field.tables(seen, table["homodyne"])}, dtype)
+        both = Seen(*(frames(torch.stack([each, each]), tables, camera) for camera, each in enumerate(page)))
+        found = field(both, tables)
+        residual = field.residual(both, found, field.power(found), tables)
+    ny, nx = recovery.grid.shape
+    for number in (0, 1):
+        assert relative(torch.stack([part[number, :ny, :nx] for part in found]), expected) < error
+    np.testing.assert_allclose(residual.numpy(), float(left.square().mean() / expected.square().mean()), rtol=0.08)
 
 
 def _typed(tables: Tables, dtype: torch.dtype) -> Tables:

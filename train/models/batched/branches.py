@@ -60,6 +60,6 @@ class BatchedBranches(nn.Module):
             for part in field
         )
         scale = torch.rsqrt(2 * power + 1e-12).to(real.dtype)[:, None, None, None]
-        cos, sin = tables["cos"] , tables["sin"]
+        cos, sin = tables["cos"], tables["sin"]
         light = torch.cat([real * cos + imaginary * sin, imaginary * cos - real * sin], 1)
         return light * scale

@@ -45,7 +45,9 @@ class BatchedDecoder(nn.Module):
             WaysBack(localizer.waves) if isinstance(localizer, WaveLocalizer) else BatchedBranches(localizer)
         )
         self.prediction = None if decoder.prediction is None else Unexplained(decoder.prediction)
-        self.refiners = nn.ModuleList(BatchedRefiner(refiner, dtype) for refiner in decoder.refiners)
+        self.refiners = nn.ModuleList(
+            BatchedRefiner(refiner, dtype) for refiner in decoder.refiners if isinstance(refiner, Refiner)
+        )
         self.inputs = decoder.table_inputs
 
     def tables(self, table: Tables) -> Tables:
@@ -76,17 +78,13 @@ class BatchedDecoder(nn.Module):
         return torch.float32 if PLACES in name else self.dtype
 
     def forward(self, in_phase: Tensor, quadrature: Tensor, tables: Tables) -> tuple[Tensor, Tensor]:
-        """Decode frames [B, H, W] to p [B, 2, ny, nx] and what is left of the equations over the field, [B]; float32."""
+        """Frames [B, H, W] to p [B, 2, ny, nx], and what is left of the equations over the field [B], float32."""
         own = {part: of_part(tables, part) for part in ("frames", "field", "way", "network", "prediction")}
         seen = Seen(*(self.frames(each, own["frames"], camera) for camera, each in enumerate((in_phase, quadrature))))
         field = self.field(seen, own["field"])
         power = self.field.power(field)
         residual = self.field.residual(seen, field, power, own["field"])
-        light = (
-            self.way(field, own["way"])
-            if isinstance(self.way, WaysBack)
-            else self.way(field, power, own["way"])
-        )
+        light = self.way(field, own["way"]) if isinstance(self.way, WaysBack) else self.way(field, power, own["way"])
         p = estimate(self.network(light, own["network"]))
         for number, refiner in enumerate(self._refining()):
             assert self.prediction is not None
@@ -183,7 +181,9 @@ class Unexplained(nn.Module):
         made = {f"there.{name}": value for name, value in there.items()}
         made |= {f"back.{name}": value for name, value in back.items()}
         page, camera = self.there.first, self.there.last
-        for axis, count, grid in zip("yx", sizes(self.illumination)[-2:], (self.back.down, self.back.across), strict=True):
+        for axis, count, grid in zip(
+            "yx", sizes(self.illumination)[-2:], (self.back.down, self.back.across), strict=True
+        ):
             made[f"page_{axis}"] = page.laid_out(torch.eye(count), axis)
             made[f"up_{axis}"] = padded(camera.laid_out(grid, axis), -2).transpose(-1, -2)
         return made | {"illumination": self.illumination, "floor": self.floor}

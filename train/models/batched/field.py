@@ -73,8 +73,11 @@ class BatchedField(nn.Module):
             "slope": slope,
             "slope_over": slope / (1 + slope * slope),
             "over": 1 / (1 + slope * slope),
-            "arms": ((1 - RELAXATION) / 2 * (1 + cos)) * amplitude[None],
-            "arms_sin": ((1 - RELAXATION) / 2 * sin) * amplitude[None],
+            "relaxed": RELAXATION * amplitude[None],
+            "relaxed_cos": RELAXATION * cos * amplitude[None],
+            "relaxed_sin": RELAXATION * sin * amplitude[None],
+            "arms": (1 - RELAXATION) * (1 + cos) * amplitude[None],
+            "arms_sin": (1 - RELAXATION) * sin * amplitude[None],
         }
 
     def forward(self, seen: Seen, tables: Tables) -> Parts:
@@ -153,38 +156,33 @@ class BatchedField(nn.Module):
         """See `lightpage.train.models.apart.reflected`.
 
         With U for twice a camera's light less its state, the state S becomes (2 - relaxation) L + f U, where f is a
-        function of what was measured over |U|^2 alone. Of S only N = S - 2 r arm is kept: then U = 2 E - N.
+        function of what was measured over |U|^2 alone. Kept are F = 2 E, and of a state N = S - (2 - relaxation) r arm:
+        then U = F - N + relaxation r arm, N becomes (1 - relaxation / 2) F + f U, and the next F is the band of both N
+        and (1 - relaxation) r arm.
         """
         weight = RELAXATION / (2 * STIFF)
-        stays = 2 - RELAXATION
         pulling = [torch.clamp(8 * WEIGHT * STIFF * weight**2 * each, min=_DARK) for each in seen]
+        stays = 1 - RELAXATION / 2
         states: list[Parts] = []
+        reflected = self._lights(field, tables)
+        twice = 2 * field[0], 2 * field[1]
         for number in range(self.recovery.reflections):
-            twice = 2 * field[0], 2 * field[1]
-            reflected = self._lights(field, tables) if not number else [
-                (twice[0] - state[0], twice[1] - state[1]) for state in states
-            ]
-            moved = []
+            if number:
+                (a, b), (c, d) = states
+                reflected = (
+                    (twice[0] - a + tables["relaxed"], twice[1] - b),
+                    (twice[0] - c + tables["relaxed_cos"], twice[1] - d + tables["relaxed_sin"]),
+                )
+            still = stays * twice[0], stays * twice[1]
+            states = []
             for (real, imaginary), measured in zip(reflected, pulling, strict=True):
                 quotient = torch.clamp(measured / (real * real + imaginary * imaginary), max=_STEEPEST)
                 factor = torch.sqrt(quotient + weight**2) + (weight - 1)
-                moved.append((factor * real, factor * imaginary))
-            still = stays * field[0], stays * field[1]
-            if number + 1 < self.recovery.reflections:
-                states = [
-                    (
-                        moved[0][0] + (still[0] - RELAXATION * tables["amplitude"]),
-                        moved[0][1] + still[1],
-                    ),
-                    (
-                        moved[1][0] + (still[0] - RELAXATION * tables["cos_amplitude"]),
-                        moved[1][1] + (still[1] - RELAXATION * tables["sin_amplitude"]),
-                    ),
-                ]
-            real = 0.5 * (moved[0][0] + moved[1][0]) + (still[0] + tables["arms"])
-            imaginary = 0.5 * (moved[0][1] + moved[1][1]) + (still[1] + tables["arms_sin"])
-            field = self._band((real, imaginary), tables)
-        return field
+                states.append((factor * real + still[0], factor * imaginary + still[1]))
+            real = states[0][0] + states[1][0] + tables["arms"]
+            imaginary = states[0][1] + states[1][1] + tables["arms_sin"]
+            twice = self._band((real, imaginary), tables)
+        return 0.5 * twice[0], 0.5 * twice[1]
 
     def _band(self, planes: Parts, tables: Tables) -> Parts:
         return self._along(planes[0], tables), self._along(planes[1], tables)

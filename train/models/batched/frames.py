@@ -10,7 +10,7 @@ from lightpage.train.models.batched.products import Tables, padded, sizes
 from lightpage.train.models.field import FieldRecovery, References, sampled
 
 BLOCK = 16
-"""Pixels of a row that one convolution takes for channels: both axes of the prefilter are one product that a GPU likes."""
+"""Pixels of a row that a convolution takes for channels: so both axes of the prefilter are one product."""
 _NEIGHBOURS = 3
 """Blocks of a row that a block's filtered pixels depend on."""
 _WIDE = 2.0**-8

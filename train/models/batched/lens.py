@@ -17,7 +17,6 @@ from lightpage.train.models.batched.pipe import Light
 from lightpage.train.models.batched.products import (
     Tables,
     padded,
-    padded_parts,
     real_form,
     sizes,
     turned_product,
@@ -126,9 +125,11 @@ class BatchedLens(nn.Module):
         plane = multiply(plane, (self._tiled(turned[0]), self._tiled(turned[1])))
         tilt_x = phasor(-per_metre * factors.x_to_x * a[:, 0, 0] * (self._axis("unit_x") * width))
         tilt_y = phasor(-per_metre * factors.y_to_y * b[0, :, 0] * (self._axis("unit_y") * width))
-        flat = [self._flat(part) for part in (to_x, between, to_y, light, plane)]
-        ends = self._modes("y", tilt_y), self._modes("x", tilt_x)
-        return self._to_plane(*flat, *ends, way) if self.backwards else self._to_modes(*flat, *ends, way)
+        to_x, between, to_y, light, plane = map(self._flat, (to_x, between, to_y, light, plane))
+        along_y, along_x = self._modes("y", tilt_y), self._modes("x", tilt_x)
+        if self.backwards:
+            return self._to_plane(to_x, between, to_y, light, plane, along_y, along_x, way)
+        return self._to_modes(to_x, between, to_y, light, plane, along_y, along_x, way)
 
     def _to_modes(
         self, to_x: Parts, between: Parts, to_y: Parts, facet: Parts, plane: Parts, y: Parts, x: Parts, way: Any
@@ -215,7 +216,7 @@ class BatchedLens(nn.Module):
         return part.reshape(ty, side_y, tx, side_x).permute(2, 0, 1, 3)[:, :, None]
 
     def _modes(self, axis: str, tilt: Parts) -> Parts:
-        """From few samples of the facet, by each tile's tilt [tiles, f], to sine modes by parity, [tiles, 2, K, few]."""
+        """From a facet's few samples, by each tile's tilt [tiles, f], to sine modes by parity, [tiles, 2, K, few]."""
         sine, up = self._axis(f"sine_{axis}"), self._axis(f"up_{axis}")
         real, imaginary = (padded(sine @ (part[:, None, :, None] * up), -1, -2) for part in tilt)
         return real, imaginary
@@ -289,7 +290,7 @@ def _columns(modes: Tensor) -> Tensor:
 
 
 def _by_parity(way: Parts, modes: Parts, *, odd: bool) -> Parts:
-    """A matrix of either parity [2, K, K] times sine modes [tiles, 2, K, few]; those of the odd one times -i if asked."""
+    """A matrix of either parity [2, K, K] times sine modes [tiles, 2, K, few]; odd ones times -i if asked."""
     real, imaginary = matmul(way, modes)
     if not odd:
         return real, imaginary
@@ -297,9 +298,9 @@ def _by_parity(way: Parts, modes: Parts, *, odd: bool) -> Parts:
 
 
 def _highest(
-    geometry: WaveGeometry, path: SeidelTerms, plane: tuple[Real, Real], tiles: tuple[int, int], sides: tuple[int, int]
+    geometry: WaveGeometry, path: SeidelTerms, plane: tuple[Real, Real], tiles: tuple[int, ...], sides: tuple[int, ...]
 ) -> tuple[float, float]:
-    """Frequencies along X and Y' that tiles see of a facet, cycles over its width, the tilt of their centre taken off."""
+    """Frequencies along X and Y' that tiles see of a facet, their centre's tilt taken off, cycles over its width."""
     half, factors = geometry.pipe_width_m / 2, couplings(geometry)
     per_metre = geometry.wave_number / geometry.focal_length_m
     edge = np.linspace(-half, half, _EDGES)
@@ -319,6 +320,6 @@ def _highest(
                     along, upward = along - per_metre * (a + x), upward - per_metre * (b + y)
                     on_x = factors.x_to_x * along + factors.y_to_x * upward + per_metre * a * factors.x_to_x
                     on_y = factors.x_to_y * along + factors.y_to_y * upward + per_metre * b * factors.y_to_y
-                    most = [max(before, float(np.abs(new).max())) for before, new in zip(most, (on_x, on_y), strict=True)]
+                    most = [max(most[0], float(np.abs(on_x).max())), max(most[1], float(np.abs(on_y).max()))]
     across_x, across_y = (slope * geometry.pipe_width_m / (2 * np.pi) for slope in most)
     return across_x, across_y

@@ -156,4 +156,3 @@ class BatchedPipe(nn.Module):
         a, b, c, d = (one.reshape(-1, rows, 2, columns) for one in light)
         turned = cos * a - sin * d, cos * b + sin * c, cos * c - sin * b, cos * d + sin * a
         return [one.reshape(-1, 2 * rows, columns) for one in turned]
-

@@ -50,7 +50,7 @@ def real_form(value: Parts, before: str = "rk", behind: str = "rk") -> Tensor:
 
 
 def with_phasor(value: Parts, before: str = "trk", behind: str = "rk") -> Tensor:
-    """The same for light that has been multiplied by a phasor's real and by its imaginary part: t says which, [4 K, 2 M].
+    """The same for light times a phasor's real part and times its imaginary one: t says which, [4 K, 2 M].
 
     So a phasor before a product costs one broadcast multiplication, and a sum over twice as many numbers.
     """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -91,16 +90,15 @@ class Form:
 def scene_of(folder: Path, out: Path) -> Scene:
     """Pages of the device of a kept data set, simulated once into a folder."""
     profile, device, seed = data_set_of(folder)
-    path = out / f"pages-{profile.name}-{folder.name}.npz"
+    path = out / f"pages-{profile.name}-{folder.name}.npy"
     symbols = list(random_symbols(profile, LEVELS, _PAGES, np.random.default_rng(seed + 1)))
     if not path.exists():
         simulator = Simulator(profile, device, seed=seed + 1)
         pairs = [simulator.page(each) for each in symbols]
         references = simulator.references()
         frames = [frame for pair in (*pairs, references) for frame in (pair.in_phase, pair.quadrature)]
-        np.savez(path, **{f"frame_{number}": frame for number, frame in enumerate(frames)})
-    with np.load(path) as held:
-        frames = [held[f"frame_{number}"] for number in range(2 * _PAGES + 2)]
+        np.save(path, np.stack(frames))
+    frames = list(np.load(path))
     made = [FramePair(*frames[number : number + 2]) for number in range(0, len(frames), 2)]
     return Scene(profile, load_calibration(folder / CALIBRATION), made[:-1], symbols, made[-1])
 
@@ -117,39 +115,35 @@ def kept_decoder(folder: Path, preset: str, scene: Scene, reflections: int) -> S
     return decoder.float().eval()
 
 
-def forms(
-    folder: Path, scene: Scene, presets: Iterable[str], reflections: int, device: torch.device
-) -> Iterator[Form]:
-    """The batched forms of kept decoders, one after the other.
+def form_of(folder: Path, scene: Scene, preset: str, reflections: int, device: torch.device) -> Form:
+    """A kept decoder in its batched form.
 
     Args:
         folder, scene: of the data set.
-        presets: which.
+        preset: which.
         reflections: rounds to the field; 0 for descent.
         device: what the form for one page is run on, which tells what is expected.
     """
     calibration, profile = scene.calibration, scene.profile
     table = sampling_table(TorchTwin(RayTwin(profile)), calibration.vector, calibration.turn_rad, profile)
-    for preset in presets:
-        graph = DecoderGraph(profile, kept_decoder(folder, preset, scene, reflections), 1.0).eval()
-        defaults = table_tensors(graph, table, scene.references)
-        start = time.perf_counter()
-        made = batched_onnx(graph, "uint8", defaults, torch.float16)
-        assert made is not None
-        exported = time.perf_counter() - start
-        expected, taken = [], []
-        with torch.no_grad():
-            graph = graph.to(device)
-            tensors = [torch.from_numpy(np.ascontiguousarray(value)).to(device) for value in defaults.values()]
-            for pair in scene.pairs:
-                frames = [torch.from_numpy(frame).to(device) for frame in (pair.in_phase, pair.quadrature)]
-                start = time.perf_counter()
-                expected.append(graph(*frames, *tensors)[0].cpu().numpy())
-                taken.append(time.perf_counter() - start)
-        del graph
-        told = {
-            "air": [scene.air(p, page) for page, p in enumerate(expected)],
-            "torch_ms": 1e3 * taken[-1],
-            "export_s": exported,
-        }
-        yield Form(preset, *made, defaults, expected, told, profile.frame_shape, profile.page_shape)
+    graph = DecoderGraph(profile, kept_decoder(folder, preset, scene, reflections), 1.0).eval()
+    defaults = table_tensors(graph, table, scene.references)
+    start = time.perf_counter()
+    made = batched_onnx(graph, "uint8", defaults, torch.float16)
+    assert made is not None
+    exported = time.perf_counter() - start
+    expected, taken = [], []
+    with torch.no_grad():
+        graph = graph.to(device)
+        tensors = [torch.from_numpy(np.ascontiguousarray(value)).to(device) for value in defaults.values()]
+        for pair in scene.pairs:
+            frames = [torch.from_numpy(frame).to(device) for frame in (pair.in_phase, pair.quadrature)]
+            start = time.perf_counter()
+            expected.append(graph(*frames, *tensors)[0].cpu().numpy())
+            taken.append(time.perf_counter() - start)
+    told = {
+        "air": [scene.air(p, page) for page, p in enumerate(expected)],
+        "torch_ms": 1e3 * taken[-1],
+        "export_s": exported,
+    }
+    return Form(preset, *made, defaults, expected, told, profile.frame_shape, profile.page_shape)

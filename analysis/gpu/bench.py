@@ -1,6 +1,6 @@
 """How fast a GPU decodes pages in batches, how exactly, and where its time goes.
 
-    python -m analysis.speed.batches --out runs/bench-gpu
+    python -m analysis.gpu.bench --out runs/bench-gpu
 
 Kept decoders of the full-size page are put into their batched form, and decode pages that are simulated here. What is
 measured is kept part by part in `gpu.json`, with the card's name; when run again, it goes on behind the last part. It
@@ -10,6 +10,7 @@ needs torch, and an ONNX Runtime that has the provider.
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import subprocess
@@ -19,6 +20,7 @@ import traceback
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +29,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from analysis.speed.kept_form import Form, Scene, forms, scene_of
+from analysis.gpu.kept_form import Form, Scene, form_of, scene_of
+from lightpage.export.operators.batches import BatchFile
 from lightpage.files import write_json
+from lightpage.runtime.model.execution.providers import Provider
+from lightpage.runtime.model.execution.session import BoundSession, open_session
 
 CUDA = "cuda"
 PARTS = "parts"
 _REPEATS = 9
+_WANTED = {"standard": (150, 250), "fast": (400, 1000), "accurate": (60, 120)}
+"""Pages a second of each preset at the full size: what is aimed at, and what would be better still."""
 _GROUPS = {
     "copies": r"memcpy|memset",
     "sampling": r"gridsample|grid_sample",
@@ -59,7 +66,7 @@ class Kept:
     def __init__(self, path: Path, head: Mapping[str, Any]) -> None:
         self.path = path
         self.whole: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {PARTS: {}}
-        self.whole |= head
+        self.whole |= dict(head)
 
     def part(self, name: str, measure: Callable[[], Any]) -> Any:
         """A part, measured now unless it is there; a failure is told and tried again the next time."""
@@ -78,26 +85,22 @@ class Kept:
         return found
 
 
-@dataclass
+@dataclass(frozen=True)
 class Machine:
     """What decodes.
 
     Attributes:
         device: torch's.
-        providers: ONNX Runtime's, with their options.
+        provider: ONNX Runtime's.
     """
 
     device: torch.device
-    providers: list[Any]
+    provider: Provider
 
     @classmethod
     def of(cls, name: str) -> Machine:
         """The machine of a provider's name, `cuda` or `cpu`."""
-        cpu = "CPUExecutionProvider"
-        if name != CUDA:
-            return cls(torch.device("cpu"), [cpu])
-        # no place goes through a product, and without TF32 cuDNN keeps float16 off the tensor cores as well
-        return cls(torch.device(CUDA), [("CUDAExecutionProvider", {"device_id": 0, "use_tf32": 1}), cpu])
+        return cls(torch.device(name), Provider.parse(name))
 
     def wait(self) -> None:
         """Until all is computed."""
@@ -122,7 +125,6 @@ def ceilings(machine: Machine) -> dict[str, float]:
     source = torch.randn(count, device=device)
     target = torch.empty_like(source)
     found["copy_bytes_per_s"] = rate(lambda: target.copy_(source), 8.0 * count)
-    del source, target
     left, right = (torch.randn(side, side, device=device).half() for _ in range(2))
     found["float16_flops"] = rate(lambda: left @ right, 2.0 * side**3)
     if device.type == CUDA:
@@ -132,38 +134,20 @@ def ceilings(machine: Machine) -> dict[str, float]:
     return found
 
 
-class Session:
+class Batches:
     """A batch graph opened for so many pages, with its constants where it computes."""
 
-    def __init__(
-        self, machine: Machine, form: Form, constants: Mapping[str, NDArray[Any]], pages: int, **options: Any
-    ) -> None:
-        import onnxruntime
-
-        settings = onnxruntime.SessionOptions()
-        settings.log_severity_level = 4
-        settings.add_free_dimension_override_by_name("pages", pages)
-        providers = machine.providers
-        if options:
-            providers = [(providers[0][0], providers[0][1] | options), *providers[1:]]
-        self.machine, self.pages = machine, pages
-        self.session = onnxruntime.InferenceSession(form.batch, settings, providers=providers)
-        kind = machine.device.type
-        self.held = {
-            name: onnxruntime.OrtValue.ortvalue_from_numpy(value, kind, 0) for name, value in constants.items()
-        }
-        rows, columns = form.frame_shape
-        self.frames = [
-            torch.zeros((pages, rows, columns), dtype=torch.uint8, device=machine.device) for _ in range(2)
-        ]
-        self.p = torch.zeros((pages, 2, *form.page_shape), dtype=torch.float32, device=machine.device)
-        self.residual = torch.zeros(pages, dtype=torch.float32, device=machine.device)
+    def __init__(self, machine: Machine, form: Form, constants: Mapping[str, NDArray[Any]], pages: int) -> None:
+        self.machine, self.pages, device = machine, pages, machine.device
+        self.session = open_session(form.batch, form.name, provider=machine.provider, pages=pages)
+        self._held = BoundSession(self.session, machine.provider, constants, form.name)
+        self.frames = [torch.zeros((pages, *form.frame_shape), dtype=torch.uint8, device=device) for _ in range(2)]
+        self.p = torch.zeros((pages, 2, *form.page_shape), dtype=torch.float32, device=device)
+        self.residual = torch.zeros(pages, dtype=torch.float32, device=device)
 
     def bound(self, frames: list[torch.Tensor]) -> Any:
         """A binding of two stacks of frames and of the outputs."""
-        binding, kind = self.session.io_binding(), self.machine.device.type
-        for name, value in self.held.items():
-            binding.bind_ortvalue_input(name, value)
+        binding, kind = self._held.binding(), self.machine.device.type
         for name, tensor, dtype in (("in_phase", frames[0], np.uint8), ("quadrature", frames[1], np.uint8)):
             binding.bind_input(name, kind, 0, dtype, tuple(tensor.shape), tensor.data_ptr())
         for name, tensor in (("p", self.p), ("residual", self.residual)):
@@ -180,42 +164,50 @@ class Session:
         return [stack.pin_memory() for stack in stacks] if self.machine.device.type == CUDA else stacks
 
 
-def decoded(session: Session, scene: Scene, form: Form) -> dict[str, Any]:
+def _name(preset: str, pages: int) -> str:
+    return f"{preset}, {pages} a batch"
+
+
+def decoded(
+    machine: Machine, form: Form, constants: Mapping[str, NDArray[Any]], pages: int, scene: Scene
+) -> dict[str, Any]:
     """Rates of a graph alone and from pinned frames to p, and what its answers are worth."""
-    machine, host = session.machine, session.filled(scene)
-    for there, here in zip(session.frames, host, strict=True):
+    batches = Batches(machine, form, constants, pages)
+    host = batches.filled(scene)
+    for there, here in zip(batches.frames, host, strict=True):
         there.copy_(here)
     machine.wait()
-    binding = session.bound(session.frames)
+    binding = batches.bound(batches.frames)
     taken = []
     for _ in range(_REPEATS if machine.device.type == CUDA else 2):
         start = time.perf_counter()
-        session.session.run_with_iobinding(binding)
+        batches.session.run_with_iobinding(binding)
         machine.wait()
         taken.append(time.perf_counter() - start)
-    p = session.p.cpu().numpy()
+    p = batches.p.cpu().numpy()
     found: dict[str, Any] = {
-        "pages": session.pages,
-        "graph_ms_a_page": 1e3 * float(np.median(taken[1:])) / session.pages,
-        "residual": [float(each) for each in session.residual.cpu()[:2]],
-        "air": [scene.air(p[page], page % len(scene.pairs)) for page in range(min(2, session.pages))],
-        "deviation": [scene.deviation(form.expected[page], p[page]) for page in range(min(2, session.pages))],
+        "pages": batches.pages,
+        "graph_ms_a_page": 1e3 * float(np.median(taken[1:])) / batches.pages,
+        "residual": [float(each) for each in batches.residual.cpu()[:2]],
+        "air": [scene.air(p[page], page % len(scene.pairs)) for page in range(min(2, batches.pages))],
+        "deviation": [scene.deviation(form.expected[page], p[page]) for page in range(min(2, batches.pages))],
     }
     if machine.device.type == CUDA:
-        found["end_to_end_ms_a_page"] = 1e3 * _end_to_end(session, host) / session.pages
-        found["memory_gb"] = (lambda free, total: (total - free) / 1e9)(*torch.cuda.mem_get_info())
-        found |= kernels(session, binding)
+        found["end_to_end_ms_a_page"] = 1e3 * _end_to_end(batches, host) / batches.pages
+        free, total = torch.cuda.mem_get_info()
+        found["memory_gb"] = (total - free) / 1e9
+        found |= kernels(batches, binding)
     found["pages_per_s"] = 1e3 / found.get("end_to_end_ms_a_page", found["graph_ms_a_page"])
     return found
 
 
-def _end_to_end(session: Session, host: list[torch.Tensor], batches: int = 12) -> float:
+def _end_to_end(batches: Batches, host: list[torch.Tensor], runs: int = 12) -> float:
     """Seconds a batch from pinned frames to p in pinned memory: the next batch is copied while one is computed."""
-    other = [torch.empty_like(each) for each in session.frames]
-    slots = [session.frames, other]
-    bindings = [session.bound(slot) for slot in slots]
-    answers = torch.empty(session.p.shape, dtype=torch.float32).pin_memory()
-    copies = torch.cuda.Stream()
+    other = [torch.empty_like(each) for each in batches.frames]
+    slots = [batches.frames, other]
+    bindings = [batches.bound(slot) for slot in slots]
+    answers = torch.empty(batches.p.shape, dtype=torch.float32).pin_memory()
+    copies = torch.cuda.Stream()  # type: ignore[no-untyped-call]
 
     def sent(slot: int) -> None:
         with torch.cuda.stream(copies):
@@ -225,37 +217,37 @@ def _end_to_end(session: Session, host: list[torch.Tensor], batches: int = 12) -
     sent(0)
     copies.synchronize()
     start = 0.0
-    for batch in range(batches + 2):
+    for batch in range(runs + 2):
         if batch == 2:
             start = time.perf_counter()
         sent((batch + 1) % 2)
-        session.session.run_with_iobinding(bindings[batch % 2])
-        answers.copy_(session.p, non_blocking=True)
+        batches.session.run_with_iobinding(bindings[batch % 2])
+        answers.copy_(batches.p, non_blocking=True)
         torch.cuda.current_stream().synchronize()
         copies.synchronize()
-    return (time.perf_counter() - start) / batches
+    return (time.perf_counter() - start) / runs
 
 
-def kernels(session: Session, binding: Any) -> dict[str, Any]:
+def kernels(batches: Batches, binding: Any) -> dict[str, Any]:
     """Kernels of a batch, and the GPU's time a page in each group of them, ms."""
     from torch.profiler import ProfilerActivity, profile
 
     with profile(activities=[ProfilerActivity.CUDA]) as watched:
-        session.session.run_with_iobinding(binding)
+        batches.session.run_with_iobinding(binding)
         torch.cuda.synchronize()
     events = [event for event in watched.key_averages() if event.self_device_time_total > 0]
     groups: dict[str, float] = defaultdict(float)
     for event in events:
         name = event.key.lower()
         group = next((group for group, pattern in _GROUPS.items() if re.search(pattern, name)), "other")
-        groups[group] += event.self_device_time_total / 1e3 / session.pages
+        groups[group] += event.self_device_time_total / 1e3 / batches.pages
     longest = sorted(events, key=lambda event: -event.self_device_time_total)[:26]
     return {
         "kernels": sum(event.count for event in events),
         "busy_ms_a_page": sum(groups.values()),
         "groups_ms_a_page": {name: round(value, 4) for name, value in sorted(groups.items(), key=lambda g: -g[1])},
         "longest": [
-            [round(event.self_device_time_total / 1e3 / session.pages, 4), event.count, event.key[:110]]
+            [round(event.self_device_time_total / 1e3 / batches.pages, 4), event.count, event.key[:110]]
             for event in longest
         ],
     }
@@ -263,13 +255,43 @@ def kernels(session: Session, binding: Any) -> dict[str, Any]:
 
 def constants_of(form: Form) -> dict[str, NDArray[Any]]:
     """The constants of a form, evaluated on the CPU."""
-    import onnxruntime
-
-    settings = onnxruntime.SessionOptions()
-    settings.log_severity_level = 4
-    first = onnxruntime.InferenceSession(form.constants, settings, providers=["CPUExecutionProvider"])
+    first = open_session(form.constants, form.name, once=True)
     names = [output.name for output in first.get_outputs()]
-    return dict(zip(names, first.run(names, dict(form.defaults)), strict=True))
+    table = {entry.name: form.defaults[entry.name] for entry in first.get_inputs()}
+    return dict(zip(names, first.run(names, table), strict=True))
+
+
+def floor(form: Form, pages: int, most: Mapping[str, float]) -> dict[str, float]:
+    """The least time that a page can take, ms: its bytes at the rate of a copy, its flops at that of a product."""
+    cost = BatchFile(form.batch, pages).cost()
+    found = {"kernels": cost.kernels, "gigabytes": cost.bytes_a_page / 1e9, "gigaflops": cost.flops_a_page / 1e9}
+    found["bytes_ms"] = 1e3 * cost.bytes_a_page / most["copy_bytes_per_s"]
+    found["flops_ms"] = 1e3 * cost.flops_a_page / most["float16_flops"]
+    if bus := most.get("pinned_bytes_per_s"):
+        found["bus_ms"] = 2e3 * math.prod(form.frame_shape) / bus
+    return found
+
+
+def table(parts: Mapping[str, Any]) -> list[str]:
+    """What people read of the parts: rates beside what is wanted, floors, and where time goes."""
+    told = ["| preset | a batch | pages/s | target, stretch | graph, ms | floor: bytes, flops, bus | AIR, today's |"]
+    told.append("|---" * 7 + "|")
+    groups = []
+    for preset, (target, stretch) in _WANTED.items():
+        least, present = parts.get(f"{preset}, floor"), parts.get(f"{preset}, present")
+        for name, part in parts.items():
+            if name.startswith(f"{preset}, ") and name.endswith(" a batch") and least and present:
+                floors = ", ".join(f"{least[key]:.2f}" for key in ("bytes_ms", "flops_ms", "bus_ms") if key in least)
+                air = f"{np.mean(part['air']):.4f}, {np.mean(present['air'][: len(part['air'])]):.4f}"
+                wanted = f"{target}, {stretch}" if part["pages"] > 1 else "1 page in 30 ms, 12"
+                told.append(
+                    f"| {preset} | {part['pages']} | {part['pages_per_s']:.1f} | {wanted} | "
+                    f"{part['graph_ms_a_page']:.2f} | {floors} | {air} |"
+                )
+                split = ", ".join(f"{group} {ms:.2f}" for group, ms in part.get("groups_ms_a_page", {}).items())
+                if split:
+                    groups.append(f"{preset}, {part['pages']} a batch, {part['kernels']} kernels, ms a page: {split}")
+    return [*told, *groups]
 
 
 def measured(kept: Kept, machine: Machine, form: Form, scene: Scene, batches: tuple[int, ...]) -> None:
@@ -279,11 +301,10 @@ def measured(kept: Kept, machine: Machine, form: Form, scene: Scene, batches: tu
     size = sum(value.nbytes for value in constants.values())
     files = {"constants": len(form.constants), "batch": len(form.batch)}
     told = {"files": files, "bytes": size, "seconds": time.perf_counter() - start}
-    kept.part(f"{form.name}, constants", lambda: told)
+    kept.part(f"{form.name}, constants", partial(dict, told))
+    kept.part(f"{form.name}, floor", lambda: floor(form, max(batches), kept.whole[PARTS]["ceilings"]))
     for pages in batches:
-        kept.part(
-            f"{form.name}, {pages} a batch", lambda: decoded(Session(machine, form, constants, pages), scene, form)
-        )
+        kept.part(_name(form.name, pages), partial(decoded, machine, form, constants, pages, scene))
 
 
 @click.command()
@@ -317,22 +338,22 @@ def main(
     out.mkdir(parents=True, exist_ok=True)
     (simulated or out).mkdir(parents=True, exist_ok=True)
     machine = Machine.of(provider)
-    if provider == CUDA:
-        import onnxruntime
-
-        onnxruntime.preload_dlls()
     torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
     card = torch.cuda.get_device_name(0) if provider == CUDA else "cpu"
     commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
-    command = f"python -m analysis.speed.batches {' '.join(sys.argv[1:])}"
+    command = f"python -m analysis.gpu.bench {' '.join(sys.argv[1:])}"
     kept = Kept(out / "gpu.json", {"card": card, "command": command, "commit": os.environ.get("COMMIT", commit)})
     kept.part("ceilings", lambda: ceilings(machine))
     scene = scene_of(folder, simulated or out)
-    for form in forms(folder, scene, presets, reflections, machine.device):
+    for preset in presets:
+        if all(_name(preset, pages) in kept.whole[PARTS] for pages in batches):
+            continue
         if time.perf_counter() - begun > seconds:
             break
-        kept.part(f"{form.name}, present", lambda form=form: form.told)
+        form = form_of(folder, scene, preset, reflections, machine.device)
+        kept.part(f"{preset}, present", partial(dict, form.told))
         measured(kept, machine, form, scene, batches)
+    click.echo("\n".join(table(kept.whole[PARTS])))
     click.echo(f"{kept.path}: {time.perf_counter() - begun:.0f} s")
 
 

@@ -1,0 +1,1 @@
+"""Pages in batches on a GPU, measured."""
