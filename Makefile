@@ -16,7 +16,7 @@ export PYTHONDONTWRITEBYTECODE =
 export ORT_DISABLE_TELEMETRY = 1
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMEXPR_NUM_THREADS=1
 
-.PHONY: help setup demo demo-hardware test pytest test-busy test-long planted test-lowest messages bench bench-speed bench-service bench-other-servers bench-scaling dashboard soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image sbom check-image check-camera-image lock licences audit proto lint format clean
+.PHONY: help setup demo demo-hardware test pytest test-busy test-long planted test-lowest messages bench bench-gpu bench-speed bench-service bench-other-servers bench-scaling dashboard soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image sbom check-image check-camera-image lock licences audit proto lint format clean
 .DELETE_ON_ERROR:
 
 help:  ## list the targets
@@ -112,6 +112,12 @@ train-decoders: $(STAMP)  ## every decoder on every data set at quarter scale, t
 	$(COMPARE) --angle 0 --angle -0.6 --exposure 1 --exposure 0.13 \
 	    --symbol-size 4 --symbol-size 2 --pages 500 --levels 4 --levels 8 --levels 16 --trained runs/train-decoders/kept --keep \
 	    --out runs/train-decoders
+
+# Of kept full-size decoders, on pages simulated there. It needs no bundle, and a machine with a GPU needs no environment of
+# its own: `python3 -m analysis.gpu.bench --out FOLDER` with this folder and an ONNX Runtime for CUDA on its path.
+GPU_ARGS ?=
+bench-gpu: $(STAMP)  ## pages in batches on a GPU: rates, floors, where time goes; in 8 minutes, resumed when run again
+	$(BIN)/python -m analysis.gpu.bench --out runs/bench-gpu $(GPU_ARGS)
 
 SPEED_ARGS ?= --decoder fast --decoder coherent --decoder wave --decoder refined --decoder "ray 32/64"
 bench-speed: $(STAMP)  ## time decoders side by side in one run: SPEED_ARGS chooses them
