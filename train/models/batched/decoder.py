@@ -6,6 +6,7 @@ import copy
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from lightpage.train.models.batched.branches import BatchedBranches
 from lightpage.train.models.batched.field import BatchedField, Seen
@@ -145,17 +146,19 @@ class Features(nn.Module):
 
     def __init__(self, network: SymbolUNet, dtype: torch.dtype) -> None:
         super().__init__()
-        self.where = network.where
+        self.where, self.bias = network.where, network.stem.bias
         self.unet = copy.deepcopy(network).to(dtype)
 
     def tables(self, positions: Tensor) -> Tables:
         """Constants of exit centroids [2, ny, nx]."""
         scale, shift = self.where.of_places(positions[None])
-        return {"scale": scale, "shift": shift}
+        assert self.bias is not None
+        return {"scale": scale, "shift": shift + scale * self.bias[:, None, None]}
 
     def forward(self, light: Tensor, tables: Tables) -> Tensor:
         """Outputs of the network, float32 [B, 3, ny, nx]."""
-        placed = self.unet.stem(light) * tables["scale"] + tables["shift"]
+        stem = functional.conv2d(light, self.unet.stem.weight, padding=self.unet.stem.padding)
+        placed = stem * tables["scale"] + tables["shift"]
         return self.unet.behind_places(placed).to(torch.float32)
 
 
