@@ -87,6 +87,11 @@ class BatchFile:
         nodes = (node for node in self.model.graph.node if node.op_type.startswith("Reduce"))
         return [node.name for node in nodes if node.input[0] in self.varying and self._is_plane(node.input[0])]
 
+    def computed_places(self) -> list[str]:
+        """Nodes that sample at places which a batch computes, by name: they may have gone through a rounded product."""
+        nodes = (node for node in self.model.graph.node if node.op_type == "GridSample")
+        return [node.name for node in nodes if node.input[1] in self.varying]
+
     def wide_planes(self, page_shape: tuple[int, int]) -> list[str]:
         """Planes in float32 that neither go into the sampling nor come from it, by name.
 

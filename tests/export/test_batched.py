@@ -133,6 +133,7 @@ def test_a_gpu_has_nothing_slow_to_do(preset: str, kernels: int, megabytes: floa
     file = graph_for_batches(preset)
     assert file.left_constants() == []
     assert file.reduced_planes() == []
+    assert file.computed_places() == []
     assert file.wide_planes(PROFILE.page_shape) == []
     assert fallbacks(file.model.SerializeToString(), "cuda") == []
     cost = file.cost()

@@ -54,7 +54,7 @@ class BatchedBranches(nn.Module):
                 mode=self.localizer.interpolation,
                 padding_mode="zeros",
                 align_corners=True,
-            )[0]
+            )
             .to(part.dtype)
             .reshape(-1, sizes(tables["cos"])[1], ny, nx)
             for part in field

@@ -64,8 +64,8 @@ class BatchedFrames(nn.Module):
         # pages are channels: the places on the frames are the same for all
         seen = functional.grid_sample(
             seen, tables[f"where_{camera}"], mode="bilinear", padding_mode="border", align_corners=False
-        )[0]
-        return seen.to(self.dtype) * tables[f"weight_{camera}"] + tables[f"offset_{camera}"]
+        )
+        return seen.to(self.dtype).squeeze(0) * tables[f"weight_{camera}"] + tables[f"offset_{camera}"]
 
     def _filtered(self, frames: Tensor) -> Tensor:
         if self.unit != 1.0:
