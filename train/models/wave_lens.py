@@ -67,7 +67,6 @@ class TiledLens(nn.Module):
         cells: sample intervals of the pipe along (y', x).
         roll_margin: radians of roll to either side that are to be served.
         tolerance: error of the expansion.
-        waves_a_tile: `WAVES_A_TILE`, or another number.
     """
 
     def __init__(
@@ -78,13 +77,11 @@ class TiledLens(nn.Module):
         cells: tuple[int, int],
         roll_margin: float,
         tolerance: float,
-        waves_a_tile: float | None = None,
     ) -> None:
         super().__init__()
-        waves_a_tile = waves_a_tile or WAVES_A_TILE
         wave = geometry.wavelength_m * geometry.focal_length_m / geometry.pipe_width_m
         self.shape = len(plane[1]), len(plane[0])
-        self.tiles = tuple(max(1, round(float(np.ptp(axis)) / wave / waves_a_tile)) for axis in plane)
+        self.tiles = tuple(max(1, round(float(np.ptp(axis)) / wave / WAVES_A_TILE)) for axis in plane)
         self.sides = tuple(-(-len(axis) // tiles) for axis, tiles in zip(plane, self.tiles, strict=True))
         pitches = [float(axis[1] - axis[0]) for axis in plane]
         offsets = [(np.arange(side) - (side - 1) / 2) * pitch for side, pitch in zip(self.sides, pitches, strict=True)]

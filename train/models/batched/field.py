@@ -22,6 +22,8 @@ _DARK = 2.0**-14
 """Least brightness, so that its quotient with the light is infinite at worst, and no zero over zero."""
 _STEEPEST = 60_000.0
 """Largest such quotient: float16 ends at 65,504."""
+_EVERY = 4
+"""Rows from one to the next of those that tell how much is left of the equations: neighbours tell the same."""
 _LOUDER = 16.0
 """Factor on what is left of the equations, whose squares are small numbers for float16."""
 
@@ -61,6 +63,7 @@ class BatchedField(nn.Module):
         return {
             "band_y": band_y,
             "band_x": band_x,
+            "band_rows": padded(band_y[:, : self.recovery.grid.shape[0] : _EVERY], -1),
             "amplitude": amplitude[None],
             "cos_amplitude": (cos * amplitude)[None],
             "sin_amplitude": (sin * amplitude)[None],
@@ -114,23 +117,25 @@ class BatchedField(nn.Module):
         return self._band((tables["lit"] * real, tables["lit"] * imaginary), tables)
 
     def left(self, seen: Seen, field: Parts, tables: Tables) -> Parts:
-        """What is left of the two equations inside the band, times the amplitude."""
+        """What is left of the two equations inside the band, times the amplitude, in every `_EVERY`-th row."""
         left = []
         for measured, light in zip(seen, self._lights(field, tables), strict=True):
             left.append((measured - light[0] * light[0] - light[1] * light[1]) * tables["half_inverse"])
-        return self._band((left[0], left[1]), tables)
+        thin = [turned_product(turned_product(part, tables["band_rows"]), tables["band_x"]) for part in left]
+        return thin[0], thin[1]
 
     def residual(self, seen: Seen, field: Parts, power: Tensor, tables: Tables) -> Tensor:
         """Power of what is left over the field's `power` [B], as `relative_power` has it, [B] float32."""
         real, imaginary = self.left(seen, field, tables)
-        return self.power((_LOUDER * real, _LOUDER * imaginary)) / (power * _LOUDER**2)
+        rows = len(range(0, self.recovery.grid.shape[0], _EVERY))
+        return self.power((_LOUDER * real, _LOUDER * imaginary), rows) / (power * _LOUDER**2)
 
-    def power(self, field: Parts) -> Tensor:
-        """Mean of the squares of both parts over the grid, [B] float32: sums of rows are products."""
+    def power(self, field: Parts, rows_shown: int | None = None) -> Tensor:
+        """Mean of the squares of both parts over the grid, or so many rows of it, [B] float32: sums are products."""
         ny, nx = self.recovery.grid.shape
         ones = field[0].new_full((sizes(field[0])[2], 8), 1 / nx)
         rows = [(part * part) @ ones for part in field]
-        return (rows[0] + rows[1])[..., 0].to(torch.float32).sum(1) * (0.5 / ny)
+        return (rows[0] + rows[1])[..., 0].to(torch.float32).sum(1) * (0.5 / (rows_shown or ny))
 
     def _lights(self, field: Parts, tables: Tables) -> tuple[Parts, Parts]:
         """L and L' of a field E."""
