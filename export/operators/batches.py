@@ -16,7 +16,7 @@ from lightpage.export.graph import FRAME_INPUTS
 
 _FREE = frozenset(["Reshape", "Squeeze", "Unsqueeze", "Flatten", "Identity", "Constant", "Shape"])
 """Operators that move nothing."""
-_PLANE = 32
+_PLANE = 24
 """Rows and columns from which on a tensor is a plane, or many."""
 
 

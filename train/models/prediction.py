@@ -85,10 +85,11 @@ class Prediction(nn.Module):
         return by_symbol(self.back.to_page(self.back.matrices(parameters), left), self.back.samples)
 
 
-def expected_phasors(p: Tensor) -> Tensor:
-    """Mean of exp(i phase) under von Mises densities, [2, ...] to [2, ...].
+def expected_phasors(p: Tensor, axis: int = 0) -> Tensor:
+    """Mean of exp(i phase) under von Mises densities, of p with its two numbers along an axis; same shape.
 
     Its length, a ratio of Bessel functions, lies within 5% of kappa / (1/2 + sqrt(kappa^2 + 9/4)), one of the bounds of
     Amos (Math. Comp. 28, 1974).
     """
-    return p / (0.5 + torch.sqrt(p.square().sum(0, keepdim=True) + 2.25))
+    x, y = p.split(1, axis)
+    return p / (0.5 + torch.sqrt(x * x + y * y + 2.25))

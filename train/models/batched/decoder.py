@@ -18,7 +18,7 @@ from lightpage.train.models.field import FieldRecovery
 from lightpage.train.models.localizers.wave import WaveLocalizer
 from lightpage.train.models.network import Refiner, SymbolUNet, estimate
 from lightpage.train.models.parts import Parts
-from lightpage.train.models.prediction import Prediction
+from lightpage.train.models.prediction import Prediction, expected_phasors
 from lightpage.train.models.waves import Waves
 
 PLACES = "where"
@@ -196,7 +196,7 @@ class Unexplained(nn.Module):
     ) -> Tensor:
         """Light that estimated pages p [B, 2, ny, nx] leave unexplained, [B, 2 S, ny, nx]."""
         dtype, back = field[0].dtype, of_part(tables, "back")
-        written = (p / (0.5 + torch.sqrt(p.square().sum(1, keepdim=True) + 2.25))).to(dtype)
+        written = expected_phasors(p, 1).to(dtype)
         lit = _multiplied(written, tables["illumination"])
         lit = turned_product(turned_product(lit, tables["page_y"]), tables["page_x"])
         expected = self.there(lit, of_part(tables, "there"))  # on the sparse samples
