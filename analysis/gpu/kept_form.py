@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from analysis.comparison.data_set import LEVELS, data_set_of
 from analysis.comparison.kept_weights import read_weights
 from analysis.comparison.weight_store import CALIBRATION, KEPT_WEIGHTS
 from lightpage.calibration.document import Calibration, load_calibration
-from lightpage.calibration.sampling_table import sampling_table
+from lightpage.calibration.sampling_table import SamplingTable, sampling_table
 from lightpage.device.profile import Profile
 from lightpage.export.batched import batched_onnx
 from lightpage.export.graph import DecoderGraph, table_tensors
@@ -49,6 +50,12 @@ class Scene:
     pairs: list[FramePair]
     symbols: list[NDArray[np.uint8]]
     references: FramePair
+
+    @cached_property
+    def table(self) -> SamplingTable:
+        """Of the calibrated device."""
+        twin, calibration = TorchTwin(RayTwin(self.profile)), self.calibration
+        return sampling_table(twin, calibration.vector, calibration.turn_rad, self.profile)
 
     def air(self, p: NDArray[np.float32], page: int) -> float:
         """Achievable rate of an answer, bits a symbol."""
@@ -124,10 +131,9 @@ def form_of(folder: Path, scene: Scene, preset: str, reflections: int, device: t
         reflections: rounds to the field; 0 for descent.
         device: what the form for one page is run on, which tells what is expected.
     """
-    calibration, profile = scene.calibration, scene.profile
-    table = sampling_table(TorchTwin(RayTwin(profile)), calibration.vector, calibration.turn_rad, profile)
+    profile = scene.profile
     graph = DecoderGraph(profile, kept_decoder(folder, preset, scene, reflections), 1.0).eval()
-    defaults = table_tensors(graph, table, scene.references)
+    defaults = table_tensors(graph, scene.table, scene.references)
     start = time.perf_counter()
     made = batched_onnx(graph, "uint8", defaults, torch.float16)
     assert made is not None

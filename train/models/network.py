@@ -200,6 +200,6 @@ class Refiner(nn.Module):
     @staticmethod
     def known(earlier: Tensor) -> tuple[Tensor, Tensor]:
         """What the network is told of an earlier p [N, 2, ny, nx]: its direction, and the logarithm of its length."""
-        x, y = earlier.split(1, 1)
+        x, y = earlier.chunk(2, 1)
         kappa = torch.sqrt(x * x + y * y + 1e-12)
         return earlier / kappa, torch.log(kappa) - _TYPICAL_LOG_KAPPA

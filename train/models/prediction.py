@@ -91,5 +91,5 @@ def expected_phasors(p: Tensor, axis: int = 0) -> Tensor:
     Its length, a ratio of Bessel functions, lies within 5% of kappa / (1/2 + sqrt(kappa^2 + 9/4)), one of the bounds of
     Amos (Math. Comp. 28, 1974).
     """
-    x, y = p.split(1, axis)
+    x, y = p.chunk(2, axis)
     return p / (0.5 + torch.sqrt(x * x + y * y + 2.25))
