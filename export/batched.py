@@ -15,10 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-import onnx_ir
 import torch
 from numpy.typing import NDArray
-from onnxscript import optimizer
+from onnxscript import ir, optimizer
 from torch import Tensor, nn
 
 from lightpage.export.graph import ANSWERS, APART, FRAME_INPUTS, DecoderGraph, answers
@@ -132,10 +131,10 @@ def traced(
             output_names=list(outputs),
             dynamic_axes={name: {0: PAGES} for name in of_pages},
         )
-        traced_model = onnx_ir.from_proto(onnx.load(file))
+        traced_model = ir.from_proto(onnx.load(file))
     optimizer.fold_constants(traced_model, output_size_limit=FOLDED)
     optimizer.remove_unused_nodes(traced_model)
-    model = anonymous(sharing(onnx_ir.to_proto(traced_model)))
+    model = anonymous(sharing(ir.to_proto(traced_model)))
     halved(model, _MATRICES)
     onnx.checker.check_model(model)
     return model
