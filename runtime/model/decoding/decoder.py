@@ -309,8 +309,11 @@ class Decoder:
             raise BundleError(f"{subject}: output {manifest.residual_output}", "nothing", "a scalar residual")
 
     def _check_golden(self) -> None:
-        self.check(self.bundle.golden.pair)
-        check_golden(self.bundle, lambda pair: self.infer(pair).p, self.bundle.manifest.precision)
+        def answer(pair: FramePair) -> NDArray[np.float32]:
+            self.check(pair)
+            return self.infer(pair).p
+
+        check_golden(self.bundle, answer, self.bundle.manifest.precision)
 
 
 def check_residual(residual: float, limit: float | None, *, doubtful: bool = False) -> None:
