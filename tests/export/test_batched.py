@@ -153,8 +153,6 @@ def test_what_is_slow_is_found() -> None:
     inputs = torch.zeros(1, 40, 40), torch.zeros(40, 40)
     model = traced(Slow(), inputs, ("in_phase", "constant"), ("p",), ("in_phase", "p"))
     file = BatchFile(model.SerializeToString(), 4)
-    assert [len(found) for found in (file.left_constants(), file.reduced_planes(), file.wide_planes((1, 1)))] == [
-        1,
-        1,
-        1,
-    ]
+    assert len(file.left_constants()) == 1
+    assert len(file.reduced_planes()) == 1
+    assert "in_phase" in file.wide_planes((1, 1))
