@@ -398,7 +398,7 @@ def _directions(light: Complex, *, bends: bool) -> Complex:
 def _of_one_phase(light: Complex) -> Complex:
     """An illumination without what bends the page's phases: a long step turns its even term away from the others."""
     phasor = light[0] / abs(light[0])
-    return phasor * (light / phasor).real
+    return np.asarray(phasor * (light / phasor).real)
 
 
 def _told_apart(found: WaveFitted, usual: Modulation) -> WaveFitted:
