@@ -87,7 +87,7 @@ class RecalibrationOutcome:
 
     `pages_lost_before` of these pages the earlier model would not have given out; they count with no bits. `air_limit`
     is the least `air_after` that would have been accepted, see `lightpage.runtime.recalibration.judgement.judge`, and
-    `air_standard_error` that of the difference.
+    `air_standard_error` that of the difference. `rounds` are those of the healing; None where pages were known.
     """
 
     path: Path
@@ -102,6 +102,7 @@ class RecalibrationOutcome:
     seconds: float
     air_limit: float
     air_standard_error: float
+    rounds: int | None = None
 
 
 def recalibrate(

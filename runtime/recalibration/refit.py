@@ -23,7 +23,7 @@ from lightpage.runtime.model.execution.twin import OnnxTwin
 from lightpage.runtime.recalibration.known_pages import KnownPages
 from lightpage.runtime.recalibration.recalibration import RefitReport, RefitResult
 
-_REFITTED = frozenset({"places", "parameters"})
+REFITTED = frozenset({"places", "parameters"})
 """Inputs that a re-fitted geometry is fed to, by one of which a decoder knows it."""
 _SEARCHED_SYMBOLS = 300
 """Known symbols by which the image is looked for: enough in any light that can be calibrated in, and soon done."""
@@ -55,8 +55,8 @@ def refit(
         BundleError: the bundle's graphs do not show the field, or hold a geometry that cannot be fed instead.
     """
     profile, earlier = bundle.profile, bundle.calibration
-    if not _REFITTED & decoder.graph.ports.keys():
-        among = f"{' or '.join(sorted(_REFITTED))} among them"
+    if not REFITTED & decoder.graph.ports.keys():
+        among = f"{' or '.join(sorted(REFITTED))} among them"
         expected = f"{among}: this decoder holds its geometry itself; calibrate, train and export anew"
         raise BundleError(f"{bundle.subject}: table inputs", sorted(decoder.graph.ports), expected)
     references = references_of(bundle, pages.references)
