@@ -1,6 +1,7 @@
 """Pages of user data that a drifted device's model does not read, and no page that anybody knows."""
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,16 +14,25 @@ from lightpage.codec.code import Code
 from lightpage.errors import Reason, RecalibrationRefusedError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
+from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.commands.archives.encode import encode
 from lightpage.runtime.commands.archives.recover import recover
+from lightpage.runtime.device.acquisition.source import open_source
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.healed_bundle import recalibrate_by_lost
 from lightpage.runtime.recalibration.healing import LostPages, heal
 from lightpage.runtime.recalibration.known_pages import KnownPages
 from lightpage.runtime.recalibration.refit import refit
+from lightpage.runtime.service.caller import Call, Caller
+from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.kept_pages import KeptPages
+from lightpage.runtime.service.jobs.recalibrator import Recalibrator
+from lightpage.runtime.service.jobs.self_calibration import SelfCalibration
+from lightpage.runtime.service.models.models import Models
+from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.monitoring.observation import Observation
+from lightpage.runtime.service.pages.page_calls import PageCalls
 
 CODE = Code(levels=8, coded_bits=2, rate_per_mille=500, corrections=2)
 CONTENT = bytes(range(250)) * 3
@@ -83,6 +93,25 @@ def test_a_service_recalibrates_by_the_pages_that_it_keeps(small_bundle: Path, d
     known = kept.pages(healed, (0.0, 0.0))
     assert isinstance(known, KnownPages)
     np.testing.assert_array_equal(known.symbols[0], symbols[-1])
+
+
+def test_a_range_of_pages_that_nobody_could_read_comes_back_with_the_model_healed(
+    small_bundle: Path, drifted: Path
+) -> None:
+    bundle, kept, monitor = Bundle.open(small_bundle), KeptPages(most_bytes=1 << 30), Monitor()
+    manifest = bundle.manifest.model_copy(update={"code": CODE.to_toml()})
+    decoder = Decoder(replace(bundle, manifest=manifest), threads=1)
+    with open_source(f"recording:{drifted / 'R.h5'}") as source, ThreadPoolExecutor(1) as pool:
+        plane = DataPlane(Models(decoder), source, monitor=monitor, observers=[kept])
+        with SelfCalibration(plane, monitor, Recalibrator(plane, refit), kept=kept):
+            request = pb.ReadDataRequest(first_page=0, pages=4)
+            replies = [*PageCalls(plane).ReadData(request, Call("ReadData", Caller(), pool))]
+    lost, healed = replies[:4], replies[4:]
+    assert not any(reply.user_data.data for reply in lost)
+    assert [(reply.page, reply.model_version, reply.restored) for reply in healed] == [
+        (page, "small-1+r1", False) for page in range(4)
+    ]
+    assert b"".join(reply.user_data.data for reply in healed)[: len(CONTENT)] == CONTENT
 
 
 def test_frames_that_do_not_show_the_device_are_refused_before_anything_is_fitted(
