@@ -11,7 +11,9 @@ from click.testing import CliRunner
 
 from lightpage.cli.simulate import simulate
 from lightpage.codec.code import Code
+from lightpage.device.state import Device
 from lightpage.errors import Reason, RecalibrationRefusedError
+from lightpage.page.pilots import Pilots
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
@@ -20,9 +22,12 @@ from lightpage.runtime.commands.archives.recover import recover
 from lightpage.runtime.device.acquisition.source import open_source
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.tracking import NoTracker
 from lightpage.runtime.recalibration.healed_bundle import recalibrate_by_lost
 from lightpage.runtime.recalibration.healing import LostPages, heal
+from lightpage.runtime.recalibration.judgement import Verdict, judge, judged_pages
 from lightpage.runtime.recalibration.known_pages import KnownPages
+from lightpage.runtime.recalibration.recalibration import refitted_bundle
 from lightpage.runtime.recalibration.refit import refit
 from lightpage.runtime.service.caller import Call, Caller
 from lightpage.runtime.service.dataplane import DataPlane
@@ -33,6 +38,7 @@ from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.monitoring.observation import Observation
 from lightpage.runtime.service.pages.page_calls import PageCalls
+from lightpage.simulator.simulator import Simulator
 
 CODE = Code(levels=8, coded_bits=2, rate_per_mille=500, corrections=2)
 CONTENT = bytes(range(250)) * 3
@@ -128,6 +134,32 @@ def test_frames_that_do_not_show_the_device_are_refused_before_anything_is_fitte
     dark = FramePair(*(np.zeros_like(frame) for frame in frames))
     with pytest.raises(RecalibrationRefusedError, match="light"):
         heal(decoder, LostPages((dark,), CODE, references=references), untouched)
+
+
+def test_a_models_own_decisions_speak_for_it_and_pages_that_come_right_for_the_better_one(small_bundle: Path) -> None:
+    decoder, rng = Decoder.load(small_bundle, threads=1), np.random.default_rng(1)
+    bundle, mask = decoder.bundle, decoder.bundle.pilot_mask
+    turned = Device().with_settings(["geometry.pipe_angle_deg=-0.57", "drift.shift_px=0"])
+    simulator = Simulator(bundle.profile, turned, 256, seed=7)
+    written = rng.integers(256, size=(2, *bundle.profile.page_shape)).astype(np.uint8)
+    pairs = tuple(simulator.page(page) for page in written)
+    right = KnownPages(pairs, tuple(written), 256, simulator.references())
+    fitted = refitted_bundle(bundle, refit(bundle, right.part(slice(1)), lambda what, share: None, decoder))
+    pages = [
+        decoder.decode(pair, 256, Pilots.of_symbols(mask, page, 256)) for pair, page in zip(pairs, written, strict=True)
+    ]
+    decided = tuple(np.where(mask, page, found.symbols) for page, found in zip(written, pages, strict=True))
+
+    def judged(pages: KnownPages) -> Verdict:
+        before, after = (
+            judged_pages(NoTracker(decoder.of_bundle(one)), one, pages, lambda share: None) for one in (bundle, fitted)
+        )
+        return judge(before, after, 256)
+
+    verdict = judged(right.part(slice(1, 2)))
+    assert verdict.after > verdict.limit
+    with pytest.raises(RecalibrationRefusedError):
+        judged(KnownPages(pairs[1:], decided[1:], 256, right.references))
 
 
 def untouched(what: str, share: float) -> None:
