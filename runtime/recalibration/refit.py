@@ -127,6 +127,7 @@ def traced(
             coherence_before=fitted.coherence_before,
             coherence_after=fitted.coherence_after,
             image=image,
+            goodness=fitted.goodness,
         ),
     )
 
