@@ -68,7 +68,10 @@ def describe(result: DemoResult) -> str:
         margin = "" if step.margin_bits is None else f" margin {step.margin_bits:+.3f} bit a symbol,"
         due = ", recalibration due" if step.recalibration_due else ""
         lines.append(f"drift {step.share:.2f}:{margin} page {'lost' if step.lost else 'read'}{due}")
-    lines.append(result.healing_told())
+    lines += result.story()[1:]
+    lines.append(
+        f"healed in {result.healed.seconds:.0f} s; {result.healed.pages_used} of the lost pages came right first"
+    )
     if result.shots:
         told = ", ".join(f"{count} {outcome}" for outcome, count in sorted(result.shots.items()))
         lines.append(f"shots of {result.source}: {told}")

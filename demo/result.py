@@ -106,15 +106,18 @@ class DemoResult:
     shots: dict[str, int] = field(default_factory=dict)
     """Shots of the cameras by how they ended; empty without cameras."""
 
-    def healing_told(self) -> str:
-        """What the healing did, for people."""
-        healed = self.healed
+    def story(self) -> tuple[str, str, str]:
+        """What happened, for people, in lines of some 120 characters."""
+        fresh, lost, again = (phase.air_bits_per_symbol for phase in self.phases)
+        margin, healed = self.phases[0].margin_bits, self.healed
+        spare = "" if margin is None else f" Their code has a margin of {margin:.2f} bit a symbol."
         angle = healed.report.angle_deg
-        found = "" if angle is None else f", pipe angle {angle:.3f} degree"
+        found = "" if angle is None else f" It found the pipe's angle: {angle:.3f} degree."
         rounds = f"{healed.rounds} round{'' if healed.rounds == 1 else 's'}"
         return (
-            f"healed by lost pages of user data, no known page shown: in {rounds}, {healed.seconds:.0f} s; "
-            f"{healed.pages_used} of them came right{found}; AIR {healed.air_before:.2f} to {healed.air_after:.2f} bit a symbol"
+            f"A picture of {self.volume.file_bytes} bytes lies on {self.volume.pages} pages, one spoilt.{spare}",
+            f"The device drifts, AIR falls from {fresh:.2f} to {lost:.2f} bit a symbol, and no known page is shown.",
+            f"The model heals by lost pages of user data: {rounds}, AIR {again:.2f} again.{found}",
         )
 
     def to_json(self) -> dict[str, Any]:

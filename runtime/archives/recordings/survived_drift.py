@@ -81,6 +81,7 @@ class DriftedReading:
         recording: with known symbols.
 
     Attributes:
+        recording: that is read.
         kinds: of `KINDS`, those that the decoder knows of.
 
     Raises:
@@ -94,7 +95,7 @@ class DriftedReading:
         check_symbols(recording, "measure a drift by")
         if not REFITTED & decoder.graph.ports.keys():
             raise BundleError(f"{decoder.bundle.subject}: table inputs", sorted(decoder.graph.ports), "a geometry")
-        self._decoder, self._recording, self._calibration = decoder, recording, decoder.bundle.calibration
+        self._decoder, self.recording, self._calibration = decoder, recording, decoder.bundle.calibration
         self._twin = OnnxTwin(decoder.bundle)
         told = self._decoder.taken({"parameters": self._calibration.vector}).get("parameters", NAMES[: KNOWN[0]])
         held = {*NAMES[min(len(told), self._twin.known) :]}
@@ -118,7 +119,7 @@ class DriftedReading:
 
     def drifted(self, amounts: Mapping[str, float]) -> Drift | None:
         """The pages, and what is read of them after a drift; None where a page is lost by it, whatever its code."""
-        start, recording = self._decoder, self._recording
+        start, recording = self._decoder, self.recording
         result = traced(start, self._twin, start.references, moved(self._calibration, amounts))
         decoder, after = start.of_bundle(refitted_bundle(start.bundle, result)), []
         try:
