@@ -30,7 +30,9 @@ from lightpage.runtime.recalibration.refit import REFITTED, traced
 _PAGES = FEWEST_PAGES
 """That are read again for every drift: what a drift costs is much the same for all."""
 
-_STEPS = 3
+_STEPS = 6
+_NEAR = 1.05
+"""Times an amount that is read, beyond which no larger one is looked for."""
 _AIM = 0.95
 """Share of what a code can spare that a step aims at: one that is short of it is found to be read."""
 _STRIDE = 8.0
@@ -132,17 +134,26 @@ class DriftedReading:
             return None
         return Drift(self._before.draw, SeenPages.of(decoder, recording, after).draw)
 
-    def survived(self, choice: Choice) -> dict[str, float]:
-        """The largest amount of each kind, alone, that pages of a code survive; 0 where none that was tried."""
-        return {kind: self._largest(kind, choice) for kind in track(self.kinds, "drifts", unit="kind")}
+    def survived(self, choice: Choice, asked: Mapping[str, float]) -> dict[str, float]:
+        """The largest amount of each kind, alone, that pages of a code survive; 0 where none that was tried.
 
-    def _largest(self, kind: str, choice: Choice) -> float:
-        amount, largest = KINDS[kind].usual, 0.0
+        Args:
+            choice: the code.
+            asked: amounts to try first.
+        """
+        kinds = track(self.kinds.items(), "drifts", unit="kind", total=len(self.kinds))
+        return {name: self._largest(name, choice, asked.get(name) or kind.usual) for name, kind in kinds}
+
+    def _largest(self, kind: str, choice: Choice, amount: float) -> float:
+        largest = 0.0
         for _ in range(_STEPS):
             drift = self.drifted({kind: amount})
             read, cost = (False, np.inf) if drift is None else survives(choice, drift, self._before.mask)
+            # a small drift costs by its square
+            further = float(np.clip(np.sqrt(_AIM * choice.spare / max(cost, _LEAST_COST)), 1 / _STRIDE, _STRIDE))
             if read:
                 largest = max(largest, amount)
-            # a small drift costs by its square
-            amount *= float(np.clip(np.sqrt(_AIM * choice.spare / max(cost, _LEAST_COST)), 1 / _STRIDE, _STRIDE))
+                if further < _NEAR:
+                    break
+            amount *= further if read else min(further, 1 / _NEAR)
         return largest

@@ -72,7 +72,7 @@ def code(
         if asked and drift is None:
             raise InvalidInputError("--survive", asked, "less drift: by this one pages are lost whatever their code")
         best, tried = choose_code(decoder, pages, tracker_for(decoder), headroom, drift)
-        survived = {} if reading is None else reading.survived(best)
+        survived = {} if reading is None else reading.survived(best, asked)
         without = bytes_without_headroom(best, pilots_of(decoder, pages))
     if out is not None:
         best.code.save(out)
