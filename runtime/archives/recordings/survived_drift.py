@@ -145,15 +145,15 @@ class DriftedReading:
         return {name: self._largest(name, choice, asked.get(name) or kind.usual) for name, kind in kinds}
 
     def _largest(self, kind: str, choice: Choice, amount: float) -> float:
-        largest = 0.0
+        largest, failed = 0.0, np.inf
         for _ in range(_STEPS):
             drift = self.drifted({kind: amount})
             read, cost = (False, np.inf) if drift is None else survives(choice, drift, self._before.mask)
+            largest, failed = (max(largest, amount), failed) if read else (largest, min(failed, amount))
             # a small drift costs by its square
-            further = float(np.clip(np.sqrt(_AIM * choice.spare / max(cost, _LEAST_COST)), 1 / _STRIDE, _STRIDE))
-            if read:
-                largest = max(largest, amount)
-                if further < _NEAR:
-                    break
-            amount *= further if read else min(further, 1 / _NEAR)
+            amount *= float(np.clip(np.sqrt(_AIM * choice.spare / max(cost, _LEAST_COST)), 1 / _STRIDE, _STRIDE))
+            if amount >= failed:  # it is not information that is short, but corrections
+                amount = float(np.sqrt(largest * failed)) if largest else failed / 2
+            if amount < _NEAR * largest:
+                break
         return largest
