@@ -1,0 +1,172 @@
+/* What takes time, written once and compiled for each set of instructions: `page_code.c` includes this file for each.
+ *
+ * LANES: checks of a row that are renewed together. TARGET: attribute of the functions. NAME(x): their names.
+ * Where the compiler knows no vectors, LANES is 1 and a vector is a number.
+ */
+
+#if LANES > 1
+typedef float NAME(floats) __attribute__((vector_size(4 * LANES)));
+typedef int32_t NAME(ints) __attribute__((vector_size(4 * LANES)));
+#define LESS(a, b) ((a) < (b))
+#define EQUAL(a, b) ((a) == (b))
+#else
+typedef float NAME(floats);
+typedef int32_t NAME(ints);
+#define LESS(a, b) (-(int32_t)((a) < (b)))
+#define EQUAL(a, b) (-(int32_t)((a) == (b)))
+#endif
+
+typedef union {
+  NAME(floats) f;
+  NAME(ints) i;
+} NAME(vector);
+
+#define CHOSEN(mask, a, b) (((mask) & (a).i) | (~(mask) & (b).i))
+
+/* Renews one row: beliefs are read at `in` and written to `out`, which are other places. Two vectors at a time, since
+ * each step of one waits for its last. */
+TARGET static void NAME(renew)(int degree, int z, float offset, const float *const *in, float *const *out, float *messages) {
+  NAME(vector) other[MOST_DEGREE][2];
+  for (int k = 0; k < z; k += 2 * LANES) {
+    NAME(vector) least[2], second[2], sign[2], low[2], high[2];
+    for (int p = 0; p < 2; p++) {
+      least[p].f = second[p].f = (NAME(floats)){0} + FAR;
+      sign[p].i = (NAME(ints)){0};
+    }
+    for (int i = 0; i < degree; i++)
+      for (int p = 0; p < 2; p++) {
+        NAME(vector) v, message, size, larger;
+        memcpy(&v, in[i] + k + p * LANES, sizeof v);
+        memcpy(&message, messages + i * z + k + p * LANES, sizeof message);
+        v.f -= message.f;
+        other[i][p] = v;
+        sign[p].i ^= v.i;
+        size.i = v.i & 0x7fffffff;
+        const NAME(ints) is_less = LESS(size.f, least[p].f);
+        larger.i = CHOSEN(is_less, least[p], size);
+        least[p].i = CHOSEN(is_less, size, least[p]);
+        second[p].i = CHOSEN(LESS(larger.f, second[p].f), larger, second[p]);
+      }
+    for (int p = 0; p < 2; p++) {
+      low[p].f = least[p].f - offset, high[p].f = second[p].f - offset;
+      low[p].i &= ~(low[p].i >> 31), high[p].i &= ~(high[p].i >> 31); /* what is negative becomes 0 */
+    }
+    for (int i = 0; i < degree; i++)
+      for (int p = 0; p < 2; p++) {
+        NAME(vector) v = other[i][p], size, told;
+        size.i = v.i & 0x7fffffff;
+        told.i = CHOSEN(EQUAL(size.f, least[p].f), high[p], low[p]) | ((sign[p].i ^ v.i) & INT32_MIN);
+        memcpy(messages + i * z + k + p * LANES, &told, sizeof told);
+        v.f += told.f;
+        memcpy(out[i] + k + p * LANES, &v, sizeof v);
+      }
+  }
+}
+
+TARGET static void NAME(clip)(float *values, int count, float most) {
+  for (int i = 0; i < count; i++) {
+    const float above = values[i] > -most ? values[i] : -most;
+    values[i] = above < most ? above : most;
+  }
+}
+
+TARGET static void NAME(decide)(uint8_t *hard, const float *belief, int count) {
+  for (int k = 0; k < count; k++) hard[k] = belief[k] < 0;
+}
+
+TARGET static int NAME(is_odd)(const uint8_t *const *hard, int degree, int z) {
+  uint8_t sum[MOST_Z] = {0}, any = 0;
+  for (int i = 0; i < degree; i++)
+    for (int k = 0; k < z; k++) sum[k] ^= hard[i][k];
+  for (int k = 0; k < z; k++) any |= sum[k];
+  return any;
+}
+
+TARGET static inline void NAME(polynomials)(const levels_table *t, int count, const double *away, const double *concentration, double *along, double *across) {
+  for (int i = 0; i < count; i++) {
+    const double square = away[i] * away[i];
+    double s = t->sine[t->terms - 1], c = t->cosine[t->terms - 1];
+    for (int n = t->terms - 2; n >= 0; n--) {
+      s = s * square + t->sine[n];
+      c = c * square + t->cosine[n];
+    }
+    along[i] = concentration[i] * c;
+    across[i] = concentration[i] * (s * away[i]);
+  }
+}
+
+TARGET static inline void NAME(weigh)(int width, const double *cosine, const double *sine, double along, double across, float *weight) {
+  for (int j = 0; j < width; j++) {
+    double x = along * cosine[j] + across * sine[j];
+    x = x > -80.0 ? x : -80.0;
+    x = x < 0.0 ? x : 0.0;
+    weight[j] = exponential((float)x);
+  }
+}
+
+TARGET static void NAME(ratios)(const levels_table *t, int count, const double *phase, const double *concentration, float most, float *out) {
+  double away[TILE], along[TILE], across[TILE];
+  float zero[TILE * MOST_BITS], one[TILE * MOST_BITS], weight[MOST_LEVELS], coset[MOST_LEVELS];
+  int place[TILE];
+  locate(t, count, phase, place, away);
+  NAME(polynomials)(t, count, away, concentration, along, across);
+  for (int i = 0; i < count; i++) {
+    const int row = t->even ? 0 : place[i];
+    const int is_near = concentration[i] >= t->limit[row];
+    const neighbours *n = is_near ? &t->near : &t->all;
+    const double *cosine = n->cosine + row * n->width, *sine = n->sine + row * n->width;
+    if (n->width == NEAR)
+      NAME(weigh)(NEAR, cosine, sine, along[i], across[i], weight);
+    else
+      NAME(weigh)(n->width, cosine, sine, along[i], across[i], weight);
+    sum_by_coset(t, n, place[i], weight, coset);
+    if (t->bits == 2)
+      split(2, coset, zero + 2 * i, one + 2 * i);
+    else
+      split(t->bits, coset, zero + t->bits * i, one + t->bits * i);
+  }
+  for (int i = 0; i < count * t->bits; i++) {
+    const float ratio = logarithm(zero[i]) - logarithm(one[i]);
+    out[i] = ratio < -most ? -most : ratio > most ? most : ratio;
+  }
+}
+
+TARGET static int64_t NAME(lack_of_truth)(int64_t count, const float *llrs, const uint8_t *bits) {
+  int64_t sum = 0;
+  for (int64_t i = 0; i < count; i++) {
+    const float right = bits[i] ? -llrs[i] : llrs[i], size = fabsf(right) < 80.0f ? fabsf(right) : 80.0f;
+    const float lack = right < 0 ? size : 0;
+    sum += (int32_t)((lack + logarithm(1.0f + exponential(-size))) * UNITS);
+  }
+  return sum;
+}
+
+TARGET static int64_t NAME(lack_as_claimed)(int64_t count, const float *llrs) {
+  int64_t sum = 0;
+  for (int64_t i = 0; i < count; i++) {
+    const float size = fabsf(llrs[i]) < 80.0f ? fabsf(llrs[i]) : 80.0f, tail = exponential(-size);
+    sum += (int32_t)((logarithm(1.0f + tail) + size * tail / (1.0f + tail)) * UNITS);
+  }
+  return sum;
+}
+
+TARGET static void NAME(numbers_in_coset)(int64_t count, const double *phase, const uint8_t *label, int bits, int level_bits, uint8_t *out) {
+  const int upper = level_bits - bits, levels = 1 << level_bits;
+  const double step = 2 * 3.14159265358979323846 / levels, wide = step * (1 << bits);
+  for (int64_t i = 0; i < count; i++, label += bits, out += upper) {
+    int number = 0;
+    for (int k = 0; k < bits; k++) number |= (label[k] & 1) << k;
+    number ^= number >> 1;
+    number ^= number >> 2;
+    number ^= number >> 4;
+    const double nearest = ((phase[i] - number * step) / wide + 6755399441055744.0) - 6755399441055744.0;
+    const int found = (int)nearest;
+    for (int k = 0; k < upper; k++) out[k] = (uint8_t)(found >> (upper - 1 - k) & 1);
+  }
+}
+
+static const kernels NAME(kernels) = {NAME(renew), NAME(clip), NAME(decide), NAME(is_odd), NAME(ratios), NAME(lack_of_truth), NAME(lack_as_claimed), NAME(numbers_in_coset)};
+
+#undef LESS
+#undef EQUAL
+#undef CHOSEN

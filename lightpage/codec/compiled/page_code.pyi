@@ -1,0 +1,54 @@
+"""What `page_code.c` offers. Arrays are contiguous and of the type that stands in the comment; results go to the last."""
+
+from typing import Any
+
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+Neighbours = tuple[int, Array, Array, Array]
+"""Width; cosines less 1 and sines, float64 [rows, width]; cosets, uint8 [levels, width], or none of even levels."""
+Levels = tuple[
+    int,  # levels
+    int,  # label bits
+    bool,  # whether levels are even
+    Array,  # coefficients of sine and cosine, float64 [terms]
+    Array,
+    tuple[float, Array, Array, Array, int],  # first border, circle and borders, float64, starts, int64; most in a step
+    Array,  # least concentration at which near neighbours suffice, float64 [rows]
+    Neighbours,
+    Neighbours,
+]
+Graph = tuple[Array, Array, int, int, int]
+"""Bits of each row and their (column, shift), int32; lifting size, information bits, sent bits."""
+
+def decode_blocks(
+    code: Graph,
+    iterations: int,
+    offset: float,
+    most: float,
+    known: float,
+    llrs: Array,  # float32 [blocks, sent]
+    information: Array,  # uint8 [blocks, information]
+    sent: Array,  # uint8 [blocks, sent]
+    taken: Array,  # int32 [blocks], 0 where a block failed
+    /,
+) -> None: ...
+def llrs(
+    phase: Array,  # float64 [symbols], at most 1e6
+    concentration: Array,  # float64 [symbols]
+    levels: Levels,
+    most: float,
+    out: Array,  # float32 [symbols, label bits]
+    /,
+) -> None: ...
+def lack_of_information(llrs: Array, bits: Array | None, /) -> int: ...
+def upper_bits(
+    phase: Array,  # float64 [symbols], at most 1e6
+    label: Array,  # uint8 [symbols, label bits]
+    label_bits: int,
+    level_bits: int,
+    out: Array,  # uint8 [symbols, level bits - label bits]
+    /,
+) -> None: ...
+def variants() -> tuple[str, ...]: ...
+def use(number: int, /) -> None: ...
