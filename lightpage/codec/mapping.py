@@ -17,6 +17,8 @@ from lightpage.codec.likelihood.ratios import MOST_PHASE, ratios
 from lightpage.errors import PageError
 from lightpage.page.levels import Levels, check_levels
 
+Real = NDArray[np.float64]
+
 _MOST_CONCENTRATION = 1e30
 """More says no more."""
 
@@ -75,10 +77,22 @@ def bit_llrs(
     mu, kappa = np.asarray(phase, np.float64).ravel(), np.asarray(concentration, np.float64).ravel()
     if np.shape(phase) != np.shape(concentration):
         raise PageError("phase, concentration", (np.shape(phase), np.shape(concentration)), "two equal shapes")
+    table = table_of(levels, bits)
+    return ratios(*_checked(mu, kappa), table, MOST_LLR, threads).reshape(*np.shape(phase), bits)
+
+
+def _checked(mu: Real, kappa: Real) -> tuple[Real, Real]:
+    """Phases and concentrations, contiguous and not too large to be counted with.
+
+    Raises:
+        PageError: a value that is not finite, a negative concentration.
+    """
+    mu, kappa, native = np.ascontiguousarray(mu), np.ascontiguousarray(kappa), compiled()
+    if native is not None and native.look(mu, kappa, _MOST_CONCENTRATION) == 0:
+        return mu, kappa
     if not (np.isfinite(mu).all() and np.isfinite(kappa).all() and (kappa >= 0).all()):
         raise PageError("phase, concentration", "NaN, infinity or a negative concentration", "finite numbers")
-    found = ratios(bounded(mu), np.minimum(kappa, _MOST_CONCENTRATION), table_of(levels, bits), MOST_LLR, threads)
-    return found.reshape(*np.shape(phase), bits)
+    return _bounded(mu), np.minimum(kappa, _MOST_CONCENTRATION)
 
 
 def to_levels(label: NDArray[np.uint8], upper: NDArray[np.integer], levels: int) -> NDArray[np.uint8]:
@@ -105,7 +119,7 @@ def decide_in_coset(phase: NDArray[np.floating], label: NDArray[np.uint8], level
     """
     levels, bits = Levels.of(levels), label.shape[1]
     _check_label(levels.count, bits)
-    mu, number = bounded(np.asarray(phase, np.float64)), np.argsort(labels(bits))[label @ (1 << np.arange(bits))]
+    mu, number = _bounded(np.asarray(phase, np.float64)), np.argsort(labels(bits))[label @ (1 << np.arange(bits))]
     if levels.is_nominal:
         step = 2 * np.pi / levels.count
         nearest = np.rint((mu - number * step) / (step * (1 << bits))).astype(np.int64)
@@ -117,7 +131,7 @@ def decide_in_coset(phase: NDArray[np.floating], label: NDArray[np.uint8], level
     return found
 
 
-def upper_bits(phase: NDArray[np.float64], label: NDArray[np.uint8], levels: Levels) -> NDArray[np.uint8]:
+def upper_bits(phase: Real, label: NDArray[np.uint8], levels: Levels) -> NDArray[np.uint8]:
     """Numbers within cosets as `decide_in_coset` finds them, bit by bit, the highest first: uint8 [symbols, m - b].
 
     Args:
@@ -131,11 +145,11 @@ def upper_bits(phase: NDArray[np.float64], label: NDArray[np.uint8], levels: Lev
         number = decide_in_coset(phase, label, levels)
         return np.asarray(number[:, None] >> np.arange(upper)[::-1] & 1, np.uint8)
     bits = np.empty((len(phase), upper), np.uint8)
-    native.upper_bits(bounded(phase), np.ascontiguousarray(label), label.shape[1], level_bits(levels.count), bits)
+    native.upper_bits(_bounded(phase), np.ascontiguousarray(label), label.shape[1], level_bits(levels.count), bits)
     return bits
 
 
-def bounded(phase: NDArray[np.float64]) -> NDArray[np.float64]:
+def _bounded(phase: Real) -> Real:
     """Phases, contiguous, whole turns taken off where one is too large to be counted in turns."""
     phase = np.ascontiguousarray(phase)
     if phase.size and np.abs(phase).max() > MOST_PHASE:

@@ -95,21 +95,58 @@ TARGET static inline void NAME(polynomials)(const levels_table *t, int count, co
   }
 }
 
+TARGET static inline float NAME(weight)(double along, double across, double cosine, double sine) {
+  double x = along * cosine + across * sine;
+  x = x > -80.0 ? x : -80.0;
+  x = x < 0.0 ? x : 0.0;
+  return exponential((float)x);
+}
+
 TARGET static inline void NAME(weigh)(int width, const double *cosine, const double *sine, double along, double across, float *weight) {
-  for (int j = 0; j < width; j++) {
-    double x = along * cosine[j] + across * sine[j];
-    x = x > -80.0 ? x : -80.0;
-    x = x < 0.0 ? x : 0.0;
-    weight[j] = exponential((float)x);
+  for (int j = 0; j < width; j++) weight[j] = NAME(weight)(along, across, cosine[j], sine[j]);
+}
+
+/* LLRs of two label bits by the near neighbours of even levels, many symbols at once: what the general way below gives.
+ * The sums of two neighbouring cosets are all that is needed, and which of them belong to which bit turns with the place. */
+TARGET static void NAME(two_bits)(const levels_table *t, int count, const int *place, const double *along, const double *across, float most, float *out) {
+  const double *cosine = t->near.cosine, *sine = t->near.sine;
+  float sum[4][TILE], difference[2][TILE];
+  for (int r = 0; r < 4; r++)
+    for (int i = 0; i < count; i++) {
+      float total = NAME(weight)(along[i], across[i], cosine[r], sine[r]);
+      total += NAME(weight)(along[i], across[i], cosine[r + 4], sine[r + 4]);
+      total += NAME(weight)(along[i], across[i], cosine[r + 8], sine[r + 8]);
+      total += NAME(weight)(along[i], across[i], cosine[r + 12], sine[r + 12]);
+      sum[r][i] = total;
+    }
+  for (int r = 0; r < 2; r++)
+    for (int i = 0; i < count; i++) {
+      const float one = sum[r][i] + sum[r + 1][i], other = sum[r + 2][i] + sum[(r + 3) & 3][i];
+      const float d = logarithm(one > TINY ? one : TINY) - logarithm(other > TINY ? other : TINY), above = d > -most ? d : -most;
+      difference[r][i] = above < most ? above : most;
+    }
+  for (int i = 0; i < count; i++) {
+    const int first = (place[i] + t->levels - NEAR / 2) & 3;
+    const float even = difference[0][i], odd = difference[1][i];
+    const float low = first & 1 ? even : odd, high = first & 1 ? odd : even;
+    out[2 * i] = first < 2 ? -low : low;
+    out[2 * i + 1] = first == 1 || first == 2 ? -high : high;
   }
 }
 
 TARGET static void NAME(ratios)(const levels_table *t, int count, const double *phase, const double *concentration, float most, float *out) {
   double away[TILE], along[TILE], across[TILE];
   float zero[TILE * MOST_BITS], one[TILE * MOST_BITS], weight[MOST_LEVELS], coset[MOST_LEVELS];
-  int place[TILE];
+  int place[TILE], far = 0;
   locate(t, count, phase, place, away);
   NAME(polynomials)(t, count, away, concentration, along, across);
+  if (t->even && t->bits == 2 && t->near.width == NEAR) {
+    for (int i = 0; i < count; i++) far |= !(concentration[i] >= t->limit[0]);
+    if (!far) {
+      NAME(two_bits)(t, count, place, along, across, most, out);
+      return;
+    }
+  }
   for (int i = 0; i < count; i++) {
     const int row = t->even ? 0 : place[i];
     const int is_near = concentration[i] >= t->limit[row];
@@ -120,10 +157,7 @@ TARGET static void NAME(ratios)(const levels_table *t, int count, const double *
     else
       NAME(weigh)(n->width, cosine, sine, along[i], across[i], weight);
     sum_by_coset(t, n, place[i], weight, coset);
-    if (t->bits == 2)
-      split(2, coset, zero + 2 * i, one + 2 * i);
-    else
-      split(t->bits, coset, zero + t->bits * i, one + t->bits * i);
+    split(t->bits, coset, zero + t->bits * i, one + t->bits * i);
   }
   for (int i = 0; i < count * t->bits; i++) {
     const float ratio = logarithm(zero[i]) - logarithm(one[i]);
@@ -150,18 +184,11 @@ TARGET static int64_t NAME(lack_as_claimed)(int64_t count, const float *llrs) {
   return sum;
 }
 
-TARGET static void NAME(numbers_in_coset)(int64_t count, const double *phase, const uint8_t *label, int bits, int level_bits, uint8_t *out) {
-  const int upper = level_bits - bits, levels = 1 << level_bits;
+TARGET static void NAME(numbers_in_coset)(int count, const double *phase, const uint8_t *number, int bits, int levels, uint8_t *out) {
   const double step = 2 * 3.14159265358979323846 / levels, wide = step * (1 << bits);
-  for (int64_t i = 0; i < count; i++, label += bits, out += upper) {
-    int number = 0;
-    for (int k = 0; k < bits; k++) number |= (label[k] & 1) << k;
-    number ^= number >> 1;
-    number ^= number >> 2;
-    number ^= number >> 4;
-    const double nearest = ((phase[i] - number * step) / wide + 6755399441055744.0) - 6755399441055744.0;
-    const int found = (int)nearest;
-    for (int k = 0; k < upper; k++) out[k] = (uint8_t)(found >> (upper - 1 - k) & 1);
+  for (int i = 0; i < count; i++) {
+    const double nearest = ((phase[i] - number[i] * step) / wide + 6755399441055744.0) - 6755399441055744.0;
+    out[i] = (uint8_t)((int)nearest & ((levels >> bits) - 1));
   }
 }
 

@@ -192,7 +192,7 @@ typedef struct {
   void (*ratios)(const levels_table *, int, const double *, const double *, float, float *);
   int64_t (*lack_of_truth)(int64_t, const float *, const uint8_t *);
   int64_t (*lack_as_claimed)(int64_t, const float *);
-  void (*numbers_in_coset)(int64_t, const double *, const uint8_t *, int, int, uint8_t *);
+  void (*numbers_in_coset)(int, const double *, const uint8_t *, int, int, uint8_t *);
 } kernels;
 
 #define TARGET
@@ -378,6 +378,43 @@ static int is_bounded(int64_t count, const double *values, double most) {
   int bad = 0;
   for (int64_t i = 0; i < count; i++) bad |= !(fabs(values[i]) <= most);
   return !bad;
+}
+
+/* Numbers of label bits that are a Gray code, the inverse of number ^ number >> 1. */
+static void numbers_of_labels(int count, const uint8_t *label, int bits, uint8_t *out) {
+  for (int i = 0; i < count; i++, label += bits) {
+    int number = 0;
+    for (int k = 0; k < bits; k++) number |= (label[k] & 1) << k;
+    number ^= number >> 1;
+    number ^= number >> 2;
+    out[i] = (uint8_t)(number ^ number >> 4);
+  }
+}
+
+/* The lowest `width` bits of numbers, a byte each, the highest first. */
+static inline void bits_of_numbers(int count, const uint8_t *number, int width, uint8_t *out) {
+  for (int i = 0; i < count; i++, out += width)
+    for (int k = 0; k < width; k++) out[k] = (uint8_t)(number[i] >> (width - 1 - k) & 1);
+}
+
+static void upper_numbers(int64_t count, const double *phase, const uint8_t *label, int bits, int level_bits, uint8_t *out) {
+  const int width = level_bits - bits;
+  uint8_t number[TILE], found[TILE];
+  for (int64_t start = 0; start < count; start += TILE) {
+    const int some = (int)(count - start < TILE ? count - start : TILE);
+    if (bits == 2)
+      numbers_of_labels(some, label + start * 2, 2, number);
+    else
+      numbers_of_labels(some, label + start * bits, bits, number);
+    used->numbers_in_coset(some, phase + start, number, bits, 1 << level_bits, found);
+    uint8_t *to = out + start * width;
+    switch (width) {
+      case 3: bits_of_numbers(some, found, 3, to); break;
+      case 4: bits_of_numbers(some, found, 4, to); break;
+      case 5: bits_of_numbers(some, found, 5, to); break;
+      default: bits_of_numbers(some, found, width, to);
+    }
+  }
 }
 
 /* A contiguous buffer of a type's `count` elements, or of any number where count is negative. */
@@ -586,10 +623,92 @@ static PyObject *upper_bits(PyObject *module, PyObject *args) {
   if (!out) return ended(&all, NULL);
   Py_BEGIN_ALLOW_THREADS;
   bounded = is_bounded(count, phase, MOST_PHASE);
-  if (bounded) used->numbers_in_coset(count, phase, label, bits, level_bits, out);
+  if (bounded) upper_numbers(count, phase, label, bits, level_bits, out);
   Py_END_ALLOW_THREADS;
   if (!bounded) {
     PyErr_SetString(PyExc_ValueError, "phase: expected at most 1e6 radians");
+    return ended(&all, NULL);
+  }
+  release(&all);
+  Py_RETURN_NONE;
+}
+
+/* Whether there is a posterior: 0 where all numbers are, 1 where some are too large for the functions here, 2 where not. */
+static PyObject *look(PyObject *module, PyObject *args) {
+  PyObject *py_phase, *py_concentration;
+  buffers all = {.count = 0};
+  double most;
+  int large = 0, wrong = 0;
+  (void)module;
+  if (!PyArg_ParseTuple(args, "OOd:look", &py_phase, &py_concentration, &most)) return NULL;
+  const double *phase = DOUBLES(py_phase, "phase", -1);
+  const Py_ssize_t count = phase ? taken_elements(&all) : 0;
+  const double *concentration = phase ? DOUBLES(py_concentration, "concentration", count) : NULL;
+  if (!concentration) return ended(&all, NULL);
+  Py_BEGIN_ALLOW_THREADS;
+  for (Py_ssize_t i = 0; i < count; i++) {
+    large |= !(fabs(phase[i]) <= MOST_PHASE && concentration[i] <= most);
+    wrong |= !(fabs(phase[i]) <= DBL_MAX && concentration[i] >= 0 && concentration[i] <= DBL_MAX);
+  }
+  Py_END_ALLOW_THREADS;
+  return ended(&all, PyLong_FromLong(wrong ? 2 : large));
+}
+
+static PyObject *gather(PyObject *module, PyObject *args) {
+  PyObject *py_values, *py_order, *py_out;
+  buffers all = {.count = 0};
+  int wrong = 0;
+  (void)module;
+  if (!PyArg_ParseTuple(args, "OOO:gather", &py_values, &py_order, &py_out)) return NULL;
+  const float *values = FLOATS(py_values, "values", -1, 0);
+  if (!values) return ended(&all, NULL);
+  const Py_ssize_t most = taken_elements(&all);
+  const int32_t *order = INTS(py_order, "order", -1, 0);
+  if (!order) return ended(&all, NULL);
+  const Py_ssize_t count = taken_elements(&all);
+  float *out = FLOATS(py_out, "gathered", count, 1);
+  if (!out) return ended(&all, NULL);
+  Py_BEGIN_ALLOW_THREADS;
+  for (Py_ssize_t i = 0; i < count; i++) {
+    const int32_t from = order[i];
+    if (from < 0 || from >= most)
+      wrong = 1;
+    else
+      out[i] = values[from];
+  }
+  Py_END_ALLOW_THREADS;
+  if (wrong) {
+    PyErr_SetString(PyExc_ValueError, "order: expected numbers of values");
+    return ended(&all, NULL);
+  }
+  release(&all);
+  Py_RETURN_NONE;
+}
+
+static PyObject *scatter(PyObject *module, PyObject *args) {
+  PyObject *py_bits, *py_order, *py_out;
+  buffers all = {.count = 0};
+  int wrong = 0;
+  (void)module;
+  if (!PyArg_ParseTuple(args, "OOO:scatter", &py_bits, &py_order, &py_out)) return NULL;
+  const uint8_t *bits = BYTES(py_bits, "bits", -1, 0);
+  if (!bits) return ended(&all, NULL);
+  const Py_ssize_t count = taken_elements(&all);
+  const int32_t *order = INTS(py_order, "order", count, 0);
+  uint8_t *out = order ? BYTES(py_out, "scattered", -1, 1) : NULL;
+  if (!out) return ended(&all, NULL);
+  const Py_ssize_t most = taken_elements(&all);
+  Py_BEGIN_ALLOW_THREADS;
+  for (Py_ssize_t i = 0; i < count; i++) {
+    const int32_t to = order[i];
+    if (to < 0 || to >= most)
+      wrong = 1;
+    else
+      out[to] = bits[i];
+  }
+  Py_END_ALLOW_THREADS;
+  if (wrong) {
+    PyErr_SetString(PyExc_ValueError, "order: expected numbers of places");
     return ended(&all, NULL);
   }
   release(&all);
@@ -633,6 +752,9 @@ static PyMethodDef methods[] = {
     {"llrs", llrs_of, METH_VARARGS, "Log-likelihood ratios of label bits."},
     {"lack_of_information", lack_of_information, METH_VARARGS, "What bits lack of full information, nats in units of 2^-24."},
     {"upper_bits", upper_bits, METH_VARARGS, "Numbers within cosets of even levels, as bits."},
+    {"look", look, METH_VARARGS, "Whether phases and concentrations are a posterior."},
+    {"gather", gather, METH_VARARGS, "Take values in an order."},
+    {"scatter", scatter, METH_VARARGS, "Put bits in an order."},
     {"variants", variants_of, METH_NOARGS, "Sets of instructions that there are, the best last."},
     {"use", use, METH_VARARGS, "Use one of the variants, by its number."},
     {NULL, NULL, 0, NULL},
