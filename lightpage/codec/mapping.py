@@ -139,14 +139,13 @@ def upper_bits(phase: Real, label: NDArray[np.uint8], levels: Levels) -> NDArray
         label: bits of each symbol, [symbols, b].
         levels: M, a power of two, or uneven levels of that number.
     """
-    upper = level_bits(levels.count) - label.shape[1]
-    native = compiled()
-    if native is None or not levels.is_nominal:
-        number = decide_in_coset(phase, label, levels)
-        return np.asarray(number[:, None] >> np.arange(upper)[::-1] & 1, np.uint8)
-    bits = np.empty((len(phase), upper), np.uint8)
-    native.upper_bits(_bounded(phase), np.ascontiguousarray(label), label.shape[1], level_bits(levels.count), bits)
-    return bits
+    label_bits, all_bits = label.shape[1], level_bits(levels.count)
+    bits, native = np.empty((len(phase), all_bits - label_bits), np.uint8), compiled()
+    if native is not None and levels.is_nominal:
+        if native.upper_bits(phase, np.ascontiguousarray(label), label_bits, all_bits, bits):
+            return bits
+    number = decide_in_coset(phase, label, levels)
+    return np.asarray(number[:, None] >> np.arange(bits.shape[1])[::-1] & 1, np.uint8)
 
 
 def _bounded(phase: Real) -> Real:

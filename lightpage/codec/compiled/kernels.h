@@ -82,16 +82,27 @@ TARGET static int NAME(is_odd)(const uint8_t *const *hard, int degree, int z) {
   return any;
 }
 
-TARGET static inline void NAME(polynomials)(const levels_table *t, int count, const double *away, const double *concentration, double *along, double *across) {
+TARGET static inline void NAME(locate_even)(const levels_table *t, int count, const double *phase, int *place, double *away) {
   for (int i = 0; i < count; i++) {
-    const double square = away[i] * away[i];
-    double s = t->sine[t->terms - 1], c = t->cosine[t->terms - 1];
-    for (int n = t->terms - 2; n >= 0; n--) {
-      s = s * square + t->sine[n];
-      c = c * square + t->cosine[n];
+    const double nearest = (phase[i] / t->step + WHOLE) - WHOLE;
+    away[i] = phase[i] - nearest * t->step;
+    place[i] = (int)nearest & (t->levels - 1);
+  }
+}
+
+TARGET static inline void NAME(polynomials)(const levels_table *t, int count, const double *away, const double *concentration, double *along, double *across) {
+  double square[TILE], sine[TILE], cosine[TILE];
+  for (int i = 0; i < count; i++) square[i] = away[i] * away[i], sine[i] = t->sine[t->terms - 1], cosine[i] = t->cosine[t->terms - 1];
+  for (int n = t->terms - 2; n >= 0; n--) {
+    const double s = t->sine[n], c = t->cosine[n];
+    for (int i = 0; i < count; i++) {
+      sine[i] = sine[i] * square[i] + s;
+      cosine[i] = cosine[i] * square[i] + c;
     }
-    along[i] = concentration[i] * c;
-    across[i] = concentration[i] * (s * away[i]);
+  }
+  for (int i = 0; i < count; i++) {
+    along[i] = concentration[i] * cosine[i];
+    across[i] = concentration[i] * (sine[i] * away[i]);
   }
 }
 
@@ -138,7 +149,10 @@ TARGET static void NAME(ratios)(const levels_table *t, int count, const double *
   double away[TILE], along[TILE], across[TILE];
   float zero[TILE * MOST_BITS], one[TILE * MOST_BITS], weight[MOST_LEVELS], coset[MOST_LEVELS];
   int place[TILE], far = 0;
-  locate(t, count, phase, place, away);
+  if (t->even)
+    NAME(locate_even)(t, count, phase, place, away);
+  else
+    locate_uneven(t, count, phase, place, away);
   NAME(polynomials)(t, count, away, concentration, along, across);
   if (t->even && t->bits == 2 && t->near.width == NEAR) {
     for (int i = 0; i < count; i++) far |= !(concentration[i] >= t->limit[0]);
@@ -185,9 +199,9 @@ TARGET static int64_t NAME(lack_as_claimed)(int64_t count, const float *llrs) {
 }
 
 TARGET static void NAME(numbers_in_coset)(int count, const double *phase, const uint8_t *number, int bits, int levels, uint8_t *out) {
-  const double step = 2 * 3.14159265358979323846 / levels, wide = step * (1 << bits);
+  const double step = TURN / levels, wide = step * (1 << bits);
   for (int i = 0; i < count; i++) {
-    const double nearest = ((phase[i] - number[i] * step) / wide + 6755399441055744.0) - 6755399441055744.0;
+    const double nearest = ((phase[i] - number[i] * step) / wide + WHOLE) - WHOLE;
     out[i] = (uint8_t)((int)nearest & ((levels >> bits) - 1));
   }
 }

@@ -91,6 +91,8 @@ static inline float logarithm(float x) { /* of a positive number that is not den
 #define NEAR 16
 #define STEPS 4096
 #define MOST_PHASE 1e6
+#define TURN (2 * 3.14159265358979323846)
+#define WHOLE 6755399441055744.0 /* 1.5 * 2^52: a sum with it is rounded to a whole number */
 #define TINY 1.17549435e-38f
 #define TILE 256
 
@@ -114,7 +116,7 @@ typedef struct {
 } levels_table;
 
 static int place_of(const levels_table *t, double phase) {
-  const double turns = (phase - t->first) / (2 * 3.14159265358979323846), part = turns - floor(turns);
+  const double turns = (phase - t->first) / TURN, part = turns - floor(turns);
   int64_t step = (int64_t)(part * STEPS);
   step = step < 0 ? 0 : step > STEPS ? STEPS : step;
   int64_t found = t->starts[step];
@@ -122,21 +124,12 @@ static int place_of(const levels_table *t, double phase) {
   return (int)(found < t->levels ? found : t->levels - 1);
 }
 
-/* Place of the nearest level, and the phase's way from there. */
-static void locate(const levels_table *t, int count, const double *phase, int *place, double *away) {
-  if (t->even) {
-    for (int i = 0; i < count; i++) {
-      const double nearest = (phase[i] / t->step + 6755399441055744.0) - 6755399441055744.0; /* 1.5 * 2^52 */
-      away[i] = phase[i] - nearest * t->step;
-      place[i] = (int)nearest & (t->levels - 1);
-    }
-    return;
-  }
+/* Places of the nearest levels, and the phases' ways from there. */
+static void locate_uneven(const levels_table *t, int count, const double *phase, int *place, double *away) {
   for (int i = 0; i < count; i++) {
     place[i] = place_of(t, phase[i]);
-    const double way = phase[i] - t->circle[place[i]], turns = way / (2 * 3.14159265358979323846);
-    const double whole = (turns + 6755399441055744.0) - 6755399441055744.0;
-    away[i] = way - whole * (2 * 3.14159265358979323846);
+    const double way = phase[i] - t->circle[place[i]], whole = (way / TURN + WHOLE) - WHOLE;
+    away[i] = way - whole * TURN;
   }
 }
 
@@ -551,7 +544,7 @@ static PyObject *llrs_of(PyObject *module, PyObject *args) {
     return NULL;
   }
   t.cosets = 1 << t.bits;
-  t.step = 2 * 3.14159265358979323846 / t.levels;
+  t.step = TURN / t.levels;
   const double *phase = DOUBLES(py_phase, "phase", -1);
   if (!phase) return ended(&all, NULL);
   const Py_ssize_t count = taken_elements(&all);
@@ -625,12 +618,7 @@ static PyObject *upper_bits(PyObject *module, PyObject *args) {
   bounded = is_bounded(count, phase, MOST_PHASE);
   if (bounded) upper_numbers(count, phase, label, bits, level_bits, out);
   Py_END_ALLOW_THREADS;
-  if (!bounded) {
-    PyErr_SetString(PyExc_ValueError, "phase: expected at most 1e6 radians");
-    return ended(&all, NULL);
-  }
-  release(&all);
-  Py_RETURN_NONE;
+  return ended(&all, PyBool_FromLong(bounded));
 }
 
 /* Whether there is a posterior: 0 where all numbers are, 1 where some are too large for the functions here, 2 where not. */

@@ -43,13 +43,13 @@ def llrs(
 ) -> None: ...
 def lack_of_information(llrs: Array, bits: Array | None, /) -> int: ...
 def upper_bits(
-    phase: Array,  # float64 [symbols], at most 1e6
+    phase: Array,  # float64 [symbols]
     label: Array,  # uint8 [symbols, label bits]
     label_bits: int,
     level_bits: int,
     out: Array,  # uint8 [symbols, level bits - label bits]
     /,
-) -> None: ...
+) -> bool: ...  # whether no phase is larger than 1e6; else there is nothing
 def look(phase: Array, concentration: Array, most: float, /) -> int: ...  # float64; 0: fine, 1: large, 2: no posterior
 def gather(values: Array, order: Array, out: Array, /) -> None: ...  # float32 by int32
 def scatter(bits: Array, order: Array, out: Array, /) -> None: ...  # uint8 by int32
