@@ -141,9 +141,9 @@ def upper_bits(phase: Real, label: NDArray[np.uint8], levels: Levels) -> NDArray
     """
     label_bits, all_bits = label.shape[1], level_bits(levels.count)
     bits, native = np.empty((len(phase), all_bits - label_bits), np.uint8), compiled()
-    if native is not None and levels.is_nominal:
-        if native.upper_bits(phase, np.ascontiguousarray(label), label_bits, all_bits, bits):
-            return bits
+    compact = np.ascontiguousarray(label)
+    if native and levels.is_nominal and native.upper_bits(phase, compact, label_bits, all_bits, bits):
+        return bits
     number = decide_in_coset(phase, label, levels)
     return np.asarray(number[:, None] >> np.arange(bits.shape[1])[::-1] & 1, np.uint8)
 

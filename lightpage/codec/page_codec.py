@@ -42,9 +42,7 @@ class PageCodec:
         InvalidInputError: the page is too small for this code.
     """
 
-    def __init__(
-        self, code: Code, pilots: NDArray[np.bool_], levels: Levels | None = None, threads: int = 1
-    ) -> None:
+    def __init__(self, code: Code, pilots: NDArray[np.bool_], levels: Levels | None = None, threads: int = 1) -> None:
         self.code, self.pilots, self._levels, self._threads = code, pilots, levels or Levels(code.levels), threads
         data = int(np.count_nonzero(~pilots))
         count = header_symbols(code.levels)
@@ -161,15 +159,15 @@ class PageCodec:
         mu, kappa = phase.ravel(), concentration.ravel()
         header = decode_header(mu[self._header], kappa[self._header], self._levels)
         other = header is not None and header.code_id != self.code.id and expected is None
-        body = mu[self._body].astype(np.float64)
-        llrs = bit_llrs(body, kappa[self._body], self._levels, self.code.coded_bits, self._threads).ravel()
+        own = mu[self._body].astype(np.float64)
+        llrs = bit_llrs(own, kappa[self._body], self._levels, self.code.coded_bits, self._threads).ravel()
         blocks = gathered(llrs, self._order[: self.blocks * self.ldpc.sent_bits]).reshape(self.blocks, -1)
         if other:
             return self._lost(header, Loss.CODE, blocks, 0, 0.0)
         found = decode(self.ldpc, blocks, threads=self._threads)
         failed, iterations = int(np.count_nonzero(~found.converged)), float(found.iterations.mean())
         label = self._interleaved(found.sent[None])
-        bits = np.concatenate([found.information.ravel(), upper_bits(body, label, self._levels).ravel()])
+        bits = np.concatenate([found.information.ravel(), upper_bits(own, label, self._levels).ravel()])
         for candidate in (header, expected):
             if candidate is None:
                 continue

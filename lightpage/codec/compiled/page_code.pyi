@@ -1,4 +1,4 @@
-"""What `page_code.c` offers. Arrays are contiguous and of the type that stands in the comment; results go to the last."""
+"""What `page_code.c` offers. Arrays are contiguous and of the types in the comments; results go to the last ones."""
 
 from typing import Any
 

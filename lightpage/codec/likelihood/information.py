@@ -22,7 +22,7 @@ def page_information(llrs: Float32, bits: NDArray[np.uint8] | None = None) -> fl
     """
     native = compiled()
     if native is not None:
-        lack = native.lack_of_information(llrs, bits)
+        lack: int = native.lack_of_information(llrs, bits)
     else:
         flat, right = llrs.ravel(), None if bits is None else bits.ravel()
         parts = [slice(start, start + _CHUNK) for start in range(0, flat.size, _CHUNK)]

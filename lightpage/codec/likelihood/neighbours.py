@@ -70,7 +70,9 @@ class LevelTable:
         ways = self._ways(numbers)
         coset = np.zeros((0, width), np.int64)
         if not self.levels.is_nominal:
-            coset = self.levels.order[(np.arange(self.levels.count)[:, None] + numbers) % self.levels.count] % self.cosets
+            coset = (
+                self.levels.order[(np.arange(self.levels.count)[:, None] + numbers) % self.levels.count] % self.cosets
+            )
         return Neighbours(-2 * np.sin(ways / 2) ** 2, np.sin(ways), np.ascontiguousarray(coset, np.uint8))
 
     @cached_property

@@ -82,9 +82,7 @@ def _weights(neighbours: Neighbours, place: NDArray[np.int64], along: Real, acro
     return exponential(exponent.astype(np.float32, order="C"))
 
 
-def _by_coset(
-    table: LevelTable, neighbours: Neighbours, place: NDArray[np.int64], weights: Float32
-) -> Float32:
+def _by_coset(table: LevelTable, neighbours: Neighbours, place: NDArray[np.int64], weights: Float32) -> Float32:
     """Sums of weights by coset, [2^b, symbols]."""
     sums = np.zeros((table.cosets, len(place)), np.float32)
     if not table.levels.is_nominal:
