@@ -1,17 +1,20 @@
-"""Time of the page code on one core: decoders of LDPC blocks side by side, whole pages, and a file to pages.
+"""Time of the page code on one core: numpy and the compiled arithmetic side by side, decoders, a file to pages.
 
     python -m analysis.codec.speed --json runs/bench-codec/speed.json
 
-Decoders take turns on the same blocks. The installed size says what each would bring into the image.
+What is compared takes turns on the same blocks or pages, so that a machine whose speed drifts tilts nothing. Times are
+those of the processor. The installed size says what a decoder would bring into the image.
 """
 
 from __future__ import annotations
 
 import io
+import os
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any
@@ -20,10 +23,10 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.codec.numba_decoder import NumbaDecoder
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.codec.code import Code
+from lightpage.codec.compiled.choice import COMPILED, NUMPY, VARIABLE, in_use
 from lightpage.codec.ldpc.code import LdpcCode
 from lightpage.codec.ldpc.decoder import MOST_ITERATIONS, decode
 from lightpage.codec.mapping import bit_information
@@ -31,17 +34,22 @@ from lightpage.codec.page_bytes import FileFacts, Header
 from lightpage.codec.page_codec import PageCodec
 from lightpage.codec.volume import DATA_PAGES, PARITY_PAGES, Volume, encode_volume
 from lightpage.device.profile import Profile, load_profile
+from lightpage.errors import InvalidInputError
 from lightpage.files import write_json
+from lightpage.page.levels import Levels
+from lightpage.page.modulation import NOMINAL, Modulation
 from lightpage.page.symbols import pilot_mask, pilot_symbols, symbol_phases
 from lightpage.recording.pages import PagesWriter
 
-Blocks = NDArray[np.float32]
+Blocks = Floats = NDArray[np.float32]
 CODES = {"0.66": (6270, 9500), "0.50": (4750, 9500)}
 """Information and sent bits: about a bench page in bright and in dim light."""
 _GAP = 0.075
 """Information beyond the rate at which blocks are drawn: a page with some margin."""
 _MARGIN_BITS = 0.1
 """Of the pages that are timed, bits a symbol."""
+_UNEVEN = Modulation(tuple((NOMINAL.as_dict() | {"stroke_relative": -0.05, "phase_sin_1_rad": 0.1}).values()))
+"""A modulator whose levels are not even, as any real one's."""
 PAGES: dict[str, tuple[str, int, Code]] = {
     "bench 4x4": ("bench", 4, Code(levels=128, coded_bits=2, rate_per_mille=660, needed_information=0.72)),
     "full size 4x4": ("paper", 4, Code(levels=64, coded_bits=2, rate_per_mille=480, needed_information=0.54)),
@@ -90,19 +98,39 @@ def by_library(code: LdpcCode) -> Callable[[Blocks], NDArray[np.uint8]]:
     return lambda blocks: np.stack([one(block) for block in blocks])
 
 
+@contextmanager
+def computed_by(name: str) -> Iterator[None]:
+    """Inside, the page code is computed by numpy or by the compiled arithmetic."""
+    before = os.environ.get(VARIABLE)
+    os.environ[VARIABLE] = name
+    try:
+        yield
+    finally:
+        os.environ.pop(VARIABLE)
+        if before is not None:
+            os.environ[VARIABLE] = before
+
+
 def decoders(code: LdpcCode) -> dict[str, Callable[[Blocks], NDArray[np.uint8]]]:
     """Decoders of blocks by name."""
-    numba = NumbaDecoder(code)
+
+    def by(name: str) -> Callable[[Blocks], NDArray[np.uint8]]:
+        def all_of(blocks: Blocks) -> NDArray[np.uint8]:
+            with computed_by(name):
+                return decode(code, blocks).information
+
+        return all_of
+
     return {
-        "numpy, one block": lambda blocks: np.concatenate([decode(code, b[None]).information for b in blocks]),
-        "numpy, 16 blocks": lambda blocks: decode(code, blocks).information,
-        "numba": lambda blocks: np.stack([numba.decode(block)[0] for block in blocks]),
+        "numpy, one block": lambda blocks: np.concatenate([by(NUMPY)(block[None]) for block in blocks]),
+        "numpy, 16 blocks": by(NUMPY),
+        "compiled": by(COMPILED),
         "ldpc (C++)": by_library(code),
     }
 
 
-BROUGHT = {"numpy": (), "numba": ("numba", "llvmlite"), "ldpc": ("ldpc", "stim", "sinter", "pymatching", "networkx")}
-"""Distributions that a decoder would bring into the image, which has numpy already."""
+BROUGHT = {"ldpc": ("ldpc", "stim", "sinter", "pymatching", "networkx")}
+"""Distributions that a decoder would bring into the image."""
 
 
 def megabytes(names: tuple[str, ...]) -> float:
@@ -127,15 +155,15 @@ def time_decoders(count: int, rounds: int) -> list[dict[str, Any]]:
         best = dict.fromkeys(ways, float("inf"))
         right = {}
         for way in ways.values():
-            way(llrs[:2])  # compiled, and in the cache
+            way(llrs[:2])  # into the cache
         for _ in range(rounds):
             for way_name, way in ways.items():
-                start = time.perf_counter()
+                start = time.process_time()
                 decoded = way(llrs)
-                best[way_name] = min(best[way_name], (time.perf_counter() - start) / count)
+                best[way_name] = min(best[way_name], (time.process_time() - start) / count)
                 right[way_name] = int(np.count_nonzero((decoded == bits).all(axis=1)))
         for way_name, seconds in best.items():
-            size = megabytes(BROUGHT[way_name.partition(",")[0].partition(" ")[0]])
+            size = megabytes(BROUGHT.get(way_name.partition(" ")[0], ()))
             found.append(
                 {
                     "rate": name,
@@ -150,28 +178,42 @@ def time_decoders(count: int, rounds: int) -> list[dict[str, Any]]:
     return found
 
 
-def time_page(profile: Profile, code: Code, rounds: int) -> dict[str, float]:
-    """Milliseconds of a page's code, by its parts, on one core."""
-    mask = pilot_mask(profile)
-    codec, rng = PageCodec(code, mask), np.random.default_rng(0)
+def drawn_page(codec: PageCodec, pilots: NDArray[np.uint8], levels: Levels) -> tuple[Floats, Floats]:
+    """Phases and concentrations of a page that is read with a margin of `_MARGIN_BITS`, as the decoder gives them."""
+    rng, code = np.random.default_rng(0), codec.code
     data = rng.integers(0, 256, (1, codec.user_bytes), dtype=np.uint8)
-    symbols = codec.encode(
-        [Header(code.id, 1, 0, 1)], data, FileFacts(1, 0, 0), pilot_symbols(profile, code.levels)[mask]
-    )[0]
-    best, iterations = float("inf"), 0.0
-    step = 2 * np.pi / code.levels
-    phase, kappa = np.zeros(symbols.shape), np.zeros(symbols.shape)
+    symbols = codec.encode([Header(code.id, 1, 0, 1)], data, FileFacts(1, 0, 0), pilots)[0]
     for share in np.linspace(0.45, 0.2, 26):
-        noise = share * step
-        phase = symbol_phases(symbols, code.levels) + noise * rng.standard_normal(symbols.shape)
-        kappa = np.full(symbols.shape, noise**-2)
-        if codec.decode(phase, kappa).margin_bits > _MARGIN_BITS:
-            break
+        noise = share * 2 * np.pi / code.levels
+        phase = symbol_phases(symbols, levels) + noise * rng.standard_normal(symbols.shape)
+        seen = phase.astype(np.float32), np.full(symbols.shape, noise**-2, np.float32)
+        if codec.decode(*seen).margin_bits > _MARGIN_BITS:
+            return seen
+    raise InvalidInputError("page to time", "no margin at any noise", "a code that its page carries")
+
+
+def time_page(profile: Profile, code: Code, levels: Levels, rounds: int) -> dict[str, Any]:
+    """Milliseconds of a page from posterior to checked bytes, numpy and compiled in turns; medians, and their ratio."""
+    mask = pilot_mask(profile)
+    codec = PageCodec(code, mask, levels)
+    seen = drawn_page(codec, pilot_symbols(profile, code.levels)[mask], levels)
+    taken: dict[str, list[float]] = {NUMPY: [], COMPILED: []}
+    found = {}
     for _ in range(rounds):
-        start = time.perf_counter()
-        found = codec.decode(phase, kappa)
-        best, iterations = min(best, time.perf_counter() - start), found.iterations
-    return {"ms": 1e3 * best, "user_bytes": codec.user_bytes, "blocks": codec.blocks, "iterations": iterations}
+        for name, times in taken.items():
+            with computed_by(name):
+                start = time.process_time()
+                found[name] = codec.decode(*seen)
+                times.append(time.process_time() - start)
+    median = {name: 1e3 * float(np.median(times)) for name, times in taken.items()}
+    return {
+        **{f"{name}_ms": value for name, value in median.items()},
+        "ratio": median[NUMPY] / median[COMPILED],
+        "same": found[NUMPY] == found[COMPILED],
+        "user_bytes": codec.user_bytes,
+        "blocks": codec.blocks,
+        "iterations": found[NUMPY].iterations,
+    }
 
 
 def time_encoding(profile: Profile, code: Code, size: int) -> float:
@@ -194,26 +236,33 @@ def time_encoding(profile: Profile, code: Code, size: int) -> float:
 @click.option("--json", "json_path", type=OutputFile(), help="Write the times to this file.")
 def main(blocks: int, rounds: int, json_path: Path | None) -> None:
     """Print the times."""
-    found = time_decoders(blocks, rounds)
+    found: Any = time_decoders(blocks, rounds)
     click.echo(f"{'rate':<6} {'decoder':<18} {'ms/block':>9} {'Mb/s':>7} {'right':>8} {'MB more':>8}")
     for each in found:
         click.echo(
             f"{each['rate']:<6} {each['decoder']:<18} {each['ms']:>9.2f} {each['megabits_per_second']:>7.2f} "
             f"{each['right']:>4}/{each['blocks']:<3} {each['brought_MB']:>8.0f}"
         )
-    pages = {}
-    click.echo(f"\n{'page':<14} {'bytes':>8} {'blocks':>7} {'iterations':>11} {'decode ms':>10} {'encode MB/s':>12}")
+    pages: dict[str, dict[str, Any]] = {}
+    click.echo(
+        f"\n{'page':<24} {'bytes':>8} {'blocks':>7} {'iterations':>11} {'numpy ms':>9} {'compiled ms':>12} {'ratio':>6}"
+    )
     for name, (profile_name, size, code) in PAGES.items():
         profile = load_profile(profile_name).with_symbols_of(size)
-        times = time_page(profile, code, rounds)
-        times["encode_MB_per_second"] = time_encoding(profile, code, 2_000_000)
-        pages[name] = times
-        click.echo(
-            f"{name:<14} {times['user_bytes']:>8.0f} {times['blocks']:>7.0f} {times['iterations']:>11.1f} "
-            f"{times['ms']:>10.1f} {times['encode_MB_per_second']:>12.2f}"
-        )
+        for suffix, levels in (("", Levels(code.levels)), (", uneven", _UNEVEN.page_levels(code.levels))):
+            pages[name + suffix] = times = time_page(profile, code, levels, rounds)
+            click.echo(
+                f"{name + suffix:<24} {times['user_bytes']:>8} {times['blocks']:>7} {times['iterations']:>11.1f} "
+                f"{times['numpy_ms']:>9.1f} {times['compiled_ms']:>12.2f} {times['ratio']:>6.1f}"
+                f"{'' if times['same'] else '   NOT THE SAME'}"
+            )
+    encoding = {}
+    for name, (profile_name, size, code) in PAGES.items():
+        encoding[name] = time_encoding(load_profile(profile_name).with_symbols_of(size), code, 2_000_000)
+        click.echo(f"{name}: a file to pages {encoding[name]:.1f} MB/s")
     if json_path is not None:
-        write_json(json_path, {"decoders": found, "pages": pages})
+        found = {"page_code": in_use(), "decoders": found, "pages": pages, "encode_MB_per_second": encoding}
+        write_json(json_path, found)
 
 
 if __name__ == "__main__":
