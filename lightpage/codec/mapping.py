@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lightpage.codec.compiled.choice import compiled
 from lightpage.codec.ldpc.decoder import MOST_LLR
-from lightpage.codec.likelihood.neighbours import table_of
+from lightpage.codec.likelihood.neighbours import searches_of, table_of
 from lightpage.codec.likelihood.ratios import MOST_PHASE, ratios
 from lightpage.errors import PageError
 from lightpage.page.levels import Levels, check_levels
@@ -142,8 +142,10 @@ def upper_bits(phase: Real, label: NDArray[np.uint8], levels: Levels) -> NDArray
     label_bits, all_bits = label.shape[1], level_bits(levels.count)
     bits, native = np.empty((len(phase), all_bits - label_bits), np.uint8), compiled()
     compact = np.ascontiguousarray(label)
-    if native and levels.is_nominal and native.upper_bits(phase, compact, label_bits, all_bits, bits):
-        return bits
+    if native is not None and bits.size:
+        searches = None if levels.is_nominal else searches_of(levels, label_bits)
+        if native.upper_bits(phase, compact, label_bits, all_bits, searches, bits):
+            return bits
     number = decide_in_coset(phase, label, levels)
     return np.asarray(number[:, None] >> np.arange(bits.shape[1])[::-1] & 1, np.uint8)
 

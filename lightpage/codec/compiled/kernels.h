@@ -90,6 +90,14 @@ TARGET static inline void NAME(locate_even)(const levels_table *t, int count, co
   }
 }
 
+TARGET static inline void NAME(locate_uneven)(const levels_table *t, int count, const double *phase, int *place, double *away) {
+  for (int i = 0; i < count; i++) {
+    place[i] = place_of(&t->places, phase[i]);
+    const double way = phase[i] - t->circle[place[i]], whole = (way / TURN + WHOLE) - WHOLE;
+    away[i] = way - whole * TURN;
+  }
+}
+
 TARGET static inline void NAME(polynomials)(const levels_table *t, int count, const double *away, const double *concentration, double *along, double *across) {
   double square[TILE], sine[TILE], cosine[TILE];
   for (int i = 0; i < count; i++) square[i] = away[i] * away[i], sine[i] = t->sine[t->terms - 1], cosine[i] = t->cosine[t->terms - 1];
@@ -117,19 +125,27 @@ TARGET static inline void NAME(weigh)(int width, const double *cosine, const dou
   for (int j = 0; j < width; j++) weight[j] = NAME(weight)(along, across, cosine[j], sine[j]);
 }
 
-/* LLRs of two label bits by the near neighbours of even levels, many symbols at once: what the general way below gives.
- * The sums of two neighbouring cosets are all that is needed, and which of them belong to which bit turns with the place. */
+/* LLRs of two label bits by the near neighbours, where cosets follow each other: what the general way below gives. The
+ * sums of two neighbouring cosets are all that is needed, and which of them belong to which bit turns with the place. */
 TARGET static void NAME(two_bits)(const levels_table *t, int count, const int *place, const double *along, const double *across, float most, float *out) {
   const double *cosine = t->near.cosine, *sine = t->near.sine;
   float sum[4][TILE], difference[2][TILE];
-  for (int r = 0; r < 4; r++)
+  if (t->even) {
+    for (int r = 0; r < 4; r++)
+      for (int i = 0; i < count; i++) {
+        float total = NAME(weight)(along[i], across[i], cosine[r], sine[r]);
+        total += NAME(weight)(along[i], across[i], cosine[r + 4], sine[r + 4]);
+        total += NAME(weight)(along[i], across[i], cosine[r + 8], sine[r + 8]);
+        total += NAME(weight)(along[i], across[i], cosine[r + 12], sine[r + 12]);
+        sum[r][i] = total;
+      }
+  } else {
     for (int i = 0; i < count; i++) {
-      float total = NAME(weight)(along[i], across[i], cosine[r], sine[r]);
-      total += NAME(weight)(along[i], across[i], cosine[r + 4], sine[r + 4]);
-      total += NAME(weight)(along[i], across[i], cosine[r + 8], sine[r + 8]);
-      total += NAME(weight)(along[i], across[i], cosine[r + 12], sine[r + 12]);
-      sum[r][i] = total;
+      float weight[NEAR];
+      NAME(weigh)(NEAR, cosine + place[i] * NEAR, sine + place[i] * NEAR, along[i], across[i], weight);
+      for (int r = 0; r < 4; r++) sum[r][i] = ((weight[r] + weight[r + 4]) + weight[r + 8]) + weight[r + 12];
     }
+  }
   for (int r = 0; r < 2; r++)
     for (int i = 0; i < count; i++) {
       const float one = sum[r][i] + sum[r + 1][i], other = sum[r + 2][i] + sum[(r + 3) & 3][i];
@@ -137,7 +153,7 @@ TARGET static void NAME(two_bits)(const levels_table *t, int count, const int *p
       difference[r][i] = above < most ? above : most;
     }
   for (int i = 0; i < count; i++) {
-    const int first = (place[i] + t->levels - NEAR / 2) & 3;
+    const int first = (place[i] + t->turn + t->levels - NEAR / 2) & 3;
     const float even = difference[0][i], odd = difference[1][i];
     const float low = first & 1 ? even : odd, high = first & 1 ? odd : even;
     out[2 * i] = first < 2 ? -low : low;
@@ -152,24 +168,17 @@ TARGET static void NAME(ratios)(const levels_table *t, int count, const double *
   if (t->even)
     NAME(locate_even)(t, count, phase, place, away);
   else
-    locate_uneven(t, count, phase, place, away);
+    NAME(locate_uneven)(t, count, phase, place, away);
   NAME(polynomials)(t, count, away, concentration, along, across);
-  if (t->even && t->bits == 2 && t->near.width == NEAR) {
-    for (int i = 0; i < count; i++) far |= !(concentration[i] >= t->limit[0]);
-    if (!far) {
-      NAME(two_bits)(t, count, place, along, across, most, out);
-      return;
-    }
+  for (int i = 0; i < count; i++) far |= !(concentration[i] >= t->limit[t->even ? 0 : place[i]]);
+  if (!far && t->turn >= 0 && t->bits == 2 && t->near.width == NEAR) {
+    NAME(two_bits)(t, count, place, along, across, most, out);
+    return;
   }
   for (int i = 0; i < count; i++) {
     const int row = t->even ? 0 : place[i];
-    const int is_near = concentration[i] >= t->limit[row];
-    const neighbours *n = is_near ? &t->near : &t->all;
-    const double *cosine = n->cosine + row * n->width, *sine = n->sine + row * n->width;
-    if (n->width == NEAR)
-      NAME(weigh)(NEAR, cosine, sine, along[i], across[i], weight);
-    else
-      NAME(weigh)(n->width, cosine, sine, along[i], across[i], weight);
+    const neighbours *n = concentration[i] >= t->limit[row] ? &t->near : &t->all;
+    NAME(weigh)(n->width, n->cosine + row * n->width, n->sine + row * n->width, along[i], across[i], weight);
     sum_by_coset(t, n, place[i], weight, coset);
     split(t->bits, coset, zero + t->bits * i, one + t->bits * i);
   }
@@ -206,7 +215,14 @@ TARGET static void NAME(numbers_in_coset)(int count, const double *phase, const 
   }
 }
 
-static const kernels NAME(kernels) = {NAME(renew), NAME(clip), NAME(decide), NAME(is_odd), NAME(ratios), NAME(lack_of_truth), NAME(lack_as_claimed), NAME(numbers_in_coset)};
+TARGET static void NAME(numbers_by_search)(int count, const double *phase, const uint8_t *number, const search *cosets, const uint8_t *order, uint8_t *out) {
+  for (int i = 0; i < count; i++) {
+    const search *own = cosets + number[i];
+    out[i] = order[number[i] * own->levels + place_of(own, phase[i])];
+  }
+}
+
+static const kernels NAME(kernels) = {NAME(renew), NAME(clip), NAME(decide), NAME(is_odd), NAME(ratios), NAME(lack_of_truth), NAME(lack_as_claimed), NAME(numbers_in_coset), NAME(numbers_by_search)};
 
 #undef LESS
 #undef EQUAL

@@ -100,40 +100,36 @@ typedef struct {
   int width;            /* neighbours of each place, from width / 2 places before it on */
   const double *cosine; /* of the way to a neighbour, less 1: [rows, width] */
   const double *sine;
-  const uint8_t *coset; /* of each place's neighbours, [levels, width]; of even levels nothing */
+  const uint8_t *coset; /* of each place's neighbours, [levels, width]; nothing where cosets follow each other */
 } neighbours;
+
+/* What finds the nearest of uneven levels: see `Levels.borders` of lightpage/page/levels.py. */
+typedef struct {
+  int levels, most;
+  double first;
+  const double *borders;
+  const int64_t *starts;
+} search;
 
 typedef struct {
   int levels, bits, cosets, even, terms;
+  int turn; /* level at the first place, where levels follow each other on the circle; else -1 */
   double step;
   const double *sine, *cosine; /* coefficients of even powers, of the sine over its argument and of the cosine */
-  double first;
-  const double *circle, *borders;
-  const int64_t *starts;
-  int most;
+  const double *circle;
+  search places;
   const double *limit; /* concentration from which the near neighbours suffice, [rows] */
   neighbours near, all;
 } levels_table;
 
-static int place_of(const levels_table *t, double phase) {
-  const double turns = (phase - t->first) / TURN, part = turns - floor(turns);
-  int64_t step = (int64_t)(part * STEPS);
-  step = step < 0 ? 0 : step > STEPS ? STEPS : step;
-  int64_t found = t->starts[step];
-  for (int i = 0; i < t->most; i++) found += found < t->levels && part > t->borders[found];
-  return (int)(found < t->levels ? found : t->levels - 1);
+static inline int place_of(const search *s, double phase) {
+  const double turns = (phase - s->first) / TURN, part = turns - floor(turns);
+  int64_t found = s->starts[part >= 0 && part <= 1 ? (int)(part * STEPS) : 0];
+  for (int i = 0; i < s->most; i++) found += found < s->levels - 1 && part > s->borders[found];
+  return (int)found;
 }
 
-/* Places of the nearest levels, and the phases' ways from there. */
-static void locate_uneven(const levels_table *t, int count, const double *phase, int *place, double *away) {
-  for (int i = 0; i < count; i++) {
-    place[i] = place_of(t, phase[i]);
-    const double way = phase[i] - t->circle[place[i]], whole = (way / TURN + WHOLE) - WHOLE;
-    away[i] = way - whole * TURN;
-  }
-}
-
-/* Sums of neighbours that follow each other by coset, when levels are even: the r-th of them are of one coset. */
+/* Sums of neighbours by coset, where cosets follow each other: those of the r-th, the r-th after the next `cosets` ... */
 static inline void fold(int width, int cosets, const float *weight, float *sum) {
   const int few = width < cosets ? width : cosets;
   for (int r = 0; r < few; r++) sum[r] = weight[r];
@@ -142,17 +138,14 @@ static inline void fold(int width, int cosets, const float *weight, float *sum) 
 }
 
 static inline void sum_by_coset(const levels_table *t, const neighbours *n, int place, const float *weight, float *coset) {
-  if (!t->even) {
+  if (t->turn < 0) {
     for (int c = 0; c < t->cosets; c++) coset[c] = 0;
     for (int j = 0; j < n->width; j++) coset[n->coset[place * n->width + j] & (t->cosets - 1)] += weight[j];
     return;
   }
   float sum[MOST_LEVELS];
-  const int few = n->width < t->cosets ? n->width : t->cosets, first = place + t->levels - n->width / 2;
-  if (n->width == NEAR && t->cosets == 4)
-    fold(NEAR, 4, weight, sum);
-  else
-    fold(n->width, t->cosets, weight, sum);
+  const int few = n->width < t->cosets ? n->width : t->cosets, first = place + t->turn + t->levels - n->width / 2;
+  fold(n->width, t->cosets, weight, sum);
   if (few < t->cosets)
     for (int c = 0; c < t->cosets; c++) coset[c] = 0;
   for (int r = 0; r < few; r++) coset[(first + r) & (t->cosets - 1)] = sum[r];
@@ -186,6 +179,7 @@ typedef struct {
   int64_t (*lack_of_truth)(int64_t, const float *, const uint8_t *);
   int64_t (*lack_as_claimed)(int64_t, const float *);
   void (*numbers_in_coset)(int, const double *, const uint8_t *, int, int, uint8_t *);
+  void (*numbers_by_search)(int, const double *, const uint8_t *, const search *, const uint8_t *, uint8_t *);
 } kernels;
 
 #define TARGET
@@ -390,7 +384,13 @@ static inline void bits_of_numbers(int count, const uint8_t *number, int width, 
     for (int k = 0; k < width; k++) out[k] = (uint8_t)(number[i] >> (width - 1 - k) & 1);
 }
 
-static void upper_numbers(int64_t count, const double *phase, const uint8_t *label, int bits, int level_bits, uint8_t *out) {
+/* What finds the levels of each coset, where levels are uneven. */
+typedef struct {
+  search of[MOST_LEVELS];
+  const uint8_t *order; /* levels of each coset in the order of their places, [cosets, levels of a coset] */
+} coset_searches;
+
+static void upper_numbers(int64_t count, const double *phase, const uint8_t *label, int bits, int level_bits, const coset_searches *uneven, uint8_t *out) {
   const int width = level_bits - bits;
   uint8_t number[TILE], found[TILE];
   for (int64_t start = 0; start < count; start += TILE) {
@@ -399,7 +399,10 @@ static void upper_numbers(int64_t count, const double *phase, const uint8_t *lab
       numbers_of_labels(some, label + start * 2, 2, number);
     else
       numbers_of_labels(some, label + start * bits, bits, number);
-    used->numbers_in_coset(some, phase + start, number, bits, 1 << level_bits, found);
+    if (uneven)
+      used->numbers_by_search(some, phase + start, number, uneven->of, uneven->order, found);
+    else
+      used->numbers_in_coset(some, phase + start, number, bits, 1 << level_bits, found);
     uint8_t *to = out + start * width;
     switch (width) {
       case 3: bits_of_numbers(some, found, 3, to); break;
@@ -512,6 +515,26 @@ static PyObject *decode_blocks(PyObject *module, PyObject *args) {
   Py_RETURN_NONE;
 }
 
+/* The search among a number of uneven levels; among none where they are even. */
+static int take_search(buffers *opened, search *s, PyObject *borders, PyObject *starts, int levels) {
+  s->levels = levels;
+  if (s->most < 0 || s->most > MOST_LEVELS) {
+    PyErr_SetString(PyExc_ValueError, "levels within a step: expected 0 to 256");
+    return -1;
+  }
+  buffers all = *opened;
+  s->borders = DOUBLES(borders, "borders", levels);
+  s->starts = s->borders ? LONGS(starts, "starts", levels ? STEPS + 1 : 0) : NULL;
+  *opened = all;
+  if (!s->starts) return -1;
+  for (int i = 0; levels && i <= STEPS; i++)
+    if (s->starts[i] < 0 || s->starts[i] >= levels) {
+      PyErr_SetString(PyExc_ValueError, "starts: expected places");
+      return -1;
+    }
+  return 0;
+}
+
 static int take_neighbours(buffers *opened, PyObject *from, const levels_table *t, neighbours *n) {
   buffers all = *opened;
   PyObject *cosine, *sine, *coset;
@@ -522,7 +545,7 @@ static int take_neighbours(buffers *opened, PyObject *from, const levels_table *
       PyErr_SetString(PyExc_ValueError, "neighbours: expected a power of two, at most all levels");
     } else {
       fine = (n->cosine = DOUBLES(cosine, "cosines", rows * n->width)) && (n->sine = DOUBLES(sine, "sines", rows * n->width)) &&
-             (n->coset = BYTES(coset, "cosets", t->even ? 0 : t->levels * n->width, 0));
+             (n->coset = BYTES(coset, "cosets", t->turn >= 0 ? 0 : t->levels * n->width, 0));
     }
   }
   *opened = all;
@@ -535,11 +558,11 @@ static PyObject *llrs_of(PyObject *module, PyObject *args) {
   levels_table t;
   float most;
   (void)module;
-  if (!PyArg_ParseTuple(args, "OO(iipOO(dOOOi)OO!O!)fO:llrs", &py_phase, &py_concentration, &t.levels, &t.bits, &t.even, &py_sine, &py_cosine, &t.first, &py_circle,
-                        &py_borders, &py_starts, &t.most, &py_limit, &PyTuple_Type, &py_near, &PyTuple_Type, &py_all, &most, &py_out))
+  if (!PyArg_ParseTuple(args, "OO(iipiOO(OdOOi)OO!O!)fO:llrs", &py_phase, &py_concentration, &t.levels, &t.bits, &t.even, &t.turn, &py_sine, &py_cosine, &py_circle,
+                        &t.places.first, &py_borders, &py_starts, &t.places.most, &py_limit, &PyTuple_Type, &py_near, &PyTuple_Type, &py_all, &most, &py_out))
     return NULL;
-  if (t.levels < 2 || t.levels > MOST_LEVELS || t.levels & (t.levels - 1) || t.bits < 1 || t.bits > MOST_BITS || 1 << t.bits > t.levels || t.most < 0 ||
-      t.most > MOST_LEVELS) {
+  if (t.levels < 2 || t.levels > MOST_LEVELS || t.levels & (t.levels - 1) || t.bits < 1 || t.bits > MOST_BITS || 1 << t.bits > t.levels || t.turn < -1 ||
+      t.turn >= t.levels || (t.even && t.turn)) {
     PyErr_SetString(PyExc_ValueError, "levels: expected a power of two, at most 256, and label bits that they have");
     return NULL;
   }
@@ -556,17 +579,12 @@ static PyObject *llrs_of(PyObject *module, PyObject *args) {
     PyErr_SetString(PyExc_ValueError, "sine: expected 1 to 20 coefficients");
     return ended(&all, NULL);
   }
-  if (!(t.cosine = DOUBLES(py_cosine, "cosine", t.terms)) || !(t.circle = DOUBLES(py_circle, "circle", uneven)) || !(t.borders = DOUBLES(py_borders, "borders", uneven)) ||
-      !(t.starts = LONGS(py_starts, "starts", t.even ? 0 : STEPS + 1)) || !(t.limit = DOUBLES(py_limit, "limit", rows)) || take_neighbours(&all, py_near, &t, &t.near) < 0 ||
+  if (!(t.cosine = DOUBLES(py_cosine, "cosine", t.terms)) || !(t.circle = DOUBLES(py_circle, "circle", uneven)) || take_search(&all, &t.places, py_borders, py_starts, uneven) < 0 ||
+      !(t.limit = DOUBLES(py_limit, "limit", rows)) || take_neighbours(&all, py_near, &t, &t.near) < 0 ||
       take_neighbours(&all, py_all, &t, &t.all) < 0)
     return ended(&all, NULL);
   float *out = FLOATS(py_out, "LLRs", count * t.bits, 1);
   if (!out) return ended(&all, NULL);
-  for (int i = 0; !t.even && i <= STEPS; i++)
-    if (t.starts[i] < 0 || t.starts[i] >= t.levels) {
-      PyErr_SetString(PyExc_ValueError, "starts: expected places");
-      return ended(&all, NULL);
-    }
   int bounded;
   Py_BEGIN_ALLOW_THREADS;
   bounded = is_bounded(count, phase, MOST_PHASE);
@@ -598,15 +616,46 @@ static PyObject *lack_of_information(PyObject *module, PyObject *args) {
   return ended(&all, PyLong_FromLongLong(sum));
 }
 
+/* Searches of the cosets of uneven levels: of each one border, borders, starts; then the most in a step, orders. */
+static int take_coset_searches(buffers *opened, PyObject *from, int bits, int level_bits, coset_searches *found) {
+  buffers all = *opened;
+  PyObject *py_first, *py_borders, *py_starts, *py_order;
+  search one;
+  const int cosets = 1 << bits, levels = 1 << (level_bits - bits);
+  if (!PyArg_ParseTuple(from, "OOOiO", &py_first, &py_borders, &py_starts, &one.most, &py_order)) return -1;
+  const double *first = DOUBLES(py_first, "first borders", cosets), *borders = first ? DOUBLES(py_borders, "borders", cosets * levels) : NULL;
+  const int64_t *starts = borders ? LONGS(py_starts, "starts", cosets * (STEPS + 1)) : NULL;
+  found->order = starts ? BYTES(py_order, "order", cosets * levels, 0) : NULL;
+  *opened = all;
+  if (!found->order) return -1;
+  int wrong = one.most < 0 || one.most > MOST_LEVELS;
+  for (int i = 0; i < cosets * (STEPS + 1); i++) wrong |= starts[i] < 0 || starts[i] >= levels;
+  if (wrong) {
+    PyErr_SetString(PyExc_ValueError, "starts: expected places");
+    return -1;
+  }
+  for (int c = 0; c < cosets; c++) {
+    one.levels = levels, one.first = first[c], one.borders = borders + c * levels, one.starts = starts + c * (STEPS + 1);
+    found->of[c] = one;
+  }
+  return 0;
+}
+
 static PyObject *upper_bits(PyObject *module, PyObject *args) {
-  PyObject *py_phase, *py_label, *py_out;
+  PyObject *py_phase, *py_label, *py_searches, *py_out;
   buffers all = {.count = 0};
   int bits, level_bits, bounded;
+  coset_searches searches;
   (void)module;
-  if (!PyArg_ParseTuple(args, "OOiiO:upper_bits", &py_phase, &py_label, &bits, &level_bits, &py_out)) return NULL;
+  if (!PyArg_ParseTuple(args, "OOiiOO:upper_bits", &py_phase, &py_label, &bits, &level_bits, &py_searches, &py_out)) return NULL;
   if (bits < 1 || level_bits < bits || level_bits > MOST_BITS) {
     PyErr_SetString(PyExc_ValueError, "bits: expected 1 to 8, and label bits among them");
     return NULL;
+  }
+  const int uneven = py_searches != Py_None;
+  if (uneven && (!PyTuple_Check(py_searches) || take_coset_searches(&all, py_searches, bits, level_bits, &searches) < 0)) {
+    if (!PyErr_Occurred()) PyErr_SetString(PyExc_TypeError, "searches: expected a tuple or None");
+    return ended(&all, NULL);
   }
   const double *phase = DOUBLES(py_phase, "phase", -1);
   if (!phase) return ended(&all, NULL);
@@ -616,7 +665,7 @@ static PyObject *upper_bits(PyObject *module, PyObject *args) {
   if (!out) return ended(&all, NULL);
   Py_BEGIN_ALLOW_THREADS;
   bounded = is_bounded(count, phase, MOST_PHASE);
-  if (bounded) upper_numbers(count, phase, label, bits, level_bits, out);
+  if (bounded) upper_numbers(count, phase, label, bits, level_bits, uneven ? &searches : NULL, out);
   Py_END_ALLOW_THREADS;
   return ended(&all, PyBool_FromLong(bounded));
 }

@@ -11,9 +11,10 @@ Levels = tuple[
     int,  # levels
     int,  # label bits
     bool,  # whether levels are even
+    int,  # level at the first place where levels follow each other, else -1
     Array,  # coefficients of sine and cosine, float64 [terms]
     Array,
-    tuple[float, Array, Array, Array, int],  # first border, circle and borders, float64, starts, int64; most in a step
+    tuple[Array, float, Array, Array, int],  # circle, first border, borders, float64, starts, int64; most in a step
     Array,  # least concentration at which near neighbours suffice, float64 [rows]
     Neighbours,
     Neighbours,
@@ -47,6 +48,7 @@ def upper_bits(
     label: Array,  # uint8 [symbols, label bits]
     label_bits: int,
     level_bits: int,
+    searches: tuple[Array, Array, Array, int, Array] | None,  # of uneven levels, of each coset
     out: Array,  # uint8 [symbols, level bits - label bits]
     /,
 ) -> bool: ...  # whether no phase is larger than 1e6; else there is nothing

@@ -28,7 +28,7 @@ class Neighbours:
     Attributes:
         cosine: cosines of the ways to them, less 1, [rows, width]; one row for all places where levels are even.
         sine: sines of the ways, the same shape.
-        coset: number of their cosets, [levels, width]; none of even levels, whose cosets follow each other.
+        coset: number of their cosets, [levels, width]; none where cosets follow each other.
     """
 
     cosine: Real
@@ -59,6 +59,14 @@ class LevelTable:
         self.all = self._around(levels.count)
         self.near = self._around(min(NEAR, levels.count))
 
+    @cached_property
+    def turn(self) -> int | None:
+        """Level at the first place where levels follow each other on the circle, as even ones do; None elsewhere."""
+        if self.levels.is_nominal:
+            return 0
+        first, count = int(self.levels.order[0]), self.levels.count
+        return first if np.array_equal(self.levels.order, (first + np.arange(count)) % count) else None
+
     def _ways(self, numbers: NDArray[np.int64]) -> Real:
         """From each place to its neighbours, radians, [rows, neighbours]."""
         if self.levels.is_nominal:
@@ -69,7 +77,7 @@ class LevelTable:
         numbers = np.arange(width) - width // 2
         ways = self._ways(numbers)
         coset = np.zeros((0, width), np.int64)
-        if not self.levels.is_nominal:
+        if self.turn is None:
             coset = (
                 self.levels.order[(np.arange(self.levels.count)[:, None] + numbers) % self.levels.count] % self.cosets
             )
@@ -103,12 +111,26 @@ class LevelTable:
     @cached_property
     def packed(self) -> tuple[object, ...]:
         """As the compiled arithmetic takes it."""
-        search: tuple[object, ...] = 0.0, np.zeros(0), np.zeros(0), np.zeros(0, np.int64), 0
+        search: tuple[object, ...] = np.zeros(0), 0.0, np.zeros(0), np.zeros(0, np.int64), 0
         if not self.levels.is_nominal:
             first, borders, starts, most = self.levels.borders
-            search = first, self.levels.circle, borders, np.ascontiguousarray(starts, np.int64), int(most)
-        count, even = self.levels.count, self.levels.is_nominal
-        return count, self.bits, even, *self.series, search, self.limit, self.near.packed, self.all.packed
+            search = self.levels.circle, first, borders, np.ascontiguousarray(starts, np.int64), int(most)
+        count, even, turn = self.levels.count, self.levels.is_nominal, -1 if self.turn is None else self.turn
+        return count, self.bits, even, turn, *self.series, search, self.limit, self.near.packed, self.all.packed
+
+
+@lru_cache(32)
+def searches_of(levels: Levels, bits: int) -> tuple[object, ...]:
+    """What finds the nearest of uneven levels of each coset, as the compiled arithmetic takes it.
+
+    Args:
+        levels: of the page, more than there are cosets.
+        bits: b, of 2^b cosets.
+    """
+    cosets = [levels.every(1 << bits, coset) for coset in range(1 << bits)]
+    first, borders, starts, most = zip(*(coset.borders for coset in cosets), strict=True)
+    orders = np.array([coset.order for coset in cosets], np.uint8)
+    return np.array(first), np.array(borders), np.array(starts, np.int64), int(max(most)), orders
 
 
 @lru_cache(32)

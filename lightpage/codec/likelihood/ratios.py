@@ -85,7 +85,7 @@ def _weights(neighbours: Neighbours, place: NDArray[np.int64], along: Real, acro
 def _by_coset(table: LevelTable, neighbours: Neighbours, place: NDArray[np.int64], weights: Float32) -> Float32:
     """Sums of weights by coset, [2^b, symbols]."""
     sums = np.zeros((table.cosets, len(place)), np.float32)
-    if not table.levels.is_nominal:
+    if table.turn is None:
         coset, symbols = neighbours.coset[place].T, np.arange(len(place))
         for j, weight in enumerate(weights):
             sums[coset[j], symbols] += weight
@@ -94,7 +94,7 @@ def _by_coset(table: LevelTable, neighbours: Neighbours, place: NDArray[np.int64
     sums[:few] = weights[:few]
     for j in range(table.cosets, neighbours.width, table.cosets):
         sums += weights[j : j + table.cosets]
-    first = place - neighbours.width // 2
+    first = place + table.turn - neighbours.width // 2
     turned = (np.arange(table.cosets)[:, None] - first) & (table.cosets - 1)
     return np.asarray(np.take_along_axis(sums, turned, axis=0))
 

@@ -11,7 +11,7 @@ from lightpage.codec.ldpc.code import LdpcCode
 from lightpage.codec.ldpc.decoder import DecodedBlocks, decode
 from lightpage.codec.likelihood.arithmetic import exponential, logarithm
 from lightpage.codec.likelihood.information import page_information
-from lightpage.codec.likelihood.neighbours import table_of
+from lightpage.codec.likelihood.neighbours import searches_of, table_of
 from lightpage.codec.mapping import MOST_LLR, bit_information, bit_llrs, upper_bits
 from lightpage.codec.page_codec import PageCodec
 from lightpage.page.levels import Levels
@@ -249,12 +249,14 @@ class TestRefusals:
                 (1, 0),
                 (1, 6),
                 (2, not packed[2]),
-                (3, np.zeros(0)),
-                (4, np.zeros(3)),
+                (3, -2),
+                (3, 32),
+                (4, np.zeros(0)),
+                (5, np.zeros(3)),
             ):
                 with pytest.raises((ValueError, TypeError)):
                     call((*packed[:place], value, *packed[place + 1 :]))
-            for place in (7, 8):
+            for place in (8, 9):
                 near: tuple[object, ...] = packed[place]  # type: ignore[assignment]
                 for width in (0, 3, 64, -16):
                     with pytest.raises((ValueError, TypeError)):
@@ -265,10 +267,10 @@ class TestRefusals:
                 call(packed, phase=np.zeros(8))
             with pytest.raises((ValueError, TypeError)):
                 call(packed, out=np.zeros((8, 2), np.float32))
-        search = list(packed[5])  # type: ignore[call-overload]
+        search = list(packed[6])  # type: ignore[call-overload]
         search[3] = search[3] + 32
         with pytest.raises(ValueError, match="starts"):
-            call((*packed[:5], tuple(search), *packed[6:]))
+            call((*packed[:6], tuple(search), *packed[7:]))
 
     def test_orders(self) -> None:
         values, bits = np.ones(5, np.float32), np.ones(3, np.uint8)
@@ -283,11 +285,18 @@ class TestRefusals:
 
     def test_numbers(self) -> None:
         phase, label, out = np.zeros(4), np.zeros((4, 2), np.uint8), np.zeros((4, 3), np.uint8)
-        assert page_code.upper_bits(phase, label, 2, 5, out)
-        assert not page_code.upper_bits(np.full(4, np.nan), label, 2, 5, out)
+        assert page_code.upper_bits(phase, label, 2, 5, None, out)
+        assert not page_code.upper_bits(np.full(4, np.nan), label, 2, 5, None, out)
         for bits, all_bits in ((0, 5), (6, 5), (2, 9), (2, 4)):
             with pytest.raises(ValueError, match="expected"):
-                page_code.upper_bits(phase, label, bits, all_bits, out)
+                page_code.upper_bits(phase, label, bits, all_bits, None, out)
+        first, borders, starts, most, order = searches_of(uneven(32), 2)
+        assert page_code.upper_bits(phase, label, 2, 5, (first, borders, starts, most, order), out)  # type: ignore[arg-type]
+        wrong: list[object] = [(), 0, (first, borders, starts, -1, order), (first, borders, starts + 8, most, order)]  # type: ignore[operator]
+        wrong += [(order, borders, starts, most, order), (first, first, starts, most, order)]
+        for searches in (*wrong, (first, borders, starts, most, first), (first, borders, first, most, order)):
+            with pytest.raises((ValueError, TypeError)):
+                page_code.upper_bits(phase, label, 2, 5, searches, out)  # type: ignore[arg-type]
         for number in (-1, len(VARIANTS)):
             with pytest.raises(ValueError, match="variant"):
                 page_code.use(number)
