@@ -1,14 +1,18 @@
-"""Compiles the page code's arithmetic where a C compiler is; without one, numpy does it.
+"""Compiles the page code's arithmetic where a C compiler and the headers of Python are; elsewhere numpy does it.
 
-All else stands in pyproject.toml.
+All else stands in pyproject.toml. With LIGHTPAGE_PAGE_CODE=compiled in the environment, failing to compile is an error.
 """
+
+import os
+import sys
 
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
 
-LIMITED_API = 0x030B0000
+FOLDER = "lightpage/codec/compiled"
+LIMITED_API = "0x030B0000"
 """Of Python 3.11: one build serves it and all later ones."""
-FLAGS = ["-std=c99", "-O3", "-ffp-contract=off", "-fno-trapping-math", "-fno-math-errno", "-fvisibility=hidden"]
+FLAGS = ["-std=c99", "-O3", "-g0", "-ffp-contract=off", "-fno-trapping-math", "-fno-math-errno", "-fvisibility=hidden"]
 """Of compilers that take gcc's: no fused operations, so that every processor gives the same bits."""
 
 
@@ -20,6 +24,7 @@ class BuildExtension(build_ext):
         if self.compiler.compiler_type != "msvc":
             for extension in self.extensions:
                 extension.extra_compile_args = FLAGS
+                extension.extra_link_args = ["-Wl,-s"] if sys.platform == "linux" else []
                 extension.libraries = ["m"]
         super().build_extensions()
 
@@ -28,10 +33,11 @@ setup(
     ext_modules=[
         Extension(
             "lightpage.codec.compiled.page_code",
-            ["lightpage/codec/compiled/page_code.c"],
-            define_macros=[("Py_LIMITED_API", hex(LIMITED_API))],
+            [f"{FOLDER}/page_code.c"],
+            depends=[f"{FOLDER}/kernels.h"],
+            define_macros=[("Py_LIMITED_API", LIMITED_API)],
             py_limited_api=True,
-            optional=True,
+            optional=os.environ.get("LIGHTPAGE_PAGE_CODE") != "compiled",
         )
     ],
     cmdclass={"build_ext": BuildExtension},
