@@ -9,12 +9,10 @@ those of the processor. The installed size says what a decoder would bring into 
 from __future__ import annotations
 
 import io
-import os
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any
@@ -23,10 +21,11 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.codec.computed_by import computed_by
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.codec.code import Code
-from lightpage.codec.compiled.choice import COMPILED, NUMPY, VARIABLE, in_use
+from lightpage.codec.compiled.choice import COMPILED, NUMPY, in_use
 from lightpage.codec.ldpc.code import LdpcCode
 from lightpage.codec.ldpc.decoder import MOST_ITERATIONS, decode
 from lightpage.codec.mapping import bit_information
@@ -96,19 +95,6 @@ def by_library(code: LdpcCode) -> Callable[[Blocks], NDArray[np.uint8]]:
         return np.asarray(((word < 0) ^ flips.astype(bool))[: code.information_bits], np.uint8)
 
     return lambda blocks: np.stack([one(block) for block in blocks])
-
-
-@contextmanager
-def computed_by(name: str) -> Iterator[None]:
-    """Inside, the page code is computed by numpy or by the compiled arithmetic."""
-    before = os.environ.get(VARIABLE)
-    os.environ[VARIABLE] = name
-    try:
-        yield
-    finally:
-        os.environ.pop(VARIABLE)
-        if before is not None:
-            os.environ[VARIABLE] = before
 
 
 def decoders(code: LdpcCode) -> dict[str, Callable[[Blocks], NDArray[np.uint8]]]:
