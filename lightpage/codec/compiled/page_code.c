@@ -450,11 +450,11 @@ static PyObject *ended(buffers *all, PyObject *result) {
   return result;
 }
 
-#define FLOATS(from, name, count, writable) take(&all, from, name, "f", 4, count, writable)
-#define DOUBLES(from, name, count) take(&all, from, name, "d", 8, count, 0)
-#define BYTES(from, name, count, writable) take(&all, from, name, "B?", 1, count, writable)
-#define INTS(from, name, count, writable) take(&all, from, name, "il", 4, count, writable)
-#define LONGS(from, name, count) take(&all, from, name, "lq", 8, count, 0)
+#define FLOATS(from, name, count, writable) take(all, from, name, "f", 4, count, writable)
+#define DOUBLES(from, name, count) take(all, from, name, "d", 8, count, 0)
+#define BYTES(from, name, count, writable) take(all, from, name, "B?", 1, count, writable)
+#define INTS(from, name, count, writable) take(all, from, name, "il", 4, count, writable)
+#define LONGS(from, name, count) take(all, from, name, "lq", 8, count, 0)
 
 /* Copies the rows of a base graph: what is checked cannot change. */
 static int take_graph(ldpc *code, const int32_t *degrees, Py_ssize_t rows, const int32_t *edges, Py_ssize_t count) {
@@ -479,29 +479,29 @@ static int take_graph(ldpc *code, const int32_t *degrees, Py_ssize_t rows, const
 
 static PyObject *decode_blocks(PyObject *module, PyObject *args) {
   PyObject *py_degrees, *py_edges, *py_llrs, *py_information, *py_sent, *py_taken;
-  buffers all = {.count = 0};
+  buffers opened = {.count = 0}, *const all = &opened;
   ldpc code;
   (void)module;
   if (!PyArg_ParseTuple(args, "(OOiii)ifffOOOO:decode_blocks", &py_degrees, &py_edges, &code.z, &code.information, &code.sent, &code.iterations, &code.offset, &code.most,
                         &code.known, &py_llrs, &py_information, &py_sent, &py_taken))
     return NULL;
   const int32_t *degrees = INTS(py_degrees, "degrees", -1, 0);
-  if (!degrees) return ended(&all, NULL);
-  const Py_ssize_t rows = taken_elements(&all);
+  if (!degrees) return ended(all, NULL);
+  const Py_ssize_t rows = taken_elements(all);
   const int32_t *edges = INTS(py_edges, "edges", -1, 0);
-  if (!edges) return ended(&all, NULL);
-  const Py_ssize_t numbers = taken_elements(&all);
+  if (!edges) return ended(all, NULL);
+  const Py_ssize_t numbers = taken_elements(all);
   if (numbers % 2 || take_graph(&code, degrees, rows, edges, numbers / 2) < 0) {
     PyErr_SetString(PyExc_ValueError, "code: got another graph, expected rows of base graph 1 and bits that fit it");
-    return ended(&all, NULL);
+    return ended(all, NULL);
   }
   int32_t *taken = INTS(py_taken, "iterations", -1, 1);
-  if (!taken) return ended(&all, NULL);
-  const Py_ssize_t blocks = taken_elements(&all);
+  if (!taken) return ended(all, NULL);
+  const Py_ssize_t blocks = taken_elements(all);
   const float *llrs = FLOATS(py_llrs, "LLRs", blocks * code.sent, 0);
   uint8_t *information = llrs ? BYTES(py_information, "information", blocks * code.information, 1) : NULL;
   uint8_t *sent = information ? BYTES(py_sent, "sent", blocks * code.sent, 1) : NULL;
-  if (!sent) return ended(&all, NULL);
+  if (!sent) return ended(all, NULL);
   scratch room = {.room = NULL};
   int has_room;
   Py_BEGIN_ALLOW_THREADS;
@@ -510,22 +510,20 @@ static PyObject *decode_blocks(PyObject *module, PyObject *args) {
     taken[b] = decode_block(&room, &code, llrs + b * code.sent, information + b * code.information, sent + b * code.sent);
   free_room(&room);
   Py_END_ALLOW_THREADS;
-  if (!has_room) return ended(&all, PyErr_NoMemory());
-  release(&all);
+  if (!has_room) return ended(all, PyErr_NoMemory());
+  release(all);
   Py_RETURN_NONE;
 }
 
 /* The search among a number of uneven levels; among none where they are even. */
-static int take_search(buffers *opened, search *s, PyObject *borders, PyObject *starts, int levels) {
+static int take_search(buffers *all, search *s, PyObject *borders, PyObject *starts, int levels) {
   s->levels = levels;
   if (s->most < 0 || s->most > MOST_LEVELS) {
     PyErr_SetString(PyExc_ValueError, "levels within a step: expected 0 to 256");
     return -1;
   }
-  buffers all = *opened;
   s->borders = DOUBLES(borders, "borders", levels);
   s->starts = s->borders ? LONGS(starts, "starts", levels ? STEPS + 1 : 0) : NULL;
-  *opened = all;
   if (!s->starts) return -1;
   for (int i = 0; levels && i <= STEPS; i++)
     if (s->starts[i] < 0 || s->starts[i] >= levels) {
@@ -535,8 +533,7 @@ static int take_search(buffers *opened, search *s, PyObject *borders, PyObject *
   return 0;
 }
 
-static int take_neighbours(buffers *opened, PyObject *from, const levels_table *t, neighbours *n) {
-  buffers all = *opened;
+static int take_neighbours(buffers *all, PyObject *from, const levels_table *t, neighbours *n) {
   PyObject *cosine, *sine, *coset;
   const int rows = t->even ? 1 : t->levels;
   int fine = 0;
@@ -548,13 +545,12 @@ static int take_neighbours(buffers *opened, PyObject *from, const levels_table *
              (n->coset = BYTES(coset, "cosets", t->turn >= 0 ? 0 : t->levels * n->width, 0));
     }
   }
-  *opened = all;
   return fine ? 0 : -1;
 }
 
 static PyObject *llrs_of(PyObject *module, PyObject *args) {
   PyObject *py_phase, *py_concentration, *py_sine, *py_cosine, *py_circle, *py_borders, *py_starts, *py_limit, *py_near, *py_all, *py_out;
-  buffers all = {.count = 0};
+  buffers opened = {.count = 0}, *const all = &opened;
   levels_table t;
   float most;
   (void)module;
@@ -569,22 +565,22 @@ static PyObject *llrs_of(PyObject *module, PyObject *args) {
   t.cosets = 1 << t.bits;
   t.step = TURN / t.levels;
   const double *phase = DOUBLES(py_phase, "phase", -1);
-  if (!phase) return ended(&all, NULL);
-  const Py_ssize_t count = taken_elements(&all);
+  if (!phase) return ended(all, NULL);
+  const Py_ssize_t count = taken_elements(all);
   const double *concentration = DOUBLES(py_concentration, "concentration", count);
-  if (!concentration || !(t.sine = DOUBLES(py_sine, "sine", -1))) return ended(&all, NULL);
-  t.terms = (int)taken_elements(&all);
+  if (!concentration || !(t.sine = DOUBLES(py_sine, "sine", -1))) return ended(all, NULL);
+  t.terms = (int)taken_elements(all);
   const int rows = t.even ? 1 : t.levels, uneven = t.even ? 0 : t.levels;
   if (t.terms < 1 || t.terms > MOST_TERMS) {
     PyErr_SetString(PyExc_ValueError, "sine: expected 1 to 20 coefficients");
-    return ended(&all, NULL);
+    return ended(all, NULL);
   }
-  if (!(t.cosine = DOUBLES(py_cosine, "cosine", t.terms)) || !(t.circle = DOUBLES(py_circle, "circle", uneven)) || take_search(&all, &t.places, py_borders, py_starts, uneven) < 0 ||
-      !(t.limit = DOUBLES(py_limit, "limit", rows)) || take_neighbours(&all, py_near, &t, &t.near) < 0 ||
-      take_neighbours(&all, py_all, &t, &t.all) < 0)
-    return ended(&all, NULL);
+  if (!(t.cosine = DOUBLES(py_cosine, "cosine", t.terms)) || !(t.circle = DOUBLES(py_circle, "circle", uneven)) || take_search(all, &t.places, py_borders, py_starts, uneven) < 0 ||
+      !(t.limit = DOUBLES(py_limit, "limit", rows)) || take_neighbours(all, py_near, &t, &t.near) < 0 ||
+      take_neighbours(all, py_all, &t, &t.all) < 0)
+    return ended(all, NULL);
   float *out = FLOATS(py_out, "LLRs", count * t.bits, 1);
-  if (!out) return ended(&all, NULL);
+  if (!out) return ended(all, NULL);
   int bounded;
   Py_BEGIN_ALLOW_THREADS;
   bounded = is_bounded(count, phase, MOST_PHASE);
@@ -593,32 +589,31 @@ static PyObject *llrs_of(PyObject *module, PyObject *args) {
   Py_END_ALLOW_THREADS;
   if (!bounded) {
     PyErr_SetString(PyExc_ValueError, "phase: expected at most 1e6 radians");
-    return ended(&all, NULL);
+    return ended(all, NULL);
   }
-  release(&all);
+  release(all);
   Py_RETURN_NONE;
 }
 
 static PyObject *lack_of_information(PyObject *module, PyObject *args) {
   PyObject *py_llrs, *py_bits;
-  buffers all = {.count = 0};
+  buffers opened = {.count = 0}, *const all = &opened;
   int64_t sum;
   (void)module;
   if (!PyArg_ParseTuple(args, "OO:lack_of_information", &py_llrs, &py_bits)) return NULL;
   const float *llrs = FLOATS(py_llrs, "LLRs", -1, 0);
-  if (!llrs) return ended(&all, NULL);
-  const Py_ssize_t count = taken_elements(&all);
+  if (!llrs) return ended(all, NULL);
+  const Py_ssize_t count = taken_elements(all);
   const uint8_t *bits = NULL;
-  if (py_bits != Py_None && !(bits = BYTES(py_bits, "bits", count, 0))) return ended(&all, NULL);
+  if (py_bits != Py_None && !(bits = BYTES(py_bits, "bits", count, 0))) return ended(all, NULL);
   Py_BEGIN_ALLOW_THREADS;
   sum = bits ? used->lack_of_truth(count, llrs, bits) : used->lack_as_claimed(count, llrs);
   Py_END_ALLOW_THREADS;
-  return ended(&all, PyLong_FromLongLong(sum));
+  return ended(all, PyLong_FromLongLong(sum));
 }
 
 /* Searches of the cosets of uneven levels: of each one border, borders, starts; then the most in a step, orders. */
-static int take_coset_searches(buffers *opened, PyObject *from, int bits, int level_bits, coset_searches *found) {
-  buffers all = *opened;
+static int take_coset_searches(buffers *all, PyObject *from, int bits, int level_bits, coset_searches *found) {
   PyObject *py_first, *py_borders, *py_starts, *py_order;
   search one;
   const int cosets = 1 << bits, levels = 1 << (level_bits - bits);
@@ -626,7 +621,6 @@ static int take_coset_searches(buffers *opened, PyObject *from, int bits, int le
   const double *first = DOUBLES(py_first, "first borders", cosets), *borders = first ? DOUBLES(py_borders, "borders", cosets * levels) : NULL;
   const int64_t *starts = borders ? LONGS(py_starts, "starts", cosets * (STEPS + 1)) : NULL;
   found->order = starts ? BYTES(py_order, "order", cosets * levels, 0) : NULL;
-  *opened = all;
   if (!found->order) return -1;
   int wrong = one.most < 0 || one.most > MOST_LEVELS;
   for (int i = 0; i < cosets * (STEPS + 1); i++) wrong |= starts[i] < 0 || starts[i] >= levels;
@@ -643,7 +637,7 @@ static int take_coset_searches(buffers *opened, PyObject *from, int bits, int le
 
 static PyObject *upper_bits(PyObject *module, PyObject *args) {
   PyObject *py_phase, *py_label, *py_searches, *py_out;
-  buffers all = {.count = 0};
+  buffers opened = {.count = 0}, *const all = &opened;
   int bits, level_bits, bounded;
   coset_searches searches;
   (void)module;
@@ -653,58 +647,58 @@ static PyObject *upper_bits(PyObject *module, PyObject *args) {
     return NULL;
   }
   const int uneven = py_searches != Py_None;
-  if (uneven && (!PyTuple_Check(py_searches) || take_coset_searches(&all, py_searches, bits, level_bits, &searches) < 0)) {
+  if (uneven && (!PyTuple_Check(py_searches) || take_coset_searches(all, py_searches, bits, level_bits, &searches) < 0)) {
     if (!PyErr_Occurred()) PyErr_SetString(PyExc_TypeError, "searches: expected a tuple or None");
-    return ended(&all, NULL);
+    return ended(all, NULL);
   }
   const double *phase = DOUBLES(py_phase, "phase", -1);
-  if (!phase) return ended(&all, NULL);
-  const Py_ssize_t count = taken_elements(&all);
+  if (!phase) return ended(all, NULL);
+  const Py_ssize_t count = taken_elements(all);
   const uint8_t *label = BYTES(py_label, "label", count * bits, 0);
   uint8_t *out = label ? BYTES(py_out, "numbers", count * (level_bits - bits), 1) : NULL;
-  if (!out) return ended(&all, NULL);
+  if (!out) return ended(all, NULL);
   Py_BEGIN_ALLOW_THREADS;
   bounded = is_bounded(count, phase, MOST_PHASE);
   if (bounded) upper_numbers(count, phase, label, bits, level_bits, uneven ? &searches : NULL, out);
   Py_END_ALLOW_THREADS;
-  return ended(&all, PyBool_FromLong(bounded));
+  return ended(all, PyBool_FromLong(bounded));
 }
 
 /* Whether there is a posterior: 0 where all numbers are, 1 where some are too large for the functions here, 2 where not. */
 static PyObject *look(PyObject *module, PyObject *args) {
   PyObject *py_phase, *py_concentration;
-  buffers all = {.count = 0};
+  buffers opened = {.count = 0}, *const all = &opened;
   double most;
   int large = 0, wrong = 0;
   (void)module;
   if (!PyArg_ParseTuple(args, "OOd:look", &py_phase, &py_concentration, &most)) return NULL;
   const double *phase = DOUBLES(py_phase, "phase", -1);
-  const Py_ssize_t count = phase ? taken_elements(&all) : 0;
+  const Py_ssize_t count = phase ? taken_elements(all) : 0;
   const double *concentration = phase ? DOUBLES(py_concentration, "concentration", count) : NULL;
-  if (!concentration) return ended(&all, NULL);
+  if (!concentration) return ended(all, NULL);
   Py_BEGIN_ALLOW_THREADS;
   for (Py_ssize_t i = 0; i < count; i++) {
     large |= !(fabs(phase[i]) <= MOST_PHASE && concentration[i] <= most);
     wrong |= !(fabs(phase[i]) <= DBL_MAX && concentration[i] >= 0 && concentration[i] <= DBL_MAX);
   }
   Py_END_ALLOW_THREADS;
-  return ended(&all, PyLong_FromLong(wrong ? 2 : large));
+  return ended(all, PyLong_FromLong(wrong ? 2 : large));
 }
 
 static PyObject *gather(PyObject *module, PyObject *args) {
   PyObject *py_values, *py_order, *py_out;
-  buffers all = {.count = 0};
+  buffers opened = {.count = 0}, *const all = &opened;
   int wrong = 0;
   (void)module;
   if (!PyArg_ParseTuple(args, "OOO:gather", &py_values, &py_order, &py_out)) return NULL;
   const float *values = FLOATS(py_values, "values", -1, 0);
-  if (!values) return ended(&all, NULL);
-  const Py_ssize_t most = taken_elements(&all);
+  if (!values) return ended(all, NULL);
+  const Py_ssize_t most = taken_elements(all);
   const int32_t *order = INTS(py_order, "order", -1, 0);
-  if (!order) return ended(&all, NULL);
-  const Py_ssize_t count = taken_elements(&all);
+  if (!order) return ended(all, NULL);
+  const Py_ssize_t count = taken_elements(all);
   float *out = FLOATS(py_out, "gathered", count, 1);
-  if (!out) return ended(&all, NULL);
+  if (!out) return ended(all, NULL);
   Py_BEGIN_ALLOW_THREADS;
   for (Py_ssize_t i = 0; i < count; i++) {
     const int32_t from = order[i];
@@ -716,25 +710,25 @@ static PyObject *gather(PyObject *module, PyObject *args) {
   Py_END_ALLOW_THREADS;
   if (wrong) {
     PyErr_SetString(PyExc_ValueError, "order: expected numbers of values");
-    return ended(&all, NULL);
+    return ended(all, NULL);
   }
-  release(&all);
+  release(all);
   Py_RETURN_NONE;
 }
 
 static PyObject *scatter(PyObject *module, PyObject *args) {
   PyObject *py_bits, *py_order, *py_out;
-  buffers all = {.count = 0};
+  buffers opened = {.count = 0}, *const all = &opened;
   int wrong = 0;
   (void)module;
   if (!PyArg_ParseTuple(args, "OOO:scatter", &py_bits, &py_order, &py_out)) return NULL;
   const uint8_t *bits = BYTES(py_bits, "bits", -1, 0);
-  if (!bits) return ended(&all, NULL);
-  const Py_ssize_t count = taken_elements(&all);
+  if (!bits) return ended(all, NULL);
+  const Py_ssize_t count = taken_elements(all);
   const int32_t *order = INTS(py_order, "order", count, 0);
   uint8_t *out = order ? BYTES(py_out, "scattered", -1, 1) : NULL;
-  if (!out) return ended(&all, NULL);
-  const Py_ssize_t most = taken_elements(&all);
+  if (!out) return ended(all, NULL);
+  const Py_ssize_t most = taken_elements(all);
   Py_BEGIN_ALLOW_THREADS;
   for (Py_ssize_t i = 0; i < count; i++) {
     const int32_t to = order[i];
@@ -746,9 +740,9 @@ static PyObject *scatter(PyObject *module, PyObject *args) {
   Py_END_ALLOW_THREADS;
   if (wrong) {
     PyErr_SetString(PyExc_ValueError, "order: expected numbers of places");
-    return ended(&all, NULL);
+    return ended(all, NULL);
   }
-  release(&all);
+  release(all);
   Py_RETURN_NONE;
 }
 
