@@ -24,7 +24,7 @@ from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.codec.page_bytes import FileFacts, Header
 from lightpage.device.state import Device
-from lightpage.errors import CalibrationError, RecalibrationRefusedError
+from lightpage.errors import CalibrationError, FramesDisagreeError, RecalibrationRefusedError, UnconfirmedPageError
 from lightpage.files import write_json
 from lightpage.metrics.measures import measure
 from lightpage.page.pilots import Pilots
@@ -32,6 +32,9 @@ from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.shipped import bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.image_tracker import tracker_for
+from lightpage.runtime.model.decoding.page import DecodedPage
+from lightpage.runtime.model.decoding.tracking import Tracker, unconfirmed_page
 from lightpage.runtime.recalibration.healing import TOGETHER, LostPages, heal
 from lightpage.runtime.recalibration.known_pages import KnownPages
 from lightpage.runtime.recalibration.recalibration import refitted_bundle
@@ -141,16 +144,27 @@ class _Bench:
     def read(self, decoder: Decoder, pairs: Sequence[FramePair]) -> tuple[float, int]:
         """AIR of the pages that are not healed by, and how many of all give their bytes."""
         mask, levels = decoder.bundle.pilot_mask, decoder.bundle.levels(self.decoder.page_codec.code.levels)
-        airs, read = list[float](), 0
+        airs, read, tracker = list[float](), 0, tracker_for(decoder)  # the image walks from page to page
         for number, (pair, symbols) in enumerate(zip(pairs, self.symbols, strict=True)):
             pilots = Pilots.of_symbols(mask, symbols, levels)
-            page = decoder.post_process(decoder.infer(pair, doubtful=True), levels.count, pilots)
+            page = _decoded(tracker, decoder, pair, pilots)
             read += decoder.page_codec.decode(page.phase, page.concentration).loss is None
             if number >= self.pages:
                 data = ~mask
                 found = measure(page.phase[data], page.concentration[data], symbols[data], levels)
                 airs.append(found.air_bits_per_symbol)
         return float(np.mean(airs)), read
+
+
+def _decoded(tracker: Tracker, decoder: Decoder, pair: FramePair, pilots: Pilots) -> DecodedPage:
+    """A page, whatever its pilots and its frames say of it."""
+    count = decoder.page_codec.code.levels
+    try:
+        return tracker.decode(pair, count, pilots)
+    except UnconfirmedPageError as error:
+        return unconfirmed_page(error)
+    except FramesDisagreeError:
+        return decoder.post_process(decoder.infer(pair, doubtful=True), count, pilots)
 
 
 @click.command()

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import click
 
+from lightpage.calibration.goodness.verdict import Goodness
 from lightpage.calibration.known_pages import first_lit_pages
 from lightpage.cli.options import FiniteRange
 from lightpage.cli.paths import NewPath, OutputFile
@@ -82,7 +83,7 @@ def recalibrate(
     recalibration of a service ends with this command, unless it is told to --detach; `lightpage jobs` then tells how it
     goes.
     """
-    start = time.perf_counter()
+    start, goodness = time.perf_counter(), None
     if target is not None:
         if bundle or out or version is not None:
             raise InvalidInputError("--target", "with --bundle, --out or --version", "either a service or a bundle")
@@ -105,8 +106,10 @@ def recalibrate(
             given = {"--bundle": bundle, "--recording": recording, "--out": out}
             lacking = ", ".join(name for name, value in given.items() if not value)
             raise InvalidInputError("options", f"no {lacking}", f"{', '.join(given)}, or --target")
-        result = _offline(bundle, recording, out, pages, version)
+        result, goodness = _offline(bundle, recording, out, pages, version)
     data = summary(result, time.perf_counter() - start)
+    if goodness is not None:
+        data |= {"verdict": goodness.verdict, "bits_lost": goodness.bits_lost, "cause": goodness.cause or None}
     write_json(json_path, data)
     click.echo(table(data))
 
@@ -172,7 +175,10 @@ def _start(client: LightpageClient, recording: str | None, pages: int, send: boo
     )
 
 
-def _offline(bundle: str, recording: str, out: Path, pages: int, version: str | None) -> Recalibrated:
+def _offline(
+    bundle: str, recording: str, out: Path, pages: int, version: str | None
+) -> tuple[Recalibrated, Goodness | None]:
+    """What came of it, and how well the re-fitted geometry explains the light."""
     if out.exists():
         raise InvalidInputError(f"--out {out}", "something that exists", "a new path: bundles are never overwritten")
     if version is not None:
@@ -184,7 +190,7 @@ def _offline(bundle: str, recording: str, out: Path, pages: int, version: str | 
         outcome = recalibrate_by_recording(
             decoder, file, pages, lambda: code_of(file, decoder.bundle), out, new, refit, progress
         )
-    return answer_of(Recalibrated, result_message(outcome))
+    return answer_of(Recalibrated, result_message(outcome)), outcome.report.goodness
 
 
 @click.command()
