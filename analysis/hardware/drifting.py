@@ -22,6 +22,8 @@ from lightpage.runtime.archives.recordings.coded_pages import air_bits
 from lightpage.runtime.device.acquisition.source import SHOT_S, FrameSource, Shot
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.execution.twin import OnnxTwin
+from lightpage.runtime.service.jobs.kept_pages import KeptPages
+from lightpage.runtime.service.monitoring.observation import Observation
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_modulation, true_parameters
 
@@ -177,6 +179,17 @@ class DriftingSource(FrameSource):
         """Return what the simulator knows of a page that was photographed lately."""
         with self._lock:
             return self._truths[page]
+
+
+@dataclass(frozen=True)
+class Untold:
+    """Pages are kept without the symbols that the simulator knows."""
+
+    kept: KeptPages
+
+    def observe(self, observation: Observation) -> None:
+        """See `Observer`."""
+        self.kept.observe(replace(observation, symbols=None))
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.hardware.drifting import DriftingSource, TrueTable, direction, moved
+from analysis.hardware.drifting import DriftingSource, TrueTable, Untold, direction, moved
 from analysis.hardware.rows import Rows, append_row, kept_rows
 from analysis.hardware.watched_recalibrator import WatchedRecalibrator
 from lightpage.calibration.parameters import NAMES, as_dict, indices
@@ -32,7 +32,7 @@ from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.models.store import Store
 from lightpage.runtime.service.monitoring.flight_recorder import FlightRecorder
 from lightpage.runtime.service.monitoring.monitor import Monitor
-from lightpage.runtime.service.monitoring.observation import Observation, Observer
+from lightpage.runtime.service.monitoring.observation import Observer
 from lightpage.runtime.service.pages.reading import read_page
 from lightpage.simulator.true_optics import true_modulation, true_parameters
 
@@ -92,17 +92,6 @@ def state(begun: Device, moment: float, pages: int, light: LightDrift) -> Device
         return device
     angle = device.geometry.pipe_angle_deg + KNOCK_DEG
     return device.model_copy(update={"geometry": device.geometry.model_copy(update={"pipe_angle_deg": angle})})
-
-
-@dataclass(frozen=True)
-class Untold:
-    """Pages are kept without the symbols that the simulator knows."""
-
-    kept: KeptPages
-
-    def observe(self, observation: Observation) -> None:
-        """See `Observer`."""
-        self.kept.observe(replace(observation, symbols=None))
 
 
 class SimulatedClock(Clock):
