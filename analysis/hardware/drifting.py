@@ -12,10 +12,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.calibration.parameters import NAMES
+from lightpage.calibration.parameters import NAMES, as_dict, indices
 from lightpage.calibration.sampling_table import sampling_table
 from lightpage.codec.volume import Volume, encode_volume
+from lightpage.device.profile import Profile
 from lightpage.device.state import Device
+from lightpage.page.modulation import Modulation
 from lightpage.page.pilots import Pilots
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.archives.recordings.coded_pages import air_bits
@@ -235,3 +237,14 @@ class TrueTable:
         shown = modulation.page_levels(levels)
         page = fed.decode(truth.pair, levels, pilots=Pilots.of_symbols(bundle.pilot_mask, truth.symbols, shown))
         return air_bits(page, truth.symbols, self.data, shown)
+
+
+def light_of(parameters: NDArray[np.float64], modulation: Modulation) -> dict[str, float]:
+    """Return the stroke and the axial places of a device, by name."""
+    names = [NAMES[index] for index in indices("axial")]
+    return {"stroke_relative": modulation.coefficients[0], **{name: as_dict(parameters)[name] for name in names}}
+
+
+def true_light(profile: Profile, device: Device) -> dict[str, float]:
+    """The same of a true device."""
+    return light_of(true_parameters(profile, device), true_modulation(device.slm))
