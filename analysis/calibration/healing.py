@@ -42,24 +42,30 @@ from lightpage.runtime.recalibration.refit import refit
 from lightpage.simulator.simulator import Simulator
 
 _AXIAL = [f"{plane}axial_rad=0.3" for plane in ("geometry.modulator_", "in_phase_camera.", "quadrature_camera.")]
-_IMAGE = ["in_phase_camera.shift_x_px=24", "quadrature_camera.shift_x_px=16"]
+_MOVED_PX = 20.0
+"""By how much the image is moved on both cameras."""
+_DOWN = ["in_phase_camera.shift_y_px=17", "quadrature_camera.shift_y_px=22"]
+_RIGHT = ["in_phase_camera.shift_x_px=24", "quadrature_camera.shift_x_px=16"]
 CASES: dict[str, list[str]] = {
     "angle off by 0.03 degree": ["geometry.pipe_angle_deg=-0.57"],
     "angle off by 0.1 degree": ["geometry.pipe_angle_deg=-0.5"],
     "angle off by 0.3 degree": ["geometry.pipe_angle_deg=-0.3"],
-    "image 20 px away": _IMAGE,
+    "image 20 px further down": _DOWN,
+    "image 20 px to the right": _RIGHT,
     "one camera moved by 1 px": ["quadrature_camera.shift_x_px=-3"],
     "focus 0.3 rad": _AXIAL,
     "stroke 2%": ["slm.stroke_relative_error=-0.02"],
     "all at once, 0.03 degree": [
         "geometry.pipe_angle_deg=-0.57",
         *_AXIAL,
-        "in_phase_camera.shift_x_px=24",
-        "quadrature_camera.shift_x_px=17",
+        "in_phase_camera.shift_y_px=17",
+        "quadrature_camera.shift_y_px=22",
+        "quadrature_camera.shift_x_px=-3",
         "slm.stroke_relative_error=-0.02",
     ],
 }
-"""Changes of the default device, which the shipped bundle was trained for."""
+"""Changes of the default device, which the shipped bundle was trained for. To the right, the image of the bench device
+leaves the cameras with some symbols of its first column: no model reads those."""
 _JUDGED = 4
 _SEED = 31
 
@@ -124,14 +130,14 @@ class _Bench:
         healed: float | str
         known: float | str
         read = rounds = 0
-        seconds, image_px = 0.0, (0.0, 0.0)
+        seconds, image_px = 0.0, (_MOVED_PX * (_RIGHT[0] in settings), _MOVED_PX * (_DOWN[0] in settings))
         try:
             found = heal(self.decoder, lost)
         except RecalibrationRefusedError as error:
             healed = str(error)
         else:
             healed, read = self.read(found.decoder, pairs)
-            rounds, seconds, image_px = found.rounds, found.seconds, found.known.image_px
+            rounds, seconds = found.rounds, found.seconds
         first = KnownPages((pairs[0],), (self.symbols[0],), code.levels, lost.references, image_px=image_px)
         try:
             result = refit(bundle, first, lambda what, share: None, self.decoder)

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import click
 
-from lightpage.calibration.goodness.verdict import Goodness
 from lightpage.calibration.known_pages import first_lit_pages
 from lightpage.cli.options import FiniteRange
 from lightpage.cli.paths import NewPath, OutputFile
@@ -31,7 +30,7 @@ from lightpage.runtime.model.bundle.shipped import bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.healed_bundle import recalibrate_by_recording
 from lightpage.runtime.recalibration.known_pages import read_recorded
-from lightpage.runtime.recalibration.recalibration import next_version
+from lightpage.runtime.recalibration.recalibration import RefitReport, next_version
 from lightpage.runtime.recalibration.refit import refit
 from lightpage.runtime.service.jobs.messages import result_message
 
@@ -83,7 +82,7 @@ def recalibrate(
     recalibration of a service ends with this command, unless it is told to --detach; `lightpage jobs` then tells how it
     goes.
     """
-    start, goodness = time.perf_counter(), None
+    start, report = time.perf_counter(), RefitReport()
     if target is not None:
         if bundle or out or version is not None:
             raise InvalidInputError("--target", "with --bundle, --out or --version", "either a service or a bundle")
@@ -106,9 +105,9 @@ def recalibrate(
             given = {"--bundle": bundle, "--recording": recording, "--out": out}
             lacking = ", ".join(name for name, value in given.items() if not value)
             raise InvalidInputError("options", f"no {lacking}", f"{', '.join(given)}, or --target")
-        result, goodness = _offline(bundle, recording, out, pages, version)
+        result, report = _offline(bundle, recording, out, pages, version)
     data = summary(result, time.perf_counter() - start)
-    if goodness is not None:
+    if (goodness := report.goodness) is not None:
         data |= {"verdict": goodness.verdict, "bits_lost": goodness.bits_lost, "cause": goodness.cause or None}
     write_json(json_path, data)
     click.echo(table(data))
@@ -177,8 +176,8 @@ def _start(client: LightpageClient, recording: str | None, pages: int, send: boo
 
 def _offline(
     bundle: str, recording: str, out: Path, pages: int, version: str | None
-) -> tuple[Recalibrated, Goodness | None]:
-    """What came of it, and how well the re-fitted geometry explains the light."""
+) -> tuple[Recalibrated, RefitReport]:
+    """What came of it, and what the fit says of itself."""
     if out.exists():
         raise InvalidInputError(f"--out {out}", "something that exists", "a new path: bundles are never overwritten")
     if version is not None:
@@ -190,7 +189,7 @@ def _offline(
         outcome = recalibrate_by_recording(
             decoder, file, pages, lambda: code_of(file, decoder.bundle), out, new, refit, progress
         )
-    return answer_of(Recalibrated, result_message(outcome)), outcome.report.goodness
+    return answer_of(Recalibrated, result_message(outcome)), outcome.report
 
 
 @click.command()

@@ -174,11 +174,13 @@ class SelfCalibration:
         return self._plane.models.current.version != version
 
     def _can_heal(self, version: str) -> bool:
-        """Whether the model that has lost pages is still in service, and there are pages to recalibrate by."""
+        """Whether the model that has lost pages is still in service, and there are pages to recalibrate by.
+
+        One lost page is not enough: what was read before may show the device before it was knocked.
+        """
         if self._stopping.is_set() or self._plane.models.current.version != version:
             return False
-        named = bool(self._settings.pages)
-        return named or (self._kept is not None and self._recalibrator.kept_pages(self._kept) is not None)
+        return bool(self._settings.pages) or (self._kept is not None and self._kept.lost(version) >= MIN_PAGES)
 
     def _pause_s(self) -> float:
         """How long to sleep where nobody wakes: until it is looked again where a try is due, else for ever."""

@@ -99,6 +99,12 @@ def test_a_service_recalibrates_by_the_pages_that_it_keeps(small_bundle: Path, d
     known = kept.pages(healed, (0.0, 0.0))
     assert isinstance(known, KnownPages)
     np.testing.assert_array_equal(known.symbols[0], symbols[-1])
+    kinds = []
+    for number, pair in enumerate(pairs[:2], start=1):  # the device is knocked: what was read before shows another one
+        kept.observe(Observation("page", 0, "small-1+r1", 0.0, 0.1, Reason.PILOTS_DISAGREE, pair=pair))
+        assert kept.lost("small-1+r1") == number
+        kinds.append(type(kept.pages(healed, (0.0, 0.0))))
+    assert kinds == [KnownPages, LostPages]
 
 
 def test_a_range_of_pages_that_nobody_could_read_comes_back_with_the_model_healed(
