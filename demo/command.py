@@ -24,7 +24,7 @@ from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 @click.option("--source", "spec", help="A simulated device that runs as hardware, camera:FOLDER/device.toml.")
 @click.option("--json", "json_path", type=OutputFile(), help="Also write the figures to this file.")
 def demo(bundle: str, out: Path, seed: int, spec: str | None, json_path: Path | None) -> None:
-    """Store a picture on the simulated device and read it back, before a drift, after it and recalibrated.
+    """Store a picture on the simulated device and read it back, before a drift, after it and healed by what was lost.
 
     Writes to the folder --out: pages.h5 (what the modulator shows), demo.json, demo.png, and the picture as it was read
     in each state (.pgm).
@@ -68,9 +68,10 @@ def describe(result: DemoResult) -> str:
         margin = "" if step.margin_bits is None else f" margin {step.margin_bits:+.3f} bit a symbol,"
         due = ", recalibration due" if step.recalibration_due else ""
         lines.append(f"drift {step.share:.2f}:{margin} page {'lost' if step.lost else 'read'}{due}")
-    found = result.recalibrated
-    angle = "" if found.angle_deg is None else f", pipe angle {found.angle_deg:.3f} degree"
-    lines.append(f"recalibrated with {found.pages_used} known pages in {found.seconds:.0f} s{angle}")
+    lines += result.story()[1:]
+    lines.append(
+        f"healed in {result.healed.seconds:.0f} s; {result.healed.pages_used} of the lost pages came right first"
+    )
     if result.shots:
         told = ", ".join(f"{count} {outcome}" for outcome, count in sorted(result.shots.items()))
         lines.append(f"shots of {result.source}: {told}")

@@ -1,15 +1,16 @@
 """The main job on the simulated device: a picture goes through a service as bytes, while the device drifts.
 
 Its bytes are encoded on pages in two groups, and one page is spoilt. The service reads them all from the simulated
-device: as it was calibrated, after a drift that loses pages, and recalibrated.
+device: as it was calibrated, after a drift that loses them, and healed by the pages that it lost.
 """
 
 from __future__ import annotations
 
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
-from lightpage.demo.drift import drift_until_lost, simulated_device
+from lightpage.demo.drift import drift_in_steps, simulated_device
 from lightpage.demo.pages import write_pages
 from lightpage.demo.picture import picture
 from lightpage.demo.reading import read_picture
@@ -18,13 +19,25 @@ from lightpage.progress import Progress
 from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
+from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome
+from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.jobs.kept_pages import KeptPages
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
 from lightpage.runtime.service.models.loader import Loader
 from lightpage.runtime.service.models.models import Models
+from lightpage.runtime.service.monitoring.observation import Observation
 from lightpage.runtime.service.server.server import LightpageServer
 
-RECALIBRATION_PAGES = 2
+_KEPT_BYTES = 1 << 28
+
+
+class UserPages(KeptPages):
+    """Keeps pages of a device that does not know what it shows, though the simulated one does."""
+
+    def observe(self, observation: Observation) -> None:
+        """See `Observer`."""
+        super().observe(replace(observation, symbols=None))
 
 
 def run_demo(
@@ -44,7 +57,7 @@ def run_demo(
         spec: see `simulated_device`.
 
     Raises:
-        LightpageError: an unusable bundle, or a recalibration that the service refuses.
+        LightpageError: an unusable bundle, or a healing that the service refuses.
     """
     progress("load the bundle", 0.0)
     decoder = Decoder.load(bundle)
@@ -53,8 +66,10 @@ def run_demo(
     with ExitStack() as stack:
         source, drift = simulated_device(spec, decoder.bundle.profile, out / "pages.h5")
         stack.enter_context(source)
-        plane = DataPlane(Models(decoder, loader=Loader(tracker_for)), source)
-        server = stack.enter_context(LightpageServer(plane, Recalibrator(plane), "127.0.0.1:0"))
+        kept = UserPages(_KEPT_BYTES)
+        plane = DataPlane(Models(decoder, loader=Loader(tracker_for)), source, observers=(kept,))
+        recalibrator = Recalibrator(plane)
+        server = stack.enter_context(LightpageServer(plane, recalibrator, "127.0.0.1:0"))
         client = stack.enter_context(LightpageClient(server.target))
         frames = source.shot(source.shot_s, 0).pair
         levels = decoder.page_codec.code.levels
@@ -66,16 +81,28 @@ def run_demo(
 
             return read_picture(client, volume, written, out / f"{name.replace(' ', '-')}.pgm", name, told)
 
-        fresh = read("as calibrated", 0.05, 0.3)
-        steps = drift_until_lost(client, drift, lambda: progress("drift", 0.3))
-        lost = read("after drift", 0.35, 0.6)
-        recalibrated = client.jobs.recalibrate(
-            pages=range(RECALIBRATION_PAGES),
-            progress=lambda step, share: progress(f"recalibrate: {step}", 0.6 + 0.15 * share),
-        )
-        again = read("recalibrated", 0.75, 1.0)
+        fresh = read("as calibrated", 0.05, 0.25)
+        steps = drift_in_steps(client, drift, lambda: progress("drift", 0.25))
+        lost = read("after drift", 0.3, 0.5)
+        healed = heal(recalibrator, kept, lambda step, share: progress(f"heal: {step}", 0.5 + 0.3 * share))
+        again = read("healed", 0.8, 1.0)
     progress("done", 1.0)
     code = decoder.page_codec.code
     shots = dict(source.shots_by_outcome())
     phases = (fresh, lost, again)
-    return DemoResult(phases, steps, recalibrated, frames, symbols, code, volume, seed, source.name, shots)
+    return DemoResult(phases, steps, healed, frames, symbols, code, volume, seed, source.name, shots)
+
+
+def heal(recalibrator: Recalibrator, kept: KeptPages, progress: Progress) -> RecalibrationOutcome:
+    """Recalibrate by the pages that were lost last, as a service does with `--self-calibrate`.
+
+    Raises:
+        RecalibrationRefusedError: too few of them come right.
+    """
+    pages = recalibrator.kept_pages(kept)
+    assert pages is not None  # all were lost, and each is kept
+    for told in recalibrator.follow(pages, Caller()):
+        if isinstance(told, RecalibrationOutcome):
+            return told
+        progress(told.name, told.fraction)
+    raise AssertionError("a job ends with its outcome")

@@ -1,4 +1,4 @@
-"""What the demo came to: its phases, the drift between them, and the recalibration."""
+"""What the demo came to: its phases, the drift between them, and the healing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lightpage.codec.code import Code
 from lightpage.codec.volume import Volume
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.archives.recordings.coded_pages import AIR_LEVELS
-from lightpage.runtime.client.answers import Recalibrated
+from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome
 
 Floats = NDArray[np.float64]
 
@@ -92,11 +92,11 @@ class DriftStep:
 
 @dataclass(frozen=True)
 class DemoResult:
-    """All of the demo: three phases, the drift and the recalibration between them, and one frame pair with its page."""
+    """All of the demo: three phases, the drift and the healing between them, and one frame pair with its page."""
 
     phases: tuple[Phase, ...]
     drift: tuple[DriftStep, ...]
-    recalibrated: Recalibrated
+    healed: RecalibrationOutcome
     frames: FramePair
     symbols: NDArray[np.uint8]
     code: Code
@@ -106,9 +106,23 @@ class DemoResult:
     shots: dict[str, int] = field(default_factory=dict)
     """Shots of the cameras by how they ended; empty without cameras."""
 
+    def story(self) -> tuple[str, str, str]:
+        """What happened, for people, in lines of some 120 characters."""
+        fresh, lost, again = (phase.air_bits_per_symbol for phase in self.phases)
+        margin, healed = self.phases[0].margin_bits, self.healed
+        spare = "" if margin is None else f" Their code has a margin of {margin:.2f} bit a symbol."
+        angle = healed.report.angle_deg
+        found = "" if angle is None else f" It found the pipe's angle: {angle:.3f} degree."
+        rounds = f"{healed.rounds} round{'' if healed.rounds == 1 else 's'}"
+        return (
+            f"A picture of {self.volume.file_bytes} bytes lies on {self.volume.pages} pages, one spoilt.{spare}",
+            f"The device drifts, AIR falls from {fresh:.2f} to {lost:.2f} bit a symbol, and no known page is shown.",
+            f"The model heals by lost pages of user data: {rounds}, AIR {again:.2f} again.{found}",
+        )
+
     def to_json(self) -> dict[str, Any]:
         """The figures under names that other programs read."""
-        recalibrated = self.recalibrated
+        healed = self.healed
         return {
             "seed": self.seed,
             "source": self.source,
@@ -120,15 +134,17 @@ class DemoResult:
             "volume": self.volume.to_json(),
             "phases": [phase.to_json() for phase in self.phases],
             "drift": [asdict(step) for step in self.drift],
-            "recalibration": {
-                "model_version": recalibrated.model_version,
-                "previous_version": recalibrated.previous_version,
-                "pages_used": recalibrated.pages_used,
-                "seconds": recalibrated.seconds,
-                "angle_deg": recalibrated.angle_deg,
-                "air_before": recalibrated.air_before,
-                "air_after": recalibrated.air_after,
-                "coherence_before": recalibrated.coherence_before,
-                "coherence_after": recalibrated.coherence_after,
+            "healing": {
+                "model_version": healed.version,
+                "previous_version": healed.previous_version,
+                "rounds": healed.rounds,
+                "pages_used": healed.pages_used,
+                "pages_held_back": healed.pages_held_back,
+                "seconds": healed.seconds,
+                "angle_deg": healed.report.angle_deg,
+                "air_before": healed.air_before,
+                "air_after": healed.air_after,
+                "coherence_before": healed.report.coherence_before,
+                "coherence_after": healed.report.coherence_after,
             },
         }

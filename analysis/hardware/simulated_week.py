@@ -8,31 +8,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from analysis.hardware.drifting import DriftingSource, TrueTable, direction, moved
+from analysis.hardware.drifting import DriftingSource, TrueTable, Untold, direction, light_of, moved, true_light
 from analysis.hardware.rows import Rows, append_row, kept_rows
 from analysis.hardware.watched_recalibrator import WatchedRecalibrator
-from lightpage.calibration.parameters import NAMES, as_dict, indices
 from lightpage.clock import Clock
 from lightpage.device.state import Device
 from lightpage.errors import FramesDisagreeError, LightpageError, LostPageError
 from lightpage.page.levels import Levels
-from lightpage.page.modulation import Modulation
 from lightpage.progress import track
 from lightpage.runtime.archives.recordings.coded_pages import air_bits
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.jobs.kept_pages import KeptPages
 from lightpage.runtime.service.jobs.self_calibration import SelfCalibration, SelfCalibrationSettings
 from lightpage.runtime.service.models.loader import Loader
 from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.models.store import Store
 from lightpage.runtime.service.monitoring.flight_recorder import FlightRecorder
 from lightpage.runtime.service.monitoring.monitor import Monitor
+from lightpage.runtime.service.monitoring.observation import Observer
 from lightpage.runtime.service.pages.reading import read_page
-from lightpage.simulator.true_optics import true_modulation, true_parameters
 
 PAGE_S = 300.0
 """Simulated time from one page to the next."""
@@ -52,6 +50,10 @@ KNOCK_PX, KNOCK_DEG = (2.0, -2.0), 0.02
 
 CALIBRATION_PAGES = (1_000_000, 1_000_001)
 """Numbers of the fully known pages, which nobody else reads."""
+_KEPT_BYTES = 1 << 29
+
+RANGE_PAGES = 12
+"""Pages of a range, an hour's; its lost ones are read once more where the service has recalibrated itself for them."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,7 @@ class Week:
         device: true state at the beginning.
         light: what drifts beside the geometry.
         true_every: pages from one that is read with the true table, too, to the next.
+        shown: whether fully known pages are shown to recalibrate by; else pages of user data serve.
     """
 
     out: Path
@@ -122,6 +125,7 @@ class Week:
     device: Device
     light: LightDrift
     true_every: int = 1
+    shown: bool = True
     rows: Rows = field(default_factory=list)
     moment: int = 0
 
@@ -141,11 +145,14 @@ class Week:
             store = stack.enter_context(Store(self.out / "models", base.bundle))
             models = Models(base, store, Loader(tracker_for))
             recorder = stack.enter_context(FlightRecorder(self.out / "flight", models, monitor=monitor))
-            plane = DataPlane(models, source, observers=[recorder], monitor=monitor)
+            kept = None if self.shown else KeptPages(_KEPT_BYTES)
+            observers: list[Observer] = [recorder] if kept is None else [recorder, Untold(kept)]
+            plane = DataPlane(models, source, observers=observers, monitor=monitor)
             watched = WatchedRecalibrator(plane)
             stack.callback(watched.close)
-            settings = SelfCalibrationSettings(pages=CALIBRATION_PAGES, busy_s=0.05)
-            stack.enter_context(SelfCalibration(plane, monitor, watched, settings, SimulatedClock(self)))
+            pages = CALIBRATION_PAGES if self.shown else ()
+            settings = SelfCalibrationSettings(enabled=True, pages=pages, busy_s=0.05)
+            stack.enter_context(SelfCalibration(plane, monitor, watched, settings, SimulatedClock(self), kept))
             begun = len(self.rows)
             numbers = track(range(begun, end), "week", total=end, done=begun)
             for number in numbers:
@@ -155,9 +162,25 @@ class Week:
                     source.knock(KNOCK_PX)
                 row = self._read(number, plane, monitor, source, true_table)
                 row |= {"restarted": number == begun > 0, "during": watched.running, "ended": watched.ended()}
+                row["again"] = [] if self.shown or (number + 1) % RANGE_PAGES else self._again([*self.rows, row], plane)
                 self.rows.append(row)
                 append_row(path, row)
                 watched.settle(monitor, self.pages_during)
+
+    def _again(self, rows: Rows, plane: DataPlane) -> list[int]:
+        """Read lost pages of the last range once more, as ReadData does; returns those that are read now."""
+        lost = [row for row in rows[-RANGE_PAGES:] if row["lost"]]
+        if not lost or plane.heal is None or not plane.heal(Caller(), lost[0]["version"]):
+            return []
+        read = list[int]()
+        for row in lost:
+            try:
+                data = read_page(plane, row["page"], None, Caller(), user_data=True).answer.user_data
+            except LightpageError:
+                continue
+            if data is not None and data.loss is None:
+                read.append(row["page"])
+        return read
 
     def _read(
         self, number: int, plane: DataPlane, monitor: Monitor, source: DriftingSource, true_table: TrueTable
@@ -190,13 +213,7 @@ class Week:
             "due": monitor.due,
             "reasons": list(monitor.state().reasons),
             "shots": source.shots,
-            "true": _light_of(true_parameters(bundle.profile, device), true_modulation(device.slm)),
-            "fitted": _light_of(bundle.calibration.vector, bundle.modulation),
+            "true": true_light(bundle.profile, device),
+            "fitted": light_of(bundle.calibration.vector, bundle.modulation),
         }
         return row
-
-
-def _light_of(parameters: NDArray[np.float64], modulation: Modulation) -> dict[str, float]:
-    """Return what `LightDrift` changes of a device, by name."""
-    names = [NAMES[index] for index in indices("axial")]
-    return {"stroke_relative": modulation.coefficients[0], **{name: as_dict(parameters)[name] for name in names}}

@@ -157,7 +157,7 @@ def evaluation(figures: Figures) -> Figures:
 
 def demo(figures: Figures) -> Figures:
     """Of `lightpage demo`."""
-    return {key: figures[key] for key in ("seed", "pages", "phases", "recalibration")}
+    return {key: figures[key] for key in ("seed", "pages", "phases", "healing")}
 
 
 def image_search(figures: Figures) -> Figures:

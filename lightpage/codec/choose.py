@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +44,8 @@ _PAGE_LOSS = 1e-3
 """Of a page whose upper bits Reed-Solomon does not mend: small beside the loss that the rate allows."""
 _UNSEEN = 3.0
 """Errors that may have been there where so many pages show none, with 95% confidence."""
+_SPREAD = 2
+"""Reed-Solomon symbols over which an upper number may spread."""
 _BISECTIONS = 7
 _LOWEST_RATE, _HIGHEST_RATE = 340, 960
 _LOWEST_RATE_OF_TWO_LEVELS = 460
@@ -74,6 +77,13 @@ Draw = Callable[[int, np.random.Generator], Sequence[DrawnPage]]
 """Draws every known page anew, at so many levels."""
 
 
+class Drift(NamedTuple):
+    """The same few pages as they are read, and as they are read of a device that has drifted."""
+
+    before: Draw
+    after: Draw
+
+
 @dataclass(frozen=True)
 class Choice:
     """A code with what was found of it.
@@ -84,6 +94,9 @@ class Choice:
         information: mean information of a coded bit.
         deviation: its standard deviation from page to page.
         upper_errors: mean wrong upper numbers of a page.
+        kept: information of a coded bit that was to be kept for drift.
+        spare: what the weakest page of a thousand carries of it beyond the need: `kept`, and what steps of the rate
+            leave.
     """
 
     code: Code
@@ -91,6 +104,8 @@ class Choice:
     information: float
     deviation: float
     upper_errors: float
+    kept: float
+    spare: float
 
     def line(self) -> str:
         """The choice for people."""
@@ -107,7 +122,12 @@ numbers of a page, corrections of a Reed-Solomon word, user bytes of a page."""
 
 
 def choose(
-    draw: Draw, air_bits: float, pilots: NDArray[np.bool_], headroom: float = HEADROOM, seed: int = 0
+    draw: Draw,
+    air_bits: float,
+    pilots: NDArray[np.bool_],
+    headroom: float = HEADROOM,
+    seed: int = 0,
+    drift: Drift | None = None,
 ) -> tuple[Choice, list[Choice]]:
     """The code that carries most, and the best of each level count.
 
@@ -117,6 +137,7 @@ def choose(
         pilots: bool [ny, nx].
         headroom: share of what a symbol carries that is kept for drift.
         seed: of what is drawn.
+        drift: that pages are to survive, where it costs more than that share.
 
     Raises:
         InvalidInputError: too few pages, or no code carries a page.
@@ -132,7 +153,7 @@ def choose(
         count = len(pages)
         if count < FEWEST_PAGES:
             raise InvalidInputError("pages to choose a code by", count, f"at least {FEWEST_PAGES}")
-        choice = _best_of(draw, pages, 1 << bits, pilots, headroom * air_bits, rng)
+        choice = _best_of(draw, pages, 1 << bits, pilots, headroom * air_bits, rng, drift)
         if choice is not None:
             tried.append(choice)
     if not tried:
@@ -151,19 +172,26 @@ def _best_of(
     pilots: NDArray[np.bool_],
     kept_bits: float,
     rng: np.random.Generator,
+    drift: Drift | None,
 ) -> Choice | None:
-    """The best code of a level count that leaves `kept_bits` of a symbol, None where none carries the pages."""
+    """The best code of a level count that leaves `kept_bits` of a symbol, or what a drift costs, whichever is more.
+
+    Returns:
+        None where no code carries the pages.
+    """
     bits = level_bits(levels)
     for coded in range(min(_CODED_BITS, bits), bits + 1):
         seen = [_information(page, coded) for page in pages]
         information, wrong = np.array([each[0] for each in seen]), np.array([each[1] for each in seen])
-        corrections = _corrections(wrong)
+        lost, more = (0.0, 0.0) if drift is None else _drift_costs(drift, levels, coded)
+        corrections = _corrections(_SPREAD * max((float(wrong.sum()) + _UNSEEN) / len(wrong), more))
         if corrections is not None:
             break
     else:
         return None
     deviation = float(information.std(ddof=1))
-    weakest = float(information.mean()) - tolerance_factor(len(pages)) * deviation - kept_bits / coded
+    kept = max(kept_bits / coded, lost)
+    weakest = float(information.mean()) - tolerance_factor(len(pages)) * deviation - kept
     lowest = _LOWEST_RATE_OF_TWO_LEVELS if levels == MIN_LEVELS else _LOWEST_RATE
     rate, tried = min(_HIGHEST_RATE, _stepped(weakest - _FIRST_GAP)), 0
     while True:  # the gap to the code's limit changes little with the rate
@@ -176,11 +204,39 @@ def _best_of(
             rate = min(rate - _RATE_STEP, _stepped(weakest - (needed - rate / 1000)))
             continue
         code = Code(**{**code.model_dump(), "needed_information": needed})
-        if _all_decode(draw, code, pilots, rng):
+        if all(_all_decode(each, code, pilots, rng) for each in (draw, *([drift.after] if drift else []))):
             break
         rate -= 2 * _RATE_STEP
     user_bytes = PageCodec(code, pilots).user_bytes
-    return Choice(code, user_bytes, float(information.mean()), deviation, float(wrong.mean()))
+    spare = weakest + kept - needed
+    return Choice(code, user_bytes, float(information.mean()), deviation, float(wrong.mean()), kept, spare)
+
+
+def survives(choice: Choice, drift: Drift, pilots: NDArray[np.bool_]) -> tuple[bool, float]:
+    """Whether the weakest page of a thousand is still read after a drift, as far as a few pages can say; what it costs.
+
+    The cost is information of a coded bit: `Choice.spare` of it may go.
+    """
+    code = choice.code
+    cost, wrong = _drift_costs(drift, code.levels, code.coded_bits)
+    mended = poisson.sf(code.corrections, _SPREAD * wrong) <= _PAGE_LOSS
+    read = cost <= choice.spare and mended and _all_decode(drift.after, code, pilots, np.random.default_rng(0))
+    return bool(read), cost
+
+
+def bytes_without_headroom(choice: Choice, pilots: NDArray[np.bool_]) -> int:
+    """User bytes of a page, about, if nothing were kept for drift: the gap to a code's limit changes little."""
+    rate = min(_HIGHEST_RATE, choice.code.rate_per_mille + _stepped(choice.kept))
+    return PageCodec(choice.code.model_copy(update={"rate_per_mille": rate}), pilots).user_bytes
+
+
+def _drift_costs(drift: Drift, levels: int, coded: int) -> tuple[float, float]:
+    """Information of a coded bit that a drift costs, and how many upper numbers of a page are wrong after it."""
+    before, after = (
+        np.mean([_information(page, coded) for page in draw(levels, np.random.default_rng(levels))], axis=0)
+        for draw in drift  # the same symbols: what is left is the drift
+    )
+    return float(before[0] - after[0]), float(after[1])
 
 
 def tolerance_factor(count: int) -> float:
@@ -210,9 +266,8 @@ def _information(page: DrawnPage, coded: int) -> tuple[float, int]:
     return bit_information(llrs, label), int(np.count_nonzero(wrong))
 
 
-def _corrections(wrong: NDArray[np.int64]) -> int | None:
-    """Corrections that a page needs; None where no word has so many. An upper number may spread over two symbols."""
-    expected = 2 * (float(wrong.sum()) + _UNSEEN) / len(wrong)
+def _corrections(expected: float) -> int | None:
+    """Corrections that a page of so many errors needs; None where no word has so many."""
     # a word of a large page has only its share of them; counting all of them is on the safe side
     return next((t for t in _CORRECTIONS if poisson.sf(t, expected) <= _PAGE_LOSS), None)
 

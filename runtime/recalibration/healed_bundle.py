@@ -55,7 +55,7 @@ def recalibrate_by_lost(
         return healed.result
 
     outcome = recalibrate(decoder, healed.known, out, version, fitted, judging, tracker)
-    return replace(outcome, seconds=outcome.seconds + healed.seconds)
+    return replace(outcome, seconds=outcome.seconds + healed.seconds, rounds=healed.rounds)
 
 
 def recalibrate_by_recording(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.goodness.light import SeenLight
-from lightpage.calibration.goodness.suspects import LEVELS, NEIGHBOURS, likeliest
+from lightpage.calibration.goodness.suspects import LEVELS, NEIGHBOURS, likeliest, unlike_profile
 from lightpage.calibration.goodness.verdict import GOOD, USABLE, Goodness, Map
 from lightpage.calibration.interfaces import Twin
 from lightpage.errors import CalibrationError
@@ -84,13 +84,14 @@ def measure_goodness(
     noise = frames + amount * modulator
     wrong = unexplained + by_level + by_neighbours
     lost = float(np.log2(1 + wrong / (noise[1] + _OWN_ERROR_RAD**2))) / 2
-    cause = ""
-    if lost >= GOOD:
+    cause = unlike_profile(device.parameters)
+    good = lost < GOOD and not cause
+    if lost >= GOOD and not cause:
         shares = {LEVELS: by_level, NEIGHBOURS: by_neighbours}
         told = max(shares, key=lambda words: shares[words])
         cause = told if shares[told] > wrong / 2 else likeliest(light, errors)
     return Goodness(
-        verdict="good" if lost < GOOD else "usable" if lost < USABLE else "wrong",
+        verdict="good" if good else "usable" if lost < USABLE else "wrong",
         bits_lost=lost,
         unexplained_relative=2 * unexplained + by_level + by_neighbours,
         noise_relative=float(noise.sum()),

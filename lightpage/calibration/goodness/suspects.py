@@ -9,6 +9,7 @@ import scipy
 from numpy.typing import NDArray
 
 from lightpage.calibration.goodness.light import SeenLight, places_on_facet, radius2
+from lightpage.calibration.parameters import NAMES, PRIORS, indices
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
@@ -24,10 +25,24 @@ _FOREIGN = 0.1
 """Mean square of the symbols' relative errors from which on light belongs to other symbols."""
 _TELLING = 0.2
 """Share of the unexplained light from which on a correction of the model is called the likeliest cause."""
-
+_UNLIKELY = 8.0
+"""Standard deviations of the prior from which on a length is another one than the profile states."""
 
 LEVELS = "levels whose phases no smooth curve tells: is the modulator's lookup table right?"
 NEIGHBOURS = "phases that go with those of the symbols beside: is there crosstalk between the modulator's pixels?"
+
+
+def unlike_profile(parameters: Real) -> str:
+    """Which length of a fitted device [P] lies so far off that its profile is of another one, in words; or none.
+
+    Light that such a fit explains may be read all the same.
+    """
+    off = {index: abs(parameters[index]) / PRIORS[index] for index in indices("lengths")}
+    furthest = max(off, key=lambda index: off[index])
+    if off[furthest] < _UNLIKELY:
+        return ""
+    name = NAMES[furthest].removesuffix("_relative").replace("_", " ")
+    return f"a {name} {parameters[furthest]:+.1%} off the profile's: is this the device's profile?"
 
 
 def likeliest(light: SeenLight, errors: Complex) -> str:

@@ -20,7 +20,7 @@ class Goodness(TomlTable):
     """How well a fit explains the light of a known page.
 
     Attributes:
-        verdict: good, usable or wrong, by `bits_lost`.
+        verdict: good, usable or wrong, by `bits_lost`; a device whose lengths are not its profile's is not good.
         bits_lost: bits a symbol that the standard decoder loses against one whose model explains all light, estimated.
         unexplained_relative: power of what a better model would explain, over the signal's, symbol by symbol.
         noise_relative: power of all noise, over the signal's: that of the frames and that of the modulator.

@@ -194,6 +194,7 @@ class WaveFit:
         of_light = [index for index in indices(*groups) if index not in (*SEEN_BY_CAMERAS, *without_effect)]
         of_cameras = [index for index in indices(*groups) if index in SEEN_BY_CAMERAS]
         free = of_light + of_cameras
+        bends = "launch" not in groups
         precision = 1 / (PRIORS * prior_scale)[free] ** 2
         centre = np.zeros(len(PARAMETERS)) if centre is None else centre
         state = self._start(start, quadrature_phase, modulation)
@@ -208,7 +209,7 @@ class WaveFit:
             if slopes is None or residual < (1 - _STALE) * taken_at:
                 told, taken_at = partial(_within_round, progress, number), residual
                 slopes = self._slopes(state, of_light, of_cameras, told, levels=levels is not None)
-            directions = _directions(state.light, bends="launch" not in groups)
+            directions = _directions(state.light, bends=bends)
             columns = self._columns(state, fields, slopes, directions)
             # What is unexplained differs from symbol to symbol, so equations tell no more than symbols do.
             variance = residual**2 * max(1.0, len(left) / (2 * self._symbols))
@@ -236,7 +237,7 @@ class WaveFit:
                 tuple(known[fitted_levels].tolist()) if levels else best.modulation_deviations,
                 state.light,
             )
-            state = self._moved(state, covariance @ pull, directions, fitted_levels, free)
+            state = self._moved(state, covariance @ pull, directions, fitted_levels, free, bends=bends)
         return best if levels is None else _told_apart(best, levels.centre)
 
     def _waves(self, parameters: Real) -> FittedWaves:
@@ -361,8 +362,10 @@ class WaveFit:
             columns.append(np.stack(mine, axis=1))
         return np.concatenate(columns)
 
-    def _moved(self, state: _State, step: Real, directions: Complex, levels: slice, free: list[int]) -> _State:
-        """The state after a step, shortened where it would move a camera too far."""
+    def _moved(
+        self, state: _State, step: Real, directions: Complex, levels: slice, free: list[int], *, bends: bool
+    ) -> _State:
+        """The state after a step, shortened where it would move a camera too far; `bends` as for `_directions`."""
         change = np.zeros(len(PARAMETERS))
         change[free] = step[levels.stop :]
         by_level = step[levels] if levels.start < levels.stop else 0.0
@@ -370,10 +373,11 @@ class WaveFit:
         seen = [self._twin.pixels(at, few) for at in (state.parameters, state.parameters + change)]
         furthest = float(np.sqrt(np.mean(np.sum((seen[1] - seen[0]) ** 2, axis=-1), axis=-1)).max())
         share = min(1.0, _LARGEST_MOVE_PX / max(furthest, 1e-9))
+        light = state.light + share * step[: len(directions)] @ directions
         return _State(
             state.parameters + share * change,
             state.quadrature_phase + share * float(step[len(directions)]),
-            state.light + share * step[: len(directions)] @ directions,
+            light if bends else _of_one_phase(light),
             state.levels + share * by_level,
         )
 
@@ -389,6 +393,12 @@ def _directions(light: Complex, *, bends: bool) -> Complex:
     if bends:
         return np.concatenate([terms, 1j * terms])
     return np.concatenate([light[0] / abs(light[0]) * terms, 1j * light[None]])
+
+
+def _of_one_phase(light: Complex) -> Complex:
+    """An illumination without what bends the page's phases: a long step turns its even term away from the others."""
+    phasor = light[0] / abs(light[0])
+    return np.asarray(phasor * (light / phasor).real)
 
 
 def _told_apart(found: WaveFitted, usual: Modulation) -> WaveFitted:

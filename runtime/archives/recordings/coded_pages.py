@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.codec.choose import HEADROOM, Choice, DrawnPage, choose
+from lightpage.codec.choose import HEADROOM, Choice, DrawnPage, Drift, choose
 from lightpage.metrics.information import achievable_rate
 from lightpage.page.levels import Levels
 from lightpage.page.pilots import Pilots, remove_piston
@@ -36,8 +37,60 @@ def air_bits(page: DecodedPage, symbols: NDArray[np.uint8], data: NDArray[np.boo
     return float(rates.mean())
 
 
+@dataclass(frozen=True)
+class SeenPages:
+    """Known pages as a decoder reads them, from which pages of any symbols are drawn.
+
+    Attributes:
+        decoder: that read them.
+        mask: where their pilots are, [ny, nx].
+        errors: see `phase_errors`, a page each.
+        concentrations: kappa, [ny, nx], a page each.
+    """
+
+    decoder: Decoder
+    mask: NDArray[np.bool_]
+    errors: Sequence[NDArray[np.float32]]
+    concentrations: Sequence[NDArray[np.float32]]
+
+    @classmethod
+    def of(
+        cls,
+        decoder: Decoder,
+        recording: Recording,
+        pages: Iterable[tuple[DecodedPage, NDArray[np.uint8]]],
+    ) -> SeenPages:
+        """Take decoded pages of a recording with their symbols."""
+        levels = decoder.bundle.levels(recording.levels)
+        read = [(phase_errors(page, symbols, levels), page.concentration) for page, symbols in pages]
+        errors, concentrations = zip(*read, strict=True) if read else ((), ())
+        return cls(decoder, pilots_of(decoder, recording), errors, concentrations)
+
+    @property
+    def air_bits(self) -> float:
+        """AIR of the pages, bits a data symbol; 1 where there are none."""
+        data = ~self.mask
+        rates = [
+            achievable_rate(error[data], kappa[data], np.zeros(int(data.sum()), np.int64), AIR_LEVELS).mean()
+            for error, kappa in zip(self.errors, self.concentrations, strict=True)
+        ]
+        return float(np.mean(rates)) if rates else 1.0
+
+    def draw(self, levels: int, rng: np.random.Generator) -> Sequence[DrawnPage]:
+        """See `lightpage.codec.choose.Draw`."""
+        pages, mask, data = list[DrawnPage](), self.mask, ~self.mask
+        shown = self.decoder.bundle.levels(levels)
+        for error, kappa in zip(self.errors, self.concentrations, strict=True):
+            symbols = rng.integers(0, levels, mask.shape, dtype=np.int64).astype(np.uint8)
+            phase = symbol_phases(symbols, shown) + error
+            pilots = Pilots.of_symbols(mask, symbols, shown)
+            phase = phase - self.decoder.phase_refit.error(phase, kappa, shown, pilots)
+            pages.append(DrawnPage(phase[data], kappa[data].astype(np.float64), symbols[data], shown))
+        return pages
+
+
 def choose_code(
-    decoder: Decoder, recording: Recording, tracker: Tracker, headroom: float = HEADROOM
+    decoder: Decoder, recording: Recording, tracker: Tracker, headroom: float = HEADROOM, drift: Drift | None = None
 ) -> tuple[Choice, list[Choice]]:
     """Choose a code by the pages of a recording that the bundle has not seen.
 
@@ -45,7 +98,7 @@ def choose_code(
         decoder: of the device.
         recording: with known symbols.
         tracker: follows the device from page to page.
-        headroom: see `lightpage.codec.choose.choose`.
+        headroom, drift: see `lightpage.codec.choose.choose`.
 
     Raises:
         RecordingError: another device's recording, or one without symbols.
@@ -53,31 +106,10 @@ def choose_code(
     """
     check_recording(decoder, recording)
     check_symbols(recording, "choose a code by")
-    levels, mask = decoder.bundle.levels(recording.levels), pilots_of(decoder, recording)
-    errors: list[NDArray[np.float32]] = []
-    concentrations: list[NDArray[np.float32]] = []
     refused: list[RefusedPage] = []
-    for page, symbols in unseen_pages(decoder, recording, tracker, "choose a code", refused):
-        errors.append(phase_errors(page, symbols, levels))  # a page that is lost to the optics is lost to every code
-        concentrations.append(page.concentration)
+    # a page that is lost to the optics is lost to every code
+    seen = SeenPages.of(decoder, recording, unseen_pages(decoder, recording, tracker, "choose a code", refused))
     if refused:
         lost = refusal(f"recording {recording.path}", refused, recording.pages)
         warn(f"{lost.subject}: {lost.got}; they do not count")
-    data = ~mask
-    rates = [
-        achievable_rate(error[data], kappa[data], np.zeros(int(data.sum()), np.int64), AIR_LEVELS).mean()
-        for error, kappa in zip(errors, concentrations, strict=True)
-    ]
-
-    def draw(levels: int, rng: np.random.Generator) -> Sequence[DrawnPage]:
-        pages = []
-        for error, kappa in zip(errors, concentrations, strict=True):
-            shown = decoder.bundle.levels(levels)
-            symbols = rng.integers(0, levels, mask.shape, dtype=np.int64).astype(np.uint8)
-            phase = symbol_phases(symbols, shown) + error
-            pilots = Pilots.of_symbols(mask, symbols, shown)
-            phase = phase - decoder.phase_refit.error(phase, kappa, shown, pilots)
-            pages.append(DrawnPage(phase[data], kappa[data].astype(np.float64), symbols[data], shown))
-        return pages
-
-    return choose(draw, float(np.mean(rates)) if rates else 1.0, mask, headroom)
+    return choose(seen.draw, seen.air_bits, seen.mask, headroom, drift=drift)

@@ -8,14 +8,20 @@ from pathlib import Path
 import click
 
 from lightpage.cli.paths import NewPath, OutputFile
-from lightpage.codec.choose import HEADER, HEADROOM
-from lightpage.errors import InvalidInputError
+from lightpage.codec.choose import HEADER, HEADROOM, bytes_without_headroom
+from lightpage.errors import BundleError, CalibrationError, InvalidInputError
 from lightpage.files import write_json
+from lightpage.progress import note
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.coded_pages import choose_code
+from lightpage.runtime.archives.recordings.evaluation import pilots_of
+from lightpage.runtime.archives.recordings.survived_drift import KINDS, DriftedReading
 from lightpage.runtime.commands.execution import Load, decoder_options
 from lightpage.runtime.model.bundle.bundle import write_bundle
+from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
+
+_UNITS = ", ".join(f"{name} ({kind.unit})" for name, kind in KINDS.items())
 
 
 @click.command()
@@ -31,6 +37,14 @@ from lightpage.runtime.model.decoding.image_tracker import tracker_for
     show_default=True,
     help="Share of what a symbol carries that is kept for drift.",
 )
+@click.option(
+    "--survive",
+    "drifts",
+    multiple=True,
+    type=(click.Choice(list(KINDS)), click.FloatRange(min=0)),
+    metavar="KIND AMOUNT",
+    help=f"Keep as much as this drift costs, where that is more; several come together. Kinds: {_UNITS}.",
+)
 @click.option("--json", "json_path", type=OutputFile(), help="Write the choices to this file.")
 def code(
     load: Load,
@@ -39,25 +53,57 @@ def code(
     out_bundle: Path | None,
     version: str | None,
     headroom: float,
+    drifts: tuple[tuple[str, float], ...],
     json_path: Path | None,
 ) -> None:
     """Choose levels and rate of a device's page code by pages of a recording that the bundle has not seen.
 
     The rate is the one that 999 of 1,000 pages still carry, as far as these pages can say: more pages, a higher rate.
+    Says what is kept for drift, what that costs, and how much drift of each kind pages survive.
     """
     if out is None and out_bundle is None:
         raise InvalidInputError("options", "neither --out nor --out-bundle", "at least one of them")
     if (version is None) != (out_bundle is None):
         raise InvalidInputError("options", "one of --out-bundle and --version", "both or neither")
-    decoder = load()
+    decoder, asked = load(), dict(drifts)
     with Recording.open(recording) as pages:
-        best, tried = choose_code(decoder, pages, tracker_for(decoder), headroom)
+        reading = _drifted_reading(decoder, pages, needed=bool(asked))
+        drift = reading.drifted(asked) if reading and asked else None
+        if asked and drift is None:
+            raise InvalidInputError("--survive", asked, "less drift: by this one pages are lost whatever their code")
+        best, tried = choose_code(decoder, pages, tracker_for(decoder), headroom, drift)
+        survived = {} if reading is None else reading.survived(best, asked)
+        without = bytes_without_headroom(best, pilots_of(decoder, pages))
     if out is not None:
         best.code.save(out)
     if out_bundle is not None:
         manifest = decoder.bundle.manifest.model_copy(update={"code": best.code.to_toml(), "version": version})
         write_bundle(out_bundle, manifest, decoder.bundle.files)
-    choices = [asdict(choice) | {"code": choice.code.model_dump()} for choice in tried]
-    write_json(json_path, {"code": best.code.model_dump(), "user_bytes_per_page": best.user_bytes, "tried": choices})
+    kept_bits = best.kept * best.code.coded_bits
+    figures = {
+        "code": best.code.model_dump(),
+        "user_bytes_per_page": best.user_bytes,
+        "headroom_bits_per_symbol": kept_bits,
+        "user_bytes_per_page_without_headroom": without,
+        "survive": asked,
+        "drift_survived": survived,
+        "tried": [asdict(choice) | {"code": choice.code.model_dump()} for choice in tried],
+    }
+    write_json(json_path, figures)
     click.echo("\n".join([HEADER, *(choice.line() for choice in tried)]))
     click.echo(f"{best.code.describe()}: {best.user_bytes} user bytes a page")
+    click.echo(f"kept for drift: {kept_bits:.3f} bit a symbol; without, a page would hold about {without} bytes")
+    for name, amount in survived.items():
+        kind = KINDS[name]
+        click.echo(f"survives: {kind.told} off by {amount:.2g} {kind.unit}")
+
+
+def _drifted_reading(decoder: Decoder, recording: Recording, needed: bool) -> DriftedReading | None:
+    """What reads pages as of a drifted device; None where a decoder's geometry cannot be moved, unless it is needed."""
+    try:
+        return DriftedReading(decoder, recording)
+    except (BundleError, CalibrationError) as error:
+        if needed:
+            raise
+        note(f"drift: not measured, since {error}")
+        return None

@@ -30,7 +30,7 @@ from lightpage.runtime.model.bundle.shipped import bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.healed_bundle import recalibrate_by_recording
 from lightpage.runtime.recalibration.known_pages import read_recorded
-from lightpage.runtime.recalibration.recalibration import next_version
+from lightpage.runtime.recalibration.recalibration import RefitReport, next_version
 from lightpage.runtime.recalibration.refit import refit
 from lightpage.runtime.service.jobs.messages import result_message
 
@@ -82,7 +82,7 @@ def recalibrate(
     recalibration of a service ends with this command, unless it is told to --detach; `lightpage jobs` then tells how it
     goes.
     """
-    start = time.perf_counter()
+    start, report = time.perf_counter(), RefitReport()
     if target is not None:
         if bundle or out or version is not None:
             raise InvalidInputError("--target", "with --bundle, --out or --version", "either a service or a bundle")
@@ -105,8 +105,10 @@ def recalibrate(
             given = {"--bundle": bundle, "--recording": recording, "--out": out}
             lacking = ", ".join(name for name, value in given.items() if not value)
             raise InvalidInputError("options", f"no {lacking}", f"{', '.join(given)}, or --target")
-        result = _offline(bundle, recording, out, pages, version)
+        result, report = _offline(bundle, recording, out, pages, version)
     data = summary(result, time.perf_counter() - start)
+    if (goodness := report.goodness) is not None:
+        data |= {"verdict": goodness.verdict, "bits_lost": goodness.bits_lost, "cause": goodness.cause or None}
     write_json(json_path, data)
     click.echo(table(data))
 
@@ -172,7 +174,10 @@ def _start(client: LightpageClient, recording: str | None, pages: int, send: boo
     )
 
 
-def _offline(bundle: str, recording: str, out: Path, pages: int, version: str | None) -> Recalibrated:
+def _offline(
+    bundle: str, recording: str, out: Path, pages: int, version: str | None
+) -> tuple[Recalibrated, RefitReport]:
+    """What came of it, and what the fit says of itself."""
     if out.exists():
         raise InvalidInputError(f"--out {out}", "something that exists", "a new path: bundles are never overwritten")
     if version is not None:
@@ -184,7 +189,7 @@ def _offline(bundle: str, recording: str, out: Path, pages: int, version: str | 
         outcome = recalibrate_by_recording(
             decoder, file, pages, lambda: code_of(file, decoder.bundle), out, new, refit, progress
         )
-    return answer_of(Recalibrated, result_message(outcome))
+    return answer_of(Recalibrated, result_message(outcome)), outcome.report
 
 
 @click.command()

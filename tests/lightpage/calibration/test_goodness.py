@@ -10,6 +10,7 @@ import pytest
 from lightpage.calibration.goodness.frame_noise import noise_variance, with_more_noise
 from lightpage.calibration.goodness.measure import measure_goodness
 from lightpage.calibration.goodness.verdict import Goodness
+from lightpage.calibration.parameters import NAMES
 from lightpage.calibration.waves.wave_fit import LevelPrior, WaveFit
 from lightpage.device.state import Device
 from lightpage.page.symbols import symbol_phases
@@ -23,8 +24,11 @@ TWIN = TorchTwin(RayTwin(PROFILE))
 STILL = ("drift.shift_px=0",)
 
 
-def goodness_of(*settings: str, wrong_symbols: float = 0.0) -> Goodness:
-    """Of a device as a calibration would find it that knows all but what it has no parameter for."""
+def goodness_of(*settings: str, wrong_symbols: float = 0.0, stated: float = 1.0) -> Goodness:
+    """Of a device as a calibration would find it that knows all but what it has no parameter for.
+
+    Its profile states `stated` times the pipe's length.
+    """
     device = Device().with_settings([*STILL, *settings])
     simulator = Simulator(PROFILE, device, seed=3)
     rng = np.random.default_rng(3)
@@ -42,7 +46,12 @@ def goodness_of(*settings: str, wrong_symbols: float = 0.0) -> Goodness:
         levels=LevelPrior(),
     )
     assert lit.illumination is not None
-    return measure_goodness(TWIN, replace(known, modulation=lit.modulation), lit.illumination, pair, told)
+    pipe, parameters = PROFILE.pipe, known.parameters.copy()
+    profile = PROFILE.model_copy(update={"pipe": pipe.model_copy(update={"length_m": stated * pipe.length_m})})
+    length = NAMES.index("pipe_length_relative")
+    parameters[length] = (1 + parameters[length]) / stated - 1
+    fitted = replace(known, profile=profile, parameters=parameters, modulation=lit.modulation)
+    return measure_goodness(TWIN, fitted, lit.illumination, pair, told)
 
 
 @pytest.mark.parametrize("settings", [(), ("slm.phase_noise_rad=0.3",), ("sensor.full_well_e=1000", "slm.blur_px=0.5")])
@@ -50,6 +59,13 @@ def test_a_right_fit_is_good_whatever_the_noise(settings: tuple[str, ...]) -> No
     found = goodness_of(*settings)
     assert (found.verdict, found.cause) == ("good", "")
     assert np.median(found.by_page) == pytest.approx(1, abs=0.35)
+
+
+def test_a_device_whose_profile_is_of_another_one_is_not_good_though_all_light_is_explained() -> None:
+    found = goodness_of(stated=1.2)
+    assert (found.verdict, found.bits_lost) == ("usable", pytest.approx(goodness_of().bits_lost, abs=0.01))
+    assert "pipe length -16.7%" in found.cause
+    assert goodness_of(stated=1.002).verdict == "good"
 
 
 def test_the_modulators_noise_is_told_from_light_that_nothing_explains() -> None:

@@ -6,7 +6,16 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from lightpage.codec.choose import Choice, DrawnPage, choose, needed_information
+from lightpage.codec.choose import (
+    Choice,
+    Draw,
+    DrawnPage,
+    Drift,
+    bytes_without_headroom,
+    choose,
+    needed_information,
+    survives,
+)
 from lightpage.codec.page_codec import PageCodec
 from lightpage.page.levels import Levels
 from lightpage.page.symbols import symbol_phases
@@ -27,13 +36,25 @@ def light(
     return symbol_phases(symbols, levels) + error, np.where(lost, 0.01, kappa)
 
 
-def choose_by(pages: int, kappa: float, lost_share: float, air_bits: float) -> tuple[Choice, list[Choice]]:
+def drawn_by(pages: int, kappa: float, lost_share: float = 0.0, claimed: float = 1.0) -> Draw:
+    """Draws pages, whose concentrations claim so many times what is true."""
+
     def draw(levels: int, rng: np.random.Generator) -> Sequence[DrawnPage]:
         count = int(np.count_nonzero(~PILOTS))
         drawn = [rng.integers(0, levels, count).astype(np.uint8) for _ in range(pages)]
-        return [DrawnPage(*light(each, levels, kappa, lost_share, rng), each, Levels(levels)) for each in drawn]
+        shown = [light(each, levels, kappa, lost_share, rng) for each in drawn]
+        return [
+            DrawnPage(phase, claimed * kappas, each, Levels(levels))
+            for (phase, kappas), each in zip(shown, drawn, strict=True)
+        ]
 
-    return choose(draw, air_bits, PILOTS)
+    return draw
+
+
+def choose_by(
+    pages: int, kappa: float, lost_share: float, air_bits: float, drift: Drift | None = None
+) -> tuple[Choice, list[Choice]]:
+    return choose(drawn_by(pages, kappa, lost_share), air_bits, PILOTS, drift=drift)
 
 
 @pytest.mark.parametrize(("lost_share", "some_in_cosets"), [(0.0, True), (0.02, False)])
@@ -67,3 +88,15 @@ def test_pages_that_nothing_carries_are_refused_with_what_they_were() -> None:
 def test_two_pages_are_too_few() -> None:
     with refused(got=2):
         choose_by(2, KAPPA, 0.0, 4.0)
+
+
+def test_a_code_survives_the_drift_that_it_was_chosen_for_and_says_what_that_costs() -> None:
+    before = drawn_by(3, KAPPA)
+    little, much = (Drift(before, drawn_by(3, KAPPA / more, claimed=more)) for more in (1.1, 1.4))
+    plain, _ = choose_by(3, KAPPA, 0.0, 4.2)
+    sure, _ = choose_by(3, KAPPA, 0.0, 4.2, drift=much)
+    assert [survives(plain, drift, PILOTS)[0] for drift in (little, much)] == [True, False]
+    assert [survives(sure, drift, PILOTS)[0] for drift in (little, much)] == [True, True]
+    assert survives(plain, little, PILOTS)[1] < plain.spare < survives(plain, much, PILOTS)[1] < sure.spare
+    assert sure.user_bytes < plain.user_bytes
+    assert bytes_without_headroom(sure, PILOTS) > sure.user_bytes
