@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from contextlib import suppress
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import click
@@ -57,6 +58,11 @@ DEFAULT_PAGES = 2
 @click.option("--version", help="Offline: version of the new bundle; by default the next one.")
 @click.option("--send", is_flag=True, help="With --target: --recording is a file here, whose frames are sent.")
 @click.option("--detach", is_flag=True, help="With --target: print the job's id and leave it to itself.")
+@click.option(
+    "--other-device",
+    is_flag=True,
+    help="Offline: the recording is of another device than the bundle's, its pages are of user data.",
+)
 @click.option("--json", "json_path", type=OutputFile(), help="Write the result to this file.")
 def recalibrate(
     bundle: str | None,
@@ -69,6 +75,7 @@ def recalibrate(
     version: str | None,
     send: bool,
     detach: bool,
+    other_device: bool,
     json_path: Path | None,
 ) -> None:
     """Re-fit the geometry of a drifted device from known pages; keep it unless it reads less than the one in use.
@@ -81,11 +88,15 @@ def recalibrate(
     service's source or, with --recording, from a file in its recordings folder, or with --send from a file here. The
     recalibration of a service ends with this command, unless it is told to --detach; `lightpage jobs` then tells how it
     goes.
+
+    With --other-device, an archive is read on a drive that was never calibrated: its geometry is found from nominal, by
+    the pilots of the first eight pages, and then healed by the pages themselves.
     """
     start = time.perf_counter()
     if target is not None:
-        if bundle or out or version is not None:
-            raise InvalidInputError("--target", "with --bundle, --out or --version", "either a service or a bundle")
+        if bundle or out or version is not None or other_device:
+            got = "with --bundle, --out, --version or --other-device"
+            raise InvalidInputError("--target", got, "either a service or a bundle")
         if send and recording is None:
             raise InvalidInputError("--send", "without --recording", "a file whose frames are sent")
         wait_s = RECALIBRATION_S if timeout_s is None else timeout_s
@@ -105,7 +116,7 @@ def recalibrate(
             given = {"--bundle": bundle, "--recording": recording, "--out": out}
             lacking = ", ".join(name for name, value in given.items() if not value)
             raise InvalidInputError("options", f"no {lacking}", f"{', '.join(given)}, or --target")
-        result = _offline(bundle, recording, out, pages, version)
+        result = _offline(bundle, recording, out, pages, version, other_device=other_device)
     data = summary(result, time.perf_counter() - start)
     write_json(json_path, data)
     click.echo(table(data))
@@ -172,7 +183,9 @@ def _start(client: LightpageClient, recording: str | None, pages: int, send: boo
     )
 
 
-def _offline(bundle: str, recording: str, out: Path, pages: int, version: str | None) -> Recalibrated:
+def _offline(
+    bundle: str, recording: str, out: Path, pages: int, version: str | None, *, other_device: bool
+) -> Recalibrated:
     if out.exists():
         raise InvalidInputError(f"--out {out}", "something that exists", "a new path: bundles are never overwritten")
     if version is not None:
@@ -181,8 +194,9 @@ def _offline(bundle: str, recording: str, out: Path, pages: int, version: str | 
     with percent_bar() as progress, Recording.open(recording) as file:
         check_recording(decoder, file)
         new = next_version(decoder.version) if version is None else version
+        code = partial(code_of, file, decoder.bundle)
         outcome = recalibrate_by_recording(
-            decoder, file, pages, lambda: code_of(file, decoder.bundle), out, new, refit, progress
+            decoder, file, pages, code, out, new, refit, progress, other_device=other_device
         )
     return answer_of(Recalibrated, result_message(outcome))
 
