@@ -19,7 +19,7 @@ from lightpage.calibration.image_search import FALSE_ALARMS
 from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.parameters import NAMES, PARAMETERS, PRIORS, indices, nominal
 from lightpage.calibration.patches import search_window
-from lightpage.calibration.unknown_pages.pilot_light import PilotLight, nats, told_nats
+from lightpage.calibration.unknown_pages.pilot_light import PilotLight, nats, told_nats, told_slope
 from lightpage.device.profile import Profile
 from lightpage.errors import CalibrationError
 from lightpage.page.pilots import Pilots
@@ -27,6 +27,7 @@ from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
 
 Real = NDArray[np.float64]
+Complex = NDArray[np.complexfloating]
 
 _REACH_PX, _STEP_PX = 36.0, 3.0
 """How far the image is looked for, and by which steps: the light's correlation falls to half within 3."""
@@ -154,7 +155,7 @@ class _Search:
         told = []
         for number, shift in enumerate(window):
             tell(number / len(window))
-            light = self._light.seen(nominal(), _BRANCHES[:1], shift[None])[0, :, :, 0]
+            light = self._light.seen(nominal(), _BRANCHES[:1], tuple(shift))[:, :, 0]
             light /= np.maximum(np.linalg.norm(light, axis=-1, keepdims=True), 1e-30)
             told.append(nats(np.abs(light.astype(np.complex64) @ sloping) ** 2, len(shares)).sum(axis=1))
         by_shift = np.stack(told)  # [shifts, cameras, slopes]
@@ -191,7 +192,7 @@ class _Search:
 
     def with_turn(self, geometry: _Geometry) -> _Geometry:
         """On which side the quadrature arm is: the cameras' phases of the same light tell."""
-        light = self._light.seen(geometry.parameters, _BRANCHES[:2])[0]
+        light = self._light.seen(geometry.parameters, _BRANCHES[:2])
         pages = np.sum(light * self._light.shares(geometry.parameters, _BRANCHES[:2]), axis=(-2, -1))
         return geometry._replace(side=float(np.sign(np.sum(pages[0] * pages[1].conj()).imag)))
 
@@ -204,7 +205,7 @@ class _Search:
             there = geometry.parameters.copy()
             there[_ANGLE] = angle
             tried.append(geometry._replace(parameters=there))
-        return max(tried, key=lambda one: self._worth(one, _BRANCHES))
+        return max(tried, key=self._worth)
 
     def fitted(
         self, what: str, start: _Geometry, groups: tuple[str, ...], branches: tuple[str, ...], steps: int
@@ -223,29 +224,48 @@ class _Search:
             done += 1
             tell(min(done / steps, 1.0))
 
+        def lost(vector: Real) -> tuple[float, Real]:
+            geometry = moved(vector)
+            light, slopes = self._light.slopes(geometry.parameters, branches, free, _DIFFERENCE * scale)
+            expected = self._light.shares(geometry.parameters, branches)
+            gain, slope = _worth_of(light, expected, geometry)
+            by_free = np.real(np.sum(slopes * slope, axis=(1, 2, 3, 4))) * scale
+            turning = 1j * np.exp(1j * geometry.turn_rad)
+            by_turn = np.real(np.sum(slope[0] * turning * light[1])) * _TURN_RAD if geometry.side else 0.0
+            return float(np.sum(vector**2) / 2 - gain), vector - np.append(by_free, by_turn)
+
         found = scipy.optimize.minimize(
-            lambda vector: -self._worth(moved(vector), branches),
+            lost,
             np.append(start.parameters[free] / scale, start.error_rad / _TURN_RAD),
+            jac=True,
             method="L-BFGS-B",
             callback=told,
-            options={"maxiter": steps, "eps": _DIFFERENCE, "ftol": _CONVERGED},
+            options={"maxiter": steps, "ftol": _CONVERGED},
         )
         return moved(found.x)
 
-    def _worth(self, geometry: _Geometry, branches: tuple[str, ...]) -> float:
-        """Logarithm of how likely a geometry is, up to a constant."""
-        away = np.append(geometry.parameters / (_PRIOR_SHARE * PRIORS), geometry.error_rad / _TURN_RAD)
-        return float(_WORTH * self._told(geometry, branches).sum() - np.sum(away**2) / 2)
+    def _worth(self, geometry: _Geometry) -> float:
+        """Logarithm of how likely a geometry is by all branches, up to a constant."""
+        light, expected = self._seen(geometry)
+        angle = geometry.parameters[_ANGLE] / (_PRIOR_SHARE * PRIORS[_ANGLE])
+        return float(_worth_of(light, expected, geometry)[0] - angle**2 / 2)
 
-    def _told(self, geometry: _Geometry, branches: tuple[str, ...]) -> Real:
-        """What each page tells of a geometry, nats."""
-        light = self._light.seen(geometry.parameters, branches)[0]
-        expected = self._light.shares(geometry.parameters, branches)
-        if not geometry.side:
-            return _ONE_CAMERA * told_nats(light, expected).sum(axis=0)
-        return told_nats(light[0] + np.exp(1j * geometry.turn_rad) * light[1], expected)
+    def _seen(self, geometry: _Geometry) -> tuple[Complex, Real]:
+        """The pilots' light along all branches, and what is expected of it."""
+        return self._light.seen(geometry.parameters, _BRANCHES), self._light.shares(geometry.parameters, _BRANCHES)
 
     def coherence(self, geometry: _Geometry) -> float:
         """Coherence of the pilots' light, in the mean of the pages."""
-        count = len(_BRANCHES) * len(self._light.centres)
-        return float(np.mean(np.sqrt(-np.expm1(-self._told(geometry, _BRANCHES) / (count - 1)))))
+        light, expected = self._seen(geometry)
+        told = told_nats(light[0] + np.exp(1j * geometry.turn_rad) * light[1], expected)
+        return float(np.mean(np.sqrt(-np.expm1(-told / (expected.size - 1)))))
+
+
+def _worth_of(light: Complex, expected: Real, geometry: _Geometry) -> tuple[float, Complex]:
+    """What light [cameras, pages, B, N] is worth, and its slope by a change of it, the same shape."""
+    if not geometry.side:
+        worth = _WORTH * _ONE_CAMERA
+        return worth * float(told_nats(light, expected).sum()), worth * told_slope(light, expected)
+    arms = np.exp(1j * np.array([0.0, geometry.turn_rad]))[:, None, None, None]
+    together = np.sum(arms * light, axis=0)
+    return _WORTH * float(told_nats(together, expected).sum()), _WORTH * arms * told_slope(together, expected)

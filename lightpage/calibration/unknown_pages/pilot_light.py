@@ -59,27 +59,66 @@ class PilotLight:
         """Share of each branch in the pilots' light, [branches, N]."""
         return branch_shares(self._twin.trace(parameters, self.centres).positions, branches)
 
-    def seen(self, parameters: Real, branches: Sequence[str], shifts_m: Real | None = None) -> Complex:
+    def seen(self, parameters: Real, branches: Sequence[str], shift_m: tuple[float, float] = (0.0, 0.0)) -> Complex:
         """Light of every pilot along every branch, its symbol's and its path's phase off.
 
         Args:
             parameters: [P], the geometry.
             branches: along which light is looked at.
-            shifts_m: by how much further on it is looked for, [K, 2] as (x, y); by default not at all, K being 1.
+            shift_m: by how much further on it is looked for, (x, y).
 
         Returns:
-            [K, cameras, pages, branches, N]. Its phase is that of the page and the camera, where the geometry holds.
+            [cameras, pages, branches, N]. Its phase is that of the page and the camera, where the geometry holds.
         """
+        pixels, conjugate = self._look(parameters, branches, shift_m)
+        return self._summed(pixels, conjugate)
+
+    def slopes(
+        self, parameters: Real, branches: Sequence[str], free: Sequence[int], steps: Real
+    ) -> tuple[Complex, Complex]:
+        """The same light, and its derivatives by some parameters, [free, cameras, pages, branches, N].
+
+        Args:
+            parameters, branches: as for `seen`.
+            free: positions of the parameters.
+            steps: finite differences, one each.
+        """
+        pixels, conjugate = self._look(parameters, branches)
+        light = self._summed(pixels, conjugate)
+        across = [
+            self._summed(pixels + axis, conjugate) - self._summed(pixels - axis, conjugate) for axis in np.eye(2) / 2
+        ]
+        chosen = [BRANCHES.index(name) for name in branches]
+        geometries = np.tile(parameters, (len(free) + 1, 1))
+        geometries[np.arange(len(free)), list(free)] += steps
+        rays = self._twin.trace(geometries, self.centres)
+        pixels_of = [
+            self._twin.pixels(one, places[chosen].reshape(-1, 2))
+            for one, places in zip(geometries, rays.places, strict=True)
+        ]
+        middles = np.reshape(pixels_of, (len(geometries), -1, 1, *light.shape[-2:], 2))
+        moved = np.moveaxis(middles[:-1] - middles[-1], -1, 0)
+        turned = (rays.phases[:-1, chosen] - rays.phases[-1, chosen])[:, None, None]
+        changes = across[0] * moved[0] + across[1] * moved[1] - 1j * turned * light
+        return light, changes / steps[:, None, None, None, None]
+
+    def _look(
+        self, parameters: Real, branches: Sequence[str], shift_m: tuple[float, float] = (0.0, 0.0)
+    ) -> tuple[Real, Complex]:
+        """Where both cameras see the pilots' points [cameras, B, N, S, 2], and what takes their phase off [B, N, S]."""
         rays = self._twin.trace(parameters, self._points, self._anchors)
         chosen, shape = [BRANCHES.index(name) for name in branches], (len(branches), len(self.centres), _SAMPLES**2)
         phases = rays.phases[chosen].reshape(shape) + self._phases[:, None]
-        conjugate = np.exp(-1j * phases)
-        found = []
-        for shift in np.zeros((1, 2)) if shifts_m is None else shifts_m:
-            pixels = self._twin.pixels(parameters, (rays.places[chosen] + shift).reshape(-1, 2))
-            light = [[_at(image, at) for image in images] for images, at in zip(self._images, pixels, strict=True)]
-            found.append(np.sum(np.reshape(light, (len(light), -1, *shape)) * conjugate, axis=-1))
-        return np.stack(found)
+        pixels = self._twin.pixels(parameters, (rays.places[chosen] + shift_m).reshape(-1, 2))
+        return pixels.reshape(-1, *shape, 2), np.exp(-1j * phases)
+
+    def _summed(self, pixels: Real, conjugate: Complex) -> Complex:
+        """Light at pixels, summed over the points of a symbol, [cameras, pages, B, N]."""
+        light = [
+            [scipy.ndimage.map_coordinates(image, [at[..., 1], at[..., 0]], order=1) for image in images]
+            for images, at in zip(self._images, pixels, strict=True)
+        ]
+        return np.asarray(np.sum(light * conjugate, axis=-1), np.complex128)
 
 
 def told_nats(light: Complex, expected: Real) -> Real:
@@ -91,16 +130,25 @@ def told_nats(light: Complex, expected: Real) -> Real:
         light: [..., branches, N].
         expected: amplitudes, up to a factor, [branches, N].
     """
-    along = np.abs(np.sum(light * expected, axis=(-2, -1))) ** 2
-    of_all = np.sum(expected**2) * np.sum(np.abs(light) ** 2, axis=(-2, -1))
-    return nats(along / np.maximum(of_all, 1e-30), expected.size)
+    return _coherent(light, expected)[0]
+
+
+def told_slope(light: Complex, expected: Real) -> Complex:
+    """What the real part of its product with a change of light [..., branches, N], summed, adds to `told_nats`."""
+    _, share, along, power = _coherent(light, expected)
+    by_share = (expected.size - 1) / (1 - share)
+    norm = np.sum(expected**2)
+    toward = along.conj()[..., None, None] * expected / norm - share[..., None, None] * light.conj()
+    return np.asarray(2 * (by_share / power)[..., None, None] * toward, np.complex128)
+
+
+def _coherent(light: Complex, expected: Real) -> tuple[Real, Real, Complex, Real]:
+    """Nats, the coherent share of the power, the coherent sum, and the power of all."""
+    along, power = np.sum(light * expected, axis=(-2, -1)), np.maximum(np.sum(np.abs(light) ** 2, axis=(-2, -1)), 1e-30)
+    share = np.minimum(np.abs(along) ** 2 / (np.sum(expected**2) * power), 1 - 1e-9)
+    return nats(share, expected.size), share, along, power
 
 
 def nats(share: Real, count: int) -> Real:
     """The same of a share of the power that is coherent, of so many amplitudes."""
     return np.asarray(-(count - 1) * np.log1p(-np.minimum(share, 1 - 1e-9)), np.float64)
-
-
-def _at(image: NDArray[np.float32], pixels: Real) -> Real:
-    """Values at pixels [N, 2] (column, row)."""
-    return np.asarray(scipy.ndimage.map_coordinates(image, [pixels[:, 1], pixels[:, 0]], order=1), np.float64)
