@@ -79,8 +79,9 @@ def study(
     context = click.get_current_context()
     context.meta["lightpage.resume"] = "run the same command again; it goes on where it was"
     settings = Settings(load_profile(_FULL if full else profile_name or "bench"), quick, seed, share, channels)
-    context.with_resource(sole_writer(out))
     results_folder = out / _RESULTS
+    chosen.chosen(settings, only, results_folder)  # before anything is written
+    context.with_resource(sole_writer(out))
     if results_folder.exists() and not results_folder.is_dir():
         raise InvalidInputError(f"study {out}: {_RESULTS}", "a file", "a folder, or another --out")
     if results_folder.exists() and not (out / BEGUN).exists():

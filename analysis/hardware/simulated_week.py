@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +25,14 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
+from lightpage.runtime.service.jobs.kept_pages import KeptPages
 from lightpage.runtime.service.jobs.self_calibration import SelfCalibration, SelfCalibrationSettings
 from lightpage.runtime.service.models.loader import Loader
 from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.models.store import Store
 from lightpage.runtime.service.monitoring.flight_recorder import FlightRecorder
 from lightpage.runtime.service.monitoring.monitor import Monitor
+from lightpage.runtime.service.monitoring.observation import Observation, Observer
 from lightpage.runtime.service.pages.reading import read_page
 from lightpage.simulator.true_optics import true_modulation, true_parameters
 
@@ -52,6 +54,10 @@ KNOCK_PX, KNOCK_DEG = (2.0, -2.0), 0.02
 
 CALIBRATION_PAGES = (1_000_000, 1_000_001)
 """Numbers of the fully known pages, which nobody else reads."""
+_KEPT_BYTES = 1 << 29
+
+RANGE_PAGES = 12
+"""Pages of a range, an hour's; its lost ones are read once more where the service has recalibrated itself for them."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +94,17 @@ def state(begun: Device, moment: float, pages: int, light: LightDrift) -> Device
     return device.model_copy(update={"geometry": device.geometry.model_copy(update={"pipe_angle_deg": angle})})
 
 
+@dataclass(frozen=True)
+class Untold:
+    """Pages are kept without the symbols that the simulator knows."""
+
+    kept: KeptPages
+
+    def observe(self, observation: Observation) -> None:
+        """See `Observer`."""
+        self.kept.observe(replace(observation, symbols=None))
+
+
 class SimulatedClock(Clock):
     """The seconds of a week that is simulated; what waits by it waits real ones."""
 
@@ -112,6 +129,7 @@ class Week:
         device: true state at the beginning.
         light: what drifts beside the geometry.
         true_every: pages from one that is read with the true table, too, to the next.
+        shown: whether fully known pages are shown to recalibrate by; else pages of user data serve.
     """
 
     out: Path
@@ -122,6 +140,7 @@ class Week:
     device: Device
     light: LightDrift
     true_every: int = 1
+    shown: bool = True
     rows: Rows = field(default_factory=list)
     moment: int = 0
 
@@ -141,11 +160,14 @@ class Week:
             store = stack.enter_context(Store(self.out / "models", base.bundle))
             models = Models(base, store, Loader(tracker_for))
             recorder = stack.enter_context(FlightRecorder(self.out / "flight", models, monitor=monitor))
-            plane = DataPlane(models, source, observers=[recorder], monitor=monitor)
+            kept = None if self.shown else KeptPages(_KEPT_BYTES)
+            observers: list[Observer] = [recorder] if kept is None else [recorder, Untold(kept)]
+            plane = DataPlane(models, source, observers=observers, monitor=monitor)
             watched = WatchedRecalibrator(plane)
             stack.callback(watched.close)
-            settings = SelfCalibrationSettings(pages=CALIBRATION_PAGES, busy_s=0.05)
-            stack.enter_context(SelfCalibration(plane, monitor, watched, settings, SimulatedClock(self)))
+            pages = CALIBRATION_PAGES if self.shown else ()
+            settings = SelfCalibrationSettings(enabled=True, pages=pages, busy_s=0.05)
+            stack.enter_context(SelfCalibration(plane, monitor, watched, settings, SimulatedClock(self), kept))
             begun = len(self.rows)
             numbers = track(range(begun, end), "week", total=end, done=begun)
             for number in numbers:
@@ -155,9 +177,25 @@ class Week:
                     source.knock(KNOCK_PX)
                 row = self._read(number, plane, monitor, source, true_table)
                 row |= {"restarted": number == begun > 0, "during": watched.running, "ended": watched.ended()}
+                row["again"] = [] if self.shown or (number + 1) % RANGE_PAGES else self._again([*self.rows, row], plane)
                 self.rows.append(row)
                 append_row(path, row)
                 watched.settle(monitor, self.pages_during)
+
+    def _again(self, rows: Rows, plane: DataPlane) -> list[int]:
+        """Read lost pages of the last range once more, as ReadData does; returns those that are read now."""
+        lost = [row for row in rows[-RANGE_PAGES:] if row["lost"]]
+        if not lost or plane.heal is None or not plane.heal(Caller(), lost[0]["version"]):
+            return []
+        read = list[int]()
+        for row in lost:
+            try:
+                data = read_page(plane, row["page"], None, Caller(), user_data=True).answer.user_data
+            except LightpageError:
+                continue
+            if data is not None and data.loss is None:
+                read.append(row["page"])
+        return read
 
     def _read(
         self, number: int, plane: DataPlane, monitor: Monitor, source: DriftingSource, true_table: TrueTable

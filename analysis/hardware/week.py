@@ -7,6 +7,9 @@ service reads it, with tracker, monitor, self-calibration and flight recorder. A
 Every page's figures are kept. An interrupted run goes on as a service does that was started anew, with the model of its
 store.
 
+With `--not-shown`, no known page is shown: pages of user data serve to recalibrate by, those that were read or those
+that were lost. Pages are read in ranges then, whose lost ones are read once more after a recalibration.
+
 With `--stroke -0.02 --axial 0.2`, the light drifts too: the modulator's stroke, and modulator and cameras out of focus.
 The table then says what was true and what the model in service took for it. Focus needs a `--bundle` whose graphs know
 axial places.
@@ -67,6 +70,7 @@ def figures_of(rows: Rows, pages: int) -> dict[str, Any]:
         "pages_lost_but_for_the_knock": sum(
             bool(row["lost"]) for row, knocked in zip(rows, apart, strict=True) if not knocked
         ),
+        "pages_read_again": sum(len(row.get("again", ())) for row in rows),
         "human_steps": 0,
         "restarts": sum(row["restarted"] for row in rows),
         "failed_requests": sum(row["failed"] for row in rows),
@@ -124,6 +128,7 @@ def table_of(rows: Rows, pages: int) -> list[str]:
 @click.option("--device", type=click.Path(path_type=Path), help="True state (TOML) at the beginning.")
 @click.option("--stroke", default=0.0, show_default=True, help="Change of the modulator's stroke, relative.")
 @click.option("--axial", default=0.0, show_default=True, help="Change of all places along the axis, rad.")
+@click.option("--shown/--not-shown", default=True, help="Show fully known pages, or recalibrate by user data alone.")
 @click.option("--out", required=True, type=OutputFolder(), help="Where pages, models and frames are kept.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def main(
@@ -136,6 +141,7 @@ def main(
     device: Path | None,
     stroke: float,
     axial: float,
+    shown: bool,
     out: Path,
     json_path: Path | None,
 ) -> None:
@@ -143,7 +149,8 @@ def main(
     out.mkdir(parents=True, exist_ok=True)
     logging.basicConfig(level=logging.INFO, filename=out / "log", format="%(asctime)s %(levelname)s %(message)s")
     begun = Device() if device is None else load_device(device)
-    week = Week(out, pages, pages_during, threads, bundle_path(bundle), begun, LightDrift(stroke, axial), true_every)
+    light, path = LightDrift(stroke, axial), bundle_path(bundle)
+    week = Week(out, pages, pages_during, threads, path, begun, light, true_every, shown)
     week.read_until(pages if stop_after is None else min(pages, stop_after))
     figures = figures_of(week.rows, pages)
     draw(week.rows, out / "week.png", int(KNOCK_SHARE * pages), PAGE_S)

@@ -14,6 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.calibration.goodness.verdict import Goodness
 from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.errors import CalibrationError, FrameError, RecalibrationRefusedError, raised_as
 from lightpage.progress import Progress
@@ -47,12 +48,14 @@ class RefitReport:
         coherence_before: of the pages with the old geometry, 0..1.
         coherence_after: with the new one.
         image: where the image was found before the fit, against the earlier calibration.
+        goodness: how well the new geometry explains the light.
     """
 
     angle_deg: float | None = None
     coherence_before: float | None = None
     coherence_after: float | None = None
     image: ImagePosition | None = None
+    goodness: Goodness | None = None
 
 
 @dataclass(frozen=True)

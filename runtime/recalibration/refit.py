@@ -50,8 +50,8 @@ def refit(
         solve_field: recovers fields; the decoder's graph if left out.
 
     Raises:
-        CalibrationError: the pages fit no geometry near the earlier calibration, there are no reference frames, or the
-            bundle holds no calibration to start from.
+        CalibrationError: the pages fit no geometry near the earlier calibration, or the bundle holds no calibration to
+            start from.
         BundleError: the bundle's graphs do not show the field, or hold a geometry that cannot be fed instead.
     """
     profile, earlier = bundle.profile, bundle.calibration
@@ -59,7 +59,7 @@ def refit(
         among = f"{' or '.join(sorted(_REFITTED))} among them"
         expected = f"{among}: this decoder holds its geometry itself; calibrate, train and export anew"
         raise BundleError(f"{bundle.subject}: table inputs", sorted(decoder.graph.ports), expected)
-    references = references_of(bundle, pages.references)
+    references = pages.references or decoder.references
     twin = OnnxTwin(bundle) if twin is None else twin
     progress("find the image", 0.0)
     image = _find(decoder, twin, pages, references)
@@ -127,22 +127,9 @@ def traced(
             coherence_before=fitted.coherence_before,
             coherence_after=fitted.coherence_after,
             image=image,
+            goodness=fitted.goodness,
         ),
     )
-
-
-def references_of(bundle: Bundle, taken: FramePair | None) -> FramePair:
-    """Reference-only frames that were taken with pages, else those that the bundle was fitted with.
-
-    Raises:
-        CalibrationError: there are none.
-    """
-    if taken is not None:
-        return taken
-    in_phase, quadrature = (bundle.table.get(name) for name in ("reference_in_phase", "reference_quadrature"))
-    if in_phase is None or quadrature is None:
-        raise CalibrationError("re-fit", "no reference frames", "reference-only frames taken with the known pages")
-    return FramePair(in_phase, quadrature)
 
 
 def _find(decoder: Decoder, twin: Twin, pages: KnownPages, references: FramePair) -> ImagePosition | None:

@@ -28,6 +28,7 @@ from lightpage.runtime.model.bundle.manifest import DECODER, GOLDEN, PILOTS, TWI
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.known_pages import KnownPages
 from lightpage.runtime.recalibration.recalibration import RefitReport, RefitResult
+from tests.lightpage.small import EXPLAINED
 
 PROFILE: Profile = load_profile("bench").model_copy(
     update={
@@ -235,7 +236,7 @@ def fit_references(bundle: Bundle, pages: KnownPages, progress: Progress, decode
         "reference_in_phase": pages.references.in_phase.astype(np.float32),
         "reference_quadrature": pages.references.quadrature.astype(np.float32),
     }
-    return RefitResult(table, "angle_deg = 0.5\n", RefitReport(0.5, 0.4, 0.9))
+    return RefitResult(table, "angle_deg = 0.5\n", RefitReport(0.5, 0.4, 0.9, goodness=EXPLAINED))
 
 
 class ToySource(FrameSource):

@@ -67,6 +67,7 @@ def test_what_cannot_be_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     ):
         with pytest.raises(InvalidInputError, match=named):
             run(*words)
+        assert not (tmp_path / "out").exists()
 
 
 def test_a_case_is_measured_once_and_comes_back_with_its_arrays(tmp_path: Path) -> None:

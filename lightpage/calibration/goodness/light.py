@@ -142,10 +142,10 @@ class SeenLight:
         return self.equations((change / self._amplitude[_EVERY] * self._along[:, *_EVERY].conj()).real)
 
     def equations_of_fit(self) -> Iterator[Real]:
-        """What each parameter of the fit does to the equations."""
+        """What each parameter that the twin knows does to the equations."""
         here = self.coarse.to_cameras(self.page)
         places = np.stack(np.meshgrid(self._grid.x_m, self._grid.y_m), axis=-1)[_EVERY]
-        for index in range(len(PARAMETERS)):
+        for index in range(min(self._twin.known, len(PARAMETERS))):
             moved = self._device.parameters.copy()
             moved[index] += _DIFFERENCE * PRIORS[index]
             if index in SEEN_BY_CAMERAS:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import click
 
+from lightpage.calibration.goodness.verdict import Goodness
 from lightpage.calibration.known_pages import first_lit_pages
 from lightpage.cli.options import FiniteRange
 from lightpage.cli.paths import NewPath, OutputFile
@@ -92,7 +93,7 @@ def recalibrate(
     With --other-device, an archive is read on a drive that was never calibrated: its geometry is found from nominal, by
     the pilots of the first eight pages, and then healed by the pages themselves.
     """
-    start = time.perf_counter()
+    start, goodness = time.perf_counter(), None
     if target is not None:
         if bundle or out or version is not None or other_device:
             got = "with --bundle, --out, --version or --other-device"
@@ -116,8 +117,10 @@ def recalibrate(
             given = {"--bundle": bundle, "--recording": recording, "--out": out}
             lacking = ", ".join(name for name, value in given.items() if not value)
             raise InvalidInputError("options", f"no {lacking}", f"{', '.join(given)}, or --target")
-        result = _offline(bundle, recording, out, pages, version, other_device=other_device)
+        result, goodness = _offline(bundle, recording, out, pages, version, other_device=other_device)
     data = summary(result, time.perf_counter() - start)
+    if goodness is not None:
+        data |= {"verdict": goodness.verdict, "bits_lost": goodness.bits_lost, "cause": goodness.cause or None}
     write_json(json_path, data)
     click.echo(table(data))
 
@@ -185,7 +188,8 @@ def _start(client: LightpageClient, recording: str | None, pages: int, send: boo
 
 def _offline(
     bundle: str, recording: str, out: Path, pages: int, version: str | None, *, other_device: bool
-) -> Recalibrated:
+) -> tuple[Recalibrated, Goodness | None]:
+    """What came of it, and how well the re-fitted geometry explains the light."""
     if out.exists():
         raise InvalidInputError(f"--out {out}", "something that exists", "a new path: bundles are never overwritten")
     if version is not None:
@@ -198,7 +202,7 @@ def _offline(
         outcome = recalibrate_by_recording(
             decoder, file, pages, code, out, new, refit, progress, other_device=other_device
         )
-    return answer_of(Recalibrated, result_message(outcome))
+    return answer_of(Recalibrated, result_message(outcome)), outcome.report.goodness
 
 
 @click.command()

@@ -56,10 +56,17 @@ class KeptPages:
         with self._lock:
             self._pages.clear()
 
+    def lost(self, version: str) -> int:
+        """How many of a model's pages gave no bytes, as far as that is known."""
+        with self._lock:
+            kept = [one for one in self._pages if one.model_version == version]
+        return sum(one.lost is not None or bool(one.user_data and one.user_data.loss) for one in kept)
+
     def pages(self, decoder: Decoder, image_px: tuple[float, float]) -> KnownPages | LostPages | None:
         """What to recalibrate by: the last pages that were read, or else those that were lost; None if there are none.
 
-        Pages count that the model in service has decoded, at the levels of its code.
+        Pages count that the model in service has decoded, at the levels of its code. Where the last ones were lost,
+        those that were read before show a device that has changed since.
 
         Args:
             decoder: in service.
@@ -70,7 +77,7 @@ class KeptPages:
         with self._lock:
             kept = [one for one in self._pages if one.model_version == decoder.version]
         pilots, codec = decoder.bundle.written_pilots(code.levels), decoder.page_codec
-        known, lost = list[tuple[FramePair, NDArray[np.uint8]]](), list[FramePair]()
+        known, lost, lost_since = list[tuple[FramePair, NDArray[np.uint8]]](), list[FramePair](), 0
         for one in reversed(kept):
             pair = one.pair
             if pair is None or one.levels not in (None, code.levels):
@@ -83,7 +90,8 @@ class KeptPages:
                 known.append((pair, codec.encode_again(found, pilots)))
             elif found is None or found.loss is not Loss.CODE:
                 lost.append(pair)
-        if len(known) >= MIN_PAGES:
+                lost_since += not known
+        if len(known) >= MIN_PAGES and lost_since < MIN_PAGES:
             pairs, symbols = zip(*known[:_USED], strict=True)
             return KnownPages(pairs, symbols, code.levels, None, decoder.bundle.pilot_mask, image_px)
         if not lost:

@@ -29,6 +29,9 @@ from lightpage.runtime.service.table import Rule, Seconds, SettingsTable, Text
 
 _log = logging.getLogger(__name__)
 
+_TO_ANSWER_S = 1.0
+"""Of a caller's time, which is left to it when waiting for a recalibration ends."""
+
 WORTH_BITS = 0.02
 """Information a symbol that a recalibration must bring for the next one to come as soon. Those of a simulated week of a
 bench device bring 0.03 and more. One that brings less cures nothing that the monitor complains of."""
@@ -54,6 +57,8 @@ class SelfCalibrationSettings(SettingsTable):
     longest_s: Seconds = 3600.0
     """To which that time is doubled by one refusal or failure after another, or by recalibrations that bring next to
     nothing. What was refused once will hardly be better a minute later, and each try costs reads a few pages' time."""
+    most_share: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.1
+    """Of all time, that recalibrations may take at most: whoever sends noise buys no more of the device than that."""
     busy_s: Seconds = 5.0
     """Time after which it is looked again whether a recalibration that somebody else runs has ended."""
 
@@ -97,8 +102,10 @@ class SelfCalibration:
         self._plane, self._monitor, self._recalibrator, self._kept = plane, monitor, recalibrator, kept
         self._settings, self._clock = settings or SelfCalibrationSettings(), clock
         _check_pages(plane, self._settings.pages)
-        self._interval_s, self._not_before = self._settings.least_s, -float("inf")
+        self._interval_s, self._not_before, self._begun = self._settings.least_s, -float("inf"), 0.0
         self._wake, self._stopping = threading.Event(), threading.Event()
+        self._lock, self._asked = threading.Lock(), list[threading.Event]()
+        """Events of callers that wait for the end of the next try."""
         self._thread = threading.Thread(target=self._run, name="lightpage-self-calibration", daemon=True)
         self._caller = Caller(actor=Actor("self-calibration"))
         self._pinned = False
@@ -107,11 +114,13 @@ class SelfCalibration:
 
     def __enter__(self) -> Self:
         self._thread.start()
+        self._plane.heal = self.heal
         return self
 
     def __exit__(self, *_: object) -> None:
         """Drop a recalibration that runs, and end the thread, which is waited for as calls are."""
         wait_s = self._plane.limits.grace_s
+        self._plane.heal = None
         self._stopping.set()
         self._caller.leave()
         self._wake.set()
@@ -123,14 +132,55 @@ class SelfCalibration:
         while True:
             self._clock.wait(self._wake, self._pause_s())
             self._wake.clear()
-            if self._stopping.is_set():
-                return
-            self.look()
+            with self._lock:
+                asked, self._asked = self._asked, []
+            try:
+                if self._stopping.is_set():
+                    return
+                self.look(asked=bool(asked))
+            finally:
+                for done in asked:
+                    done.set()
 
-    def look(self) -> None:
-        """Recalibrate if the monitor says that it is due, and the last time was long enough ago."""
-        if self._monitor.due and self._clock.now() >= self._not_before:
+    def look(self, *, asked: bool = False) -> None:
+        """Recalibrate if that was asked for or the monitor says that it is due, and the last time was long ago."""
+        if (asked or self._monitor.due) and self._clock.now() >= self._not_before:
             self._try_once()
+
+    def heal(self, caller: Caller, version: str) -> bool:
+        """Recalibrate for a caller whose pages are lost, as soon as that may be, and wait for the end.
+
+        Where the last recalibration is not long enough ago, none begins and nobody waits.
+
+        Args:
+            caller: waits for as long as it has time. Where it leaves, the work goes on.
+            version: of the model that has lost the pages.
+
+        Returns:
+            Whether another model is in service.
+
+        Raises:
+            CallerLeft: the caller has gone.
+        """
+        if self._can_heal(version):
+            done = threading.Event()
+            with self._lock:
+                self._asked.append(done)
+            self._wake.set()
+            most_s = min(caller.seconds_left() - _TO_ANSWER_S, self._plane.limits.recalibration_s)
+            with caller.telling(done.set):
+                self._clock.wait(done, max(0.0, most_s))
+            caller.check()
+        return self._plane.models.current.version != version
+
+    def _can_heal(self, version: str) -> bool:
+        """Whether the model that has lost pages is still in service, and there are pages to recalibrate by.
+
+        One lost page is not enough: what was read before may show the device before it was knocked.
+        """
+        if self._stopping.is_set() or self._plane.models.current.version != version:
+            return False
+        return bool(self._settings.pages) or (self._kept is not None and self._kept.lost(version) >= MIN_PAGES)
 
     def _pause_s(self) -> float:
         """How long to sleep where nobody wakes: until it is looked again where a try is due, else for ever."""
@@ -139,7 +189,7 @@ class SelfCalibration:
 
     def _try_once(self) -> None:
         """Recalibrate, and decide when the next time may be; not while the model in service is pinned."""
-        now = self._plane.models.now
+        now, self._begun = self._plane.models.now, self._clock.now()
         if now.state.known(now.current.version).pinned:
             if not self._pinned:
                 _log.info("self-calibration: put off, since the model in service is pinned")
@@ -147,7 +197,7 @@ class SelfCalibration:
             self._wait(self._settings.busy_s)
             return
         self._pinned = False
-        reasons = "; ".join(self._monitor.state().reasons) or "the monitor says so"
+        reasons = "; ".join(self._monitor.state().reasons) or "pages were lost"
         _log.info("self-calibration: begins, since %s", reasons)
         try:
             *_, outcome = self._recalibrator.follow(self._pages(), self._caller)
@@ -193,7 +243,10 @@ class SelfCalibration:
         _log.warning("self-calibration: %s, next in %.0f s: %s", end, self._interval_s, error, exc_info=unforeseen)
 
     def _wait(self, seconds: float) -> None:
-        self._not_before = self._clock.now() + seconds
+        """Begin no other one for so long, nor before all of them together have taken their share of the time alone."""
+        now = self._clock.now()
+        took_s = max(0.0, now - self._begun)
+        self._not_before = max(now + seconds, self._begun + took_s / self._settings.most_share)
 
 
 def _check_pages(plane: DataPlane, pages: Sequence[int]) -> None:

@@ -12,7 +12,7 @@ from lightpage.runtime.client.wire.status import detail_of, reason_told, refusal
 from lightpage.runtime.service.caller import Call, Caller, Role
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.frames.frames import check_options, decode_reply, user_data_message
-from lightpage.runtime.service.pages.reading import DataPage, ReadAnswer, read_data, read_page
+from lightpage.runtime.service.pages.reading import DataPage, ReadAnswer, Unread, read_again, read_data, read_page
 from lightpage.runtime.service.pages.replays import Replays
 from lightpage.runtime.service.rpc import rpc
 from lightpage.runtime.service.stages import Stage, Stages
@@ -96,7 +96,17 @@ class PageCalls:
         self._check_count("pages", request.pages)
         if request.first_page + request.pages > _MOST_PAGES:
             raise InvalidInputError("first_page", request.first_page, f"less than {_MOST_PAGES} with all")
-        pages = read_data(self._plane, request.first_page, request.pages, call.caller, call.times.page)
+        unread = Unread()
+        times = call.times.page
+        yield from self._sent(
+            read_data(self._plane, request.first_page, request.pages, call.caller, times, unread), call
+        )
+        heal = self._plane.heal
+        if unread.pages and heal is not None and heal(call.caller, unread.model_version):
+            yield from self._sent(read_again(self._plane, unread, call.caller, times), call)
+
+    def _sent(self, pages: Iterator[DataPage], call: Call) -> Iterator[pb.ReadDataReply]:
+        """Pages of a range as messages."""
         while True:
             with self._plane.ranges.held(call.caller):  # not while the caller takes its time to read the reply
                 page = next(pages, None)

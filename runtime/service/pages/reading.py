@@ -9,13 +9,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.codec.page_bytes import Header, PageBytes
+from lightpage.codec.page_bytes import Header, Loss, PageBytes
 from lightpage.codec.volume import Successor, Volume, restore_group
-from lightpage.errors import LightpageError, LostPageError, PageError, SourceError
+from lightpage.errors import BusyError, FramesDisagreeError, LightpageError, LostPageError, PageError, SourceError
 from lightpage.page.pilots import Pilots
 from lightpage.runtime.device.acquisition.source import FrameSource, Shot, own_fault
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import Answer, DataPlane, Seen, levels_for, observed
+from lightpage.runtime.service.monitoring.monitor import SHOWS_DEVICE
 from lightpage.runtime.service.stages import Stage, Stages
 
 GROUPS = 4
@@ -139,8 +140,31 @@ def _shot(plane: DataPlane, source: FrameSource, page: int | None, caller: Calle
         raise
 
 
+@dataclass
+class Unread:
+    """Pages of a range that came to nothing, and might be read by a model that fits the device.
+
+    Attributes:
+        model_version: of the model that the range began with.
+        pages: by their numbers in the source, the page of its volume that each is or should be, None where unknown.
+    """
+
+    model_version: str = ""
+    pages: dict[int, Header | None] = field(default_factory=dict)
+
+    def drop(self, restored: DataPage) -> None:
+        """Leave out a page that its group has given."""
+        header = None if restored.found is None else restored.found.header
+        self.pages = {index: page for index, page in self.pages.items() if page is None or page != header}
+
+
 def read_data(
-    plane: DataPlane, first: int, count: int, caller: Caller, timed: Callable[[], Stages] = Stages
+    plane: DataPlane,
+    first: int,
+    count: int,
+    caller: Caller,
+    timed: Callable[[], Stages] = Stages,
+    unread: Unread | None = None,
 ) -> Iterator[DataPage]:
     """Read pages `first` to `first + count - 1` of the source, or to its last one.
 
@@ -149,6 +173,7 @@ def read_data(
         first, count: of the source's pages.
         caller: who waits.
         timed: begins to time a page.
+        unread: takes the pages that came to nothing.
 
     Raises:
         BundleError: the model has no code.
@@ -157,37 +182,79 @@ def read_data(
     """
     _ = plane.source, plane.models.current.decoder.page_codec  # they are there
     groups: dict[tuple[Volume, int], _Group] = {}
-    successor = Successor()
+    successor, unread = Successor(), unread or Unread()
+    unread.model_version = plane.models.current.version
+
+    def restored(group: _Group) -> Iterator[DataPage]:
+        for page in group.restored():
+            unread.drop(page)
+            yield page
+
     for index in range(first, first + count):
-        stages = timed()
         try:
-            answer = read_page(
-                plane, index, None, caller, user_data=True, expected=successor.header, stages=stages
-            ).answer
-        except (LostPageError, SourceError) as error:
-            successor = successor.after()
-            stages.begin(Stage.RESPOND)
-            yield DataPage(index, None, error, stages=stages)
-            continue
+            page = _data_page(plane, index, successor.header, caller, timed())
         except PageError:
             if index == first:
                 raise
             break
-        found = answer.user_data
-        assert found is not None  # it was asked for
-        volume = Volume.of_page(found)
-        if volume is not None and found.header is not None and found.data is not None:
+        found = page.found
+        volume = None if found is None else Volume.of_page(found)
+        if volume is not None and found is not None and found.header is not None and found.data is not None:
             key = volume, found.header.page // volume.group_pages
             if key not in groups and len(groups) == GROUPS:
-                yield from groups.pop(next(iter(groups))).restored()
-            group = groups.pop(key, None) or _Group(*key, found, answer.model_version)
+                yield from restored(groups.pop(next(iter(groups))))
+            group = groups.pop(key, None) or _Group(*key, found, page.model_version)
             groups[key] = group  # the one used last is the last to go
-            group.last, group.model_version = found, answer.model_version
+            group.last, group.model_version = found, page.model_version
             group.pages[found.header.page] = found.data
             if len(group.pages) == len(volume.numbers_in(group.number)):
                 del groups[key]  # nothing is missing
             successor = Successor(volume, found.header)
+        elif _curable(page):
+            unread.pages[index] = (found and found.header) or successor.header
         successor = successor.after()
-        yield DataPage(index, found, model_version=answer.model_version, stages=stages)
+        yield page
     for group in groups.values():
-        yield from group.restored()
+        yield from restored(group)
+
+
+def read_again(
+    plane: DataPlane, unread: Unread, caller: Caller, timed: Callable[[], Stages] = Stages
+) -> Iterator[DataPage]:
+    """Read those pages of a range once more that came to nothing; yields the ones that another model reads.
+
+    Args:
+        plane, caller, timed: as for `read_data`.
+        unread: of the range.
+    """
+    for index, expected in unread.pages.items():
+        try:
+            page = _data_page(plane, index, expected, caller, timed())
+        except (PageError, BusyError):  # the caller knows that it is lost
+            continue
+        if page.found is not None and page.found.loss is None:
+            yield page
+
+
+def _data_page(plane: DataPlane, index: int, expected: Header | None, caller: Caller, stages: Stages) -> DataPage:
+    """Read a page of a range.
+
+    Raises:
+        PageError: there is none.
+    """
+    try:
+        answer = read_page(plane, index, None, caller, user_data=True, expected=expected, stages=stages).answer
+    except (LostPageError, SourceError) as error:
+        stages.begin(Stage.RESPOND)
+        return DataPage(index, None, error, stages=stages)
+    assert answer.user_data is not None  # it was asked for
+    return DataPage(index, answer.user_data, model_version=answer.model_version, stages=stages)
+
+
+def _curable(page: DataPage) -> bool:
+    """Whether a page that came to nothing shows the device, so that a model which fits that may read it."""
+    if page.found is not None:
+        return page.found.loss in (Loss.HEADER, Loss.BODY, Loss.CHECKSUM)
+    if isinstance(page.error, LostPageError):
+        return page.error.reason in SHOWS_DEVICE
+    return page.error is not None and isinstance(page.error.__cause__, FramesDisagreeError)

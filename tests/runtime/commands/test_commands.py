@@ -25,6 +25,7 @@ from lightpage.runtime.commands.client import recalibrate as cli_recalibrate
 from lightpage.runtime.device.acquisition.source import open_source
 from lightpage.runtime.model.bundle.bundle import Bundle
 from tests.lightpage.full_disk import full_disk
+from tests.lightpage.small import EXPLAINED
 from tests.runtime import toy
 from tests.runtime.service.stage import Running, Start
 from tests.runtime.slow_fit import SlowFit
@@ -205,6 +206,7 @@ def test_offline_recalibration_writes_a_better_bundle(
     data = json.loads((tmp_path / "r.json").read_text())
     assert (data["version"], data["pages_used"], data["angle_deg"]) == ("toy-1+r1", 2, 0.5)
     assert (data["coherence_before"], data["coherence_after"]) == (0.4, 0.9)
+    assert (data["verdict"], data["bits_lost"]) == (EXPLAINED.verdict, EXPLAINED.bits_lost)
     before, after = (evaluate(bundle, tmp_path / "d.h5") for bundle in (toy_zip, tmp_path / "new.zip"))
     assert after["pages_left_out"] == 2
     assert after["air_bits_per_symbol"] > before["air_bits_per_symbol"] + 0.5

@@ -1,6 +1,7 @@
 """Pages of user data that a drifted device's model does not read, and no page that anybody knows."""
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,19 +11,34 @@ from click.testing import CliRunner
 
 from lightpage.cli.simulate import simulate
 from lightpage.codec.code import Code
+from lightpage.device.state import Device
 from lightpage.errors import Reason, RecalibrationRefusedError
+from lightpage.page.pilots import Pilots
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
+from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.commands.archives.encode import encode
 from lightpage.runtime.commands.archives.recover import recover
+from lightpage.runtime.device.acquisition.source import open_source
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.tracking import NoTracker
 from lightpage.runtime.recalibration.healed_bundle import recalibrate_by_lost
 from lightpage.runtime.recalibration.healing import LostPages, heal
+from lightpage.runtime.recalibration.judgement import Verdict, judge, judged_pages
 from lightpage.runtime.recalibration.known_pages import KnownPages
+from lightpage.runtime.recalibration.recalibration import refitted_bundle
 from lightpage.runtime.recalibration.refit import refit
+from lightpage.runtime.service.caller import Call, Caller
+from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.kept_pages import KeptPages
+from lightpage.runtime.service.jobs.recalibrator import Recalibrator
+from lightpage.runtime.service.jobs.self_calibration import SelfCalibration
+from lightpage.runtime.service.models.models import Models
+from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.monitoring.observation import Observation
+from lightpage.runtime.service.pages.page_calls import PageCalls
+from lightpage.simulator.simulator import Simulator
 
 CODE = Code(levels=8, coded_bits=2, rate_per_mille=500, corrections=2)
 CONTENT = bytes(range(250)) * 3
@@ -83,6 +99,31 @@ def test_a_service_recalibrates_by_the_pages_that_it_keeps(small_bundle: Path, d
     known = kept.pages(healed, (0.0, 0.0))
     assert isinstance(known, KnownPages)
     np.testing.assert_array_equal(known.symbols[0], symbols[-1])
+    kinds = []
+    for number, pair in enumerate(pairs[:2], start=1):  # the device is knocked: what was read before shows another one
+        kept.observe(Observation("page", 0, "small-1+r1", 0.0, 0.1, Reason.PILOTS_DISAGREE, pair=pair))
+        assert kept.lost("small-1+r1") == number
+        kinds.append(type(kept.pages(healed, (0.0, 0.0))))
+    assert kinds == [KnownPages, LostPages]
+
+
+def test_a_range_of_pages_that_nobody_could_read_comes_back_with_the_model_healed(
+    small_bundle: Path, drifted: Path
+) -> None:
+    bundle, kept, monitor = Bundle.open(small_bundle), KeptPages(most_bytes=1 << 30), Monitor()
+    manifest = bundle.manifest.model_copy(update={"code": CODE.to_toml()})
+    decoder = Decoder(replace(bundle, manifest=manifest), threads=1)
+    with open_source(f"recording:{drifted / 'R.h5'}") as source, ThreadPoolExecutor(1) as pool:
+        plane = DataPlane(Models(decoder), source, monitor=monitor, observers=[kept])
+        with SelfCalibration(plane, monitor, Recalibrator(plane, refit), kept=kept):
+            request = pb.ReadDataRequest(first_page=0, pages=4)
+            replies = [*PageCalls(plane).ReadData(request, Call("ReadData", Caller(), pool))]
+    lost, healed = replies[:4], replies[4:]
+    assert not any(reply.user_data.data for reply in lost)
+    assert [(reply.page, reply.model_version, reply.restored) for reply in healed] == [
+        (page, "small-1+r1", False) for page in range(4)
+    ]
+    assert b"".join(reply.user_data.data for reply in healed)[: len(CONTENT)] == CONTENT
 
 
 def test_frames_that_do_not_show_the_device_are_refused_before_anything_is_fitted(
@@ -99,6 +140,32 @@ def test_frames_that_do_not_show_the_device_are_refused_before_anything_is_fitte
     dark = FramePair(*(np.zeros_like(frame) for frame in frames))
     with pytest.raises(RecalibrationRefusedError, match="light"):
         heal(decoder, LostPages((dark,), CODE, references=references), untouched)
+
+
+def test_a_models_own_decisions_speak_for_it_and_pages_that_come_right_for_the_better_one(small_bundle: Path) -> None:
+    decoder, rng = Decoder.load(small_bundle, threads=1), np.random.default_rng(1)
+    bundle, mask = decoder.bundle, decoder.bundle.pilot_mask
+    turned = Device().with_settings(["geometry.pipe_angle_deg=-0.57", "drift.shift_px=0"])
+    simulator = Simulator(bundle.profile, turned, 256, seed=7)
+    written = rng.integers(256, size=(2, *bundle.profile.page_shape)).astype(np.uint8)
+    pairs = tuple(simulator.page(page) for page in written)
+    right = KnownPages(pairs, tuple(written), 256, simulator.references())
+    fitted = refitted_bundle(bundle, refit(bundle, right.part(slice(1)), lambda what, share: None, decoder))
+    pages = [
+        decoder.decode(pair, 256, Pilots.of_symbols(mask, page, 256)) for pair, page in zip(pairs, written, strict=True)
+    ]
+    decided = tuple(np.where(mask, page, found.symbols) for page, found in zip(written, pages, strict=True))
+
+    def judged(pages: KnownPages) -> Verdict:
+        before, after = (
+            judged_pages(NoTracker(decoder.of_bundle(one)), one, pages, lambda share: None) for one in (bundle, fitted)
+        )
+        return judge(before, after, 256)
+
+    verdict = judged(right.part(slice(1, 2)))
+    assert verdict.after > verdict.limit
+    with pytest.raises(RecalibrationRefusedError):
+        judged(KnownPages(pairs[1:], decided[1:], 256, right.references))
 
 
 def untouched(what: str, share: float) -> None:

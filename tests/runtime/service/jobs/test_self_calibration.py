@@ -9,12 +9,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from lightpage.codec.page_bytes import Loss, PageBytes
-from lightpage.errors import CalibrationError, InvalidInputError, Reason, SourceError, UnconfirmedPageError
+from lightpage.errors import CalibrationError, CallerLeft, InvalidInputError, Reason, SourceError, UnconfirmedPageError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.device.acquisition.source import SHOT_S, Shot
 from lightpage.runtime.model.decoding.decoder import Decoder
@@ -459,6 +460,49 @@ def test_one_that_brings_nothing_doubles_the_interval(loop: Loop) -> None:
     assert loop.look() == "toy-1+r1"
     loop.complain()
     assert loop.look(119.9) == "toy-1+r1"
+    assert loop.look(0.1) == "toy-1+r2"
+
+
+def test_a_caller_who_has_lost_pages_waits_for_the_next_recalibration_and_for_none_that_may_not_begin_yet(
+    loop: Loop,
+) -> None:
+    loop.drift()
+    assert loop.monitor.due
+    with loop.running:
+        assert loop.plane.heal is not None
+        assert loop.plane.heal(Caller(), "toy-1")
+        assert loop.version == "toy-1+r1"
+        assert loop.plane.heal(Caller(), "toy-1")  # somebody else had it healed
+        assert not loop.plane.heal(Caller(), "toy-1+r1")  # the last one was just now
+        assert loop.version == "toy-1+r1"
+    assert loop.plane.heal is None
+
+
+def test_a_caller_waits_no_longer_than_it_has_time_and_not_where_it_has_left(make: Make) -> None:
+    fit = SlowFit()
+    loop = make(fit)
+    with loop.running:
+        loop.drift()
+        assert fit.entered.wait(60)
+        assert loop.plane.heal is not None
+        assert not loop.plane.heal(Caller(lambda: 0.5), "toy-1")
+        gone = Caller()
+        gone.leave()
+        with pytest.raises(CallerLeft):
+            loop.plane.heal(gone, "toy-1")
+
+
+def test_recalibrations_take_no_more_than_their_share_of_the_time(make: Make) -> None:
+    def slow(*given: Any) -> RefitResult:
+        loop.clock.advance(30)
+        return toy.fit_references(*given)
+
+    loop = make(slow, SelfCalibrationSettings(pages=(100, 101), most_share=0.05))
+    loop.drift()
+    assert loop.look() == "toy-1+r1"
+    loop.source.device.offsets = toy.OFFSETS
+    loop.read(10)
+    assert loop.look(569.9) == "toy-1+r1"
     assert loop.look(0.1) == "toy-1+r2"
 
 

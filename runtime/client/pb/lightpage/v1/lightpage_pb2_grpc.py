@@ -200,6 +200,7 @@ class LightpageServicer:
         """Read a range of pages from the service's own source and send their user bytes, a message a page. A lost page ends
         nothing: its message says why. Where data pages of a group are missing and enough of it was read, their bytes follow
         once three other groups have begun, or at the end; their figures are 0. The range ends with the source's last page.
+        Where the service recalibrates itself, a lost page that it can read then comes last, once more under its number.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
