@@ -7,6 +7,7 @@ from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
+from lightpage.calibration.document import parse_calibration
 from lightpage.calibration.known_pages import first_lit_pages, lit_pages
 from lightpage.codec.code import Code
 from lightpage.errors import RecalibrationRefusedError
@@ -57,10 +58,16 @@ def recalibrate_by_lost(
         progress(what, _HEALING_SHARE + (1 - _HEALING_SHARE) * share)
 
     def fitted(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decoder) -> RefitResult:
-        return healed.result
+        return healed.result if start is None else _first_of_its_device(healed.result)
 
     outcome = recalibrate(decoder, healed.known, out, version, fitted, judging, tracker)
     return replace(outcome, seconds=outcome.seconds + healed.seconds)
+
+
+def _first_of_its_device(result: RefitResult) -> RefitResult:
+    """A fit by whose coherence later ones are measured."""
+    calibration = parse_calibration(result.calibration_toml).model_copy(update={"coherence_at_first": None})
+    return replace(result, calibration_toml=calibration.to_toml())
 
 
 def recalibrate_by_recording(

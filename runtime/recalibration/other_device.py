@@ -14,7 +14,7 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.execution.twin import OnnxTwin
 from lightpage.runtime.recalibration.healing import LostPages
 from lightpage.runtime.recalibration.recalibration import refitted_bundle
-from lightpage.runtime.recalibration.refit import references_of, traced
+from lightpage.runtime.recalibration.refit import traced
 
 MOST_PAGES = 8
 """Pages at most that a device is found by."""
@@ -23,7 +23,8 @@ MOST_PAGES = 8
 def of_other_device(decoder: Decoder, pages: LostPages, progress: Progress) -> Decoder:
     """The model of a device with the geometry of another one of its profile, as that one's pilots show it.
 
-    It is near enough for a healing to go on from. Its bundle lies in memory.
+    It is near enough for a healing to go on from. Its bundle lies in memory; its calibration tells no coherence, which
+    fits that follow would have to reach.
 
     Args:
         decoder: calibrated for some device; its geometry and modulator are left aside.
@@ -37,7 +38,7 @@ def of_other_device(decoder: Decoder, pages: LostPages, progress: Progress) -> D
     bundle, levels = decoder.bundle, pages.code.levels
     distinct = {hash_frames(pair): pair for pair in pages.pairs[:MOST_PAGES]}
     with raised_as(RecalibrationRefusedError, CalibrationError):
-        twin, references = OnnxTwin(bundle), references_of(bundle, pages.references)
+        twin, references = OnnxTwin(bundle), pages.references or decoder.references
         pilots = Pilots(bundle.pilot_mask, symbol_phases(bundle.written_pilots(levels), levels))
         found = find_device(twin, bundle.profile, list(distinct.values()), references, pilots, progress)
         start = bundle.calibration.model_copy(
@@ -45,7 +46,7 @@ def of_other_device(decoder: Decoder, pages: LostPages, progress: Progress) -> D
                 "parameters": as_dict(found.parameters),
                 "turn_rad": found.turn_rad,
                 "modulation": NOMINAL.as_dict(),
-                "coherence_after": found.coherence,
+                "coherence_after": 0.0,
                 "coherence_at_first": None,
                 "goodness": None,
                 "calibrated_pages": tuple(distinct),

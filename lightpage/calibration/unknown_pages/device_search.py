@@ -64,12 +64,10 @@ class FoundDevice(NamedTuple):
     Attributes:
         parameters: [P].
         turn_rad: angle between the homodyne arms.
-        coherence: of the pilots' light, 0 to 1.
     """
 
     parameters: Real
     turn_rad: float
-    coherence: float
 
 
 def find_device(
@@ -100,14 +98,14 @@ def find_device(
     together = work.fitted("fit the field", work.with_turn(shape), _SHAPE_GROUPS, _BRANCHES[:2], steps=15)
     groups = tuple(dict.fromkeys(parameter.group for parameter in PARAMETERS[: twin.known]))
     found = work.fitted("fit all branches", work.with_angle(together), groups, _BRANCHES, steps=25)
-    told, coherence = work.outcome(found)
+    told = work.told(found)
     if not told >= _LEAST_NATS:
         raise CalibrationError(
             "pilots",
             f"{told:.0f} nats that {len(pairs)} pages tell of a device",
             f"at least {_LEAST_NATS:.0f}: different pages of one device of the bundle's profile, with its pilots",
         )
-    return FoundDevice(found.parameters, found.turn_rad, coherence)
+    return FoundDevice(found.parameters, found.turn_rad)
 
 
 class _Geometry(NamedTuple):
@@ -251,11 +249,10 @@ class _Search:
         """The pilots' light along all branches, and what is expected of it."""
         return self._light.seen(geometry.parameters, _BRANCHES), self._light.shares(geometry.parameters, _BRANCHES)
 
-    def outcome(self, geometry: _Geometry) -> tuple[float, float]:
-        """What the pages together tell of a geometry, nats, and the coherence of the pilots' light, in their mean."""
+    def told(self, geometry: _Geometry) -> float:
+        """What the pages together tell of a geometry, nats."""
         light, expected = self._seen(geometry)
-        told = told_nats(light[0] + np.exp(1j * geometry.turn_rad) * light[1], expected)
-        return float(told.sum()), float(np.mean(np.sqrt(-np.expm1(-told / (expected.size - 1)))))
+        return float(told_nats(light[0] + np.exp(1j * geometry.turn_rad) * light[1], expected).sum())
 
 
 def _worth_of(light: Complex, expected: Real, geometry: _Geometry) -> tuple[float, Complex]:

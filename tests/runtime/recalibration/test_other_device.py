@@ -56,6 +56,8 @@ def test_a_file_of_another_drive_comes_back(archive: Path) -> None:
     )
     figures = json.loads((archive / "r").read_text())
     assert figures["version"] in told
+    calibration = Bundle.open(archive / "B.zip").calibration
+    assert calibration.reference_coherence == calibration.coherence_after > 0
     assert figures["angle_deg"] == pytest.approx(-0.3, abs=0.01)
     run(recover, "--bundle", archive / "B.zip", "--code", archive / "code.toml", *read, archive / "out", "--no-heal")
     assert (archive / "out").read_bytes() == CONTENT
