@@ -27,10 +27,11 @@ RUN groupadd --gid 10001 lightpage \
     && install -d -o 10001 -g 10001 /bundles /state
 
 # /opt/build has Debian's pip and the tools that make wheels; /opt/lightpage gets what is installed, and neither of them.
+# The compiler, too, stays here.
 FROM base AS build
 ARG SOURCE_DATE_EPOCH
 RUN apt-get update \
-    && apt-get install -y --no-install-recommends python3-venv \
+    && apt-get install -y --no-install-recommends gcc libc6-dev python3-dev python3-venv \
     && rm -rf /var/lib/apt/lists/* \
     && python3 -m venv /opt/build \
     && python3 -m venv --without-pip /opt/lightpage
@@ -40,7 +41,7 @@ RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
     --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
     --mount=type=bind,from=packages,target=/run/packages \
     /opt/build/bin/pip install --no-cache-dir --require-hashes --only-binary :all: --requirement release/locks/build.txt
-COPY pyproject.toml LICENSE README.md ./
+COPY pyproject.toml setup.py LICENSE README.md ./
 COPY lightpage lightpage
 COPY train train
 COPY export export
@@ -49,7 +50,7 @@ COPY demo demo
 COPY report report
 COPY study study
 COPY virtual_device virtual_device
-RUN /opt/build/bin/pip wheel --no-deps --no-build-isolation --no-index --wheel-dir /dist .
+RUN LIGHTPAGE_PAGE_CODE=compiled /opt/build/bin/pip wheel --no-deps --no-build-isolation --no-index --wheel-dir /dist .
 
 FROM base AS service
 # The root file system is read-only in service: no byte code is written, and what must be written goes to /state or /tmp.

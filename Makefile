@@ -24,13 +24,15 @@ help:  ## list the targets
 
 setup: $(STAMP)  ## make the virtual environment with everything in it
 
+# Where a C compiler and the headers of Python are, the page code is compiled; the last line says whether it was.
 # Debian splits ensurepip off into a package of its own; there the machine's pip puts a pip into the environment.
-$(STAMP): pyproject.toml constraints.txt
+$(STAMP): pyproject.toml constraints.txt setup.py $(wildcard lightpage/codec/compiled/*.[ch])
 	@test -n "$(PYTHON)" || { echo "make: no python3 found; install Python 3.11 or newer" >&2; exit 1; }
 	@$(PYTHON) -c 'import sys; sys.exit("make: Python 3.11 or newer wanted, got " + sys.version if sys.version_info < (3, 11) else 0)'
 	@test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV) 2>/dev/null || \
 	  { $(PYTHON) -m venv --clear --without-pip $(VENV) && $(PYTHON) -m pip --python $(BIN)/python install --quiet pip; }
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[cpu,train,dev]'
+	@$(BIN)/lightpage --version
 	@touch $@
 
 demo: $(STAMP)  ## run the whole main job on a simulated device, into out/demo

@@ -139,6 +139,8 @@ lock="release/locks/$(label title | sed 's/^lightpage //').txt"
 claim "holds what $sbom and $lock say, and nothing else" python3 release/inventory.py "$tree" --against "$sbom" "$lock"
 claim "has no pip" not in_image python -c 'import pip'
 claim "has the command" in_image "${entrypoint[0]}" --help
+has_compiled_code() { in_image "${entrypoint[0]}" --version | grep "page code: compiled"; }
+claim "computes the page code compiled" has_compiled_code
 claim "is not healthy before it serves" not probe
 
 # What the image itself starts, on loopback and a port of the check's own.

@@ -14,13 +14,11 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import click
 import numpy as np
-from numpy.typing import NDArray
 
 from lightpage.calibration.parameters import as_dict
 from lightpage.cli.main import run
@@ -134,7 +132,7 @@ class _Drives:
         told = {"start": start, "found": found, "read": read, "wrong": wrong, "rounds": rounds, "refused": refused}
         return Outcome(**{**asdict(known), **told, "seconds": seconds, "cpu_seconds": cpu_seconds})
 
-    def _read(self, decoder: Decoder, pairs: Sequence[FramePair]) -> tuple[float, int, int]:
+    def _read(self, decoder: Decoder, pairs: list[FramePair]) -> tuple[float, int, int]:
         """Mean AIR of pages, how many give bytes, and how many of these bytes are wrong."""
         mask, levels, codec = decoder.bundle.pilot_mask, decoder.bundle.levels(self._code.levels), self._codec(decoder)
         airs, read, wrong = list[float](), 0, 0
@@ -144,15 +142,10 @@ class _Drives:
             given = codec.decode(page.phase, page.concentration).data
             if given is not None:
                 read += 1
-                wrong += _differing(given, data)
+                wrong += int(np.count_nonzero(np.frombuffer(given, np.uint8) != data))
             found = measure(page.phase[~mask], page.concentration[~mask], symbols[~mask], levels)
             airs.append(found.air_bits_per_symbol)
         return float(np.mean(airs)), read, wrong
-
-
-def _differing(given: bytes, data: NDArray[np.uint8]) -> int:
-    """How many bytes are not those written."""
-    return int(np.count_nonzero(np.frombuffer(given, np.uint8) != data))
 
 
 @click.command()

@@ -1,8 +1,9 @@
-"""Time of the page code on one core: decoders of LDPC blocks side by side, whole pages, and a file to pages.
+"""Time of the page code on one core: numpy and the compiled arithmetic side by side, decoders, a file to pages.
 
     python -m analysis.codec.speed --json runs/bench-codec/speed.json
 
-Decoders take turns on the same blocks. The installed size says what each would bring into the image.
+What is compared takes turns on the same blocks or pages, so that a machine whose speed drifts tilts nothing. Times are
+those of the processor. The installed size says what a decoder would bring into the image.
 """
 
 from __future__ import annotations
@@ -11,8 +12,6 @@ import io
 import sys
 import tempfile
 import time
-from collections.abc import Callable
-from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any
 
@@ -20,28 +19,28 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.codec.numba_decoder import NumbaDecoder
+from analysis.codec.block_decoders import time_decoders
+from analysis.codec.computed_by import computed_by
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.codec.code import Code
-from lightpage.codec.ldpc.code import LdpcCode
-from lightpage.codec.ldpc.decoder import MOST_ITERATIONS, decode
-from lightpage.codec.mapping import bit_information
+from lightpage.codec.compiled.choice import COMPILED, NUMPY, in_use
 from lightpage.codec.page_bytes import FileFacts, Header
 from lightpage.codec.page_codec import PageCodec
 from lightpage.codec.volume import DATA_PAGES, PARITY_PAGES, Volume, encode_volume
 from lightpage.device.profile import Profile, load_profile
+from lightpage.errors import InvalidInputError
 from lightpage.files import write_json
+from lightpage.page.levels import Levels
+from lightpage.page.modulation import NOMINAL, Modulation
 from lightpage.page.symbols import pilot_mask, pilot_symbols, symbol_phases
 from lightpage.recording.pages import PagesWriter
 
-Blocks = NDArray[np.float32]
-CODES = {"0.66": (6270, 9500), "0.50": (4750, 9500)}
-"""Information and sent bits: about a bench page in bright and in dim light."""
-_GAP = 0.075
-"""Information beyond the rate at which blocks are drawn: a page with some margin."""
+Floats = NDArray[np.float32]
 _MARGIN_BITS = 0.1
 """Of the pages that are timed, bits a symbol."""
+_UNEVEN = Modulation(tuple((NOMINAL.as_dict() | {"stroke_relative": -0.05, "phase_sin_1_rad": 0.1}).values()))
+"""A modulator whose levels are not even, as any real one's."""
 PAGES: dict[str, tuple[str, int, Code]] = {
     "bench 4x4": ("bench", 4, Code(levels=128, coded_bits=2, rate_per_mille=660, needed_information=0.72)),
     "full size 4x4": ("paper", 4, Code(levels=64, coded_bits=2, rate_per_mille=480, needed_information=0.54)),
@@ -49,143 +48,56 @@ PAGES: dict[str, tuple[str, int, Code]] = {
 }
 
 
-def drawn(code: LdpcCode, count: int, rng: np.random.Generator) -> tuple[NDArray[np.uint8], Blocks]:
-    """Blocks and their LLRs in Gaussian noise, at a gap of `_GAP` above the code's rate."""
-    bits = rng.integers(0, 2, (count, code.information_bits), dtype=np.uint8)
-    sent = code.encode(bits)
-    low, high = 0.1, 3.0
-    noise = rng.standard_normal(sent.shape)
-
-    def seen(sigma: float) -> NDArray[np.float64]:
-        return np.asarray(2 * (1 - 2.0 * sent + sigma * noise) / sigma**2)
-
-    for _ in range(20):
-        sigma = (low + high) / 2
-        low, high = (sigma, high) if bit_information(seen(sigma), sent) > code.rate + _GAP else (low, sigma)
-    return bits, seen((low + high) / 2).astype(np.float32)
+def drawn_page(codec: PageCodec, pilots: NDArray[np.uint8], levels: Levels) -> tuple[Floats, Floats]:
+    """Phases and concentrations of a page that is read with a margin of `_MARGIN_BITS`, as the decoder gives them."""
+    rng, code = np.random.default_rng(0), codec.code
+    data = rng.integers(0, 256, (1, codec.user_bytes), dtype=np.uint8)
+    symbols = codec.encode([Header(code.id, 1, 0, 1)], data, FileFacts(1, 0, 0), pilots)[0]
+    for share in np.linspace(0.45, 0.2, 26):
+        noise = share * 2 * np.pi / code.levels
+        phase = symbol_phases(symbols, levels) + noise * rng.standard_normal(symbols.shape)
+        seen = phase.astype(np.float32), np.full(symbols.shape, noise**-2, np.float32)
+        if codec.decode(*seen).margin_bits > _MARGIN_BITS:
+            return seen
+    raise InvalidInputError("page to time", "no margin at any noise", "a code that its page carries")
 
 
-def by_library(code: LdpcCode) -> Callable[[Blocks], NDArray[np.uint8]]:
-    """Minimum-sum of the package `ldpc`."""
-    from ldpc.bp_decoder import BpDecoder
-    from scipy.sparse import csr_matrix
-
-    checks = [np.arange(code.lifting) + row * code.lifting for row in range(len(code.checks))]
-    rows = np.concatenate([np.tile(own, len(bits)) for own, bits in zip(checks, code.checks, strict=True)])
-    columns = np.concatenate([check.ravel() for check in code.checks])
-    matrix = csr_matrix((np.ones(len(rows), np.uint8), (rows, columns)))
-    coder = BpDecoder(
-        matrix, error_rate=0.1, max_iter=MOST_ITERATIONS, bp_method="minimum_sum", ms_scaling_factor=0.75,
-        schedule="serial",
-    )  # fmt: skip
-
-    def one(llrs: Blocks) -> NDArray[np.uint8]:
-        word = np.zeros(code.word_bits)
-        word[code.fillers] = 40
-        word[code.sent] = np.clip(llrs, -40, 40)
-        coder.update_channel_probs(1 / (1 + np.exp(np.abs(word))))
-        flips = coder.decode(np.asarray(matrix @ (word < 0) % 2, np.uint8))
-        return np.asarray(((word < 0) ^ flips.astype(bool))[: code.information_bits], np.uint8)
-
-    return lambda blocks: np.stack([one(block) for block in blocks])
-
-
-def decoders(code: LdpcCode) -> dict[str, Callable[[Blocks], NDArray[np.uint8]]]:
-    """Decoders of blocks by name."""
-    numba = NumbaDecoder(code)
+def time_page(profile: Profile, code: Code, levels: Levels, rounds: int) -> dict[str, Any]:
+    """Milliseconds of a page from posterior to checked bytes, numpy and compiled in turns; medians, and their ratio."""
+    mask = pilot_mask(profile)
+    codec = PageCodec(code, mask, levels)
+    seen = drawn_page(codec, pilot_symbols(profile, code.levels)[mask], levels)
+    taken: dict[str, list[float]] = {NUMPY: [], COMPILED: []}
+    found = {}
+    for _ in range(rounds):
+        for name, times in taken.items():
+            with computed_by(name):
+                start = time.process_time()
+                found[name] = codec.decode(*seen)
+                times.append(time.process_time() - start)
+    median = {name: 1e3 * float(np.median(times)) for name, times in taken.items()}
     return {
-        "numpy, one block": lambda blocks: np.concatenate([decode(code, b[None]).information for b in blocks]),
-        "numpy, 16 blocks": lambda blocks: decode(code, blocks).information,
-        "numba": lambda blocks: np.stack([numba.decode(block)[0] for block in blocks]),
-        "ldpc (C++)": by_library(code),
+        **{f"{name}_ms": value for name, value in median.items()},
+        "ratio": median[NUMPY] / median[COMPILED],
+        "same": found[NUMPY] == found[COMPILED],
+        "user_bytes": codec.user_bytes,
+        "blocks": codec.blocks,
+        "iterations": found[NUMPY].iterations,
     }
 
 
-BROUGHT = {"numpy": (), "numba": ("numba", "llvmlite"), "ldpc": ("ldpc", "stim", "sinter", "pymatching", "networkx")}
-"""Distributions that a decoder would bring into the image, which has numpy already."""
-
-
-def megabytes(names: tuple[str, ...]) -> float:
-    """Installed size of distributions."""
-    total = 0
-    for name in names:
-        try:
-            files = distribution(name).files or []
-        except PackageNotFoundError:
-            continue
-        total += sum(path.stat().st_size for file in files if (path := Path(str(file.locate()))).is_file())
-    return total / 1e6
-
-
-def time_decoders(count: int, rounds: int) -> list[dict[str, Any]]:
-    """Milliseconds a block of each decoder, the best of some rounds, and whether all came out right."""
-    found = []
-    for name, (information, sent) in CODES.items():
-        code = LdpcCode(information, sent)
-        bits, llrs = drawn(code, count, np.random.default_rng(0))
-        ways = decoders(code)
-        best = dict.fromkeys(ways, float("inf"))
-        right = {}
-        for way in ways.values():
-            way(llrs[:2])  # compiled, and in the cache
-        for _ in range(rounds):
-            for way_name, way in ways.items():
-                start = time.perf_counter()
-                decoded = way(llrs)
-                best[way_name] = min(best[way_name], (time.perf_counter() - start) / count)
-                right[way_name] = int(np.count_nonzero((decoded == bits).all(axis=1)))
-        for way_name, seconds in best.items():
-            size = megabytes(BROUGHT[way_name.partition(",")[0].partition(" ")[0]])
-            found.append(
-                {
-                    "rate": name,
-                    "decoder": way_name,
-                    "ms": 1e3 * seconds,
-                    "megabits_per_second": information / seconds / 1e6,
-                    "right": right[way_name],
-                    "blocks": count,
-                    "brought_MB": size,
-                }
-            )
-    return found
-
-
-def time_page(profile: Profile, code: Code, rounds: int) -> dict[str, float]:
-    """Milliseconds of a page's code, by its parts, on one core."""
-    mask = pilot_mask(profile)
-    codec, rng = PageCodec(code, mask), np.random.default_rng(0)
-    data = rng.integers(0, 256, (1, codec.user_bytes), dtype=np.uint8)
-    symbols = codec.encode(
-        [Header(code.id, 1, 0, 1)], data, FileFacts(1, 0, 0), pilot_symbols(profile, code.levels)[mask]
-    )[0]
-    best, iterations = float("inf"), 0.0
-    step = 2 * np.pi / code.levels
-    phase, kappa = np.zeros(symbols.shape), np.zeros(symbols.shape)
-    for share in np.linspace(0.45, 0.2, 26):
-        noise = share * step
-        phase = symbol_phases(symbols, code.levels) + noise * rng.standard_normal(symbols.shape)
-        kappa = np.full(symbols.shape, noise**-2)
-        if codec.decode(phase, kappa).margin_bits > _MARGIN_BITS:
-            break
-    for _ in range(rounds):
-        start = time.perf_counter()
-        found = codec.decode(phase, kappa)
-        best, iterations = min(best, time.perf_counter() - start), found.iterations
-    return {"ms": 1e3 * best, "user_bytes": codec.user_bytes, "blocks": codec.blocks, "iterations": iterations}
-
-
 def time_encoding(profile: Profile, code: Code, size: int) -> float:
-    """Megabytes a second from a file to pages in HDF5, in groups of 60 + 4."""
+    """Megabytes a second of one core from a file to pages in HDF5, in groups of 60 + 4."""
     mask = pilot_mask(profile)
     codec, content = PageCodec(code, mask), np.random.default_rng(0).bytes(size)
     volume = Volume.of_file(io.BytesIO(content), 1, codec.user_bytes, DATA_PAGES, PARITY_PAGES)
     pilots = pilot_symbols(profile, code.levels)[mask]
     with tempfile.TemporaryDirectory() as folder:
-        start = time.perf_counter()
+        start = time.process_time()
         with PagesWriter(Path(folder) / "pages.h5", profile, code.levels, {}) as writer:
             for pages in encode_volume(codec, volume, io.BytesIO(content), pilots):
                 writer.append(pages)
-        return size / (time.perf_counter() - start) / 1e6
+        return size / (time.process_time() - start) / 1e6
 
 
 @click.command()
@@ -194,26 +106,33 @@ def time_encoding(profile: Profile, code: Code, size: int) -> float:
 @click.option("--json", "json_path", type=OutputFile(), help="Write the times to this file.")
 def main(blocks: int, rounds: int, json_path: Path | None) -> None:
     """Print the times."""
-    found = time_decoders(blocks, rounds)
+    found: Any = time_decoders(blocks, rounds)
     click.echo(f"{'rate':<6} {'decoder':<18} {'ms/block':>9} {'Mb/s':>7} {'right':>8} {'MB more':>8}")
     for each in found:
         click.echo(
             f"{each['rate']:<6} {each['decoder']:<18} {each['ms']:>9.2f} {each['megabits_per_second']:>7.2f} "
             f"{each['right']:>4}/{each['blocks']:<3} {each['brought_MB']:>8.0f}"
         )
-    pages = {}
-    click.echo(f"\n{'page':<14} {'bytes':>8} {'blocks':>7} {'iterations':>11} {'decode ms':>10} {'encode MB/s':>12}")
+    pages: dict[str, dict[str, Any]] = {}
+    click.echo(
+        f"\n{'page':<24} {'bytes':>8} {'blocks':>7} {'iterations':>11} {'numpy ms':>9} {'compiled ms':>12} {'ratio':>6}"
+    )
     for name, (profile_name, size, code) in PAGES.items():
         profile = load_profile(profile_name).with_symbols_of(size)
-        times = time_page(profile, code, rounds)
-        times["encode_MB_per_second"] = time_encoding(profile, code, 2_000_000)
-        pages[name] = times
-        click.echo(
-            f"{name:<14} {times['user_bytes']:>8.0f} {times['blocks']:>7.0f} {times['iterations']:>11.1f} "
-            f"{times['ms']:>10.1f} {times['encode_MB_per_second']:>12.2f}"
-        )
+        for suffix, levels in (("", Levels(code.levels)), (", uneven", _UNEVEN.page_levels(code.levels))):
+            pages[name + suffix] = times = time_page(profile, code, levels, rounds)
+            click.echo(
+                f"{name + suffix:<24} {times['user_bytes']:>8} {times['blocks']:>7} {times['iterations']:>11.1f} "
+                f"{times['numpy_ms']:>9.1f} {times['compiled_ms']:>12.2f} {times['ratio']:>6.1f}"
+                f"{'' if times['same'] else '   NOT THE SAME'}"
+            )
+    encoding = {}
+    for name, (profile_name, size, code) in PAGES.items():
+        encoding[name] = time_encoding(load_profile(profile_name).with_symbols_of(size), code, 2_000_000)
+        click.echo(f"{name}: a file to pages {encoding[name]:.1f} MB/s")
     if json_path is not None:
-        write_json(json_path, {"decoders": found, "pages": pages})
+        found = {"page_code": in_use(), "decoders": found, "pages": pages, "encode_MB_per_second": encoding}
+        write_json(json_path, found)
 
 
 if __name__ == "__main__":

@@ -12,16 +12,20 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.calibration.parameters import NAMES
+from lightpage.calibration.parameters import NAMES, as_dict, indices
 from lightpage.calibration.sampling_table import sampling_table
 from lightpage.codec.volume import Volume, encode_volume
+from lightpage.device.profile import Profile
 from lightpage.device.state import Device
+from lightpage.page.modulation import Modulation
 from lightpage.page.pilots import Pilots
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.archives.recordings.coded_pages import air_bits
 from lightpage.runtime.device.acquisition.source import SHOT_S, FrameSource, Shot
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.execution.twin import OnnxTwin
+from lightpage.runtime.service.jobs.kept_pages import KeptPages
+from lightpage.runtime.service.monitoring.observation import Observation
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_modulation, true_parameters
 
@@ -180,6 +184,17 @@ class DriftingSource(FrameSource):
 
 
 @dataclass(frozen=True)
+class Untold:
+    """Pages are kept without the symbols that the simulator knows."""
+
+    kept: KeptPages
+
+    def observe(self, observation: Observation) -> None:
+        """See `Observer`."""
+        self.kept.observe(replace(observation, symbols=None))
+
+
+@dataclass(frozen=True)
 class TrueTable:
     """The same network, fed the table of the device's true state: as good as any calibration could make it.
 
@@ -222,3 +237,14 @@ class TrueTable:
         shown = modulation.page_levels(levels)
         page = fed.decode(truth.pair, levels, pilots=Pilots.of_symbols(bundle.pilot_mask, truth.symbols, shown))
         return air_bits(page, truth.symbols, self.data, shown)
+
+
+def light_of(parameters: NDArray[np.float64], modulation: Modulation) -> dict[str, float]:
+    """Return the stroke and the axial places of a device, by name."""
+    names = [NAMES[index] for index in indices("axial")]
+    return {"stroke_relative": modulation.coefficients[0], **{name: as_dict(parameters)[name] for name in names}}
+
+
+def true_light(profile: Profile, device: Device) -> dict[str, float]:
+    """The same of a true device."""
+    return light_of(true_parameters(profile, device), true_modulation(device.slm))

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from analysis.hardware.drifting import DriftingSource, TrueTable, direction, moved
+from analysis.hardware.drifting import DriftingSource, TrueTable, Untold, direction, light_of, moved, true_light
 from analysis.hardware.rows import Rows, append_row, kept_rows
 from analysis.hardware.watched_recalibrator import WatchedRecalibrator
-from lightpage.calibration.parameters import NAMES, as_dict, indices
 from lightpage.clock import Clock
 from lightpage.device.state import Device
 from lightpage.errors import FramesDisagreeError, LightpageError, LostPageError
 from lightpage.page.levels import Levels
-from lightpage.page.modulation import Modulation
 from lightpage.progress import track
 from lightpage.runtime.archives.recordings.coded_pages import air_bits
 from lightpage.runtime.model.decoding.decoder import Decoder
@@ -32,9 +29,8 @@ from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.models.store import Store
 from lightpage.runtime.service.monitoring.flight_recorder import FlightRecorder
 from lightpage.runtime.service.monitoring.monitor import Monitor
-from lightpage.runtime.service.monitoring.observation import Observation, Observer
+from lightpage.runtime.service.monitoring.observation import Observer
 from lightpage.runtime.service.pages.reading import read_page
-from lightpage.simulator.true_optics import true_modulation, true_parameters
 
 PAGE_S = 300.0
 """Simulated time from one page to the next."""
@@ -92,17 +88,6 @@ def state(begun: Device, moment: float, pages: int, light: LightDrift) -> Device
         return device
     angle = device.geometry.pipe_angle_deg + KNOCK_DEG
     return device.model_copy(update={"geometry": device.geometry.model_copy(update={"pipe_angle_deg": angle})})
-
-
-@dataclass(frozen=True)
-class Untold:
-    """Pages are kept without the symbols that the simulator knows."""
-
-    kept: KeptPages
-
-    def observe(self, observation: Observation) -> None:
-        """See `Observer`."""
-        self.kept.observe(replace(observation, symbols=None))
 
 
 class SimulatedClock(Clock):
@@ -228,13 +213,7 @@ class Week:
             "due": monitor.due,
             "reasons": list(monitor.state().reasons),
             "shots": source.shots,
-            "true": _light_of(true_parameters(bundle.profile, device), true_modulation(device.slm)),
-            "fitted": _light_of(bundle.calibration.vector, bundle.modulation),
+            "true": true_light(bundle.profile, device),
+            "fitted": light_of(bundle.calibration.vector, bundle.modulation),
         }
         return row
-
-
-def _light_of(parameters: NDArray[np.float64], modulation: Modulation) -> dict[str, float]:
-    """Return what `LightDrift` changes of a device, by name."""
-    names = [NAMES[index] for index in indices("axial")]
-    return {"stroke_relative": modulation.coefficients[0], **{name: as_dict(parameters)[name] for name in names}}

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from copy import copy
 from functools import wraps
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, entry_points, version
 from types import FrameType
 from typing import Any, NoReturn, Self
 
@@ -171,8 +171,23 @@ def missing(subject: str, error: ModuleNotFoundError) -> LightpageError:
     return LightpageError(subject, f"no module {error.name}", "a complete installation of lightpage")
 
 
+def _show_version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
+    if wanted and not context.resilient_parsing:
+        from lightpage.codec.compiled.choice import in_use
+
+        click.echo(f"lightpage, version {version('lightpage')}\npage code: {in_use()}")
+        context.exit()
+
+
 @click.command(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(package_name="lightpage")
+@click.option(
+    "--version",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_show_version,
+    help="Show the version, and what computes the page code.",
+)
 def lightpage() -> None:
     """Decode phase pages read through a glass light-pipe, and keep the decoder calibrated to its device."""
 

@@ -10,12 +10,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.codec.compiled.choice import compiled
 from lightpage.codec.ldpc.decoder import MOST_LLR
+from lightpage.codec.likelihood.neighbours import searches_of, table_of
+from lightpage.codec.likelihood.ratios import MOST_PHASE, ratios
 from lightpage.errors import PageError
 from lightpage.page.levels import Levels, check_levels
 
-_CHUNK = 1 << 18
-"""Probabilities at once: few enough for the cache."""
+Real = NDArray[np.float64]
+
+_MOST_CONCENTRATION = 1e30
+"""More says no more."""
 
 
 def level_bits(levels: int) -> int:
@@ -46,17 +51,19 @@ def bit_llrs(
     concentration: NDArray[np.floating],
     levels: int | Levels,
     label_bits: int | None = None,
+    threads: int = 1,
 ) -> NDArray[np.float32]:
     """Log-likelihood ratios ln P(0) / P(1) of the label bits of symbols whose levels are equally likely.
 
     The posterior of a level at theta is proportional to exp(kappa cos(theta - mu)); those of all levels whose label has
-    the bit are added up.
+    the bit are added up. Levels far from the phase are left out where what they weigh changes nothing.
 
     Args:
         phase: decoded phases mu, radians, any shape; piston removed.
         concentration: kappa, the same shape.
         levels: M, a power of two, or uneven levels of that number.
         label_bits: b, 1 to log2 M; all bits, in Gray code, if left out.
+        threads: that share the work where it is compiled.
 
     Returns:
         float32, the shape of `phase` and b; -40 to 40.
@@ -70,52 +77,22 @@ def bit_llrs(
     mu, kappa = np.asarray(phase, np.float64).ravel(), np.asarray(concentration, np.float64).ravel()
     if np.shape(phase) != np.shape(concentration):
         raise PageError("phase, concentration", (np.shape(phase), np.shape(concentration)), "two equal shapes")
+    table = table_of(levels, bits)
+    return ratios(*_checked(mu, kappa), table, MOST_LLR, threads).reshape(*np.shape(phase), bits)
+
+
+def _checked(mu: Real, kappa: Real) -> tuple[Real, Real]:
+    """Phases and concentrations, contiguous and not too large to be counted with.
+
+    Raises:
+        PageError: a value that is not finite, a negative concentration.
+    """
+    mu, kappa, native = np.ascontiguousarray(mu), np.ascontiguousarray(kappa), compiled()
+    if native is not None and native.look(mu, kappa, _MOST_CONCENTRATION) == 0:
+        return mu, kappa
     if not (np.isfinite(mu).all() and np.isfinite(kappa).all() and (kappa >= 0).all()):
         raise PageError("phase, concentration", "NaN, infinity or a negative concentration", "finite numbers")
-    ratios = np.empty((mu.size, bits), np.float32)
-    weights = _CosetWeights(levels, bits)
-    ones = labels(bits)[:, None] >> np.arange(bits) & 1
-    rows = max(1, _CHUNK // levels.count)
-    for start in range(0, mu.size, rows):
-        some = slice(start, start + rows)
-        by_coset = weights(mu[some], kappa[some])
-        one, zero = by_coset @ ones.astype(np.float32), by_coset @ (1 - ones).astype(np.float32)
-        tiny = np.float32(np.finfo(np.float32).tiny)
-        ratios[some] = np.log(np.maximum(zero, tiny)) - np.log(np.maximum(one, tiny))
-    return np.clip(ratios, -MOST_LLR, MOST_LLR).reshape(*np.shape(phase), bits)
-
-
-class _CosetWeights:
-    """Posterior of the cosets, but for a factor, so that no sum underflows.
-
-    Args:
-        levels: of the page.
-        bits: b.
-    """
-
-    def __init__(self, levels: Levels, bits: int) -> None:
-        self._levels, self._cosets = levels, 1 << bits
-        first = 1.0 if levels.is_nominal else 0.0
-        self._waves = np.stack([np.cos(levels.phases) - first, np.sin(levels.phases)])
-
-    def __call__(self, mu: NDArray[np.float64], kappa: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Weights of symbols' cosets, float32 [symbols, 2^b]."""
-        if not self._levels.is_nominal:
-            drop = (kappa * np.stack([np.cos(mu), np.sin(mu)])).T @ self._waves
-            return self._summed(drop - drop.max(axis=1, keepdims=True))
-        step = 2 * np.pi / self._levels.count
-        nearest = np.rint(mu / step)
-        # about the nearest level: float32 then keeps what a large concentration makes of small differences;
-        # kappa (cos(offset - away) - cos(away)) as a product
-        away = mu - nearest * step
-        weight = self._summed((kappa * np.stack([np.cos(away), np.sin(away)])).T @ self._waves)
-        first = nearest.astype(np.int64) % self._cosets
-        places = (np.arange(self._cosets) - first[:, None]) % self._cosets
-        return np.take_along_axis(weight, places, axis=1)
-
-    def _summed(self, logits: NDArray[np.float64]) -> NDArray[np.float32]:
-        weights = np.exp(logits.astype(np.float32)).reshape(len(logits), -1, self._cosets)
-        return np.asarray(weights.sum(axis=1))
+    return _bounded(mu), np.minimum(kappa, _MOST_CONCENTRATION)
 
 
 def to_levels(label: NDArray[np.uint8], upper: NDArray[np.integer], levels: int) -> NDArray[np.uint8]:
@@ -142,7 +119,7 @@ def decide_in_coset(phase: NDArray[np.floating], label: NDArray[np.uint8], level
     """
     levels, bits = Levels.of(levels), label.shape[1]
     _check_label(levels.count, bits)
-    mu, number = np.asarray(phase, np.float64), np.argsort(labels(bits))[label @ (1 << np.arange(bits))]
+    mu, number = _bounded(np.asarray(phase, np.float64)), np.argsort(labels(bits))[label @ (1 << np.arange(bits))]
     if levels.is_nominal:
         step = 2 * np.pi / levels.count
         nearest = np.rint((mu - number * step) / (step * (1 << bits))).astype(np.int64)
@@ -152,6 +129,33 @@ def decide_in_coset(phase: NDArray[np.floating], label: NDArray[np.uint8], level
         for coset in range(1 << bits):
             found[number == coset] = levels.every(1 << bits, coset).nearest(mu[number == coset])
     return found
+
+
+def upper_bits(phase: Real, label: NDArray[np.uint8], levels: Levels) -> NDArray[np.uint8]:
+    """Numbers within cosets as `decide_in_coset` finds them, bit by bit, the highest first: uint8 [symbols, m - b].
+
+    Args:
+        phase: decoded phases, radians, [symbols].
+        label: bits of each symbol, [symbols, b].
+        levels: M, a power of two, or uneven levels of that number.
+    """
+    label_bits, all_bits = label.shape[1], level_bits(levels.count)
+    bits, native = np.empty((len(phase), all_bits - label_bits), np.uint8), compiled()
+    compact = np.ascontiguousarray(label)
+    if native is not None and bits.size:
+        searches = None if levels.is_nominal else searches_of(levels, label_bits)
+        if native.upper_bits(phase, compact, label_bits, all_bits, searches, bits):
+            return bits
+    number = decide_in_coset(phase, label, levels)
+    return np.asarray(number[:, None] >> np.arange(bits.shape[1])[::-1] & 1, np.uint8)
+
+
+def _bounded(phase: Real) -> Real:
+    """Phases, contiguous, whole turns taken off where one is too large to be counted in turns."""
+    phase = np.ascontiguousarray(phase)
+    if phase.size and np.abs(phase).max() > MOST_PHASE:
+        return np.fmod(phase, 2 * np.pi)
+    return phase
 
 
 def bit_information(llrs: NDArray[np.floating], bits: NDArray[np.uint8] | None = None) -> float:

@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 
 from lightpage.codec.checksum import CRC32C_BYTES, crc32c
 from lightpage.codec.code import Code
+from lightpage.codec.compiled.order import gathered, scatter
 from lightpage.codec.header import decode_header, encode_headers, header_symbols
 from lightpage.codec.ldpc.code import MOST_INFORMATION_BITS, Bits, LdpcCode
 from lightpage.codec.ldpc.decoder import decode
-from lightpage.codec.mapping import bit_information, bit_llrs, decide_in_coset, to_levels
+from lightpage.codec.likelihood.information import page_information
+from lightpage.codec.mapping import bit_llrs, to_levels, upper_bits
 from lightpage.codec.page_bytes import FILE_BYTES, FileFacts, Header, Loss, PageBytes
 from lightpage.codec.random_bits import random_bytes, random_order
 from lightpage.codec.reed_solomon import LONGEST_WORD, SYMBOL_BITS, parity, repair
@@ -34,13 +36,14 @@ class PageCodec:
         code: its parameters.
         pilots: where the pilots are, bool [ny, nx].
         levels: of the pages that are read, where they are uneven; as many as the code has.
+        threads: that share the work on a page where it is compiled.
 
     Raises:
         InvalidInputError: the page is too small for this code.
     """
 
-    def __init__(self, code: Code, pilots: NDArray[np.bool_], levels: Levels | None = None) -> None:
-        self.code, self.pilots, self._levels = code, pilots, levels or Levels(code.levels)
+    def __init__(self, code: Code, pilots: NDArray[np.bool_], levels: Levels | None = None, threads: int = 1) -> None:
+        self.code, self.pilots, self._levels, self._threads = code, pilots, levels or Levels(code.levels), threads
         data = int(np.count_nonzero(~pilots))
         count = header_symbols(code.levels)
         if count >= data:
@@ -70,9 +73,9 @@ class PageCodec:
             raise small
 
     @cached_property
-    def _order(self) -> NDArray[np.intp]:
+    def _order(self) -> NDArray[np.int32]:
         """Bit of the body that each sent bit goes to."""
-        return random_order(_INTERLEAVER_SEED, self._coded_bits)
+        return random_order(_INTERLEAVER_SEED, self._coded_bits).astype(np.int32)
 
     @cached_property
     def _filling(self) -> Bits:
@@ -156,23 +159,22 @@ class PageCodec:
         mu, kappa = phase.ravel(), concentration.ravel()
         header = decode_header(mu[self._header], kappa[self._header], self._levels)
         other = header is not None and header.code_id != self.code.id and expected is None
-        llrs = bit_llrs(mu[self._body], kappa[self._body], self._levels, self.code.coded_bits).ravel()
-        blocks = llrs[self._order[: self.blocks * self.ldpc.sent_bits]].reshape(self.blocks, -1)
+        own = mu[self._body].astype(np.float64)
+        llrs = bit_llrs(own, kappa[self._body], self._levels, self.code.coded_bits, self._threads).ravel()
+        blocks = gathered(llrs, self._order[: self.blocks * self.ldpc.sent_bits]).reshape(self.blocks, -1)
         if other:
             return self._lost(header, Loss.CODE, blocks, 0, 0.0)
-        found = decode(self.ldpc, blocks)
+        found = decode(self.ldpc, blocks, threads=self._threads)
         failed, iterations = int(np.count_nonzero(~found.converged)), float(found.iterations.mean())
         label = self._interleaved(found.sent[None])
-        upper = decide_in_coset(mu[self._body], label, self._levels)
-        high = (upper[:, None] >> np.arange(self._upper_bits)[::-1] & 1).astype(np.uint8)
-        bits = np.concatenate([found.information.ravel(), high.ravel()])
+        bits = np.concatenate([found.information.ravel(), upper_bits(own, label, self._levels).ravel()])
         for candidate in (header, expected):
             if candidate is None:
                 continue
             body, corrected = self._checked(bits, candidate)
             if body is not None:
                 # the code words are right where the checksum holds, but for what Reed-Solomon has mended
-                information = bit_information(blocks, found.sent)
+                information = page_information(blocks, found.sent)
                 margin = self.code.coded_bits * (information - self.code.needed_information)
                 data = body[FILE_BYTES:-CRC32C_BYTES].tobytes()
                 file = FileFacts.parse(body[:FILE_BYTES].tobytes())
@@ -189,7 +191,7 @@ class PageCodec:
     def _lost(
         self, header: Header | None, loss: Loss, blocks: NDArray[np.float32], failed: int, iterations: float
     ) -> PageBytes:
-        margin = self.code.coded_bits * (bit_information(blocks) - self.code.needed_information)
+        margin = self.code.coded_bits * (page_information(blocks) - self.code.needed_information)
         # what is wrong and claims to be certain is no margin
         return PageBytes(header, None, None, loss, iterations, failed, self.blocks, 0, min(margin, 0.0))
 
@@ -227,8 +229,9 @@ class PageCodec:
         pages = len(sent)
         label = np.empty((pages, self._coded_bits), np.uint8)
         reached = self.blocks * self.ldpc.sent_bits
-        label[:, self._order[:reached]] = sent.reshape(pages, -1)
-        label[:, self._order[reached:]] = self._filling
+        for page, bits in zip(label, sent.reshape(pages, -1), strict=True):
+            scatter(bits, self._order[:reached], page)
+            scatter(self._filling, self._order[reached:], page)
         return label.reshape(-1, self.code.coded_bits)
 
     def _symbols(self, bits: Bits) -> NDArray[np.int64]:

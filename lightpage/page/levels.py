@@ -87,7 +87,7 @@ class Levels:
         if self.uneven is None:
             nearest = np.rint(phase * (self.count / (2 * np.pi)))
             return np.asarray(nearest.astype(np.int64) % self.count, np.uint8)
-        return np.asarray(self._order[self.places(phase)], np.uint8)
+        return np.asarray(self.order[self.places(phase)], np.uint8)
 
     def nearest_phases(self, mu: Real) -> Real:
         """Phase of the level nearest to each phase, radians, within pi of it; same shape."""
@@ -112,17 +112,18 @@ class Levels:
         return np.asarray(np.abs(self.gaps(np.array([-1, 1]))).min(axis=0)[self.places(mu)] / 2)
 
     @cached_property
-    def _order(self) -> NDArray[np.intp]:
+    def order(self) -> NDArray[np.intp]:
+        """Levels in the order in which they lie on the circle, [M]."""
         return np.argsort(np.mod(self.phases, 2 * np.pi), kind="stable")
 
     @cached_property
     def circle(self) -> Real:
         """Phases in the order in which they lie on the circle, 0 to 2 pi, [M]."""
-        return np.asarray(np.mod(self.phases, 2 * np.pi)[self._order])
+        return np.asarray(np.mod(self.phases, 2 * np.pi)[self.order])
 
     def places(self, mu: Real) -> NDArray[np.intp]:
         """Place on the circle of the level nearest to each phase (radians, any winding); same shape."""
-        first, borders, starts, most = self._borders
+        first, borders, starts, most = self.borders
         turns = (mu - first) / (2 * np.pi)
         turns = turns - np.floor(turns)
         found = starts[(turns * (len(starts) - 1)).astype(np.intp)]
@@ -131,7 +132,7 @@ class Levels:
         return np.asarray(found)
 
     @cached_property
-    def _borders(self) -> tuple[float, Real, NDArray[np.intp], int]:
+    def borders(self) -> tuple[float, Real, NDArray[np.intp], int]:
         """Half ways between levels on the circle.
 
         Returns:

@@ -69,7 +69,8 @@ def assembled(settings: ServiceSettings, observer: Observer) -> Iterator[Assembl
     service, flight = settings.service, settings.flight_recorder
     key = None if service.bundle_key is None else BundleKey(service.bundle_key)
     provider = Provider.parse(service.provider, service.engine_cache)
-    base = Decoder(Bundle.open(bundle_path(service.bundle), key=key), service.threads, provider=provider)
+    bundle = Bundle.open(bundle_path(service.bundle), key=key)
+    base = Decoder(bundle, service.threads, provider=provider, code_threads=service.code_threads)
     metrics = ServiceMetrics()
     monitor = Monitor(metrics=metrics)
     own = settings.self_calibration

@@ -82,6 +82,9 @@ class ServiceTable(SettingsTable):
         None, description="Folder whose recordings a caller may name to recalibrate with."
     )
     threads: int | None = Field(None, ge=1, le=4096)
+    code_threads: int = Field(
+        1, ge=1, le=64, description="Threads that share the code of a page, where it is compiled."
+    )
     provider: Annotated[str, checked(Provider.parse)] = CPU
     engine_cache: Folder | None = None
     tracking: bool = Field(True, description="Follow the image, and find it again.")

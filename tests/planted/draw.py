@@ -17,7 +17,7 @@ from tests.planted.faults import ROOT, Fault, blocks_of, load
 
 COUNT = 60
 AREAS = {
-    "page-code": {"lightpage/codec": "* ldpc/*"},
+    "page-code": {"lightpage/codec": "* ldpc/* compiled/* likelihood/*"},
     "decoder": {"lightpage": "page/* metrics/*", "runtime/model/decoding": "decoder page phase_refit"},
     "tracking": {"runtime/model/decoding": "image_tracker following tracking image_drift"},
     "calibration": {"lightpage/calibration": "*", "train/fitting": "fit fitted"},

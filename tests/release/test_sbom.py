@@ -86,7 +86,7 @@ def image(root: Path) -> Path:
         (root / "opt/lightpage" / name).symlink_to(target)
     write(root / "opt/lightpage/bin/activate", b"")
     write(root / "opt/lightpage/pyvenv.cfg", b"home = /usr/bin\ninclude-system-site-packages = false\n")
-    wheels = f"{64 * '1'}  lightpage-0.1.0-py3-none-any.whl\n{64 * '2'}  click-8.5.1-py3-none-any.whl\n"
+    wheels = f"{64 * '1'}  lightpage-0.1.0-cp311-abi3-linux_x86_64.whl\n{64 * '2'}  click-8.5.1-py3-none-any.whl\n"
     write(root / "opt/lightpage/wheels.sha256", wheels.encode())
     write(root / "etc/os-release", b'NAME="Debian"\nVERSION_ID="12"\n')
     write(root / "var/lib/dpkg/status", STATUS.encode())

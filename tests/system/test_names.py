@@ -71,7 +71,7 @@ def test_a_callers_own_modules_break_nothing(toy_zip: Path, tmp_path: Path) -> N
 
 def test_a_wheel_has_one_name_and_is_small(tmp_path: Path) -> None:
     source = tmp_path / "source"
-    for name in ("pyproject.toml", "LICENSE", "README.md"):
+    for name in ("pyproject.toml", "setup.py", "LICENSE", "README.md"):
         source.mkdir(exist_ok=True)
         shutil.copy(ROOT / name, source)
     shutil.copytree(ROOT / "lightpage", source / "lightpage", symlinks=True, ignore=_compiled)
@@ -79,7 +79,7 @@ def test_a_wheel_has_one_name_and_is_small(tmp_path: Path) -> None:
         shutil.copytree(ROOT / name, source / name, ignore=_compiled)
     pip = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
     subprocess.run([*pip, "--wheel-dir", str(tmp_path), "."], cwd=source, check=True, timeout=120)
-    (wheel,) = tmp_path.glob("*.whl")
+    (wheel,) = tmp_path.glob("lightpage-*-cp311-abi3-*.whl")  # of this platform, for Python 3.11 and later
     assert wheel.stat().st_size <= 5e6
     names = zipfile.ZipFile(wheel).namelist()
     assert {name.partition("/")[0].partition("-")[0] for name in names} == {"lightpage"}
@@ -88,6 +88,9 @@ def test_a_wheel_has_one_name_and_is_small(tmp_path: Path) -> None:
     }
     packed = {name.removeprefix("lightpage/") if name.split("/")[1] in FOLDERS else name for name in names}
     assert ours - packed == set()
+    compiled = {name for name in packed if name.endswith((".so", ".pyd"))}
+    assert compiled <= {f"lightpage/codec/compiled/page_code{suffix}" for suffix in (".abi3.so", ".pyd")}
+    assert compiled or not shutil.which("cc")
 
 
 @pytest.mark.long  # mypy reads everything anew, for a minute; a source checkout shows the same by what lint checks
@@ -102,4 +105,4 @@ def test_mypy_finds_an_error_in_every_package(tmp_path: Path) -> None:
 
 
 def _compiled(folder: str, names: list[str]) -> list[str]:
-    return [name for name in names if name in ("__pycache__", "weights", "planted.py")]
+    return [name for name in names if name in ("__pycache__", "weights", "planted.py") or name.endswith(".so")]

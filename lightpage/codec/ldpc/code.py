@@ -106,6 +106,13 @@ class LdpcCode:
             for row in range(self._rows)
         )
 
+    @cached_property
+    def rows(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """How many bits the checks of each row have, [rows], and the group and shift of each of them, [bits, 2]."""
+        entries = [(c, s) for row in range(self._rows) for (r, c), s in self._shift.items() if r == row]
+        degrees = np.bincount([r for r, _ in self._shift], minlength=self._rows)
+        return degrees.astype(np.int32), np.array(entries, np.int32)
+
     @property
     def word_bits(self) -> int:
         """Bits of the whole word, those included that are not sent."""

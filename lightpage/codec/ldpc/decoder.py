@@ -1,4 +1,4 @@
-"""Layered offset min-sum decoding of LDPC blocks in numpy, many blocks at once.
+"""Layered offset min-sum decoding of LDPC blocks: in numpy, many at once, and by the compiled arithmetic bit for bit.
 
 Each row of the base graph is a layer of Z independent checks. A check tells every bit of it the least certain of the
 other bits, with the sign that makes the parity even, less an offset (Chen et al., IEEE Trans. Commun. 53, 1288, 2005).
@@ -8,10 +8,12 @@ The next layer already uses what this one found.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.codec.compiled.choice import compiled, spread
 from lightpage.codec.ldpc.code import Bits, LdpcCode
 from lightpage.errors import InvalidInputError
 
@@ -44,13 +46,16 @@ class DecodedBlocks:
     iterations: NDArray[np.int64]
 
 
-def decode(code: LdpcCode, llrs: NDArray[np.floating], iterations: int = MOST_ITERATIONS) -> DecodedBlocks:
+def decode(
+    code: LdpcCode, llrs: NDArray[np.floating], iterations: int = MOST_ITERATIONS, threads: int = 1
+) -> DecodedBlocks:
     """Decode blocks; each stops as soon as all of its checks hold.
 
     Args:
         code: that they were encoded with.
         llrs: log-likelihood ratios ln P(0) / P(1) of the sent bits, [blocks, n].
         iterations: at most.
+        threads: that share the blocks where the decoder is compiled.
 
     Raises:
         InvalidInputError: another shape, or a value that is no number.
@@ -59,6 +64,9 @@ def decode(code: LdpcCode, llrs: NDArray[np.floating], iterations: int = MOST_IT
         raise InvalidInputError("LDPC decoder: LLRs", f"shape {llrs.shape}", f"(blocks, {code.sent_bits})")
     if np.isnan(llrs).any():
         raise InvalidInputError("LDPC decoder: LLRs", "NaN", "numbers")
+    native = compiled()
+    if native is not None and iterations > 0:
+        return _decode_compiled(native, code, llrs, iterations, threads)
     blocks = len(llrs)
     words = np.zeros((code.word_bits, blocks), np.bool_)
     converged, taken = np.zeros(blocks, np.bool_), np.full(blocks, iterations)
@@ -67,6 +75,24 @@ def decode(code: LdpcCode, llrs: NDArray[np.floating], iterations: int = MOST_IT
         _decode_some(code, llrs[some], iterations, words[:, some], converged[some], taken[some])
     bits = words.T.astype(np.uint8)
     return DecodedBlocks(bits[:, : code.information_bits], bits[:, code.sent], converged, taken)
+
+
+def _decode_compiled(
+    native: ModuleType, code: LdpcCode, llrs: NDArray[np.floating], iterations: int, threads: int
+) -> DecodedBlocks:
+    with np.errstate(over="ignore"):  # infinity is clipped like all else
+        ratios = np.ascontiguousarray(llrs, np.float32)
+    blocks, graph = len(ratios), (*code.rows, code.lifting, code.information_bits, code.sent_bits)
+    information = np.empty((blocks, code.information_bits), np.uint8)
+    sent, taken = np.empty(ratios.shape, np.uint8), np.empty(blocks, np.int32)
+
+    def work(some: slice) -> None:
+        native.decode_blocks(
+            graph, iterations, OFFSET, MOST_LLR, _KNOWN, ratios[some], information[some], sent[some], taken[some]
+        )
+
+    spread(work, blocks, threads)
+    return DecodedBlocks(information, sent, taken > 0, np.where(taken > 0, taken, iterations).astype(np.int64))
 
 
 def _decode_some(

@@ -5,12 +5,10 @@ from __future__ import annotations
 import time
 from contextlib import suppress
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 
 import click
 
-from lightpage.calibration.goodness.verdict import Goodness
 from lightpage.calibration.known_pages import first_lit_pages
 from lightpage.cli.options import FiniteRange
 from lightpage.cli.paths import NewPath, OutputFile
@@ -32,7 +30,7 @@ from lightpage.runtime.model.bundle.shipped import bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.healed_bundle import recalibrate_by_recording
 from lightpage.runtime.recalibration.known_pages import read_recorded
-from lightpage.runtime.recalibration.recalibration import next_version
+from lightpage.runtime.recalibration.recalibration import RefitReport, next_version
 from lightpage.runtime.recalibration.refit import refit
 from lightpage.runtime.service.jobs.messages import result_message
 
@@ -93,7 +91,7 @@ def recalibrate(
     With --other-device, an archive is read on a drive that was never calibrated: its geometry is found from nominal, by
     the pilots of the first eight pages, and then healed by the pages themselves.
     """
-    start, goodness = time.perf_counter(), None
+    start, report = time.perf_counter(), RefitReport()
     if target is not None:
         if bundle or out or version is not None or other_device:
             got = "with --bundle, --out, --version or --other-device"
@@ -117,9 +115,9 @@ def recalibrate(
             given = {"--bundle": bundle, "--recording": recording, "--out": out}
             lacking = ", ".join(name for name, value in given.items() if not value)
             raise InvalidInputError("options", f"no {lacking}", f"{', '.join(given)}, or --target")
-        result, goodness = _offline(bundle, recording, out, pages, version, other_device=other_device)
+        result, report = _offline(bundle, recording, out, pages, version, other_device=other_device)
     data = summary(result, time.perf_counter() - start)
-    if goodness is not None:
+    if (goodness := report.goodness) is not None:
         data |= {"verdict": goodness.verdict, "bits_lost": goodness.bits_lost, "cause": goodness.cause or None}
     write_json(json_path, data)
     click.echo(table(data))
@@ -188,8 +186,8 @@ def _start(client: LightpageClient, recording: str | None, pages: int, send: boo
 
 def _offline(
     bundle: str, recording: str, out: Path, pages: int, version: str | None, *, other_device: bool
-) -> tuple[Recalibrated, Goodness | None]:
-    """What came of it, and how well the re-fitted geometry explains the light."""
+) -> tuple[Recalibrated, RefitReport]:
+    """What came of it, and what the fit says of itself."""
     if out.exists():
         raise InvalidInputError(f"--out {out}", "something that exists", "a new path: bundles are never overwritten")
     if version is not None:
@@ -198,11 +196,18 @@ def _offline(
     with percent_bar() as progress, Recording.open(recording) as file:
         check_recording(decoder, file)
         new = next_version(decoder.version) if version is None else version
-        code = partial(code_of, file, decoder.bundle)
         outcome = recalibrate_by_recording(
-            decoder, file, pages, code, out, new, refit, progress, other_device=other_device
+            decoder,
+            file,
+            pages,
+            lambda: code_of(file, decoder.bundle),
+            out,
+            new,
+            refit,
+            progress,
+            other_device=other_device,
         )
-    return answer_of(Recalibrated, result_message(outcome)), outcome.report.goodness
+    return answer_of(Recalibrated, result_message(outcome)), outcome.report
 
 
 @click.command()

@@ -10,6 +10,7 @@ import click
 import numpy as np
 
 from lightpage.cli.paths import OutputFile
+from lightpage.codec.compiled.choice import in_use as page_code_in_use
 from lightpage.files import write_json
 from lightpage.progress import track
 from lightpage.runtime.client.client import LightpageClient
@@ -52,11 +53,13 @@ def bench(load: Load, rounds: int, json_path: Path | None) -> None:
         "bundle_version": decoder.version,
         "threads": decoder.threads or available_cpus(),
         "provider": str(decoder.graph.provider),
+        "page_code": page_code_in_use(),
         "rounds": rounds,
         **{f"{name}_p50_seconds": value for name, value in median.items()},
         "decode_over_inference": median["decode"] / median["inference"],
         "grpc_over_inference": median["grpc"] / median["inference"],
     }
     write_json(json_path, figures)
+    click.echo(f"page code: {figures['page_code']}")
     for name, label in (("inference", "ONNX Runtime alone"), ("decode", "whole decode"), ("grpc", "through gRPC")):
         click.echo(f"{label:<20} p50 {1e3 * median[name]:8.1f} ms   {median[name] / median['inference']:5.2f} x")

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import click
 from click.core import ParameterSource
 
+from lightpage.codec.compiled.choice import in_use as page_code_in_use
 from lightpage.progress import reporting
 from lightpage.runtime.client.wire.address import host_and_port
 from lightpage.runtime.commands.execution import ENGINE_CACHE, THREADS
@@ -144,7 +145,11 @@ def _serve(effective: Effective, wait_for_stop: Callable[[], None]) -> None:
 
 def _versions() -> dict[str, str]:
     versions = {name: installed_version(name) for name in ("lightpage", "grpcio", "numpy")}
-    return versions | {"onnxruntime": RUNTIME_VERSION, "python": platform.python_version()}
+    return versions | {
+        "onnxruntime": RUNTIME_VERSION,
+        "python": platform.python_version(),
+        "page_code": page_code_in_use(),
+    }
 
 
 @contextmanager

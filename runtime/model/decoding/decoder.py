@@ -74,6 +74,7 @@ class Decoder:
         threads: threads of one inference; by default the cores that this process may use.
         graph: of the bundle, where it is open already; then neither it nor the golden page is looked at.
         provider: what pages are computed with; all else is computed on the CPU.
+        code_threads: threads that share the code of a page, where it is compiled.
 
     Raises:
         ProviderError: there is no such provider here.
@@ -82,9 +83,14 @@ class Decoder:
     """
 
     def __init__(
-        self, bundle: Bundle, threads: int | None = None, graph: TableGraph | None = None, provider: Provider = ON_CPU
+        self,
+        bundle: Bundle,
+        threads: int | None = None,
+        graph: TableGraph | None = None,
+        provider: Provider = ON_CPU,
+        code_threads: int = 1,
     ) -> None:
-        self.bundle, self.threads = bundle, threads
+        self.bundle, self.threads, self._code_threads = bundle, threads, code_threads
         self.graph = graph or open_graph(bundle, threads, provider)
         residual = bundle.manifest.residual_output
         self._outputs = [*OUTPUTS, *([residual] if residual else [])]
@@ -103,7 +109,7 @@ class Decoder:
 
     def of_another(self, bundle: Bundle) -> Decoder:
         """The decoder of another bundle, on the same threads and provider; raises as the constructor does."""
-        return Decoder(bundle, self.threads, provider=self.graph.provider)
+        return Decoder(bundle, self.threads, provider=self.graph.provider, code_threads=self._code_threads)
 
     def with_table(self, table: SamplingTable) -> Decoder:
         """This decoder with other tensors in its table, by name; those left out stay. The golden page is not looked at.
@@ -111,7 +117,7 @@ class Decoder:
         Raises:
             InvalidInputError: a table that does not fit.
         """
-        return Decoder(self.bundle, self.threads, self.graph.with_table(table))
+        return Decoder(self.bundle, self.threads, self.graph.with_table(table), code_threads=self._code_threads)
 
     def taken(self, table: SamplingTable) -> SamplingTable:
         """The tensors of a traced table that the graph takes; of parameters those that it knows, the first ones."""
@@ -128,7 +134,8 @@ class Decoder:
             BundleError: its table does not fit.
         """
         with raised_as(BundleError, InvalidInputError, about=f"{bundle.subject}: "):
-            return Decoder(bundle, self.threads, self.graph.with_table(bundle.table))
+            graph = self.graph.with_table(bundle.table)
+            return Decoder(bundle, self.threads, graph, code_threads=self._code_threads)
 
     @property
     def references(self) -> FramePair:
@@ -240,7 +247,7 @@ class Decoder:
             raise NoCodeError(f"{self.bundle.subject}: code", "none", "one, as `lightpage code --out-bundle` adds it")
         with raised_as(BundleError, InvalidInputError, about=f"{self.bundle.subject}: "):
             code = self.bundle.code
-            return PageCodec(code, self.bundle.pilot_mask, self.bundle.levels(code.levels))
+            return PageCodec(code, self.bundle.pilot_mask, self.bundle.levels(code.levels), self._code_threads)
 
     def written_pilots(self, levels: int) -> Pilots:
         """The pilots of pages that were written at `levels` levels, each on one of them.

@@ -1,0 +1,1 @@
+"""What symbols say of their bits: log-likelihood ratios and the information in them."""

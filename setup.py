@@ -1,0 +1,45 @@
+"""Compiles the page code's arithmetic where a C compiler and the headers of Python are; elsewhere numpy does it.
+
+All else stands in pyproject.toml. With LIGHTPAGE_PAGE_CODE=compiled in the environment, failing to compile is an error.
+"""
+
+import os
+import sys
+
+from setuptools import Extension, setup
+from setuptools.command.build_ext import build_ext
+
+FOLDER = "lightpage/codec/compiled"
+LIMITED_API = "0x030B0000"
+"""Of Python 3.11: one build serves it and all later ones."""
+FLAGS = ["-std=c99", "-O3", "-g0", "-ffp-contract=off", "-fno-trapping-math", "-fno-math-errno", "-fvisibility=hidden"]
+"""Of compilers that take gcc's: no fused operations, so that every processor gives the same bits."""
+
+
+class BuildExtension(build_ext):
+    """Gives gcc and clang their flags; another compiler gets none."""
+
+    def build_extensions(self) -> None:
+        """Compile."""
+        if self.compiler.compiler_type != "msvc":
+            for extension in self.extensions:
+                extension.extra_compile_args = FLAGS
+                extension.extra_link_args = ["-Wl,-s"] if sys.platform == "linux" else []
+                extension.libraries = ["m"]
+        super().build_extensions()
+
+
+setup(
+    ext_modules=[
+        Extension(
+            "lightpage.codec.compiled.page_code",
+            [f"{FOLDER}/page_code.c"],
+            depends=[f"{FOLDER}/kernels.h"],
+            define_macros=[("Py_LIMITED_API", LIMITED_API)],
+            py_limited_api=True,
+            optional=os.environ.get("LIGHTPAGE_PAGE_CODE") != "compiled",
+        )
+    ],
+    cmdclass={"build_ext": BuildExtension},
+    options={"bdist_wheel": {"py_limited_api": "cp311"}},
+)
