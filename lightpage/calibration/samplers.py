@@ -21,6 +21,13 @@ def smooth_reference(reference: NDArray[np.integer]) -> NDArray[np.float32]:
     return np.asarray(np.maximum(level, max(1e-3 * float(level.mean()), 1e-6)), dtype=np.float32)
 
 
+def linear_light(frame: NDArray[np.integer], reference: NDArray[np.integer]) -> NDArray[np.float32]:
+    """A frame [H, W] as a linear estimate of the field's projection on its reference, smoothed, |E|^2 left in."""
+    level = smooth_reference(reference)
+    linear = (frame.astype(np.float32) - level) / np.sqrt(level)
+    return np.asarray(scipy.ndimage.gaussian_filter(linear, _FRAME_SMOOTHING_PX), np.float32)
+
+
 class FrameSampler:
     """One camera's frame as a linear estimate of the field's projection on its reference, |E|^2 left in.
 
@@ -33,9 +40,7 @@ class FrameSampler:
     def __init__(
         self, frame: NDArray[np.integer], reference: NDArray[np.integer], camera: int, twin: Twin, parameters: Real
     ) -> None:
-        level = smooth_reference(reference)
-        linear = (frame.astype(np.float32) - level) / np.sqrt(level)
-        self._image = scipy.ndimage.gaussian_filter(linear, _FRAME_SMOOTHING_PX)
+        self._image = linear_light(frame, reference)
         self._camera, self._twin, self._parameters = camera, twin, parameters
 
     def __call__(self, places: Real) -> NDArray[np.float32]:

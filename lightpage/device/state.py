@@ -298,9 +298,9 @@ class Spread(NamedTuple):
         """Draw a number anywhere in the range."""
         return float(rng.uniform(self.low, self.high))
 
-    def normal(self, rng: np.random.Generator) -> float:
-        """Draw a number of a rough device, within the range."""
-        drawn = rng.normal(self.centre, self.deviation)
+    def normal(self, rng: np.random.Generator, share: float = 1.0) -> float:
+        """Draw a number of a rough device, within the range; it scatters by a share of the deviation."""
+        drawn = rng.normal(self.centre, share * self.deviation)
         return float(np.clip(drawn if self.low else abs(drawn), self.low, self.high))
 
 
@@ -365,19 +365,23 @@ def draw_device(rng: np.random.Generator) -> Device:
     return Device().with_values(values | _smooth_error(_SMOOTH_ERROR.even(rng), rng))
 
 
-def draw_rough(rng: np.random.Generator) -> Device:
+def draw_rough(rng: np.random.Generator, share: float = 1.0) -> Device:
     """Draw a device whose numbers scatter as on a bench: normally, clipped at the range that `draw_device` fills.
 
     Noise, drift and illumination are those of the realistic device.
+
+    Args:
+        rng: draws.
+        share: of a rough device's deviations.
     """
     values: dict[str, float] = {}
     for key, knob in CAPTURE_RANGE.items():
         if not isinstance(knob, Spread):
             values[key] = knob(rng)
         elif knob.deviation:
-            values[key] = knob.normal(rng)
+            values[key] = knob.normal(rng, share)
     del values["sensor.bit_depth"]  # the electronics are those of the realistic device
-    return Device().with_values(values | _smooth_error(_SMOOTH_ERROR.normal(rng), rng))
+    return Device().with_values(values | _smooth_error(_SMOOTH_ERROR.normal(rng, share), rng))
 
 
 def _smooth_error(largest: float, rng: np.random.Generator) -> dict[str, float]:

@@ -57,6 +57,11 @@ DEFAULT_PAGES = 2
 @click.option("--version", help="Offline: version of the new bundle; by default the next one.")
 @click.option("--send", is_flag=True, help="With --target: --recording is a file here, whose frames are sent.")
 @click.option("--detach", is_flag=True, help="With --target: print the job's id and leave it to itself.")
+@click.option(
+    "--other-device",
+    is_flag=True,
+    help="Offline: the recording is of another device than the bundle's, its pages are of user data.",
+)
 @click.option("--json", "json_path", type=OutputFile(), help="Write the result to this file.")
 def recalibrate(
     bundle: str | None,
@@ -69,6 +74,7 @@ def recalibrate(
     version: str | None,
     send: bool,
     detach: bool,
+    other_device: bool,
     json_path: Path | None,
 ) -> None:
     """Re-fit the geometry of a drifted device from known pages; keep it unless it reads less than the one in use.
@@ -81,11 +87,15 @@ def recalibrate(
     service's source or, with --recording, from a file in its recordings folder, or with --send from a file here. The
     recalibration of a service ends with this command, unless it is told to --detach; `lightpage jobs` then tells how it
     goes.
+
+    With --other-device, an archive is read on a drive that was never calibrated: its geometry is found from nominal, by
+    the pilots of the first eight pages, and then healed by the pages themselves.
     """
     start, report = time.perf_counter(), RefitReport()
     if target is not None:
-        if bundle or out or version is not None:
-            raise InvalidInputError("--target", "with --bundle, --out or --version", "either a service or a bundle")
+        if bundle or out or version is not None or other_device:
+            got = "with --bundle, --out, --version or --other-device"
+            raise InvalidInputError("--target", got, "either a service or a bundle")
         if send and recording is None:
             raise InvalidInputError("--send", "without --recording", "a file whose frames are sent")
         wait_s = RECALIBRATION_S if timeout_s is None else timeout_s
@@ -105,7 +115,7 @@ def recalibrate(
             given = {"--bundle": bundle, "--recording": recording, "--out": out}
             lacking = ", ".join(name for name, value in given.items() if not value)
             raise InvalidInputError("options", f"no {lacking}", f"{', '.join(given)}, or --target")
-        result, report = _offline(bundle, recording, out, pages, version)
+        result, report = _offline(bundle, recording, out, pages, version, other_device=other_device)
     data = summary(result, time.perf_counter() - start)
     if (goodness := report.goodness) is not None:
         data |= {"verdict": goodness.verdict, "bits_lost": goodness.bits_lost, "cause": goodness.cause or None}
@@ -175,7 +185,7 @@ def _start(client: LightpageClient, recording: str | None, pages: int, send: boo
 
 
 def _offline(
-    bundle: str, recording: str, out: Path, pages: int, version: str | None
+    bundle: str, recording: str, out: Path, pages: int, version: str | None, *, other_device: bool
 ) -> tuple[Recalibrated, RefitReport]:
     """What came of it, and what the fit says of itself."""
     if out.exists():
@@ -187,7 +197,15 @@ def _offline(
         check_recording(decoder, file)
         new = next_version(decoder.version) if version is None else version
         outcome = recalibrate_by_recording(
-            decoder, file, pages, lambda: code_of(file, decoder.bundle), out, new, refit, progress
+            decoder,
+            file,
+            pages,
+            lambda: code_of(file, decoder.bundle),
+            out,
+            new,
+            refit,
+            progress,
+            other_device=other_device,
         )
     return answer_of(Recalibrated, result_message(outcome)), outcome.report
 

@@ -102,6 +102,8 @@ def test_drawn_devices_fill_the_capture_range_and_rough_ones_scatter_within_it()
         abs(d.slm.level_sine_rad) + abs(d.slm.level_cosine_rad) + abs(d.slm.level_sine_twice_rad) for d in devices
     ]
     assert 0.27 < max(errors) <= 0.3 + 1e-12
+    half = np.std([draw_rough(rng, 0.5).geometry.pipe_angle_deg for _ in range(200)])
+    assert 0.25 < half < 0.35
 
 
 def test_a_pipe_deviates_from_the_angle_of_its_profile_unless_its_own_is_given() -> None:

@@ -1,0 +1,1 @@
+"""Calibration by pages whose pilots alone are known."""
