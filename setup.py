@@ -5,6 +5,7 @@ All else stands in pyproject.toml. With LIGHTPAGE_PAGE_CODE=compiled in the envi
 
 import os
 import sys
+import sysconfig
 
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
@@ -29,17 +30,20 @@ class BuildExtension(build_ext):
         super().build_extensions()
 
 
-setup(
-    ext_modules=[
-        Extension(
-            "lightpage.codec.compiled.page_code",
-            [f"{FOLDER}/page_code.c"],
-            depends=[f"{FOLDER}/kernels.h"],
-            define_macros=[("Py_LIMITED_API", LIMITED_API)],
-            py_limited_api=True,
-            optional=os.environ.get("LIGHTPAGE_PAGE_CODE") != "compiled",
-        )
-    ],
-    cmdclass={"build_ext": BuildExtension},
-    options={"bdist_wheel": {"py_limited_api": "cp311"}},
+PAGE_CODE = Extension(
+    "lightpage.codec.compiled.page_code",
+    [f"{FOLDER}/page_code.c"],
+    depends=[f"{FOLDER}/kernels.h"],
+    define_macros=[("Py_LIMITED_API", LIMITED_API)],
+    py_limited_api=True,
+    optional=os.environ.get("LIGHTPAGE_PAGE_CODE") != "compiled",
 )
+
+if sysconfig.get_config_var("Py_GIL_DISABLED"):
+    setup()  # a free-threaded Python has no stable ABI: numpy does it there
+else:
+    setup(
+        ext_modules=[PAGE_CODE],
+        cmdclass={"build_ext": BuildExtension},
+        options={"bdist_wheel": {"py_limited_api": "cp311"}},
+    )

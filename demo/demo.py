@@ -15,6 +15,7 @@ from lightpage.demo.pages import write_pages
 from lightpage.demo.picture import picture
 from lightpage.demo.reading import read_picture
 from lightpage.demo.result import DemoResult, Phase
+from lightpage.errors import InvalidInputError
 from lightpage.progress import Progress
 from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.model.decoding.decoder import Decoder
@@ -84,7 +85,7 @@ def run_demo(
         fresh = read("as calibrated", 0.05, 0.25)
         steps = drift_in_steps(client, drift, lambda: progress("drift", 0.25))
         lost = read("after drift", 0.3, 0.5)
-        healed = heal(recalibrator, kept, lambda step, share: progress(f"heal: {step}", 0.5 + 0.3 * share))
+        healed = heal(recalibrator, kept, decoder, lambda step, share: progress(f"heal: {step}", 0.5 + 0.3 * share))
         again = read("healed", 0.8, 1.0)
     progress("done", 1.0)
     code = decoder.page_codec.code
@@ -93,14 +94,18 @@ def run_demo(
     return DemoResult(phases, steps, healed, frames, symbols, code, volume, seed, source.name, shots)
 
 
-def heal(recalibrator: Recalibrator, kept: KeptPages, progress: Progress) -> RecalibrationOutcome:
+def heal(recalibrator: Recalibrator, kept: KeptPages, decoder: Decoder, progress: Progress) -> RecalibrationOutcome:
     """Recalibrate by the pages that were lost last, as a service does with `--self-calibrate`.
 
     Raises:
         RecalibrationRefusedError: too few of them come right.
+        InvalidInputError: none was lost.
     """
     pages = recalibrator.kept_pages(kept)
-    assert pages is not None  # all were lost, and each is kept
+    if pages is None or not kept.lost(decoder):
+        raise InvalidInputError(
+            "demo, after the drift", "no page that was lost", "a device that this drift is too much for"
+        )
     for told in recalibrator.follow(pages, Caller()):
         if isinstance(told, RecalibrationOutcome):
             return told

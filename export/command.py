@@ -32,7 +32,7 @@ from lightpage.train.runs import load_run
 )
 @click.option(
     "--batches/--no-batches",
-    default=True,
+    default=False,
     show_default=True,
     help="Hold the decoder for many pages too, which a GPU runs.",
 )

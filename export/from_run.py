@@ -160,11 +160,12 @@ def _for_batches(
         warn("no decoder for many pages: the cameras of this device stand apart")
         return {}
     names = CONSTANTS, BATCH
-    first, second = (open_session(model, f"{out}: {name}", pages=1) for model, name in zip(made, names, strict=True))
+    first, second = (open_session(model, f"{out}: {name}", pages=2) for model, name in zip(made, names, strict=True))
     outputs = [node.name for node in first.get_outputs()]
     table = {node.name: defaults[node.name] for node in first.get_inputs()}
     feeds = dict(zip(outputs, first.run(outputs, table), strict=True))
-    feeds |= {"in_phase": pair.in_phase[None], "quadrature": pair.quadrature[None]}
+    pages = [pair, FramePair(pair.quadrature, pair.in_phase)]  # another one beside it
+    feeds |= {name: np.stack([getattr(each, name) for each in pages]) for name in ("in_phase", "quadrature")}
     (answer,) = second.run(["p"], feeds)
     try:
         check_parity(expected, answer[0], f"{out}, {BATCH}", GOLDEN_TOLERANCE[FLOAT16])

@@ -83,9 +83,14 @@ class _Attack:
 
     def seen(self, symbols: np.ndarray, seed: int, device: Device | None = None) -> list[FramePair]:
         """Frames of pages, by default of the model's device after its pipe has turned by a twentieth of a degree."""
-        own = Device().of_profile(self.profile).with_settings(["geometry.pipe_angle_deg=-0.55"])
-        simulator = Simulator(self.profile, device or own, self.code.levels, seed)
+        turned = self.own.with_settings(["geometry.pipe_angle_deg=-0.55"])
+        simulator = Simulator(self.profile, device or turned, self.code.levels, seed)
         return [simulator.page(page) for page in symbols]
+
+    @cached_property
+    def own(self) -> Device:
+        """The device that the model was trained for."""
+        return Device().of_profile(self.profile)
 
     def coded(self, count: int, seed: int, codec: PageCodec | None = None) -> np.ndarray:
         """Pages of user data, uint8 [count, ny, nx]."""
@@ -145,9 +150,9 @@ class _Attack:
 
     @cached_property
     def fresh(self) -> tuple[list[FramePair], np.ndarray]:
-        """Two pages of the device as it is, and their symbols."""
+        """Two pages of the device as the model knows it, and their symbols."""
         symbols = self.coded(2, 1 << 20)
-        return self.seen(symbols, 1 << 20), symbols
+        return self.seen(symbols, 1 << 20, self.own), symbols
 
     def air(self, decoder: Decoder) -> float:
         """Of the fresh pages."""
@@ -162,13 +167,13 @@ class _Attack:
 
     def tried(self, kind: str, seed: int, folder: Path) -> Try:
         """Make a try."""
-        out, refused, begun = folder / f"{seed}.zip", "", time.thread_time()
+        out, refused, begun = folder / f"{seed}.zip", "", time.process_time()
         lost = LostPages(tuple(self.kinds()[kind](seed)), self.code)
         try:
             recalibrate_by_lost(self.decoder, lost, out, f"tried-{seed}", refit, lambda what, share: None)
         except RecalibrationRefusedError as error:
             refused = str(error)
-        seconds, before = time.thread_time() - begun, self.air(self.decoder)
+        seconds, before = time.process_time() - begun, self.air(self.decoder)
         after = before if refused else self.air(Decoder.load(out))
         return Try(kind, seed, refused, before, after, seconds)
 

@@ -30,6 +30,7 @@ import torch
 from numpy.typing import NDArray
 
 from analysis.gpu.kept_form import Form, Scene, form_of, scene_of
+from lightpage.errors import InvalidInputError
 from lightpage.export.operators.batches import BatchFile
 from lightpage.files import write_json
 from lightpage.runtime.model.execution.providers import Provider
@@ -66,6 +67,9 @@ class Kept:
     def __init__(self, path: Path, head: Mapping[str, Any]) -> None:
         self.path = path
         self.whole: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {PARTS: {}}
+        for name in ("card", "commit"):  # figures of two cards or programs are not mixed
+            if self.whole.get(name, head.get(name)) != head.get(name):
+                raise InvalidInputError(f"{path}: {name}", self.whole[name], f"{head.get(name)}, or another folder")
         self.whole |= dict(head)
 
     def part(self, name: str, measure: Callable[[], Any]) -> Any:

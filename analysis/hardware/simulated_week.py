@@ -170,7 +170,7 @@ class Week:
     def _again(self, rows: Rows, plane: DataPlane) -> list[int]:
         """Read lost pages of the last range once more, as ReadData does; returns those that are read now."""
         lost = [row for row in rows[-RANGE_PAGES:] if row["lost"]]
-        if not lost or plane.heal is None or not plane.heal(Caller(), lost[0]["version"]):
+        if not lost or plane.heal is None or not plane.heal(Caller(), lost[-1]["version"], len(lost)):
             return []
         read = list[int]()
         for row in lost:

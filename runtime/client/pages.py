@@ -21,7 +21,8 @@ class PagesClient(SubClient):
         for found in client.pages.read_many([1, 2, 5]):  # a page, or the error that it ended with
             print(found if isinstance(found, Exception) else found.page)
 
-        content = [found.user_data.data for found in client.pages.read_data(0, 30)]
+        found = [page.user_data for page in client.pages.read_data(0, 30)]
+        content = {page.header.page: page.data for page in found if page.header and page.data is not None}
 
     `read` raises the error of a page that is lost; the others go on with the next one.
     """
@@ -100,7 +101,8 @@ class PagesClient(SubClient):
     def read_data(self, first: int, pages: int, timeout_s: float = DATA_S) -> Iterator[RemoteData]:
         """Read the bytes of pages `first` to `first + pages - 1`, and yield them.
 
-        Lost pages come as such; those that parity restores follow at the end of their group.
+        Lost pages come as such; those that parity restores follow at the end of their group. A service that
+        recalibrates itself may do so for lost pages, for a minute or more, and those that it then reads come once more.
 
         Raises:
             BundleError: the model in service has no code.

@@ -165,7 +165,7 @@ class DataPlane:
         self.received = ReceiveBudget(self.limits.receive_bytes)
         self.shared: SharedMemory | None = None
         """Memory that clients share with the service."""
-        self.heal: Callable[[Caller, str], bool] | None = None
+        self.heal: Callable[[Caller, str, int], bool] | None = None
         """Makes the model fit the device again and waits for that, see `SelfCalibration.heal`; None where none does."""
         self.heart = Heart(self.limits.decode_s, clock.now)
         self.decodes = Slots(self.limits.concurrent_decodes, "decodes", self.limits.deadline_s, clock)

@@ -19,6 +19,10 @@
 #include <stdlib.h>
 #include <string.h>
 
+#ifdef _MSC_VER
+#pragma fp_contract(off)
+#endif
+
 #if FLT_EVAL_METHOD != 0
 #error "floating-point operations must be done in their own precision"
 #endif
@@ -41,7 +45,7 @@ typedef union {
 #define MOST_LANES 32 /* that a kernel takes at once */
 #define FAR 1e30f
 
-/* ---- exponentials and logarithms, as lightpage/codec/compiled/arithmetic.py: the polynomials of Cephes ---- */
+/* ---- exponentials and logarithms, as lightpage/codec/likelihood/arithmetic.py: the polynomials of Cephes ---- */
 
 static inline float exponential(float x) { /* of -80 to 0 */
   bits32 turn, scale;
@@ -417,7 +421,7 @@ static void upper_numbers(int64_t count, const double *phase, const uint8_t *lab
 static int take_buffer(PyObject *from, Py_buffer *view, const char *name, const char *kinds, Py_ssize_t size, Py_ssize_t count, int writable) {
   if (PyObject_GetBuffer(from, view, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | (writable ? PyBUF_WRITABLE : 0)) < 0) return -1;
   const char *format = view->format ? view->format : "B";
-  if (view->itemsize != size || format[1] != 0 || !strchr(kinds, format[0]) || (uintptr_t)view->buf % (size_t)size != 0) {
+  if (view->itemsize != size || format[0] == 0 || format[1] != 0 || !strchr(kinds, format[0]) || (uintptr_t)view->buf % (size_t)size != 0) {
     PyErr_Format(PyExc_TypeError, "%s: got elements '%s' of %zd bytes, expected aligned ones of '%s', %zd bytes", name, format, view->itemsize, kinds, size);
   } else if (count >= 0 && view->len != count * size) {
     PyErr_Format(PyExc_ValueError, "%s: got %zd elements, expected %zd", name, view->len / size, count);

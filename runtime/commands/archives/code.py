@@ -66,8 +66,17 @@ def code(
     if (version is None) != (out_bundle is None):
         raise InvalidInputError("options", "one of --out-bundle and --version", "both or neither")
     decoder, asked = load(), dict(drifts)
+    if len(asked) < len(drifts):
+        raise InvalidInputError("--survive", ", ".join(name for name, _ in drifts), "each kind once")
     with Recording.open(recording) as pages:
         reading = _drifted_reading(decoder, pages, needed=bool(asked))
+        unknown = [name for name in asked if reading and name not in reading.kinds]
+        if reading and unknown:
+            raise InvalidInputError(
+                f"--survive {unknown[0]}",
+                "a drift that this bundle's geometry does not know",
+                f"among {', '.join(reading.kinds)}",
+            )
         drift = reading.drifted(asked) if reading and asked else None
         if asked and drift is None:
             raise InvalidInputError("--survive", asked, "less drift: by this one pages are lost whatever their code")

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lightpage.errors import BundleError, InvalidInputError
 from lightpage.recording.frame_pair import FramePair
@@ -33,6 +35,8 @@ class BatchDecoder:
         if missing := {CONSTANTS, BATCH} - bundle.files.keys():
             raise BundleError(f"{bundle.subject}: files", f"no {', '.join(sorted(missing))}", "a graph for batches")
         self.decoder, self.pages, subject = decoder, pages, f"{bundle.subject}: {BATCH}"
+        if like is not None and (like.pages, like.decoder.bundle.files[BATCH]) != (pages, bundle.files[BATCH]):
+            raise BundleError(f"{bundle.subject}: {BATCH}", "another graph, or as many pages", "those of the first one")
         first = open_session(bundle.files[CONSTANTS], f"{bundle.subject}: {CONSTANTS}", decoder.threads, once=True)
         names = [node.name for node in first.get_outputs()]
         with running(subject):
@@ -44,7 +48,14 @@ class BatchDecoder:
         )
         self._bound = BoundSession(self._session, graph.provider, dict(zip(names, made, strict=True)), subject)
         if like is None:
-            check_golden(bundle, lambda pair: self.infer([pair])[0].p, FLOAT16)
+            for place in {0, pages - 1}:
+                check_golden(bundle, partial(self._among_others, place), FLOAT16)
+
+    def _among_others(self, place: int, pair: FramePair) -> NDArray[np.float32]:
+        """What is said of a page at a place of a run whose other pages are no pages."""
+        run = [FramePair(pair.quadrature, pair.in_phase)] * self.pages
+        run[place] = pair
+        return self.infer(run, doubtful=True)[place].p
 
     def infer(self, pairs: Sequence[FramePair], *, doubtful: bool = False) -> list[Inference]:
         """Run the graph on checked pairs, as `Decoder.infer` does on one; it raises for the first that is refused.
@@ -56,8 +67,11 @@ class BatchDecoder:
             raise InvalidInputError("pages of a batch", len(pairs), f"1 to {self.pages}")
         filled = [*pairs, *[pairs[-1]] * (self.pages - len(pairs))]
         feeds = {name: np.stack([getattr(pair, name) for pair in filled]) for name in ("in_phase", "quadrature")}
-        answers = zip(*self._bound.run([*OUTPUTS, "residual"], feeds), strict=True)
-        read = [Inference(p, phase, length, float(residual)) for p, phase, length, residual in answers][: len(pairs)]
+        answers = list(zip(*self._bound.run([*OUTPUTS, "residual"], feeds), strict=True))
+        if len(answers) != self.pages:
+            subject = f"{self.decoder.bundle.subject}: {BATCH}, pages of an answer"
+            raise BundleError(subject, len(answers), f"{self.pages}, as many as were asked for")
+        read = [Inference(p, phase, length, float(residual)) for p, phase, length, residual in answers[: len(pairs)]]
         for page in read:
             check_residual(page.residual, self.decoder.bundle.manifest.residual_limit, doubtful=doubtful)
         return read

@@ -56,11 +56,9 @@ class KeptPages:
         with self._lock:
             self._pages.clear()
 
-    def lost(self, version: str) -> int:
-        """How many of a model's pages gave no bytes, as far as that is known."""
-        with self._lock:
-            kept = [one for one in self._pages if one.model_version == version]
-        return sum(one.lost is not None or bool(one.user_data and one.user_data.loss) for one in kept)
+    def lost(self, decoder: Decoder) -> int:
+        """How many of the pages that the model in service has decoded gave no bytes."""
+        return len(self._sorted(decoder)[1])
 
     def pages(self, decoder: Decoder, image_px: tuple[float, float]) -> KnownPages | LostPages | None:
         """What to recalibrate by: the last pages that were read, or else those that were lost; None if there are none.
@@ -74,10 +72,22 @@ class KeptPages:
         """
         if (code := decoder.bundle.code) is None:
             return None
+        known, lost, lost_since = self._sorted(decoder)
+        if len(known) >= MIN_PAGES and lost_since < MIN_PAGES:
+            pairs, symbols = zip(*known[:_USED], strict=True)
+            return KnownPages(pairs, symbols, code.levels, None, decoder.bundle.pilot_mask, image_px)
+        if not lost:
+            return None
+        return LostPages(tuple(lost[:TOGETHER]), code, image_px=image_px)
+
+    def _sorted(self, decoder: Decoder) -> tuple[list[tuple[FramePair, NDArray[np.uint8]]], list[FramePair], int]:
+        """Pages that are known, with their symbols, those that were lost, and how many of these came last."""
+        known, lost, lost_since = list[tuple[FramePair, NDArray[np.uint8]]](), list[FramePair](), 0
+        if (code := decoder.bundle.code) is None:
+            return known, lost, lost_since
         with self._lock:
             kept = [one for one in self._pages if one.model_version == decoder.version]
         pilots, codec = decoder.bundle.written_pilots(code.levels), decoder.page_codec
-        known, lost, lost_since = list[tuple[FramePair, NDArray[np.uint8]]](), list[FramePair](), 0
         for one in reversed(kept):
             pair = one.pair
             if pair is None or one.levels not in (None, code.levels):
@@ -91,12 +101,7 @@ class KeptPages:
             elif found is None or found.loss is not Loss.CODE:
                 lost.append(pair)
                 lost_since += not known
-        if len(known) >= MIN_PAGES and lost_since < MIN_PAGES:
-            pairs, symbols = zip(*known[:_USED], strict=True)
-            return KnownPages(pairs, symbols, code.levels, None, decoder.bundle.pilot_mask, image_px)
-        if not lost:
-            return None
-        return LostPages(tuple(lost[:TOGETHER]), code, image_px=image_px)
+        return known, lost, lost_since
 
 
 def _found(kept: Observation, decoder: Decoder) -> PageBytes | None:

@@ -121,7 +121,11 @@ class SelfCalibration:
         """Drop a recalibration that runs, and end the thread, which is waited for as calls are."""
         wait_s = self._plane.limits.grace_s
         self._plane.heal = None
-        self._stopping.set()
+        with self._lock:
+            self._stopping.set()
+            asked, self._asked = self._asked, []
+        for done in asked:
+            done.set()
         self._caller.leave()
         self._wake.set()
         self._thread.join(wait_s)
@@ -138,6 +142,9 @@ class SelfCalibration:
                 if self._stopping.is_set():
                     return
                 self.look(asked=bool(asked))
+            except Exception:
+                _log.exception("self-calibration: goes on")
+                self._wait(self._settings.busy_s)
             finally:
                 for done in asked:
                     done.set()
@@ -147,14 +154,17 @@ class SelfCalibration:
         if (asked or self._monitor.due) and self._clock.now() >= self._not_before:
             self._try_once()
 
-    def heal(self, caller: Caller, version: str) -> bool:
+    def heal(self, caller: Caller, version: str, lost: int) -> bool:
         """Recalibrate for a caller whose pages are lost, as soon as that may be, and wait for the end.
 
-        Where the last recalibration is not long enough ago, none begins and nobody waits.
+        Where the last recalibration is not long enough ago, none begins and nobody waits; as many callers wait as
+        ranges are read at once. One lost page is not enough: what was read before may show the device before it was
+        knocked.
 
         Args:
             caller: waits for as long as it has time. Where it leaves, the work goes on.
             version: of the model that has lost the pages.
+            lost: how many it has lost.
 
         Returns:
             Whether another model is in service.
@@ -162,25 +172,20 @@ class SelfCalibration:
         Raises:
             CallerLeft: the caller has gone.
         """
-        if self._can_heal(version):
-            done = threading.Event()
-            with self._lock:
-                self._asked.append(done)
-            self._wake.set()
-            most_s = min(caller.seconds_left() - _TO_ANSWER_S, self._plane.limits.recalibration_s)
-            with caller.telling(done.set):
-                self._clock.wait(done, max(0.0, most_s))
-            caller.check()
+        model, done = self._plane.models.current, threading.Event()
+        if model.version != version:
+            return True
+        enough = lost if self._settings.pages else self._kept.lost(model.decoder) if self._kept else 0
+        with self._lock:
+            if enough < MIN_PAGES or self._stopping.is_set() or len(self._asked) >= self._plane.ranges.count:
+                return False
+            self._asked.append(done)
+        self._wake.set()
+        most_s = min(caller.seconds_left() - _TO_ANSWER_S, self._plane.limits.recalibration_s)
+        with caller.telling(done.set):
+            self._clock.wait(done, max(0.0, most_s))
+        caller.check()
         return self._plane.models.current.version != version
-
-    def _can_heal(self, version: str) -> bool:
-        """Whether the model that has lost pages is still in service, and there are pages to recalibrate by.
-
-        One lost page is not enough: what was read before may show the device before it was knocked.
-        """
-        if self._stopping.is_set() or self._plane.models.current.version != version:
-            return False
-        return bool(self._settings.pages) or (self._kept is not None and self._kept.lost(version) >= MIN_PAGES)
 
     def _pause_s(self) -> float:
         """How long to sleep where nobody wakes: until it is looked again where a try is due, else for ever."""
@@ -205,8 +210,8 @@ class SelfCalibration:
             _log.info("self-calibration: dropped, the service stops")
             self._wait(self._settings.busy_s)
         except BusyError as error:
-            _log.info("self-calibration: put off by %.0f s: %s", self._settings.busy_s, error)
-            self._wait(self._settings.busy_s)
+            self._begun = self._clock.now()  # it waited, and took nothing
+            _log.info("self-calibration: put off by %.0f s: %s", self._wait(self._settings.busy_s), error)
         except Exception as error:
             self._back_off(error)
         else:
@@ -237,16 +242,17 @@ class SelfCalibration:
 
     def _back_off(self, error: Exception) -> None:
         self._interval_s = min(2 * self._interval_s, self._settings.longest_s)
-        self._wait(self._interval_s)
+        wait_s = self._wait(self._interval_s)
         end = "refused" if isinstance(error, RecalibrationRefusedError) else "failed"
         unforeseen = None if isinstance(error, LightpageError) else error
-        _log.warning("self-calibration: %s, next in %.0f s: %s", end, self._interval_s, error, exc_info=unforeseen)
+        _log.warning("self-calibration: %s, next in %.0f s: %s", end, wait_s, error, exc_info=unforeseen)
 
-    def _wait(self, seconds: float) -> None:
-        """Begin no other one for so long, nor before all of them together have taken their share of the time alone."""
+    def _wait(self, seconds: float) -> float:
+        """Begin no other one for so long, nor before this one has taken no more than its share; returns the seconds."""
         now = self._clock.now()
         took_s = max(0.0, now - self._begun)
         self._not_before = max(now + seconds, self._begun + took_s / self._settings.most_share)
+        return self._not_before - now
 
 
 def _check_pages(plane: DataPlane, pages: Sequence[int]) -> None:

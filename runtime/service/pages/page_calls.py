@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 
 from lightpage.clock import Clock
 from lightpage.errors import CallerLeft, InvalidInputError, LimitError, SlotsTakenError
@@ -96,22 +97,21 @@ class PageCalls:
         self._check_count("pages", request.pages)
         if request.first_page + request.pages > _MOST_PAGES:
             raise InvalidInputError("first_page", request.first_page, f"less than {_MOST_PAGES} with all")
-        unread = Unread()
-        times = call.times.page
-        yield from self._sent(
-            read_data(self._plane, request.first_page, request.pages, call.caller, times, unread), call
-        )
-        heal = self._plane.heal
-        if unread.pages and heal is not None and heal(call.caller, unread.model_version):
-            yield from self._sent(read_again(self._plane, unread, call.caller, times), call)
+        plane, caller, timed, unread = self._plane, call.caller, call.times.page, Unread()
+        yield from self._sent(read_data(plane, request.first_page, request.pages, caller, timed, unread), call)
+        if unread.pages and plane.heal is not None and plane.heal(caller, unread.model_version, len(unread.pages)):
+            with suppress(SlotsTakenError):  # all of them are told of as lost
+                yield from self._sent(read_again(plane, unread, caller, timed), call, again=True)
 
-    def _sent(self, pages: Iterator[DataPage], call: Call) -> Iterator[pb.ReadDataReply]:
-        """Pages of a range as messages."""
+    def _sent(self, pages: Iterator[DataPage], call: Call, *, again: bool = False) -> Iterator[pb.ReadDataReply]:
+        """Pages of a range as messages; those that are read `again` only where they give their bytes."""
         while True:
             with self._plane.ranges.held(call.caller):  # not while the caller takes its time to read the reply
                 page = next(pages, None)
             if page is None:
                 return
+            if again and (page.found is None or page.found.loss is not None):
+                continue
             if page.error is not None:
                 self._plane.metrics.rejected(reason_told(page.error))
             yield data_reply(page)

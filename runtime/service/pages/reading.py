@@ -11,7 +11,16 @@ from numpy.typing import NDArray
 
 from lightpage.codec.page_bytes import Header, Loss, PageBytes
 from lightpage.codec.volume import Successor, Volume, restore_group
-from lightpage.errors import BusyError, FramesDisagreeError, LightpageError, LostPageError, PageError, SourceError
+from lightpage.errors import (
+    BundleError,
+    BusyError,
+    FramesDisagreeError,
+    InvalidInputError,
+    LightpageError,
+    LostPageError,
+    PageError,
+    SourceError,
+)
 from lightpage.page.pilots import Pilots
 from lightpage.runtime.device.acquisition.source import FrameSource, Shot, own_fault
 from lightpage.runtime.service.caller import Caller
@@ -61,10 +70,15 @@ class _Group:
     model_version: str
     pages: dict[int, bytes] = field(default_factory=dict)
 
+    @property
+    def absent(self) -> list[int]:
+        """Numbers of the data pages that were not read."""
+        numbers = self.volume.numbers_in(self.number)[: self.volume.data_in(self.number)]
+        return [number for number in numbers if number not in self.pages]
+
     def restored(self) -> Iterator[DataPage]:
         """Data pages of the group that were not read, where the others give them."""
-        numbers = self.volume.numbers_in(self.number)[: self.volume.data_in(self.number)]
-        absent = [number for number in numbers if number not in self.pages]
+        numbers, absent = self.volume.numbers_in(self.number), self.absent
         whole = restore_group(self.volume, self.number, self.pages) if absent else None
         if whole is None or self.last.header is None:
             return
@@ -145,17 +159,48 @@ class Unread:
     """Pages of a range that came to nothing, and might be read by a model that fits the device.
 
     Attributes:
-        model_version: of the model that the range began with.
+        model_version: of the model that lost the last of them.
         pages: by their numbers in the source, the page of its volume that each is or should be, None where unknown.
+        groups: that lack pages, with those that were read.
     """
 
     model_version: str = ""
     pages: dict[int, Header | None] = field(default_factory=dict)
+    groups: dict[tuple[Volume, int], _Group] = field(default_factory=dict)
 
-    def drop(self, restored: DataPage) -> None:
-        """Leave out a page that its group has given."""
-        header = None if restored.found is None else restored.found.header
-        self.pages = {index: page for index, page in self.pages.items() if page is None or page != header}
+    def add(self, index: int, header: Header | None, version: str) -> None:
+        """Take in a page."""
+        self.pages[index], self.model_version = header, version
+
+    def told(self, index: int, header: Header) -> None:
+        """A page was read, which says what those before it should have been."""
+        for before, known in self.pages.items():
+            if known is None and 0 < index - before <= header.page:
+                self.pages[before] = replace(header, page=header.page - (index - before))
+
+    def group_of(self, page: DataPage) -> _Group | None:
+        """The group that a page belongs to, with that page; None where it says of none."""
+        found = page.found
+        volume = None if found is None else Volume.of_page(found)
+        if volume is None or found is None or found.header is None or found.data is None:
+            return None
+        key = volume, found.header.page // volume.group_pages
+        group = self.groups.pop(key, None) or _Group(*key, found, page.model_version)
+        self.groups[key] = group  # the one used last is the last to go
+        group.last, group.model_version = found, page.model_version
+        group.pages[found.header.page] = found.data
+        return group
+
+    def restored(self, group: _Group) -> Iterator[DataPage]:
+        """Pages that the others of a group give. Where none of its data is missing then, nor are its parity pages."""
+        absent, pages = group.absent, list(group.restored())
+        if len(pages) == len(absent):
+            del self.groups[group.volume, group.number]
+            gone = {(group.volume.id, number) for number in group.volume.numbers_in(group.number)}
+            self.pages = {
+                i: page for i, page in self.pages.items() if page is None or (page.volume, page.page) not in gone
+            }
+        yield from pages
 
 
 def read_data(
@@ -181,15 +226,7 @@ def read_data(
         PageError: there is no page `first`.
     """
     _ = plane.source, plane.models.current.decoder.page_codec  # they are there
-    groups: dict[tuple[Volume, int], _Group] = {}
     successor, unread = Successor(), unread or Unread()
-    unread.model_version = plane.models.current.version
-
-    def restored(group: _Group) -> Iterator[DataPage]:
-        for page in group.restored():
-            unread.drop(page)
-            yield page
-
     for index in range(first, first + count):
         try:
             page = _data_page(plane, index, successor.header, caller, timed())
@@ -197,43 +234,45 @@ def read_data(
             if index == first:
                 raise
             break
-        found = page.found
-        volume = None if found is None else Volume.of_page(found)
-        if volume is not None and found is not None and found.header is not None and found.data is not None:
-            key = volume, found.header.page // volume.group_pages
-            if key not in groups and len(groups) == GROUPS:
-                yield from restored(groups.pop(next(iter(groups))))
-            group = groups.pop(key, None) or _Group(*key, found, page.model_version)
-            groups[key] = group  # the one used last is the last to go
-            group.last, group.model_version = found, page.model_version
-            group.pages[found.header.page] = found.data
-            if len(group.pages) == len(volume.numbers_in(group.number)):
-                del groups[key]  # nothing is missing
-            successor = Successor(volume, found.header)
+        oldest = next(iter(unread.groups.values()), None)
+        group = unread.group_of(page)
+        if group is not None and group.last.header is not None:
+            if oldest is not None and len(unread.groups) > GROUPS:
+                yield from unread.restored(oldest)
+                unread.groups.pop((oldest.volume, oldest.number), None)
+            if len(group.pages) == len(group.volume.numbers_in(group.number)):
+                del unread.groups[group.volume, group.number]  # nothing is missing
+            unread.told(index, group.last.header)
+            successor = Successor(group.volume, group.last.header)
         elif _curable(page):
-            unread.pages[index] = (found and found.header) or successor.header
+            header = page.found.header if page.found is not None else None
+            unread.add(index, header or successor.header, page.model_version or plane.models.current.version)
         successor = successor.after()
         yield page
-    for group in groups.values():
-        yield from restored(group)
+    for group in list(unread.groups.values()):
+        yield from unread.restored(group)
 
 
 def read_again(
     plane: DataPlane, unread: Unread, caller: Caller, timed: Callable[[], Stages] = Stages
 ) -> Iterator[DataPage]:
-    """Read those pages of a range once more that came to nothing; yields the ones that another model reads.
+    """Read those pages of a range once more that came to nothing; yields each, and those that their groups give then.
+
+    The caller knows that they are lost: it ends early where there is no room or time, or another model has no code.
 
     Args:
         plane, caller, timed: as for `read_data`.
         unread: of the range.
     """
-    for index, expected in unread.pages.items():
+    for index, expected in list(unread.pages.items()):
         try:
             page = _data_page(plane, index, expected, caller, timed())
-        except (PageError, BusyError):  # the caller knows that it is lost
-            continue
-        if page.found is not None and page.found.loss is None:
-            yield page
+        except (BundleError, BusyError, InvalidInputError):
+            return
+        unread.group_of(page)
+        yield page
+    for group in list(unread.groups.values()):
+        yield from unread.restored(group)
 
 
 def _data_page(plane: DataPlane, index: int, expected: Header | None, caller: Caller, stages: Stages) -> DataPage:

@@ -102,7 +102,7 @@ def test_a_service_recalibrates_by_the_pages_that_it_keeps(small_bundle: Path, d
     kinds = []
     for number, pair in enumerate(pairs[:2], start=1):  # the device is knocked: what was read before shows another one
         kept.observe(Observation("page", 0, "small-1+r1", 0.0, 0.1, Reason.PILOTS_DISAGREE, pair=pair))
-        assert kept.lost("small-1+r1") == number
+        assert kept.lost(healed) == number
         kinds.append(type(kept.pages(healed, (0.0, 0.0))))
     assert kinds == [KnownPages, LostPages]
 

@@ -6,6 +6,7 @@ import logging
 import math
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -470,10 +471,11 @@ def test_a_caller_who_has_lost_pages_waits_for_the_next_recalibration_and_for_no
     assert loop.monitor.due
     with loop.running:
         assert loop.plane.heal is not None
-        assert loop.plane.heal(Caller(), "toy-1")
+        assert not loop.plane.heal(Caller(), "toy-1", 1)  # one page may be spoilt
+        assert loop.plane.heal(Caller(), "toy-1", 2)
         assert loop.version == "toy-1+r1"
-        assert loop.plane.heal(Caller(), "toy-1")  # somebody else had it healed
-        assert not loop.plane.heal(Caller(), "toy-1+r1")  # the last one was just now
+        assert loop.plane.heal(Caller(), "toy-1", 2)  # somebody else had it healed
+        assert not loop.plane.heal(Caller(), "toy-1+r1", 2)  # the last one was just now
         assert loop.version == "toy-1+r1"
     assert loop.plane.heal is None
 
@@ -485,11 +487,17 @@ def test_a_caller_waits_no_longer_than_it_has_time_and_not_where_it_has_left(mak
         loop.drift()
         assert fit.entered.wait(60)
         assert loop.plane.heal is not None
-        assert not loop.plane.heal(Caller(lambda: 0.5), "toy-1")
+        with ThreadPoolExecutor(1) as pool:
+            waits = pool.submit(loop.plane.heal, Caller(lambda: 5.0), "toy-1", 2)
+            loop.clock.until_somebody_waits()
+            loop.clock.advance(3.9)
+            assert not waits.done()
+            loop.clock.advance(0.2)
+            assert waits.result(30) is False
         gone = Caller()
         gone.leave()
         with pytest.raises(CallerLeft):
-            loop.plane.heal(gone, "toy-1")
+            loop.plane.heal(gone, "toy-1", 2)
 
 
 def test_recalibrations_take_no_more_than_their_share_of_the_time(make: Make) -> None:
