@@ -25,7 +25,7 @@ NAMED: list[dict[str, str]] = [PROJECT["scripts"], *PROJECT["entry-points"].valu
 LOCKS = ROOT / "release" / "locks"
 # What a wheel is made of, and what the image build is given beside that.
 PACKAGES = ("lightpage", "train", "export", "runtime", "report", "study", "demo", "virtual_device")
-SOURCES = ("pyproject.toml", "LICENSE", "README.md", *PACKAGES)
+SOURCES = ("pyproject.toml", "setup.py", "LICENSE", "README.md", *PACKAGES)
 
 
 def run(command: Sequence[str | Path], *, cwd: Path = ROOT, timeout_s: float = 60) -> subprocess.CompletedProcess[str]:

@@ -57,8 +57,9 @@ class KeptPages:
             self._pages.clear()
 
     def lost(self, decoder: Decoder) -> int:
-        """How many of the pages that the model in service has decoded gave no bytes."""
-        return len(self._sorted(decoder)[1])
+        """How many of the pages that the model in service has decoded gave no bytes, whoever knows what they hold."""
+        found = (_found(one, decoder) for one in self._of(decoder))
+        return sum(page is None or page.loss not in (None, Loss.CODE) for page in found)
 
     def pages(self, decoder: Decoder, image_px: tuple[float, float]) -> KnownPages | LostPages | None:
         """What to recalibrate by: the last pages that were read, or else those that were lost; None if there are none.
@@ -80,18 +81,21 @@ class KeptPages:
             return None
         return LostPages(tuple(lost[:TOGETHER]), code, image_px=image_px)
 
+    def _of(self, decoder: Decoder) -> list[Observation]:
+        """The pages that the model in service has decoded, at the levels of its code."""
+        if (code := decoder.bundle.code) is None:
+            return []
+        with self._lock:
+            return [o for o in self._pages if o.model_version == decoder.version and o.levels in (None, code.levels)]
+
     def _sorted(self, decoder: Decoder) -> tuple[list[tuple[FramePair, NDArray[np.uint8]]], list[FramePair], int]:
         """Pages that are known, with their symbols, those that were lost, and how many of these came last."""
         known, lost, lost_since = list[tuple[FramePair, NDArray[np.uint8]]](), list[FramePair](), 0
-        if (code := decoder.bundle.code) is None:
-            return known, lost, lost_since
-        with self._lock:
-            kept = [one for one in self._pages if one.model_version == decoder.version]
-        pilots, codec = decoder.bundle.written_pilots(code.levels), decoder.page_codec
-        for one in reversed(kept):
+        codec = decoder.page_codec
+        pilots = decoder.bundle.written_pilots(codec.code.levels)
+        for one in reversed(self._of(decoder)):
             pair = one.pair
-            if pair is None or one.levels not in (None, code.levels):
-                continue
+            assert pair is not None  # else it is not kept
             if one.symbols is not None:
                 known.append((pair, one.symbols))
                 continue

@@ -91,7 +91,8 @@ def test_a_service_recalibrates_by_the_pages_that_it_keeps(small_bundle: Path, d
     out = tmp_path / "healed.zip"
     outcome = recalibrate_by_lost(decoder, lost, out, "small-1+r1", refit, lambda what, share: None)
     assert outcome.air_before < outcome.air_after - 0.5
-    assert outcome.report.angle_deg == pytest.approx(-0.2, abs=0.01)
+    # a known page shows it to 0.01; where decisions gave more pages, theirs stays
+    assert outcome.report.angle_deg == pytest.approx(-0.2, abs=0.03)
     healed = Decoder.load(out, threads=1)
     for pair in pairs:
         page = healed.post_process(healed.infer(pair), CODE.levels, healed.written_pilots(CODE.levels))

@@ -63,6 +63,7 @@ def test_a_file_of_another_drive_comes_back(archive: Path) -> None:
     assert (archive / "out").read_bytes() == CONTENT
 
 
+@pytest.mark.long  # two hopeless searches; that pilots tell nothing of other light is shown beside the search itself
 def test_pages_without_the_pilots_and_a_repeated_page_are_refused(archive: Path) -> None:
     decoder = Decoder.load(archive / "A.zip", threads=1)
     with Recording.open(archive / "R.h5") as recording:
