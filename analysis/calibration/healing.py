@@ -112,6 +112,11 @@ class _Bench:
     pages: int
 
     @cached_property
+    def tracker(self) -> Tracker:
+        """Of the model as it was calibrated, whose golden page shows what a shift does."""
+        return tracker_for(self.decoder)
+
+    @cached_property
     def symbols(self) -> np.ndarray:
         """Symbols that are written, uint8 [pages, ny, nx]; the last pages are not healed by."""
         codec, count, code = self.decoder.page_codec, self.pages + _JUDGED, self.decoder.page_codec.code
@@ -150,7 +155,8 @@ class _Bench:
     def read(self, decoder: Decoder, pairs: Sequence[FramePair]) -> tuple[float, int]:
         """AIR of the pages that are not healed by, and how many of all give their bytes."""
         mask, levels = decoder.bundle.pilot_mask, decoder.bundle.levels(self.decoder.page_codec.code.levels)
-        airs, read, tracker = list[float](), 0, tracker_for(decoder)  # the image walks from page to page
+        airs, read = list[float](), 0
+        tracker = self.tracker.refitted(decoder)  # the image walks from page to page
         for number, (pair, symbols) in enumerate(zip(pairs, self.symbols, strict=True)):
             pilots = Pilots.of_symbols(mask, symbols, levels)
             page = _decoded(tracker, decoder, pair, pilots)
