@@ -57,7 +57,7 @@ class Try:
 
     @property
     def moved_for_the_worse(self) -> bool:
-        """Whether the model reads its device worse than before."""
+        """True where the model reads its device worse than before."""
         return self.after < self.before - WORSE_BITS
 
 
@@ -69,7 +69,7 @@ class _Attack:
         self.profile, self.code = decoder.bundle.profile, decoder.page_codec.code
 
     def kinds(self) -> dict[str, Callable[[int], list[FramePair]]]:
-        """What makes the pages of a try from its seed, by name."""
+        """Makers of a try's pages from its seed, by name."""
         return {
             "noise": self.noise,
             "symbols at random": lambda seed: self.seen(self.at_random(seed), seed),
@@ -155,7 +155,7 @@ class _Attack:
         return self.seen(symbols, 1 << 20, self.own), symbols
 
     def air(self, decoder: Decoder) -> float:
-        """Of the fresh pages."""
+        """Return the mean AIR of the fresh pages, bits a symbol."""
         bundle, found = decoder.bundle, list[float]()
         levels, data = bundle.levels(self.code.levels), ~bundle.pilot_mask
         for pair, symbols in zip(*self.fresh, strict=True):

@@ -113,7 +113,7 @@ class _Bench:
 
     @cached_property
     def tracker(self) -> Tracker:
-        """Of the model as it was calibrated, whose golden page shows what a shift does."""
+        """Tracker of the model as it was calibrated: its golden page shows what a shift does."""
         return tracker_for(self.decoder)
 
     @cached_property

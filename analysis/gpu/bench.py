@@ -1,4 +1,4 @@
-"""How fast a GPU decodes pages in batches, how exactly, and where its time goes.
+"""Measure how fast and how exactly a GPU decodes pages in batches, and where its time goes.
 
     python -m analysis.gpu.bench --out runs/bench-gpu
 
@@ -81,17 +81,17 @@ class Kept:
             found = measure()
         except Exception as error:
             traceback.print_exc(limit=5)
-            click.echo(f"{name}: failed, {error}"[:300])
+            click.echo(f"{name}: failed, {error}"[:300], err=True)
             return None
         self.whole[PARTS][name] = found
         write_json(self.path, self.whole)
-        click.echo(f"{name} ({time.perf_counter() - start:.1f} s): {json.dumps(found)[:2000]}")
+        click.echo(f"{name} ({time.perf_counter() - start:.1f} s): {json.dumps(found)[:2000]}", err=True)
         return found
 
 
 @dataclass(frozen=True)
 class Machine:
-    """What decodes.
+    """A machine that decodes.
 
     Attributes:
         device: torch's.
@@ -107,13 +107,13 @@ class Machine:
         return cls(torch.device(name), Provider.parse(name))
 
     def wait(self) -> None:
-        """Until all is computed."""
+        """Wait until all is computed."""
         if self.device.type == CUDA:
             torch.cuda.synchronize()
 
 
 def ceilings(machine: Machine) -> dict[str, float]:
-    """What the card can do at most: bytes of a copy, flops of a product, bytes over the bus, a second."""
+    """Measure what the card can do at most: bytes of a copy, flops of a product, bytes over the bus, a second."""
     device, found = machine.device, {}
 
     def rate(work: Callable[[], Any], amount: float) -> float:
@@ -294,7 +294,7 @@ def floor(form: Form, pages: int, most: Mapping[str, float]) -> dict[str, float]
 
 
 def table(parts: Mapping[str, Any]) -> list[str]:
-    """What people read of the parts: rates beside what is wanted, floors, and where time goes."""
+    """Return the parts for people: rates beside what is wanted, floors, and where time goes."""
     told = [
         "| preset | a batch | pages/s | target, stretch | graph, ms | batch alone, ms | floors, ms | AIR, today's |"
     ]

@@ -53,7 +53,7 @@ class Scene:
 
     @cached_property
     def table(self) -> SamplingTable:
-        """Of the calibrated device."""
+        """Table of the calibrated device."""
         twin, calibration = TorchTwin(RayTwin(self.profile)), self.calibration
         return sampling_table(twin, calibration.vector, calibration.turn_rad, self.profile)
 
@@ -67,7 +67,7 @@ class Scene:
 
     @staticmethod
     def deviation(expected: NDArray[np.float32], got: NDArray[np.float32]) -> float:
-        """How far p is off, over its length: the 99th percentile of the symbols."""
+        """Return the error of p over its length, the 99th percentile of the symbols."""
         length = np.maximum(np.linalg.norm(expected, axis=0), np.finfo(np.float32).tiny)
         return float(np.percentile(np.linalg.norm(got - expected, axis=0) / length, 99))
 
