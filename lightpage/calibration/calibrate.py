@@ -308,7 +308,7 @@ class _Registration:
         self.illumination: NDArray[np.complexfloating] | None = None
         self.total = 1
         self._stage, self._done = "", 0
-        self._pixel = profile.camera.pitch_m
+        self._pixel = profile.image_pixel_m
         self._looked: list[Measurement] = []
         self._found: list[Measurement] = []
 

@@ -43,7 +43,7 @@ class CameraView:
     """Where the pixels of one camera look on the common camera plane.
 
     Args:
-        camera: sensor size and pitch.
+        camera: sensor size, and pitch where the image has the page's own size.
         pose: similarity transform of the sensor.
         distortion_relative: relative radial displacement of the image at `distortion_radius_m`.
         distortion_radius_m: normalising radius.

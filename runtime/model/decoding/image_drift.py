@@ -249,7 +249,7 @@ class BundleTables:
         """Tilt (x, y) of the signal against a reference that stays while the image shifts, radians."""
         profile = self._decoder.bundle.profile
         half = profile.page_width_m / 2, profile.page_height_m / 2
-        return tilt_of_shift(self._calibration.parameters, shift_px * profile.camera.pitch_m, *half)
+        return tilt_of_shift(self._calibration.parameters, shift_px * profile.image_pixel_m, *half)
 
     def traced(self, tilt_rad: Real) -> Decoder:
         """The decoder with the table of a device whose signal is tilted so against the reference."""
