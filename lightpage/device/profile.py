@@ -63,7 +63,8 @@ class Relay(TomlTable):
     """Lenses that show the image to the cameras at another size than the de-launch lens makes it."""
 
     magnification: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] = Field(
-        1.0, description="size on the sensors over size behind the de-launch lens; a turned image is the cameras' matter"
+        1.0,
+        description="size on the sensors over size behind the de-launch lens; a turned image is the cameras' matter",
     )
 
 

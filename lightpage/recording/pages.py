@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.device.profile import Profile
+from lightpage.device.profile import Profile, parse_profile
 from lightpage.errors import RecordingError
 from lightpage.failures import os_failure
 from lightpage.files import move_into_place
@@ -161,6 +161,21 @@ class Pages:
     def page_shape(self) -> tuple[int, int]:
         """Symbols as (rows, columns)."""
         return self._shape[1:]
+
+    def device(self, given: Profile | None) -> Profile:
+        """The nominal profile of the pages: the one that was given, or else the file's own.
+
+        Raises:
+            RecordingError: there is none, or the pages have another shape.
+            ProfileError: the file's own is needed, and cannot be read.
+        """
+        subject = f"{self._subject}: attribute 'profile'"
+        if given is None:
+            if not isinstance(text := self._file.attribute("profile"), str):
+                raise RecordingError(subject, "none", "one, or --profile P")
+            given = parse_profile(text, subject)
+        self.check_against(given)
+        return given
 
     def check_against(self, profile: Profile) -> None:
         """Check that the pages are for devices of this profile.
