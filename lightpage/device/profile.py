@@ -252,7 +252,7 @@ class Profile(TomlTable):
     def to_toml(self) -> str:
         """The profile as TOML text, which `parse_profile` reads back to an equal one.
 
-        Tables that were added to the format later are left out where they say nothing, so that a profile keeps its text.
+        Tables that the format had later are left out where they say nothing, so that earlier profiles keep their text.
         """
         return to_toml(self, without=[name for name in ("relay", "lens_path") if getattr(self, name) == _SILENT[name]])
 

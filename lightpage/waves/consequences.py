@@ -1,4 +1,4 @@
-"""What follows from a profile: how its image lies on the cameras, what the pipe does to its light, what a page takes."""
+"""What follows from a profile: how the image lies on cameras, what the pipe does to its light, what a page takes."""
 
 from __future__ import annotations
 

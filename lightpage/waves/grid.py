@@ -82,8 +82,8 @@ class FieldGrid:
 def check_camera(profile: Profile) -> None:
     """Check that the cameras see all of the page's image, and the pipe's light finely enough.
 
-    All is compared where the image has the page's own size (`Profile.image_pixel_m`). The intensity of light from a pipe
-    of width w has frequencies up to w / (lambda f), twice the field's; two samples a period on a grid of
+    All is compared where the image has the page's own size (`Profile.image_pixel_m`). The intensity of light from a
+    pipe of width w has frequencies up to w / (lambda f), twice the field's; two samples a period on a grid of
     `GRID_STEP_PX` pixels need pixels of at most lambda f / (2 GRID_STEP_PX w).
 
     Raises:

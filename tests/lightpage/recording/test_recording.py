@@ -144,7 +144,7 @@ class TestReading:
             assert recording.page_hash(0) == hash_frames(recording.frames(0)) != stored
 
     def test_it_tells_where_its_own_profile_says_otherwise(self, foreign: Path) -> None:
-        profile = load_profile("bench")
+        profile = small_profile()
         other = profile.model_copy(update={"pipe": profile.pipe.model_copy(update={"length_m": 0.2})})
         for text, own in ((other.to_toml(), other), (profile.to_toml(), profile), ("somebody else's notes", None)):
             with h5py.File(foreign, "r+") as file:
