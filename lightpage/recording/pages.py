@@ -22,7 +22,7 @@ from lightpage.failures import os_failure
 from lightpage.files import move_into_place
 from lightpage.page.levels import check_levels
 from lightpage.page.symbols import check_symbols
-from lightpage.recording.hdf5 import open_hdf5
+from lightpage.recording.hdf5 import open_hdf5, read_attribute
 from lightpage.recording.hdf_file import open_to_write
 from lightpage.recording.stored import ArrayFile
 
@@ -135,6 +135,17 @@ class Pages:
             RecordingError: missing, truncated, foreign or inconsistent.
         """
         return cls(open_hdf5(path, f"pages {path}"), path)
+
+    @staticmethod
+    def are_in(path: Path) -> bool:
+        """Whether an HDF5 file says that it holds pages to write.
+
+        Raises:
+            RecordingError: it is no HDF5 file, or cannot be read.
+        """
+        subject = f"file {path}"
+        with open_hdf5(path, subject) as file:
+            return bool(read_attribute(file, "format", subject) == FORMAT)
 
     def __enter__(self) -> Self:
         return self
