@@ -16,7 +16,8 @@ from lightpage.files import replace_file, replace_text, write_json
 from lightpage.study import STUDIES
 from lightpage.study.study import RESULTS, Settings, aligned, measured
 from lightpage.train.fitting.memory import keep_freed_memory
-from lightpage.train.runs import BEGUN, begin, sole_writer
+from lightpage.train.run_files import BEGUN
+from lightpage.train.runs import begin, sole_writer
 
 _FULL = "paper"
 _RESULTS = "results"

@@ -29,9 +29,8 @@ from lightpage.train.models.hyperparameters import Hyperparameters
 from lightpage.train.processes import is_first_process
 from lightpage.train.published.localizers import NAMES as PUBLISHED
 from lightpage.train.published.training import PublishedChoices
+from lightpage.train.run_files import BEGUN, DESCRIPTION
 
-BEGUN = "begun.json"
-DESCRIPTION = "run.json"
 WEIGHTS = "decoder.pt"
 REFERENCES = "references.npz"
 GOLDEN = "golden.npz"

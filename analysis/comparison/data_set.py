@@ -19,7 +19,8 @@ from lightpage.recording.reader import Recording
 from lightpage.simulator.recording_job import RecordingJob
 from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
 from lightpage.train.models.twin import RayTwin, TorchTwin
-from lightpage.train.runs import BEGUN, begin
+from lightpage.train.run_files import BEGUN
+from lightpage.train.runs import begin
 
 LEVELS = 256
 CALIBRATED = 2

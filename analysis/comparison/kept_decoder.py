@@ -26,7 +26,8 @@ from lightpage.train.fitting.validation import without_piston
 from lightpage.train.models.decoder import SymbolDecoder
 from lightpage.train.models.hyperparameters import Hyperparameters
 from lightpage.train.models.twin import RayTwin, TorchTwin
-from lightpage.train.runs import BEGUN, renamed
+from lightpage.train.run_files import BEGUN
+from lightpage.train.runs import renamed
 from lightpage.train.trainers.refinement import fit_prediction
 from lightpage.train.trainers.symbols import MATCHED_PAGES
 

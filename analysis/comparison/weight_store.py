@@ -20,7 +20,8 @@ from lightpage.errors import InvalidInputError
 from lightpage.files import replace_file
 from lightpage.train.data.pages import Page
 from lightpage.train.fitting.fitted import CHECKPOINTS, FITTED, FITTED_WEIGHTS, Fitted
-from lightpage.train.runs import BEGUN, FORMAT, renamed
+from lightpage.train.run_files import BEGUN
+from lightpage.train.runs import FORMAT, renamed
 
 TRAINED = Path(__file__).parents[1] / "weights"
 CALIBRATION = "calibration.toml"

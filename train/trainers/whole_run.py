@@ -26,8 +26,8 @@ from lightpage.train.models.decoder import LOCALIZERS
 from lightpage.train.models.hyperparameters import Hyperparameters
 from lightpage.train.processes import AS_IT_IS, Processes, is_first_process
 from lightpage.train.published.trainer import PublishedTrainer
+from lightpage.train.run_files import DESCRIPTION
 from lightpage.train.runs import (
-    DESCRIPTION,
     GOLDEN,
     REFERENCES,
     Run,

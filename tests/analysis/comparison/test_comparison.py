@@ -19,7 +19,7 @@ from lightpage.device.state import Device, ideal_device
 from lightpage.page.symbols import pilot_mask
 from lightpage.simulator.true_optics import true_parameters
 from lightpage.train.fitting.fitted import FITTED_WEIGHTS
-from lightpage.train.runs import BEGUN
+from lightpage.train.run_files import BEGUN
 from tests.lightpage.small import small_profile
 
 PROFILE = small_profile()
