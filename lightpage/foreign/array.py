@@ -78,6 +78,8 @@ def readable(subject: str, expected: str) -> Iterator[None]:
         if (failure := understood(subject, error)) is not None:
             raise failure from None
         told = " ".join(str(error).split())[:200]
+        if "imagecodecs" in told:
+            expected = "one without compression, or the codecs: pip install imagecodecs"
         raise InvalidInputError(
             subject, f"data that cannot be read ({type(error).__name__}: {told})", expected
         ) from None

@@ -43,23 +43,24 @@ class TiffArray(ForeignArray):
             raise
 
     def _choose(self, name: str | None) -> None:
-        series = {str(number): each for number, each in enumerate(self._file.series)}
-        number = chosen(self.subject, name, {key: each.shape for key, each in series.items()})
-        self._series = series[number]
-        page = self._series.keyframe
+        found = self._file.series
+        if name is None and len({(each.shape, each.dtype) for each in found}) == 1:
+            self._series = list(found)  # whoever writes picture by picture may have made a series of each
+        else:
+            shapes = {str(number): each.shape for number, each in enumerate(found)}
+            self._series = [found[int(chosen(self.subject, name, shapes))]]
+        series = self._series[0]
+        page = series.keyframe
         photometric = getattr(page.photometric, "name", str(page.photometric))
         if photometric != "MINISBLACK" or page.samplesperpixel != 1:
             got = f"pictures of {page.samplesperpixel} samples a pixel, {photometric}"
-            raise InvalidInputError(self.subject, got, "grey ones, where 0 is black")
-        if self._series.dtype is None or self._series.shape[-2:] != page.shape:
-            raise InvalidInputError(self.subject, f"shape {self._series.shape}", "pictures along the last two axes")
-        self.shape, self.dtype = tuple(self._series.shape), np.dtype(self._series.dtype)
-
-    @property
-    def declared_bits(self) -> int | None:
-        """Bits of a count where the file says that they are fewer than its type has; else None."""
-        bits = self._series.keyframe.bitspersample
-        return bits if isinstance(bits, int) and bits < 8 * self.dtype.itemsize else None
+            raise InvalidInputError(self.subject, got, "grey ones, where 0 is black (photometric='minisblack')")
+        if series.dtype is None or series.shape[-2:] != page.shape:
+            raise InvalidInputError(self.subject, f"shape {series.shape}", "pictures along the last two axes")
+        self._each = math.prod(series.shape[:-2])
+        many = len(self._series)
+        self.shape = tuple(series.shape) if many == 1 else (many * self._each, *series.shape[-2:])
+        self.dtype = np.dtype(series.dtype)
 
     def take(self, axis: int, start: int, stop: int) -> NDArray[Any]:
         """See `ForeignArray`; the axis is none of a picture's own, but where there is one picture alone."""
@@ -73,19 +74,20 @@ class TiffArray(ForeignArray):
 
     def _pictures(self, numbers: NDArray[np.intp]) -> NDArray[Any]:
         pictures = np.empty((len(numbers), *self.shape[-2:]), self.dtype)
-        offset, size = self._series.dataoffset, math.prod(self.shape[-2:]) * self.dtype.itemsize
-        kind = self.dtype.newbyteorder(self._file.byteorder)
         for row, number in enumerate(map(int, numbers)):
             with readable(f"{self.subject}: picture {number}", _EXPECTED):
-                if offset is None:
-                    page = self._series.pages[number]
-                    assert page is not None  # those of a series that is not in one piece are all there
-                    pictures[row] = page.asarray()
-                    continue
-                self._file.filehandle.seek(offset + number * size)
-                data = self._file.filehandle.read(size)
-                pictures[row] = np.frombuffer(data, kind).reshape(self.shape[-2:])
+                pictures[row] = self._picture(*divmod(number, self._each))
         return pictures
+
+    def _picture(self, series: int, number: int) -> NDArray[Any]:
+        found, size = self._series[series], math.prod(self.shape[-2:]) * self.dtype.itemsize
+        if found.dataoffset is None:
+            page = found.pages[number]
+            assert page is not None  # those of a series that is not in one piece are all there
+            return np.asarray(page.asarray())
+        self._file.filehandle.seek(found.dataoffset + number * size)
+        data = self._file.filehandle.read(size)
+        return np.frombuffer(data, self.dtype.newbyteorder(self._file.byteorder)).reshape(self.shape[-2:])
 
     def close(self) -> None:
         """See `ForeignArray`."""

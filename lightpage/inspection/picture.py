@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from lightpage.errors import InvalidInputError
@@ -14,8 +15,10 @@ from lightpage.inspection.finding import Finding, printable
 from lightpage.pictures import write_figure_png
 
 _COLUMNS = 3
-_SIDE_PX = 900
+_SIDE_PX = 1800
 """Pixels of a frame's longer side that are drawn."""
+_SHADES = (0.2, 99.5)
+"""Percentiles of the counts that are black and white: single bright pixels would leave the rest in the dark."""
 _DOTS = 110
 
 
@@ -36,8 +39,8 @@ def draw(found: Finding, out: Path) -> None:
         axis = figure.add_subplot(rows, _COLUMNS, place)
         step = max(1, max(pixels.shape) // _SIDE_PX)
         shown = pixels[::step, ::step]
-        low, high = (float(sampled(shown).min()), float(sampled(shown).max()))
-        image = axis.imshow(shown, cmap="gray", vmin=low, vmax=max(high, low + 1e-9), interpolation="nearest")
+        low, high = np.percentile(sampled(shown), _SHADES)
+        image = axis.imshow(shown, cmap="gray", vmin=low, vmax=max(high, low + 1e-9))
         axis.set_title(title, fontsize=9)
         axis.set_xticks([])
         axis.set_yticks([])
