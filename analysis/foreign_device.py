@@ -306,13 +306,12 @@ class ForeignDevice:
         # Cycles a pixel along the SLM's own axes: they set what a square pixel and the blur let through.
         u, v = (c * SLM_PITCH / (WAVELENGTH * f) for c in rotate(x, y, roll))
         field *= np.sinc(u) * np.sinc(v) * np.exp(-2 * (np.pi * self.parameters.blur_px) ** 2 * (u**2 + v**2))
-        return field * self.out_of_focus(self.parameters.modulator_behind_mm) * SLM_PITCH**2 / (WAVELENGTH * f)
-
-    def out_of_focus(self, distance: float) -> ComplexArray:
-        """What a plane so far from its focal plane, mm, does to the field on a facet [y', x]."""
-        x, y = self.facet_points
-        sine2 = (x**2 + y**2) / self.focal_length**2
-        return np.asarray(np.exp(1j * WAVENUMBER * distance * (np.sqrt(1 - sine2) - 1)))
+        return (
+            field
+            * out_of_focus(self.facet_points, f, self.parameters.modulator_behind_mm)
+            * SLM_PITCH**2
+            / (WAVELENGTH * f)
+        )
 
     def delaunch(self, facet: ComplexArray) -> Image:
         """Return the field on the camera plane of that on the exit facet, in the pipe's axes."""
@@ -334,7 +333,10 @@ class ForeignDevice:
         facet = self.launch(self.modulate(symbols, levels, rng))
         leaving = propagate_pipe(facet, self.pipe_width, self.pipe_length, self.angle, self.design.steps)
         behind = [camera.behind_mm for camera in (self.parameters.in_phase_camera, self.parameters.quadrature_camera)]
-        made = {distance: self.delaunch(leaving * self.out_of_focus(distance)) for distance in behind}
+        made = {
+            distance: self.delaunch(leaving * out_of_focus(self.facet_points, self.focal_length, distance))
+            for distance in behind
+        }
         return [made[distance] for distance in behind]
 
     # --- cameras ------------------------------------------------------------------------------------------------------
@@ -347,19 +349,9 @@ class ForeignDevice:
         power = np.sum(np.abs(facet) ** 2) * np.prod(self.pitches) / np.cos(self.angle)
         return float(np.sqrt(power / (np.prod(self.design.page_px) * SLM_PITCH**2)))
 
-    def plane_coordinates(self, camera: Camera, drift: PageDrift) -> tuple[FloatArray, FloatArray]:
-        """(x, y) in the camera plane, mm, that each pixel of a frame looks at."""
-        rows, columns = (np.arange(n) - (n - 1) / 2 for n in self.design.frame_shape)
-        x = columns[None, :] - camera.shift_px[0] - drift.shift_px[0]
-        y = rows[:, None] - camera.shift_px[1] - drift.shift_px[1]
-        half_height, half_width = (n * SLM_PITCH / CAMERA_PITCH / 2 for n in self.design.page_px)
-        growth = camera.keystone[0] * columns[None, :] / half_width + camera.keystone[1] * rows[:, None] / half_height
-        scale = CAMERA_PITCH / (1 + camera.scale) * (1 + growth)
-        return rotate(x * scale, y * scale, -np.deg2rad(camera.rotation_deg))
-
     def signal(self, image: Image, camera: Camera, drift: PageDrift) -> ComplexArray:
         """The signal on a camera's pixels."""
-        x, y = self.plane_coordinates(camera, drift)
+        x, y = plane_coordinates(self.design, camera, drift)
         stretch = 1 + self.parameters.distortion * (x**2 + y**2) / self.design.corner**2
         x, y = rotate(x * stretch, y * stretch, -np.deg2rad(self.parameters.pipe_roll_deg))
         return np.asarray(image.at(x, y) * np.exp(1j * drift.piston_rad))
@@ -367,7 +359,7 @@ class ForeignDevice:
     def reference(self, camera: Camera) -> ComplexArray:
         """The reference on a camera's pixels."""
         p = self.parameters
-        x, y = self.plane_coordinates(camera, PageDrift())
+        x, y = plane_coordinates(self.design, camera, PageDrift())
         rng = np.random.default_rng(p.ripple_seed)
         fringes = np.zeros(self.design.frame_shape)
         for amplitude in (0.5, 0.3, 0.2):
@@ -471,6 +463,23 @@ class ForeignDevice:
                 for name, intensity in zip(names, self.intensities(images, drifts[page]), strict=True):
                     file[name][page] = self.expose(intensity, rng)
         return symbols
+
+
+def plane_coordinates(design: Design, camera: Camera, drift: PageDrift) -> tuple[FloatArray, FloatArray]:
+    """(x, y) in the camera plane, mm, that each pixel of a frame looks at."""
+    rows, columns = (np.arange(n) - (n - 1) / 2 for n in design.frame_shape)
+    x = columns[None, :] - camera.shift_px[0] - drift.shift_px[0]
+    y = rows[:, None] - camera.shift_px[1] - drift.shift_px[1]
+    half_height, half_width = (n * SLM_PITCH / CAMERA_PITCH / 2 for n in design.page_px)
+    growth = camera.keystone[0] * columns[None, :] / half_width + camera.keystone[1] * rows[:, None] / half_height
+    scale = CAMERA_PITCH / (1 + camera.scale) * (1 + growth)
+    return rotate(x * scale, y * scale, -np.deg2rad(camera.rotation_deg))
+
+
+def out_of_focus(points: tuple[FloatArray, FloatArray], focal_length: float, distance: float) -> ComplexArray:
+    """What a plane so far from its focal plane, mm, does to the field at points (x, y) of a facet, mm."""
+    sine2 = (points[0] ** 2 + points[1] ** 2) / focal_length**2
+    return np.asarray(np.exp(1j * WAVENUMBER * distance * (np.sqrt(1 - sine2) - 1)))
 
 
 def walk(

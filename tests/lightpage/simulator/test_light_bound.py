@@ -59,5 +59,6 @@ def test_the_command_goes_on_where_it_was(tmp_path: Path) -> None:
     file.write_text(json.dumps(found | {"concentrations": [[1.0] * 3]}))
     assert CliRunner().invoke(bound.main, [*words, "--pages", "2"]).exit_code == 0
     first, second = json.loads(file.read_text())["concentrations"]
-    assert first == [1.0] * 3 and len(second) == 3
+    assert first == [1.0] * 3
+    assert len(second) == 3
     assert CliRunner().invoke(bound.main, [*words, "--seed", "1"]).exit_code
