@@ -40,6 +40,9 @@ _CAMERA_TILTS = "cameras_axial_x_rad", "cameras_axial_y_rad"
 _RIPPLE = 1
 """The random stream of the reference's ripple; a simulator draws others from a seed of its own."""
 
+_STEP = 1e-4
+"""Of a derivative, radians; exact to 1e-8 in double precision."""
+
 
 class Place(NamedTuple):
     """How a camera stands against its focal plane, by the numbers of its pose."""
@@ -151,11 +154,20 @@ class TrueOptics:
         if flicker_rad:
             stroke = slm.stroke_relative_error + flicker_rad / (2 * np.pi)
             slm = slm.model_copy(update={"stroke_relative_error": stroke})
+        return self.signal_scale * self._through(self._shown(slm, page_phase, noise_rad))
+
+    def exit_field_change(self, page_phase: Real, direction: Real) -> Complex:
+        """Derivative of `exit_field` at phases [ny, nx] along a direction of them [ny, nx], per radian."""
+        ahead, behind = (self._shown(self.device.slm, page_phase + step * direction) for step in (_STEP, -_STEP))
+        return self.signal_scale * self._through((ahead - behind) / (2 * _STEP))
+
+    def _shown(self, slm: SlmDefects, page_phase: Real, noise_rad: Real | float = 0.0) -> Complex:
+        """Light that the SLM makes of nominal phases, [ny, nx]."""
         shown = modulated(slm, with_crosstalk(page_phase, slm.crosstalk_relative)) * np.exp(1j * np.asarray(noise_rad))
         if self._dead_pixels is not None:
             dead, light = self._dead_pixels
             shown[dead] = light
-        return self.signal_scale * self._through(shown)
+        return shown
 
     @cached_property
     def _dead_pixels(self) -> tuple[NDArray[np.bool_], Complex] | None:
