@@ -26,8 +26,12 @@ class ForeignArray(ABC):
         subject: the file, and the array where it has several, for errors.
         shape: of the array as its own program shows it: MATLAB's are not turned round.
         dtype: of an element.
+        pages_last: whether its program counts axes from the inner one, so that pages lie along the last.
+        in_sequence: whether reading a part means to read all before it, as in a compressed archive.
     """
 
+    in_sequence = False
+    pages_last = False
     subject: str
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
@@ -46,7 +50,9 @@ class ForeignArray(ABC):
 
 
 class WholeArray(ForeignArray):
-    """An array that lies in memory."""
+    """An array of MATLAB that lies in memory."""
+
+    pages_last = True  # MATLAB's
 
     def __init__(self, subject: str, data: NDArray[Any]) -> None:
         self.subject, self._data = subject, data

@@ -33,7 +33,7 @@ class Hdf5Array(ForeignArray):
     """
 
     def __init__(self, path: Path, name: str | None, *, reversed_axes: bool = False) -> None:
-        self._reversed = reversed_axes
+        self._reversed = self.pages_last = reversed_axes
         file = open_hdf5(path, f"file {path}")
         self._file = ArrayFile(file, f"file {path}")
         try:
@@ -101,7 +101,7 @@ def open_mat(path: Path, name: str | None) -> ForeignArray:
     subject, expected = f"file {path}", "a .mat file of MATLAB"
     found = mat_arrays(path)
     name = chosen(subject, name, found)
-    if (size := math.prod(found[name])) > MOST_BYTES:
+    if (size := math.prod(found[name])) > MOST_BYTES // 4:
         got = f"an array of {size:,} elements, which can only be read whole"
         raise InvalidInputError(f"{subject}: array '{name}'", got, "save(..., '-v7.3')")
     with readable(subject, expected):

@@ -34,12 +34,12 @@ class NumpyArray(ForeignArray):
     """
 
     def __init__(self, subject: str, opened: Callable[[], IO[bytes]], path: Path | None) -> None:
-        self.subject, self._path = subject, path
+        self.subject, self._path, self.in_sequence = subject, path, path is None
         with readable(subject, _EXPECTED):
             self._file = opened()  # kept open: a compressed one would be read from its start for each part
         with self._closed_if_refused(), readable(subject, _EXPECTED):
             self.shape, self._fortran, self.dtype = header_of(self._file, subject)
-            self._start = self._file.tell()
+            self._start, self.pages_last = self._file.tell(), self._fortran
             self._check_size()
 
     @contextmanager

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lightpage.inspection.finding import Histogram
 
 _BINS = 16
-_PIXELS = 1 << 20
+_PIXELS = 1 << 18
 """Of a frame that are counted."""
 _BAR = 40
 _TOLD = 0.0005
@@ -18,7 +18,7 @@ _TOLD = 0.0005
 
 
 def sampled(frame: NDArray[Any]) -> NDArray[Any]:
-    """Return pixels spread over a frame, at most about a million."""
+    """Return pixels spread over a frame, at most about a quarter of a million."""
     flat = frame.reshape(-1)
     return flat[:: max(1, flat.size // _PIXELS)]
 

@@ -6,6 +6,7 @@ import math
 import shlex
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +16,12 @@ from lightpage.foreign.array import MOST_BYTES, SEPARATOR, ForeignArray
 from lightpage.foreign.hdf5_file import arrays_in, mat_arrays
 from lightpage.foreign.numpy_file import arrays_of
 from lightpage.foreign.opening import open_array
-from lightpage.inspection.exposure import histogram
+from lightpage.inspection.exposure import histogram, sampled
 from lightpage.inspection.finding import Finding, Picture, shape_text, spread
 from lightpage.recording.hdf5 import hdf, open_hdf5
 
 _SAMPLED = 4
+_SAMPLE_BYTES = 1 << 26
 _LARGEST_SYMBOL = 256
 _NEEDED = "an array of counts"
 _TOLD = 20
@@ -89,28 +91,33 @@ def _one(found: Finding, array: ForeignArray, named: str, profile: Profile | Non
         found.facts["may be"] = "symbols"
         found.next.append(f"lightpage import --symbols {named} --in-phase I --quadrature Q ... --profile P --out R.h5")
         return
-    frames = _frames(array)
+    axis = len(array.shape) - 1 if array.pages_last and len(array.shape) > 2 else 0
+    pages = array.shape[axis] if len(array.shape) > 2 else 1
+    if (size := math.prod(array.shape) // pages * array.dtype.itemsize) > MOST_BYTES:
+        found.problems.append(f"a page of {size / 1e9:.3g} GB, more than is looked at")
+        return
+    frames = _frames(array, axis, pages, max(1, _SAMPLE_BYTES // max(1, size)))
     found.pictures = lambda: _pictures(str(named), frames)
-    if any(not np.isfinite(frame).all() for frame in frames):
+    pixels = [sampled(frame) for frame in frames]
+    if any(not np.isfinite(each).all() for each in pixels):
         found.problems.append("values that are no numbers")
-    elif any(np.any(frame != np.rint(frame)) or frame.min() < 0 for frame in frames):
+    elif any(np.any(each != np.rint(each)) or each.min() < 0 for each in pixels):
         found.problems.append("values that are no whole counts: multiply by full scale, and round")
     else:
-        _counts(found, [frame.astype(np.int64) for frame in frames])
+        _counts(found, [each.astype(np.int64) for each in pixels])
     found.next.append(
         f"lightpage import --in-phase {named} --quadrature Q --reference-in-phase RI --reference-quadrature RQ "
         "--symbols S --profile P --out R.h5"
     )
 
 
-def _frames(array: ForeignArray) -> list[NDArray[np.generic]]:
-    """Return some pages of an array, along its first axis or its last, whichever pages lie along."""
-    axis = 0 if len(array.shape) == 2 or array.shape[0] <= array.shape[-1] else len(array.shape) - 1
+def _frames(array: ForeignArray, axis: int, pages: int, most: int) -> list[NDArray[Any]]:
+    """Return some pages of an array, which lie along an axis; the first ones where the last would take long."""
+    most = min(most, _SAMPLED, pages)
     if len(array.shape) == 2:
         return [array.take(0, 0, array.shape[0])]
-    if math.prod(array.shape) // array.shape[axis] * array.dtype.itemsize > MOST_BYTES:
-        return [np.zeros((1, 1), np.uint8)]
-    taken = (array.take(axis, page, page + 1).squeeze(axis) for page in spread(array.shape[axis], _SAMPLED))
+    looked_at = range(most) if array.in_sequence else spread(pages, most)
+    taken = (array.take(axis, page, page + 1).squeeze(axis) for page in looked_at)
     return [page if page.ndim == 2 else page[0] for page in taken]
 
 
@@ -138,5 +145,5 @@ def _fits(found: Finding, array: ForeignArray, profile: Profile) -> None:
         found.problems.append(f"shape {array.shape}, and profile {profile.name} has {wanted}{more}")
 
 
-def _pictures(name: str, frames: list[NDArray[np.generic]]) -> list[Picture]:
+def _pictures(name: str, frames: list[NDArray[Any]]) -> list[Picture]:
     return [(f"{Path(name).name}, frame looked at {number}", frame) for number, frame in enumerate(frames)]

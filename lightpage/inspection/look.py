@@ -9,7 +9,6 @@ from pathlib import Path
 
 from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError
-from lightpage.failures import os_errors
 from lightpage.foreign.array import readable
 from lightpage.inspection.documents import MOST_BYTES, look_at_json, look_at_toml
 from lightpage.inspection.finding import Finding
@@ -44,11 +43,8 @@ def look(path: Path, profile: Profile | None = None) -> Finding:
         StorageError, SurroundingsError: storage fails, or a resource is short.
     """
     subject = f"file {path}"
-    with os_errors(subject, "a file that can be read"):
-        try:
-            status = os.stat(path)
-        except ValueError as error:  # a null in the name
-            raise InvalidInputError(subject, error, "a name of a file") from None
+    with readable(subject, "a file that can be read"):
+        status = os.stat(path)
         if stat.S_ISDIR(status.st_mode):
             return look_at_folder(path, profile)
         if not stat.S_ISREG(status.st_mode):
@@ -57,7 +53,7 @@ def look(path: Path, profile: Profile | None = None) -> Finding:
             raise InvalidInputError(subject, "an empty file", _KNOWN)
         with path.open("rb") as file:
             head = file.read(_HEAD)
-    return _by_content(path, head, status.st_size, profile)
+        return _by_content(path, head, status.st_size, profile)
 
 
 def _by_content(path: Path, head: bytes, size: int, profile: Profile | None) -> Finding:

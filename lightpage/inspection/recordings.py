@@ -11,11 +11,12 @@ import numpy as np
 from lightpage.device.profile import Profile
 from lightpage.errors import FrameError, InvalidInputError
 from lightpage.foreign.array import MOST_BYTES
-from lightpage.inspection.exposure import contrast, histogram
+from lightpage.inspection.exposure import contrast, histogram, sampled
 from lightpage.inspection.finding import Finding, Picture, shape_text, spread
 from lightpage.inspection.foreign_files import look_at_hdf5
 from lightpage.recording import decoded_file, layout, pages
 from lightpage.recording.exposure import check_pair_light
+from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.hdf5 import find, open_hdf5, read_attribute
 from lightpage.recording.pages import Pages
 from lightpage.recording.reader import Recording
@@ -37,7 +38,7 @@ def look_at(path: Path, profile: Profile | None) -> Finding:
     """
     subject = f"file {path}"
     with open_hdf5(path, subject) as file:
-        told = read_attribute(file, "format", subject)
+        told = str(read_attribute(file, "format", subject))
         _check_sizes(file, subject)
         unfinished = "pages_complete" in file.attrs
         if told == layout.FORMAT and unfinished:
@@ -137,14 +138,14 @@ def _exposure(found: Finding, recording: Recording) -> None:
     """Tell how some frames are exposed, and the references."""
     pair = recording.references()
     with found.trying("reference frames with light"):
-        check_pair_light("reference: ", pair, recording.bit_depth)
+        check_pair_light("reference: ", _sampled(pair), recording.bit_depth)
     frame_bytes = 2 * pair.in_phase.nbytes
     looked_at = spread(recording.pages, max(1, min(_MOST_PAGES, _SAMPLE_BYTES // frame_bytes)))
     unlit, frames = [], []
     for page in looked_at:
         frames.append(recording.frames(page))
         try:
-            check_pair_light("", frames[-1], recording.bit_depth)
+            check_pair_light("", _sampled(frames[-1]), recording.bit_depth)
         except FrameError as error:
             unlit.append(f"page {page}: {error.subject} {error.got}")
     found.facts["pages looked at"] = ", ".join(map(str, looked_at))
@@ -154,6 +155,10 @@ def _exposure(found: Finding, recording: Recording) -> None:
         found.histograms[name] = histogram(own, recording.bit_depth)
         found.facts[f"{name}: saturated"] = f"{found.histograms[name].saturated:.2%} of the pixels"
         found.facts[f"{name}: contrast of fringes"] = f"{np.mean([contrast(each, reference) for each in own]):.2f}"
+
+
+def _sampled(pair: FramePair) -> FramePair:
+    return FramePair(sampled(pair.in_phase), sampled(pair.quadrature))
 
 
 def _next(found: Finding, recording: Recording, coded: bool) -> None:

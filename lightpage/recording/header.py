@@ -113,7 +113,7 @@ def read_header(file: ArrayFile) -> Header:
         RecordingError: no recording, one that is newer than this program, or one that contradicts itself.
         StorageError, SurroundingsError: it cannot be read.
     """
-    if (found := file.attribute("format")) != FORMAT:
+    if not isinstance(found := file.attribute("format"), str) or found != FORMAT:
         got = "none" if found is None else repr(found)
         raise RecordingError(f"{file.subject}: attribute 'format'", got, repr(FORMAT))
     _whole(file, "version", VERSION, VERSION, f"version {VERSION}")

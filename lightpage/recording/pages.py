@@ -145,7 +145,8 @@ class Pages:
         """
         subject = f"file {path}"
         with open_hdf5(path, subject) as file:
-            return bool(read_attribute(file, "format", subject) == FORMAT)
+            told = read_attribute(file, "format", subject)
+            return isinstance(told, str) and told == FORMAT
 
     def __enter__(self) -> Self:
         return self
