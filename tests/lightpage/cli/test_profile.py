@@ -1,4 +1,4 @@
-"""`lightpage profile`, and commands that take the profile of what they read."""
+"""`lightpage profile`: a file to fill in, what follows from it, and what is refused."""
 
 import json
 from pathlib import Path
@@ -8,8 +8,6 @@ import pytest
 from lightpage.cli import main
 from lightpage.cli.profile import profile
 from lightpage.device.profile import load_profile
-from lightpage.recording.reader import Recording
-from lightpage.train.commands.calibrate import calibrate
 
 
 def test_a_new_profile_is_checked_and_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -22,16 +20,3 @@ def test_a_new_profile_is_checked_and_shown(tmp_path: Path, capsys: pytest.Captu
     capsys.readouterr()
     assert main.run(profile, ["check", str(mine)]) == 2
     assert "camera.columns_px" in capsys.readouterr().err
-
-
-def test_a_contradiction_to_the_recording_is_refused(
-    small_device: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    named = dict(zip(small_device[::2], small_device[1::2], strict=True))
-    other = tmp_path / "other.toml"
-    other.write_text(Path(named["--profile"]).read_text().replace("angle_deg = 0.0", "angle_deg = 0.5"))
-    options = ["--recording", named["--recording"], "--out", str(tmp_path / "C.toml")]
-    assert main.run(calibrate, [*options, "--profile", str(other)]) == 2
-    assert "pipe.angle_deg = 0.0 (profile small: 0.5)" in capsys.readouterr().err
-    with Recording.open(named["--recording"]) as recording:
-        assert recording.header.device(None).name == "small"

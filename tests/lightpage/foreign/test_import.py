@@ -16,11 +16,12 @@ from click.testing import CliRunner
 from PIL import Image
 from scipy.io import savemat
 
+from lightpage.calibration.calibrate import ORIENTATIONS
 from lightpage.cli.import_frames import import_frames
 from lightpage.cli.unpack import unpack
 from lightpage.errors import BlackFrameError, FrameError, InvalidInputError, PageError
 from lightpage.foreign import import_job
-from lightpage.foreign.frames import Pages
+from lightpage.foreign.frames import Pages, Upright
 from lightpage.foreign.opening import open_array
 from lightpage.foreign.unpacking import Form
 from lightpage.recording.reader import Recording
@@ -28,6 +29,15 @@ from tests.lightpage.refused import refused
 from tests.runtime import coded, toy
 
 LEVELS, PAGES = 16, 4
+TURNS = [Upright("", turn) for turn in (180, 270, 90)]
+WAYS = [Upright("x"), Upright("y"), *TURNS, Upright("x", 270), Upright("x", 90)]
+    Upright("x"),
+    Upright("y"),
+    *(Upright("", turn) for turn in (180, 270, 90)),
+    Upright("x", 270),
+    Upright("x", 90),
+]
+"""Those that docs/your-device.md names, in the order of `ORIENTATIONS`."""
 Arrays = dict[str, np.ndarray]
 
 
@@ -208,16 +218,22 @@ class TestRefused:
         with refused(subject, got):
             bring(f"{options} {REST}")
 
-    def test_pictures_in_colour_and_of_another_size_are_named(self, folder: Path) -> None:
+    def test_a_picture_of_another_kind_or_size_is_named(self, folder: Path) -> None:
         (folder / "p").mkdir()
         Image.new("L", (96, 64)).save("p/1.png")
         for mode, size in (("RGB", (96, 64)), ("L", (95, 64))):
             Image.new(mode, size).save("p/2.png")
             with refused("p/2.png"):
                 open_array("p").take(0, 0, 2)
-        tifffile.imwrite("c.tif", np.zeros((3, 64, 96, 3), np.uint8), photometric="rgb")
-        with refused("c.tif", "RGB"):
-            open_array("c.tif")
+
+
+@pytest.mark.parametrize(("shown", "upright"), list(zip(list(ORIENTATIONS.values())[1:], WAYS, strict=True)))
+def test_each_way_that_calibrate_finds_is_set_upright(shown: tuple[tuple[int, int], ...], upright: Upright) -> None:
+    page, seen = np.arange(9).reshape(3, 3), np.zeros((3, 3), int)
+    for row, column in np.ndindex(3, 3):
+        at = np.array(shown) @ (column - 1, row - 1) + 1
+        seen[at[1], at[0]] = page[row, column]
+    np.testing.assert_array_equal(upright(seen), page)
 
 
 def test_unlit_frames_are_taken_and_told_where_that_is_asked_for(folder: Path, arrays: Arrays) -> None:
