@@ -477,7 +477,7 @@ def plane_coordinates(design: Design, camera: Camera, drift: PageDrift) -> tuple
 
 
 def out_of_focus(points: tuple[FloatArray, FloatArray], focal_length: float, distance: float) -> ComplexArray:
-    """What a plane so far from its focal plane, mm, does to the field at points (x, y) of a facet, mm."""
+    """Return the factors by which a defocus of `distance` mm changes the field at points (x, y) mm of a facet."""
     sine2 = (points[0] ** 2 + points[1] ** 2) / focal_length**2
     return np.asarray(np.exp(1j * WAVENUMBER * distance * (np.sqrt(1 - sine2) - 1)))
 

@@ -87,7 +87,7 @@ class Attacker:
         }
 
     def good(self) -> bool:
-        """Whether a good pair is answered."""
+        """Send a good pair, and return whether it is answered."""
         return self._ended(self._memory.handle, 0) == "OK"
 
     def close(self) -> None:
@@ -109,7 +109,7 @@ class Attacker:
         return self._stub.DecodeFrames.future(iter([pb.DecodeFramesRequest(header=header)]), timeout=CALL_S)
 
     def _ended(self, region: bytes, offset: int, rows_px: int | None = None) -> str:
-        """How a call ends."""
+        """Make a call, and return the name of its status code."""
         return str(self._begun(region, offset, rows_px).code().name)
 
     def _cancelled(self) -> str:
@@ -220,7 +220,7 @@ def attacked(tries: int, seed: int) -> dict[str, Any]:
 
 
 def faults(found: Mapping[str, Any]) -> list[str]:
-    """What is wrong with figures of `attacked`, a few words each."""
+    """Return the faults in the figures of `attacked`, a few words each."""
     before, after = found["regions_and_files_before"], found["regions_and_files_after"]
     wrong = {
         f"{found['crashes']} crashes": found["crashes"],

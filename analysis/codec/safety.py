@@ -1,4 +1,4 @@
-"""Whether a wrong byte is ever given out: pages drawn at and below the code's limit, and pages damaged in every way.
+"""Check that no wrong byte is ever given out: pages drawn at and below the code's limit, and pages damaged every way.
 
 python -m analysis.codec.safety --json runs/bench-codec/safety.json
 """
@@ -38,7 +38,7 @@ _LIMIT_PAGES, _LIMIT_STEPS = 20, 10
 
 @dataclass(frozen=True)
 class Count:
-    """What became of pages.
+    """Count of pages by outcome.
 
     Attributes:
         right, lost, wrong: how many gave their bytes, gave none, or gave others.
@@ -82,7 +82,7 @@ class Pages:
         return (low + high) / 2
 
     def outcome(self, sent: bytes, header: Header, phase: Floats, concentration: Floats) -> str:
-        """Whether a page is right, lost or wrong."""
+        """Decode a page, and return its outcome: right, lost or wrong."""
         try:
             found = self.codec.decode(phase, concentration)
         except LightpageError:

@@ -1,4 +1,4 @@
-"""How well calibrated confidences are on pages of few levels, where decisions are mostly right."""
+"""Calibration of confidences on pages of few levels, where most decisions are right."""
 
 from __future__ import annotations
 

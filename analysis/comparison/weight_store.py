@@ -30,7 +30,7 @@ KEPT_WEIGHTS = "fitted.xz"
 
 @dataclass(frozen=True)
 class WeightStore:
-    """What is kept of a data set.
+    """Store of what was trained on a data set: its calibration and the methods' weights.
 
     Attributes:
         data_set: folder of the data set, with its recording.
@@ -44,7 +44,7 @@ class WeightStore:
 
     @property
     def is_of_this_data_set(self) -> bool:
-        """Whether something is kept, and of just this data set: device, pages, seed and the code's format."""
+        """Return whether the store holds this very data set: the same device, pages, seed and format of the code."""
         return (self.folder / BEGUN).exists() and _read(self.folder / BEGUN) == _read(self.data_set / BEGUN)
 
     def bring_calibration(self) -> None:

@@ -133,7 +133,7 @@ def _moment(seconds: float) -> datetime:
 
 
 def _colours(panel: dict[str, Any]) -> dict[str, str]:
-    """Of the series that have one of their own."""
+    """Return the colours of a panel's series that have one of their own, by name."""
     found = {}
     for override in panel["fieldConfig"]["overrides"]:
         for one in override["properties"]:

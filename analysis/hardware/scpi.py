@@ -47,7 +47,7 @@ _SETTINGS = {"WIDT": "WIDTh", "DEL": "DELay"}
 
 @dataclass
 class Outcome:
-    """What became of the queries.
+    """Outcome of the queries.
 
     Attributes:
         queries: asked.

@@ -21,7 +21,7 @@ _SATURATED = 0.9
 
 @dataclass(frozen=True)
 class Work:
-    """What a worker does.
+    """Work of one worker.
 
     Attributes:
         page_seconds: of a range's pages in the mean, one for each range that was measured; drawn from at random.
@@ -39,13 +39,13 @@ class Work:
 
     @property
     def mean_s(self) -> float:
-        """Of a page, with its part of what a range takes."""
+        """Seconds for a page, with its share of a range's overhead."""
         return float(np.mean(self.page_seconds)) + self.range_s / self.range_pages
 
 
 @dataclass(frozen=True)
 class Driver:
-    """What a range costs the driver: `base_s`, and more for each that is on its way.
+    """Cost of a range to the driver: `base_s`, and more for each range that is in flight.
 
     Attributes:
         base_s: seconds.
@@ -58,7 +58,7 @@ class Driver:
     ahead: int
 
     def range_s(self, workers: int) -> float:
-        """Of so many workers."""
+        """Return the driver's seconds for a range with so many workers."""
         return self.base_s + self.in_flight_s * self.ahead * workers
 
 
@@ -85,7 +85,7 @@ class Cluster:
 
 @dataclass(frozen=True)
 class Rate:
-    """How fast a cluster reads.
+    """Rate at which a cluster reads.
 
     Attributes:
         nodes: that it has.
@@ -104,7 +104,7 @@ class Rate:
 
     @property
     def bound(self) -> str:
-        """What more of would make it faster."""
+        """Name of the bottleneck: the driver, the storage or the workers."""
         name, use = max((("driver", self.driver), ("storage", self.storage)), key=lambda part: part[1])
         return name if use >= _SATURATED else "workers"
 
@@ -230,7 +230,7 @@ def _rate(cluster: Cluster, work: Work, driver: Driver, pages_per_s: float, lost
 
 
 def nodes_that_saturate(cluster: Cluster, work: Work, driver: Driver) -> dict[str, float]:
-    """By arithmetic alone: how many nodes, that wait for nothing, take all of the driver, and all of the storage."""
+    """Return how many nodes saturate the driver, and how many the storage, if no node waits for anything."""
     node_pages_per_s = cluster.workers / work.mean_s
     storage = cluster.storage_bytes_per_s / ((work.read_bytes + work.written_bytes) * node_pages_per_s)
     ranges_per_s = node_pages_per_s / work.range_pages

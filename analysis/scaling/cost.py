@@ -79,13 +79,13 @@ def kinds(figures: NodeFigures, full_size_s: float, full_size_bytes: float) -> l
 
 
 def round_trip_s(figures: NodeFigures) -> float:
-    """From a worker's end of a range to its beginning of the next: workers that do nothing, two ranges on their way."""
+    """Return the seconds between two ranges of a worker that does nothing, with two ranges in flight."""
     least = min(figures.ray, key=lambda driver: driver.in_flight)
     return least.wall_s * least.in_flight
 
 
 def fitted_driver(figures: Sequence[DriverFigures], ahead: int) -> Driver:
-    """What a range costs the driver against how many are on their way: a line through what was measured."""
+    """Fit the driver's cost of a range as a line over the number of ranges in flight."""
     in_flight, took = np.array([(each.in_flight, each.cpu_s) for each in figures]).T
     if len(figures) == 1:
         return Driver(float(took[0]), 0.0, ahead)
@@ -133,7 +133,7 @@ def curve(kind: Kind, cluster: Cluster, driver: Driver, nodes: Sequence[int], se
 
 
 def assumptions(figures: NodeFigures, cluster: Cluster, driver: Driver) -> list[str]:
-    """What the model takes for granted."""
+    """List the assumptions of the model."""
     failures = (
         "no node fails"
         if cluster.mtbf_s is None

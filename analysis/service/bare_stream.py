@@ -17,7 +17,7 @@ MESSAGE_BYTES = 4 << 20
 
 
 async def take(parts: AsyncIterator[bytes], context: Any) -> bytes:
-    """How many bytes came, as text."""
+    """Count the bytes that come, and return their number as text."""
     count = 0
     async for part in parts:
         count += len(part)

@@ -87,7 +87,7 @@ class RunningService:
         raise RuntimeError(f"the service ended with {self.process.wait()}: {self.log()[-2000:]}")
 
     def log(self) -> str:
-        """What it wrote to stderr."""
+        """Return all that the service has written to stderr."""
         self._log.seek(0)
         return self._log.read()
 
@@ -97,7 +97,7 @@ class RunningService:
         return (int(fields[11]) + int(fields[12])) / 100
 
     def resident_bytes(self) -> int:
-        """Its memory."""
+        """Return the resident memory of the service, bytes."""
         return int(Path(f"/proc/{self.pid}/statm").read_text().split()[1]) * resource.getpagesize()
 
     @property

@@ -1,4 +1,4 @@
-"""What a second pass reads and takes, by how exactly it follows light: weights stay, waves and precision change.
+"""Accuracy and time of a second pass, by how exactly it models light: weights stay, waves and precision change.
 
     python -m analysis.speed.fidelity --kept analysis/weights/bench/-0.6deg-32e-4px --out runs/fidelity
 

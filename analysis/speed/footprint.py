@@ -1,4 +1,4 @@
-"""What a bundle weighs, file by file, and what loading it and decoding with it take in time and memory.
+"""Footprint of a bundle: its size, file by file, and the time and memory that loading and decoding take.
 
     python -m analysis.speed.footprint --profile paper
 
@@ -37,7 +37,7 @@ _PATIENCE_S = 900
 
 @dataclass(frozen=True)
 class File:
-    """One file of a bundle.
+    """File of a bundle.
 
     Attributes:
         name: of it.
@@ -52,7 +52,7 @@ class File:
 
 @dataclass(frozen=True)
 class Footprint:
-    """What a bundle weighs and takes.
+    """Footprint of a bundle: its size, and what loading and decoding take.
 
     Attributes:
         decoder: name.
@@ -70,7 +70,7 @@ class Footprint:
 
     @property
     def unpacked_bytes(self) -> int:
-        """Of all files."""
+        """Bytes of all files, unpacked."""
         return sum(file.unpacked_bytes for file in self.files)
 
 
@@ -82,7 +82,7 @@ def files_of(bundle: Path) -> tuple[File, ...]:
 
 
 def measured(bundle: Path, pages: int, threads: int) -> Taken:
-    """What a process of its own took that loads a bundle and decodes so many pages.
+    """Load a bundle and decode so many pages in a new process, and return what that took.
 
     Raises:
         InvalidInputError: it failed, or took longer than it may.

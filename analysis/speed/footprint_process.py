@@ -20,7 +20,7 @@ _LEVELS = 16
 
 @dataclass(frozen=True)
 class Taken:
-    """What a process took.
+    """Time and memory that a process took.
 
     Attributes:
         load_s: seconds from the path to a decoder that has proven its golden page.

@@ -1,4 +1,4 @@
-"""What an execution provider makes of one bundle: how fast, how exact, and whether every node runs there."""
+"""Behaviour of one bundle on an execution provider: speed, accuracy, and whether every node runs there."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Kernel:
 
 @dataclass(frozen=True)
 class Made:
-    """What a provider makes of one bundle in one precision.
+    """Measurements of one bundle in one precision on a provider.
 
     Attributes:
         bundle: its name.
@@ -103,7 +103,7 @@ def in_precision(bundle: Bundle, precision: Precision) -> Bundle:
 
 
 def placed(bundle: Bundle, provider: Provider) -> dict[str, int]:
-    """How many nodes run for a page on each provider, by ONNX Runtime's profile."""
+    """Count the nodes that run for a page on each provider, by ONNX Runtime's profile."""
     file = GraphFile(bundle.files[DECODER], bundle.subject)
     pair = bundle.golden.pair
     with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""Where a page's time goes: the parts of a decoder, each against its floor, from the runtime's own profile.
+"""Breakdown of a page's time: the parts of a decoder, each against its floor, from the runtime's own profile.
 
 A part's floor is the larger of its arithmetic at the runtime's measured peak and of its bytes at the measured memory
 bandwidth: what it takes from other parts, its weights, and what it gives to others. All else that it moves could stay
@@ -55,7 +55,7 @@ _ORDER = (
 
 @dataclass(frozen=True)
 class Machine:
-    """What the runtime reaches on this machine.
+    """Peak rates that the runtime reaches on this machine.
 
     Attributes:
         flops_per_s: in a product of large matrices of float32.
@@ -68,7 +68,7 @@ class Machine:
 
 @dataclass(frozen=True)
 class Part:
-    """One part of a decoder, a page.
+    """Part of a decoder, with its cost for a page.
 
     Attributes:
         name: of the part.
@@ -214,7 +214,7 @@ def _crossing(model: bytes) -> Mapping[str, float]:
 
 
 def _flops(arguments: Mapping[str, Any]) -> float:
-    """Of a product or convolution, by the shapes that the runtime notes; 0 for all else."""
+    """Return the flops of a product or convolution, by the shapes that the runtime notes; 0 for all other operators."""
     shapes = [next(iter(entry.values())) for entry in arguments.get("input_type_shape", [])]
     out = [next(iter(entry.values())) for entry in arguments.get("output_type_shape", [])]
     operator = arguments.get("op_name", "")

@@ -1,4 +1,4 @@
-"""What a GPU would make of a page, by its data sheet: an estimate, where no GPU can be measured.
+"""Estimate of a page's time on a GPU, by its data sheet, where no GPU can be measured.
 
     python -m analysis.speed.roofline --profile paper --decoder fast --decoder coherent --decoder refined
 
@@ -80,7 +80,7 @@ H100 = Gpu("H100 SXM", 67e12, 989e12, 3.35e12, 55e9, 4e-6)
 
 @dataclass(frozen=True)
 class Load:
-    """What one kind of node asks for, a page.
+    """Load of all nodes of a kind, for a page.
 
     Attributes:
         nodes: how many.
@@ -96,7 +96,7 @@ class Load:
 
 
 def loads(decoder: bytes, gpu: Gpu, share: float) -> dict[str, Load]:
-    """What a page asks for, by kind.
+    """Return the load of a page, by kind of node.
 
     Args:
         decoder: decoder.onnx.

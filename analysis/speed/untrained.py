@@ -34,7 +34,7 @@ _HEAD = 0.01
 
 @dataclass(frozen=True)
 class Seen:
-    """What both cameras of a device saw.
+    """Frames of both cameras of a device.
 
     Attributes:
         device: its true state.
@@ -48,7 +48,7 @@ class Seen:
 
 
 def simulated(profile: Profile, device: Device, seed: int = 0) -> Seen:
-    """One page of random symbols and the references; minutes at full size.
+    """Simulate a page of random symbols and the references; this takes minutes at full size.
 
     Args:
         profile, device: nominal device and its true state.

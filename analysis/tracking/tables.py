@@ -1,4 +1,4 @@
-"""What `analysis.tracking.image_search` prints."""
+"""Tables that `analysis.tracking.image_search` prints."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What all servers carry: graphs, frames that they take, and the bundles that they come from."""
+"""Graphs that all servers run, frames that they take, and the bundles that both come from."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Graph:
 
     @property
     def pair_bytes(self) -> int:
-        """Of both frames."""
+        """Bytes of both frames."""
         return int(self.pair.in_phase.nbytes + self.pair.quadrature.nbytes)
 
 

@@ -1,6 +1,6 @@
-"""One ONNX graph in ONNX Runtime: what each of the other servers carries, in its own environment.
+"""Run of an ONNX graph in ONNX Runtime, the same for each of the other servers in its own environment.
 
-It needs numpy and onnxruntime, and nothing of Lightpage.
+The module needs numpy and onnxruntime, and nothing of Lightpage.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How each server is started and called: the configuration that counts, and others that were tried."""
+"""Starts and callers of the other servers: the configuration that counts, and others that were tried."""
 
 from __future__ import annotations
 

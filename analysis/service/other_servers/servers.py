@@ -50,7 +50,7 @@ class Marked:
         self.mark = uuid.uuid4().hex
 
     def ids(self) -> list[int]:
-        """Of those that run now."""
+        """Return the numbers of the marked processes that run now."""
         wanted, found = f"{MARK}={self.mark}".encode(), []
         for folder in Path("/proc").iterdir():
             if folder.name.isdigit():

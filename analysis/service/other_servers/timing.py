@@ -25,7 +25,7 @@ CALLERS = 4
 def in_turns(
     calls: Mapping[str, Callable[[], T]], rounds: int, what: str, rng: np.random.Generator, warm: int = WARM
 ) -> dict[str, list[T]]:
-    """What calls tell of themselves, round by round. Each round has an order of its own: none always follows another.
+    """Call in turns, and return the calls' results by name, one a round; each round has an order of its own, by chance.
 
     Args:
         calls: by name.
