@@ -85,20 +85,20 @@ def _reads_clock(node: ast.AST) -> bool:
 
 
 def _private(node: ast.Attribute) -> bool:
-    """Whether it is an attribute of another's that its name calls private."""
+    """Return whether a node reads another object's attribute that its name calls private."""
     named = node.attr.startswith("_") and not node.attr.startswith("__")
     return named and _name(node.value) not in {"self", "cls", "os", "sys", "ctypes"}
 
 
 def _told(node: ast.AST) -> bool:
-    """Whether it is what a program or an error tells people."""
+    """Return whether a node is text that a program or an error shows people."""
     if isinstance(node, ast.Call):
         return _name(node.func) in {"str", "details"}
     return isinstance(node, ast.Attribute) and node.attr in TEXTS
 
 
 def _text(node: ast.AST) -> str:
-    """What of a string stands in the source."""
+    """Return the literal parts of a string."""
     return " ".join(
         part.value for part in ast.walk(node) if isinstance(part, ast.Constant) and isinstance(part.value, str)
     )

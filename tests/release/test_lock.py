@@ -32,7 +32,7 @@ def constrained() -> dict[str, str]:
 
 
 def asked(target: str) -> list[Requirement]:
-    """What pyproject.toml asks for, for a target."""
+    """Return the requirements that pyproject.toml states for a target."""
     extras: Mapping[str, list[str]] = PROJECT["optional-dependencies"]
     lists = [PROJECT["dependencies"], *(extras[extra] for extra in lock.TARGETS[target].extras)]
     return [Requirement(line) for requirements in lists for line in requirements]
@@ -62,7 +62,7 @@ def closure(requirements: Iterable[Requirement], machine: str) -> set[str]:
 def disagreements(
     locked: Mapping[str, Any], pins: Mapping[str, str], needed: set[str], beyond: tuple[str, ...] = ()
 ) -> list[str]:
-    """What is wrong with a lock: packages that are missing or too many, and versions that constraints.txt has not."""
+    """List a lock's faults: packages that are missing or too many, and versions that constraints.txt does not have."""
     lines = [f"{name} is not locked" for name in needed - locked.keys()]
     for name, package in locked.items():
         if beyond and name.startswith(beyond):

@@ -1,4 +1,4 @@
-"""One name: all that is installed lies under `lightpage.`, and a caller's own modules of any name break nothing."""
+"""All that is installed lies under `lightpage.`, and a caller's own modules of any name break nothing."""
 
 import ast
 import os

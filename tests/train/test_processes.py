@@ -23,7 +23,7 @@ ROUNDING = 1e-5
 
 
 def on_two_nodes(out: Path) -> list[str]:
-    """What training prints on either of two nodes that meet on this machine."""
+    """Train on two nodes that meet on this machine, and return what either prints."""
     with socket.socket() as found:
         found.bind(("127.0.0.1", 0))
         meeting = {**os.environ, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(found.getsockname()[1])}

@@ -57,7 +57,7 @@ def path(tracer: RayTracer, points: np.ndarray, angle: float = 0.0) -> np.ndarra
 
 
 def follow(profile: Profile, angle: float, point: np.ndarray) -> Ray:
-    """One ray through the middle of the pipe's entrance."""
+    """Trace a ray through the middle of the pipe's entrance."""
     values = dict.fromkeys(NAMES, 0.0) | {"pipe_angle_rad": angle - np.deg2rad(profile.pipe.angle_deg)}
     return one_ray(profile, values, point, np.zeros(2))
 
