@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self
 
 
 class Cause(StrEnum):
-    """What a failure is about; `lightpage.failures.cause_of` says it of any failure."""
+    """Cause of a failure; `lightpage.failures.cause_of` finds that of any exception."""
 
     LIGHT = "light"
     """The light of a page: it was read as it is, and cannot be decoded. A finding, which stays."""
@@ -200,7 +200,7 @@ class SlotsTakenError(BusyError):
 
 
 class OverloadedError(SlotsTakenError):
-    """What the caller wants could not be done before its deadline, so it is not begun."""
+    """Refusal of work that could not be done before the caller's deadline, so that it is not begun."""
 
 
 class StalledError(LightpageError):

@@ -1,4 +1,4 @@
-"""What a failure means: light, content, storage or surroundings, told apart in this one place."""
+"""Causes of failures: the one place where light, content, storage and surroundings are told apart."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def cause_of(error: BaseException) -> Cause:
 
 
 def may_pass(error: BaseException) -> bool:
-    """Whether a failure finds nothing about a page, and the same work may go well a moment later."""
+    """Return whether a failure finds nothing about a page, so that the same work may succeed a moment later."""
     return isinstance(error, (StorageError, SurroundingsError))
 
 

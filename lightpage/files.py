@@ -140,7 +140,7 @@ def replace_file(path: str | Path, write: Callable[[IO[bytes]], object], subject
 
 
 def is_special(path: Path) -> bool:
-    """Whether something is at `path` that is written to and not replaced: a device, a pipe or a socket.
+    """Return whether `path` is a device, a pipe or a socket, which is written to and not replaced.
 
     Raises:
         OSError: the system does not say, e.g. since the name is too long.
@@ -260,7 +260,7 @@ def read_text(path: str | Path, subject: str, expected: str, failure: type[Light
 
 
 def read_toml(path: str | Path, subject: str, expected: str) -> dict[str, Any]:
-    """What a TOML file says.
+    """Read a TOML file into a dictionary.
 
     Raises:
         InvalidInputError, StorageError, SurroundingsError: it cannot be read, or is no TOML.

@@ -228,7 +228,7 @@ def same_packages(threads: int) -> dict[str, str]:
 
 
 def serve(target: str) -> None:
-    """In such a process: make the helper, and do what the parent asks for until it has gone or wants no more.
+    """Run a helper in this process: make it, and do what the parent asks until the parent has gone or asks to end.
 
     The kernel's own signal for that (PR_SET_PDEATHSIG) comes when the thread ends that has started the process. An
     error that nobody foresaw ends the process.

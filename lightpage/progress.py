@@ -1,4 +1,4 @@
-"""How long work tells of itself; whoever runs it decides how it is shown, and by default nobody sees it."""
+"""Progress of long work; its caller decides how it is shown, and by default it is not."""
 
 from __future__ import annotations
 

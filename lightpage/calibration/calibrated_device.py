@@ -1,4 +1,4 @@
-"""One device as calibration found it."""
+"""Calibrated device: the parameters, phases and references that decoders need of it."""
 
 from __future__ import annotations
 
@@ -33,5 +33,5 @@ class CalibratedDevice:
 
     @property
     def stands_apart(self) -> bool:
-        """Whether the cameras stand so far apart that each must be seen through a defocus of its own."""
+        """Return whether the cameras' axial places differ so much that each needs a defocus of its own."""
         return stand_apart(self.parameters)

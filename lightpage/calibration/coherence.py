@@ -1,4 +1,4 @@
-"""How well a geometry explains a known page: one number between 0 and 1."""
+"""Coherence of a geometry with a known page: a number between 0 and 1, 1 where the geometry explains the page."""
 
 from __future__ import annotations
 

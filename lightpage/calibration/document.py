@@ -153,7 +153,7 @@ class Calibration(TomlTable):
 
     @property
     def modulator(self) -> Modulation:
-        """What the modulator makes of its levels."""
+        """Modulation that was fitted: the complex light of each level."""
         return Modulation(tuple(self.modulation.values()))
 
     def device(self, profile: Profile, references: FramePair) -> CalibratedDevice:
@@ -166,7 +166,7 @@ class Calibration(TomlTable):
 
     @property
     def is_wrong(self) -> bool:
-        """Whether the fit leaves so much light unexplained that it is wrong."""
+        """Return whether the fit leaves so much light unexplained that it is wrong."""
         return self.goodness is not None and self.goodness.verdict == "wrong"
 
     def check_good(self, subject: str, remedy: str = "; mend the cause and calibrate anew") -> None:

@@ -58,7 +58,7 @@ class FoundImage(NamedTuple):
 
     @property
     def found(self) -> bool:
-        """Whether the pilots bear out that the image lies there."""
+        """Return whether the pilots confirm that the image lies at this place."""
         return self.significance >= self.needed
 
 
@@ -172,7 +172,7 @@ def _lattice(around: Real, reach: float, step: float) -> Real:
 
 
 def _vertex(scores: Real) -> Real:
-    """Where the quadratic fitted to 3x3 scores [y, x] peaks, in steps (x, y) from the middle, within the lattice."""
+    """Return the vertex (x, y) of a quadratic fitted to 3x3 scores [y, x], in steps from the middle, within +-1."""
     y, x = (axis.ravel() for axis in np.mgrid[-1:2, -1:2])
     terms = np.stack([np.ones(9), x, y, x * x, x * y, y * y], axis=1)
     _, slope_x, slope_y, xx, xy, yy = np.linalg.lstsq(terms, scores.ravel(), rcond=None)[0]

@@ -1,4 +1,4 @@
-"""What registration asks of a ray twin, whoever computes it (torch when training, ONNX in the runtime)."""
+"""Interfaces that registration needs of a ray twin, computed by torch in training and by ONNX in the runtime."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ in x, odd in y', odd in both. In a sheared pipe the last splits by which wall is
 
 
 class Rays(NamedTuple):
-    """What the twin says of points on the page.
+    """Rays of points on the page, as the twin traces them.
 
     Attributes:
         places: where each branch lands on the camera plane, [B, N, 2] as (x, y), metres from the optical axis.

@@ -12,7 +12,7 @@ Real = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number that calibration may fit; its nominal value is zero.
+    """Parameter that calibration may fit; its nominal value is zero.
 
     Attributes:
         name: with the unit as its suffix; `relative` and `slope` are dimensionless.

@@ -49,7 +49,7 @@ def camera_phase(value: Mapping[str, Any], x: Any, y: Any, edge_x: float, edge_y
 def tilt_of_shift(
     value: Mapping[str, float], shift_m: NDArray[np.float64], half_width_m: float, half_height_m: float
 ) -> NDArray[np.float64]:
-    """What `camera_phase` gains as tilt, at the page's edges, where the image moves over a reference that stays.
+    """Return the tilt of `camera_phase` at the page's edges that a shift of the image over a fixed reference adds.
 
     The gradient of its quadratic terms times the shift; the constant that is left over is piston.
 

@@ -213,9 +213,9 @@ def _best_of(
 
 
 def survives(choice: Choice, drift: Drift, pilots: NDArray[np.bool_]) -> tuple[bool, float]:
-    """Whether the weakest page of a thousand is still read after a drift, as far as a few pages can say; what it costs.
+    """Estimate whether the weakest page of a thousand is still read after a drift, and what the drift costs.
 
-    The cost is information of a coded bit: `Choice.spare` of it may go.
+    Few pages are drawn for it. The cost is information of a coded bit, of which `Choice.spare` may be lost.
     """
     code = choice.code
     cost, wrong = _drift_costs(drift, code.levels, code.coded_bits)
@@ -315,7 +315,7 @@ def needed_information(code: LdpcCode, pages: Sequence[DrawnPage], coded: int, r
 
 
 def _all_decode(draw: Draw, code: Code, pilots: NDArray[np.bool_], rng: np.random.Generator) -> bool:
-    """Whether every page decodes, drawn some times."""
+    """Return whether every page decodes, in each of several draws."""
     ldpc = PageCodec(code, pilots).ldpc
     return all(
         decode(ldpc, _blocks(draw(code.levels, rng), ldpc, code.coded_bits, 0.0, rng)[0]).converged.all()

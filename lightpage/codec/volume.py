@@ -31,7 +31,7 @@ _READ_BYTES = 1 << 20
 
 @dataclass(frozen=True)
 class Volume:
-    """How a file lies on pages.
+    """Volume: the layout of a file on pages.
 
     Attributes:
         id: a number that tells files on one medium apart.
@@ -88,7 +88,7 @@ class Volume:
         return self.file_pages + self.groups * self.parity_pages
 
     def holds(self, page: int) -> bool:
-        """Whether a page of this number is written."""
+        """Return whether a page of this number is written."""
         group, place = divmod(page, self.group_pages)
         return group < self.groups and (place >= self.data_pages or place < self.data_in(group))
 
@@ -99,7 +99,7 @@ class Volume:
         return later[0] if later else (group + 1) * self.group_pages if group + 1 < self.groups else None
 
     def to_json(self) -> dict[str, int]:
-        """What a file of pages says of its volume."""
+        """Return the fields that a file of pages states about its volume, as JSON."""
         return {
             "volume": self.id,
             "file_bytes": self.file_bytes,
@@ -111,7 +111,7 @@ class Volume:
 
     @property
     def facts(self) -> FileFacts:
-        """What every page says of the file."""
+        """Facts about the file that every page states."""
         return FileFacts(self.data_pages, self.parity_pages, self.checksum)
 
     @classmethod
@@ -160,7 +160,7 @@ class Successor:
     header: Header | None = None
 
     def after(self) -> Successor:
-        """What should come after that."""
+        """Return the successor of the page that should come next."""
         if self.volume is None or self.header is None:
             return Successor()
         following = self.volume.following(self.header.page)

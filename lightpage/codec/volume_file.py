@@ -28,7 +28,7 @@ PARTIAL = ".partial"
 
 @dataclass(frozen=True)
 class Restored:
-    """What became of a file's pages.
+    """Numbers of a file's data pages that were missing: those restored, and those lost.
 
     Attributes:
         restored: numbers of data pages that parity pages gave back.
@@ -157,7 +157,7 @@ class VolumeFile:
         return check.value
 
     def _place(self, number: int) -> int:
-        """Where a page lies in the partial file: data in order, parity behind all data."""
+        """Return the offset of a page in the partial file, bytes: data pages in order, parity pages behind all data."""
         group, place = divmod(number, self.volume.group_pages)
         if place < self.volume.data_pages:
             return (group * self.volume.data_pages + place) * self.volume.page_bytes

@@ -18,7 +18,7 @@ _AT_ONCE = 1 << 16
 
 
 class Accumulator:
-    """What `lightpage.metrics.information` says of all pages together, in twelve bytes a symbol.
+    """Accumulator of the figures of `lightpage.metrics.information` over all pages, in twelve bytes a symbol.
 
     Args:
         levels: M, or uneven levels.
@@ -83,7 +83,7 @@ class Accumulator:
         return SymbolMaps(*(self._maps / (len(self._measures) or np.nan)))
 
     def confidence_bins(self) -> list[ConfidenceBin]:
-        """What `reliability` says of the symbols of all pages."""
+        """Return what `reliability` returns for the symbols of all pages together."""
         counts, claimed, right = self._reliability
         return [
             ConfidenceBin(

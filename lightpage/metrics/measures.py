@@ -88,7 +88,7 @@ def symbol_maps(
     levels: int | Levels,
     data: NDArray[np.bool_],
 ) -> SymbolMaps:
-    """What `measure` averages over the page, place by place.
+    """Return maps over the page of what `measure` averages over it.
 
     Args:
         mu, kappa, symbols: of the data symbols, [pages, number of Trues in data] in row order.

@@ -1,4 +1,4 @@
-"""What a modulator makes of a level: a complex number, smooth over the levels, told by a few coefficients.
+"""Modulation: the complex light that a modulator makes of each level, smooth over the levels, by a few coefficients.
 
 Nominally level s of M is light of unit amplitude and the phase 2 pi s / M. A real modulator has a phase stroke of less
 or more than 2 pi, a lookup table that is not straight, light that it does not modulate, and an amplitude that goes with
@@ -47,7 +47,7 @@ class Modulation:
 
     @cached_property
     def is_nominal(self) -> bool:
-        """Whether every coefficient is zero."""
+        """Return whether every coefficient is zero."""
         return not any(self.coefficients)
 
     def light(self, phases: Real) -> NDArray[np.complex128]:
@@ -85,7 +85,7 @@ class Modulation:
 
 @lru_cache(16)
 def _page_levels(modulation: Modulation, count: int) -> Levels:
-    """Those of every page of one device: what is known of their neighbours is computed once."""
+    """Return the levels of a modulation, cached: all pages of a device share them and what they have computed."""
     return Levels(count, None if modulation.is_nominal else tuple(modulation.phases(count).tolist()))
 
 

@@ -1,4 +1,4 @@
-"""What pilots show: the piston, which frames alone do not, and how far a decoder's claims may be trusted."""
+"""Evidence of pilots: the piston, which frames alone do not show, and how far a decoder's claims may be trusted."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class Piston:
 
 @dataclass(frozen=True)
 class PilotCheck:
-    """What a decoder claims to know of the pilots, and how much of it they confirm.
+    """Check of a decoder by its pilots: the information that it claims of them, and how much of that they confirm.
 
     Attributes:
         pilots: how many were looked at.
@@ -123,28 +123,28 @@ class PilotCheck:
 
     @property
     def agrees(self) -> bool:
-        """Whether the pilots bear out enough of what is claimed."""
+        """Return whether the pilots confirm a large enough share of the claimed information."""
         return self.share >= LEAST_CONFIRMED_SHARE
 
     @property
     def tells(self) -> bool:
-        """Whether the pilots together tell more than chance would."""
+        """Return whether the pilots confirm more information than chance would."""
         nats = self.confirmed_bits * np.log(2) * self.pilots
         return bool(nats >= LEAST_CONFIRMED_NATS + self.gained_nats)
 
     @property
     def confirmed(self) -> bool:
-        """Whether the page may be given out."""
+        """Return whether the pilots confirm the page, so that it may be given out."""
         return self.agrees and self.tells
 
     @property
     def sound(self) -> bool:
-        """Whether the device is as the decoder knows it, as far as this page's pilots can tell."""
+        """Return whether this page's pilots are consistent with the device as the decoder knows it."""
         return self.confirmed_bits >= SOUND_SHARE * self.claimed_bits - _NOISE_DEVIATIONS * self.noise_bits
 
     @property
     def recalibration_due(self) -> bool:
-        """Whether the device has changed so far that a recalibration pays."""
+        """Return whether the device has changed so far that a recalibration pays."""
         return not self.sound
 
 

@@ -1,4 +1,4 @@
-"""What no decoder exceeds: the information of a page's light on one symbol, where all else of page and device is known.
+"""Bound that no decoder exceeds: information of a page's light on one symbol, all else of page and device being known.
 
 It is Fisher's, against shot noise, read noise, quantisation and the noise of the modulator's pixels. Hot pixels, dust
 and what a camera bends are left out: each takes information away.
@@ -23,7 +23,7 @@ Complex = NDArray[np.complexfloating]
 
 @dataclass(frozen=True)
 class _View:
-    """One camera's light of a page, on the plane and at the pitch that the optics are computed on.
+    """Light of a page on one camera, on the plane and at the pitch of the computed optics.
 
     Attributes:
         pose: of the camera.

@@ -1,4 +1,4 @@
-"""What a modulator makes of the phases that are written on it."""
+"""Effects of a modulator on the phases that are written on it."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ _SYMBOLS = 3
 
 
 class RecordingJob:
-    """One recording to make. Beside the partial file lie the settings that it is made with, until it is complete.
+    """Job that makes one recording. Its settings lie beside the partial file until the recording is complete.
 
     Args:
         profile: the nominal device.

@@ -33,7 +33,7 @@ _WALK, _NOISE, _FLICKER = 0, 2, 4
 
 @dataclass(frozen=True)
 class SimulatedPage:
-    """One page as recorded, with what only the simulator knows.
+    """Recorded page, with quantities that only the simulator knows.
 
     Attributes:
         pair: the frames.

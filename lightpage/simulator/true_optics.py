@@ -45,7 +45,7 @@ _STEP = 1e-4
 
 
 class Place(NamedTuple):
-    """How a camera stands against its focal plane, by the numbers of its pose."""
+    """Place of a camera against its focal plane, by the numbers of its pose."""
 
     axial_rad: float
     tilt_x_rad: float
@@ -281,7 +281,7 @@ def true_geometry(profile: Profile, device: Device, camera_tilt_rad: tuple[float
 
 
 def _like_taper(profile: Profile, device: Device) -> tuple[float, float, float]:
-    """What a taper does, told by parameters that a twin has, to first order.
+    """Express a taper by parameters that a twin has, to first order.
 
     Returns:
         Relative change of the focal length, and what is added to the axial places of modulator and cameras, radians.

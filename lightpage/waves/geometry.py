@@ -57,7 +57,7 @@ class WaveGeometry:
 
 
 def taper_defocus(wave_number: float, length_m: float, taper: float) -> tuple[float, float]:
-    """What a taper of the pipe bends: factors of R^2 on entrance and exit, rad/m^2.
+    """Return the curvature that a taper of the pipe adds: factors of R^2 at entrance and exit, rad/m^2.
 
     Modes of widening walls are those of even ones under exp(i k w'/(2 w) R^2), w' being the growth of the width per
     length. This is exact for paraxial light and walls that run straight.

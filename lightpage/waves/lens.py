@@ -52,10 +52,10 @@ def entrance_window(
 
 @dataclass(frozen=True)
 class LensPath:
-    """A lens's phase between (x, y) on its plane and (X, Y') on the facet, by parts. Radians, in numpy or torch.
+    """Phase of a lens between (x, y) on its plane and (X, Y') on the facet, by parts. Radians, in numpy or torch.
 
-    What depends on the facet alone, on x and X, on y and X or on y and Y' has a place in the factors that the couplings
-    have. Only the `rest` needs terms of its own: half as many as all of it would. Places are told from (a, b).
+    Terms in the facet's point alone, in (x, X), (y, X) or (y, Y') are merged into the factors of the couplings. The
+    `rest` needs an expansion of its own, with half as many terms as the whole phase. Places are relative to (a, b).
 
     Args:
         geometry: the device.
@@ -68,24 +68,24 @@ class LensPath:
     factors: Couplings
 
     def on_facet(self, across: Any, up: Any) -> Any:
-        """What the facet alone decides."""
+        """Return the part of the path's phase that depends on the facet's point alone, radians."""
         return self.path.of_both(0.0, 0.0, *on_facet(self.factors, across, up))
 
     def beyond(self, x: Any, y: Any, across: Any, up: Any, a: Any = 0.0, b: Any = 0.0) -> Any:
-        """By how much the path at (x, y) differs from that at (a, b)."""
+        """Return the path's phase at (x, y) less that at (a, b), radians."""
         if not self.path.couples:
             return 0.0 * (a + b + x + y + across + up)
         there = on_facet(self.factors, across, up)
         return self.path.of_both(a + x, b + y, *there) - self.path.of_both(a, b, *there)
 
     def phase(self, x: Any, y: Any, across: Any, up: Any, a: Any = 0.0, b: Any = 0.0) -> Any:
-        """The same of the whole lens, the ideal one included."""
+        """Return `beyond` of the whole lens, with the ideal lens's phase, radians."""
         along, upward = on_facet(self.factors, across, up)
         per_metre = self.geometry.wave_number / self.geometry.focal_length_m
         return self.beyond(x, y, across, up, a, b) - per_metre * (x * along + y * upward)
 
     def rest(self, x: Any, y: Any, across: Any, up: Any, a: Any = 0.0, b: Any = 0.0) -> Any:
-        """What of that has no such place, the coupling of x with Y' included, which a roll makes."""
+        """Return the phase, radians, that no factor of the couplings takes in, the term in (x, Y') of a roll included."""
         rolled = -self.geometry.wave_number / self.geometry.focal_length_m * self.factors.x_to_y * x * up
         to_x, to_both = self.beyond(x, 0.0, across, 0.0, a, b), self.beyond(0.0, y, across, 0.0, a, b)
         to_y = self.beyond(0.0, y, 0.0, up, a, b)
@@ -170,7 +170,7 @@ def _phasor(phase: Real) -> Complex:
 
 
 def modes_of_plane(geometry: WaveGeometry, plane_m: Real, cells: int) -> Complex:
-    """One axis of a field on a lens's outer plane to the square pipe's sine modes, by a matrix [cells - 1, samples].
+    """Return the matrix from a lens's outer plane to the square pipe's sine modes on one axis, [cells - 1, samples].
 
     Mode m = row + 1. The pipe neither sheared nor rolled; the matrix's adjoint takes modes back to the plane.
 

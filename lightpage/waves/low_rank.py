@@ -90,7 +90,7 @@ class Interpolation:
 
     @classmethod
     def of(cls, phases: Sequence[Sequence[Phase]], tile: Plane, second: Plane, tolerance: float) -> Interpolation:
-        """As few nodes as serve, the same number in each tile.
+        """Choose as few nodes as reach the tolerance, the same number in each tile.
 
         Args:
             phases: of each tile some phases, for these and what lies between them, places told within the tile.

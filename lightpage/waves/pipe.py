@@ -110,14 +110,14 @@ def modes_by_parity(cells: int) -> Real:
 
 
 def _stay_together(apart: Real) -> Real:
-    """How far modes are coupled that fall apart by so many radians in a step: beyond about half a turn, not at all."""
+    """Return how far modes stay coupled whose phases part by so many radians in a step: 1 near 0, 0 beyond about pi."""
     uncoupled, fully = UNCOUPLED
     return np.clip((uncoupled - np.abs(apart)) / (uncoupled - fully), 0, 1)
 
 
 @lru_cache(maxsize=8)
 def _parity_basis(cells: int, lag: float) -> ParityBasis:
-    """It depends on nothing else, and takes as long as the rest of a small propagator."""
+    """Return the parity basis, cached, since it takes as long as the rest of a small propagator."""
     return ParityBasis(cells, lag)
 
 

@@ -17,7 +17,7 @@ GOOD, USABLE = 0.1, 0.3
 
 
 class Goodness(TomlTable):
-    """How well a fit explains the light of a known page.
+    """Goodness of fit: how well a calibration explains the light of a known page.
 
     Attributes:
         verdict: good, usable or wrong, by `bits_lost`; a device whose lengths are not its profile's is not good.

@@ -88,7 +88,7 @@ class WaveFitted:
 
 
 class LevelPrior(NamedTuple):
-    """What is known of a modulation before a page is seen.
+    """Prior of a modulation: its distribution before a page is seen.
 
     Attributes:
         centre: most likely one.
@@ -100,7 +100,7 @@ class LevelPrior(NamedTuple):
 
 
 class _State(NamedTuple):
-    """What is fitted.
+    """State of the fit: every quantity that is fitted.
 
     Attributes:
         parameters: [P].
@@ -244,7 +244,7 @@ class WaveFit:
         return FittedWaves(self._profile, parameters, self._samples, filled=True)
 
     def _page(self, levels: Real) -> Complex:
-        """What the modulator makes of the page, evenly lit, [ny samples, nx samples]."""
+        """Return the light on the modulator under even illumination, complex [ny samples, nx samples]."""
         return on_modulator(Modulation(tuple(levels.tolist())).light(self._phases), self._samples)
 
     def _light(self, state: _State) -> Complex:
@@ -253,7 +253,7 @@ class WaveFit:
         return self._waves(state.parameters).to_cameras(lit)
 
     def _start(self, parameters: Real, quadrature_phase: float, modulation: Modulation) -> _State:
-        """With the even illumination that fits best."""
+        """Return the state to start from: the given values, and the even illumination that fits best."""
         chosen, counts, amplitude = self._look(parameters)
         even = np.eye(1, len(self._terms), dtype=np.complex128)[0]
         state = _State(parameters, quadrature_phase, even, np.array(modulation.coefficients))
@@ -308,7 +308,7 @@ class WaveFit:
         return np.asarray(np.linalg.inv(np.stack([right - middle, below - middle], axis=1)))
 
     def _pixels(self, parameters: Real) -> Real:
-        """Where both cameras see the places [...], [2, ..., 2]."""
+        """Return the pixels at which the cameras see the grid's places [...], [2, ..., 2] as (column, row)."""
         return self._twin.pixels(parameters, self._places.reshape(-1, 2)).reshape(2, *self._places.shape)
 
     def _look(self, parameters: Real) -> tuple[NDArray[np.bool_], Real, Real]:
@@ -409,12 +409,12 @@ def _told_apart(found: WaveFitted, usual: Modulation) -> WaveFitted:
 
 
 def _weight(here: Complex, phasor: complex) -> Real:
-    """One over the noise of equations of the light `here`."""
+    """Return 1 over the standard deviation of the equations' noise, where the light is `here`."""
     return np.asarray(1 / np.sqrt(np.abs(1 / phasor + here) ** 2 + READ_NOISE))
 
 
 def _inverse(information: Real) -> Real:
-    """Of a symmetric matrix whose rows have units of very different size."""
+    """Invert a symmetric matrix whose rows have units of very different size."""
     unit = 1 / np.sqrt(np.diag(information))
     inverse = np.linalg.pinv(information * unit * unit[:, None], hermitian=True)
     return np.asarray(inverse * unit * unit[:, None])

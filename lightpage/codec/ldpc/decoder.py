@@ -31,7 +31,7 @@ MOST_ITERATIONS = 25
 
 @dataclass(frozen=True)
 class DecodedBlocks:
-    """What became of some blocks.
+    """Decoded LDPC blocks.
 
     Attributes:
         information: uint8 [blocks, K].
