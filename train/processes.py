@@ -63,7 +63,7 @@ class Processes:
         return self
 
     def environment(self) -> ClusterEnvironment:
-        """How the processes find each other."""
+        """Return the environment by which the processes find each other."""
         from lightning.fabric.plugins.environments.lightning import LightningEnvironment
         from lightning.fabric.plugins.environments.torchelastic import TorchElasticEnvironment
 
@@ -95,14 +95,14 @@ ONE = Processes(1)
 
 
 def process_number() -> int:
-    """Of this process, 0 for the first one of the first node; each has another."""
+    """Return this process's number, which is unique; it is 0 for the first process of the first node."""
     if _by_torchrun():
         return int(os.environ["RANK"])
     return _MOST_ON_A_NODE * int(os.environ.get("NODE_RANK") or 0) + int(os.environ.get("LOCAL_RANK") or 0)
 
 
 def is_first_process() -> bool:
-    """Whether this is the process that writes, and shows how far it is."""
+    """Return whether this is the process that writes, and shows progress."""
     return process_number() == 0
 
 

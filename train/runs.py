@@ -46,7 +46,7 @@ _RENAMED = {"levels": "depth"}
 
 @dataclass(frozen=True)
 class Run:
-    """What a finished run is, as `run.json` keeps it.
+    """Record of a finished run, as `run.json` keeps it.
 
     Attributes:
         localizer: name.

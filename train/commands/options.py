@@ -1,4 +1,4 @@
-"""What `lightpage train` lets one choose of a decoder and its training: one table, read by the command."""
+"""Options of `lightpage train` for a decoder and its training: one table, read by the command."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ class Choice:
 
     @property
     def name(self) -> str:
-        """Of the parameter."""
+        """Name of the command's parameter."""
         return self.flag.removeprefix("--").replace("-", "_")
 
     @property
     def help(self) -> str:
-        """With what holds without it."""
+        """Help text of the option, followed by its default."""
         if self.localizers == PUBLISHED:
             return f"{self.what} [default: {self.published}; only with {', '.join(PUBLISHED)}]"
         value = getattr(Hyperparameters, self.name) if self.default is None else self.default

@@ -55,7 +55,7 @@ class FeatureStore(Dataset[Page]):
         return len(self._pages)
 
     def __getitem__(self, index: int) -> Page:
-        """One page."""
+        """Return a whole page."""
         return self.part(index, slice(None), slice(None))
 
     def part(self, index: int, rows: slice, columns: slice) -> Page:

@@ -1,4 +1,4 @@
-"""What known pages show, against what the fitted waves say of them."""
+"""Light of known pages, compared with the fitted waves' prediction."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Explained:
 
     @property
     def seen(self) -> NDArray[np.bool_]:
-        """Where both cameras look at the common grid, bool [Gy, Gx]."""
+        """Mask of the common grid's samples that both cameras see, bool [Gy, Gx]."""
         return self.measured.lit.numpy().astype(bool)
 
 

@@ -1,4 +1,4 @@
-"""What a network is shown of a page."""
+"""Pages as a network takes them."""
 
 from __future__ import annotations
 

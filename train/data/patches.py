@@ -18,7 +18,7 @@ from lightpage.train.models.network import reach, with_page_coordinates
 
 
 def training_pages(stores: Sequence[FeatureStore], mask: NDArray[np.bool_], choices: Hyperparameters) -> Dataset[Page]:
-    """What a network at symbol pitch trains on: whole pages, or patches where they are larger than those.
+    """Return the data set of a network at symbol pitch: whole pages, or patches where pages are larger than those.
 
     Args:
         stores: pages of one shape.
@@ -62,7 +62,7 @@ class Patches(Dataset[Page]):
         self._each = int(np.prod([np.ceil(count / side) for count in mask.shape]))
 
     def __len__(self) -> int:
-        """As many as cover all pages."""
+        """Number of patches that cover all pages."""
         return len(self._places) * self._each
 
     def __getitem__(self, index: int) -> Page:

@@ -62,7 +62,7 @@ anything."""
 
 @dataclass(frozen=True)
 class ModelMatch:
-    """What recorded pages show over the fitted geometry.
+    """Discrepancy between recorded pages and the fitted geometry.
 
     Attributes:
         illumination: complex factor on the modulator as a quadratic in the page's coordinates (-1 to 1), [6].
@@ -76,7 +76,7 @@ class ModelMatch:
 
 
 def model_match(known: Sequence[Explained]) -> ModelMatch:
-    """What known pages show over the fitted wave model, as means over them."""
+    """Return the discrepancy between known pages and the fitted wave model, as means over the pages."""
     left = [
         np.mean(np.abs(light.field - light.expected)[light.seen] ** 2) / np.mean(np.abs(light.field[light.seen]) ** 2)
         for light in known

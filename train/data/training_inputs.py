@@ -1,4 +1,4 @@
-"""What every way of training a decoder starts from, and what it comes to."""
+"""Inputs and results that all trainers share."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class TrainingInputs:
 
     @property
     def levels(self) -> Levels:
-        """Of the recording's pages, as the device shows them."""
+        """Levels of the recording's pages, as the device shows them."""
         return self.calibration.modulator.page_levels(self.recording.levels)
 
 

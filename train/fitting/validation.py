@@ -1,4 +1,4 @@
-"""What held-out pages say of a network in training."""
+"""Validation of a network on held-out pages while it is trained."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What each of two cameras sees of one field, apart on the axis or not, and the field that both have seen.
+"""Fields of two cameras that see one field from two places on the axis or from one, and the field that fits both.
 
 Against the mean of both places the in-phase camera sees D e and the quadrature camera D* e, with D = exp(i phi) over
 the facet and phi growing as the square of the frequency (`lightpage.waves.defocus`). Without |e|^2, and for a turn of
@@ -61,7 +61,7 @@ class CamerasApart(NamedTuple):
         return cls(torch.cat(forth + adjoint), torch.cat(adjoint + forth), torch.cat(added))
 
     def seen(self, field: Tensor) -> Tensor:
-        """What the cameras see of a field [2, ny, nx]: in-phase, then quadrature, [4, ny, nx]."""
+        """Return the fields that the cameras see of a field [2, ny, nx]: in-phase, then quadrature, [4, ny, nx]."""
         ny, nx = field.shape[1:]
         return _along_columns(_along_rows(_in_blocks(field), self.there), self.there)[:, :ny, :nx]
 

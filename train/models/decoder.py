@@ -22,7 +22,7 @@ _BY_WAVES = ("parameters",)
 
 
 class SymbolDecoder(nn.Module):
-    """What the cameras measured of one calibrated device to p.
+    """Decoder from the cameras' measurements of one calibrated device to p.
 
     Args:
         profile: the nominal device.

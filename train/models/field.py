@@ -44,7 +44,7 @@ _FLOOR = 0.1
 
 
 class Measured(NamedTuple):
-    """What the cameras measured on the common grid, [ny, nx] each but the turn's cosine and sine.
+    """Measurements of the cameras on the common grid, [ny, nx] each but the cosine and sine of the turn.
 
     Attributes:
         a, b: left sides of the two equations, zero where a camera has no reference.
@@ -63,12 +63,12 @@ class Measured(NamedTuple):
     apart: CamerasApart | None = None
 
     def left(self, e: Tensor) -> Tensor:
-        """What is left of the two equations at e, [2, ny, nx] real and imaginary part."""
+        """Return the residual of both equations at e, [2, ny, nx], a camera each."""
         in_phase, turned = self._brightness(*self._seen(e), 0.0)
         return torch.stack([self.a + (1 - in_phase) / 2, self.b + (1 - turned) / 2])
 
     def pull(self, e: Tensor, floor: Tensor | float, share: float = 1.0) -> Tensor:
-        """How the measurements pull at e: the gradient of their likelihood, or a share of it, [2, ny, nx].
+        """Return the gradient of the measurements' log-likelihood at e, times `share`, [2, ny, nx].
 
         An equation's variance is that of its camera's photons, |1 + e|^2 or |exp(i turn) + e|^2, and of its
         electronics, the `floor`. The first is also the squared length of its gradient, so a step along the sum needs
@@ -117,7 +117,7 @@ class Measured(NamedTuple):
 
 
 class References(NamedTuple):
-    """What the references and the registration say of the common grid.
+    """References and registration, evaluated on the common grid.
 
     Attributes:
         where: places in both frames for grid_sample, [2, ny, nx, 2].
@@ -223,7 +223,7 @@ class FieldRecovery(nn.Module):
         return torch.as_tensor(self.prefilter(blocks)) if self.binning == 1 else blocks
 
     def references(self, blocks: Tensor, registration: Tensor) -> References:
-        """What the references alone say, of both in blocks."""
+        """Evaluate the references on the common grid, both given in blocks."""
         where = self._where(registration, self.binning)
         reference = self._reference(blocks, registration)
         floor = _FLOOR * blocks.mean(dim=(1, 2))[:, None, None]
@@ -250,7 +250,7 @@ class FieldRecovery(nn.Module):
         return (e * blocks.amplitude)[:, :ny, :nx], residual[:, :ny, :nx]
 
     def innovation(self, measured: Measured, field: Tensor, floor: Tensor | float) -> Tensor:
-        """What was measured beyond what a predicted field would show, as a change of the field.
+        """Return the change of a predicted field that the measurements ask for.
 
         Args:
             measured: of the frames.
@@ -298,7 +298,7 @@ class FieldRecovery(nn.Module):
         return torch.as_tensor(estimate)
 
     def _where(self, registration: Tensor, side: int, step: int = 1) -> Tensor:
-        """Where every `step`-th grid sample lies in frames of blocks of pixels, [2, ny, nx, 2] for grid_sample.
+        """Return the places of every `step`-th grid sample in frames of blocks, [2, ny, nx, 2] for grid_sample.
 
         From -1 to 1 between the outer edges of the blocks.
         """

@@ -1,4 +1,4 @@
-"""What a training run chooses."""
+"""Hyperparameters of a training run."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Hyperparameters:
 
     @property
     def first_pass(self) -> str:
-        """What the features of the first pass depend on."""
+        """Key of all settings that the features of the first pass depend on."""
         reflections = f"{self.reflections} reflections " if self.reflections else ""
         rest = f"{self.binning} {self.field_step} {self.samples} {self.interpolation}"
         return f"{reflections}{self.field_rounds} {rest}"

@@ -159,7 +159,7 @@ class SymbolUNet(nn.Module):
         return estimate(self.outputs(light, positions))
 
     def outputs(self, light: Tensor, positions: Tensor) -> Tensor:
-        """What `estimate` makes p of, [N, 3, ny, nx]; light and exit centroids as for p itself."""
+        """Return the outputs that `estimate` turns into p, [N, 3, ny, nx]; light and exit centroids are those for p."""
         return self.behind_places(self.where(self.stem(light), positions))
 
     def behind_places(self, x: Tensor) -> Tensor:
@@ -199,7 +199,7 @@ class Refiner(nn.Module):
 
     @staticmethod
     def known(earlier: Tensor) -> tuple[Tensor, Tensor]:
-        """What the network is told of an earlier p [N, 2, ny, nx]: its direction, and the logarithm of its length."""
+        """Return the network's input of an earlier p [N, 2, ny, nx]: its direction, and the logarithm of its length."""
         x, y = earlier.chunk(2, 1)
         kappa = torch.sqrt(x * x + y * y + 1e-12)
         return earlier / kappa, torch.log(kappa) - _TYPICAL_LOG_KAPPA

@@ -42,7 +42,7 @@ class Matrix(NamedTuple):
 
     @property
     def adjoint(self) -> Matrix:
-        """Its conjugate transpose."""
+        """Conjugate transpose."""
         real, difference, both = (part.transpose(-1, -2) for part in self)
         return Matrix(real, -both, -difference)
 

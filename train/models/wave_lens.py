@@ -127,7 +127,7 @@ class TiledLens(nn.Module):
 
     @property
     def terms(self) -> int:
-        """Of each tile."""
+        """Number of terms of each tile."""
         return self.nodes.shape[2]
 
     def matrices(
@@ -256,7 +256,7 @@ def _terms(
     roll_margin: float,
     tolerance: float,
 ) -> Interpolation:
-    """Of the rest, over all tiles."""
+    """Expand the phases that no factor takes in, over all tiles."""
     half = geometry.pipe_width_m / 2
     rolled = [replace(geometry, pipe_roll=geometry.pipe_roll + share * roll_margin) for share in (-1, 0, 1)]
     phases = [LensPath(one, path, couplings(one)) for one in rolled]
@@ -270,7 +270,7 @@ def _terms(
 
 
 def _strip(lens: LensMatrices, number: int) -> LensMatrices:
-    """What belongs to one strip of tiles."""
+    """Return the matrices of one strip of tiles."""
 
     def chosen(value: Any) -> Any:
         return (

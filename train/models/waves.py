@@ -33,7 +33,7 @@ Real = NDArray[np.float64]
 
 
 class Fidelity(NamedTuple):
-    """How exactly light is followed; what is less exact takes less time.
+    """Fidelity of the simulated light: error bounds; larger ones take less time.
 
     Attributes:
         pipe: error of the splitting of a sheared pipe.
@@ -133,7 +133,7 @@ class Waves(nn.Module):
         self.register_buffer("default", torch.from_numpy(parameters).to(torch.float32), persistent=False)
 
     def matrices(self, parameters: Tensor | None = None) -> WaveMatrices:
-        """What the two ways need, of parameters [P]; of those that the model was made with if left out."""
+        """Return the matrices of both ways for parameters [P]; for those that the model was made with if left out."""
         value = dict(zip(NAMES, (self.default if parameters is None else parameters).unbind(), strict=True))
         geometry = fitted_geometry(self.profile, value)
         x = self.x_m + value["page_centre_x_m"], self.y_m + value["page_centre_y_m"]

@@ -143,7 +143,7 @@ def sample_frames(frames: Tensor, grid: Tensor) -> Tensor:
 
 
 def over_reference(seen: Tensor, level: Tensor) -> Tensor:
-    """What a page adds to the reference, over the reference's amplitude, of unit root mean square a page.
+    """Return a page's frames less the reference, over its amplitude, with a root mean square of 1 a page.
 
     Args:
         seen, level: counts of the frames and of the references, [N, 2, h, w].

@@ -90,7 +90,7 @@ class FramePages(Dataset[Page]):
         return len(self._pages)
 
     def __getitem__(self, index: int) -> Page:
-        """One page."""
+        """Return a page: frames, state and true phases."""
         page, state = self._pages[index], self.states[index]
         pair, symbols = self.recording.frames(page), self.recording.symbols(page)
         assert symbols is not None
@@ -118,7 +118,7 @@ class DataPages(Dataset[Page]):
         return len(self._pages)  # type: ignore[arg-type]  # it has a length
 
     def __getitem__(self, index: int) -> Page:
-        """One page."""
+        """Return a page, with NaN for the phases of its pilots."""
         *shown, phases = self._pages[index]
         return *shown, torch.where(self._pilots, torch.nan, phases)
 

@@ -185,7 +185,7 @@ def make_run(
 
 
 def _symbols_digest(recording: Recording, pages: list[int]) -> str:
-    """Of what was written on these pages, of its levels, and of the recording's own pilots if it has any."""
+    """Return a digest of the symbols written on these pages, their levels, and the recording's own pilots if any."""
     digest = hashlib.sha256(str(recording.levels).encode())
     for values in (*(recording.symbols(page) for page in pages), recording.pilots()):
         digest.update(b"" if values is None else np.ascontiguousarray(values).tobytes())

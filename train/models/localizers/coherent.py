@@ -76,7 +76,7 @@ class CoherentLocalizer(nn.Module):
         return torch.stack([real, imaginary])
 
     def looks(self, places: Tensor, gradients: Tensor, phases: Tensor) -> tuple[Tensor, Tensor]:
-        """Where samples lie, [1, B S ny, nx, 2] for grid_sample, and their phases, [B, S, ny, nx] radians."""
+        """Return the samples' places, [1, B S ny, nx, 2] for grid_sample, and their phases, [B, S, ny, nx] radians."""
         x, y = self.offset_x, self.offset_y
         column = places[:, 0:1] + gradients[:, 0:1] * x + gradients[:, 1:2] * y
         row = places[:, 1:2] + gradients[:, 2:3] * x + gradients[:, 3:4] * y
