@@ -1,4 +1,4 @@
-"""How all figures of a report look: small, on white, as data that a page carries in itself."""
+"""Style of a report's figures: small, on white, as data that a page carries in itself."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ class JsonFile:
         return cls(path, text, command, _keys(content) if command is None else f"the JSON of `lightpage {command}`")
 
     def checked(self, model: type[Model]) -> Model:
-        """What is in it.
+        """Parse the file as `model`.
 
         Raises:
             InvalidInputError: something is missing, of another type or out of range; the first problems are named.

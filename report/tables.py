@@ -117,7 +117,7 @@ def _with_deviation(value: float, deviation: float) -> tuple[str, str]:
 
 
 def zones(data: ReportData, centroids: Real) -> list[Zone]:
-    """One row a zone, from top left to bottom right.
+    """Return a row for each zone, from top left to bottom right.
 
     Args:
         data: of the report.

@@ -55,13 +55,13 @@ class Device:
 
     @property
     def losses(self) -> str:
-        """How many pages by cause, for people."""
+        """Pages lost by cause, for people."""
         return ", ".join(f"{count:,} {cause}" for cause, count in self.group.lost.most_common())
 
 
 @dataclass(frozen=True)
 class Recalibration:
-    """What became of a device that was to be recalibrated.
+    """Outcome of a device's recalibration.
 
     Attributes:
         name: of the device, or its recording where there is no fleet.
@@ -84,7 +84,7 @@ class Recalibration:
 
 @dataclass(frozen=True)
 class Worker:
-    """What a worker has done.
+    """Work done by one worker.
 
     Attributes:
         name: host and process.
@@ -154,12 +154,12 @@ class BulkData:
 
     @property
     def lost(self) -> str:
-        """What becomes of pages, or of devices, that are not read."""
+        """Word for pages, or devices, that are not read."""
         return _LOST[self.unit]
 
     @property
     def summary(self) -> str:
-        """What matters most, in a few words."""
+        """Headline figures, in a few words."""
         found = self.found
         done = f"{found.pages - found.missing:,} of {found.pages:,} {self.unit} done"
         return f"{done}, {found.lost.total():,} {self.lost}"

@@ -31,7 +31,7 @@ _UNKNOWN, _NO_SYMBOLS = "unknown: no page of it could be read", "unknown: the re
 
 
 class PageResult(Part):
-    """One recorded page; see `lightpage.runtime.archives.recordings.recovery.RecoveredPage`."""
+    """Result of a recorded page; see `lightpage.runtime.archives.recordings.recovery.RecoveredPage`."""
 
     page: Count
     number: Count | None
@@ -130,7 +130,7 @@ class RecoveryData:
 
     @property
     def summary(self) -> str:
-        """What matters most, in a few words."""
+        """Headline figure, in a few words."""
         return f"{len(self.unread) + self.more_unread} of {len(self.pages)} pages unread"
 
 

@@ -73,7 +73,7 @@ def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportDat
 
 
 def _curves(folder: Path, run: Run) -> list[dict[str, Curve]]:
-    """Those of each pass; none unless they were kept for all."""
+    """Return the curves of each pass; none unless they were kept for all."""
     found = [curves_of(at) or fitted_curves(at) for at in passes_of(folder, run)]
     return found if all(found) else []
 
