@@ -37,7 +37,7 @@ _VALIDATION_SHARE = 0.1
 
 @dataclass(frozen=True)
 class Teaching:
-    """How much a decoder is taught.
+    """Amount of training of a decoder.
 
     Attributes:
         pages: recorded pages.

@@ -15,7 +15,7 @@ _CAMERAS = ("in_phase_camera", "quadrature_camera")
 
 @dataclass(frozen=True)
 class Knob:
-    """One deviation of a device, told by one number; all else stays as on the device that decoders are trained on.
+    """Knob: a deviation of a device that one number sets; all else stays as on the device that decoders are trained on.
 
     Attributes:
         name: on the command line.
@@ -48,7 +48,7 @@ class Knob:
 
 @dataclass(frozen=True)
 class _FullSize:
-    """What numbers of the full-size device are in millimetres and degrees."""
+    """Conversion of the knobs' numbers to millimetres and degrees of the full-size device."""
 
     profile: Profile
 

@@ -1,4 +1,4 @@
-"""What a study is: cases that are measured one by one and kept, then a table and a picture of all of them."""
+"""Studies: cases that are measured one by one and kept, then a table and a picture of all of them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Row = Sequence[object]
 
 @dataclass(frozen=True)
 class Settings:
-    """What every study is told.
+    """Settings that every study is given.
 
     Attributes:
         profile: the nominal device.

@@ -63,7 +63,7 @@ def trained(
     knows_piston: bool = False,
     **changes: Any,
 ) -> Result:
-    """What a published decoder reaches on held-out pages of a simulated device, trained as its authors did.
+    """Train a published decoder on a simulated device as its authors did, and return its figures on held-out pages.
 
     Piston and shift of the pages are those that were simulated. Recordings are large: those of other data sets are
     dropped, so cases on one data set should follow each other.

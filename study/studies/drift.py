@@ -1,4 +1,4 @@
-"""How a day's drift shows in crosshairs, and how much of each drift costs a decoder so much that it is recalibrated."""
+"""Study of drift: a day's drift seen in crosshairs, and the amount of each drift that makes a recalibration due."""
 
 from __future__ import annotations
 

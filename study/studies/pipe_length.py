@@ -1,4 +1,4 @@
-"""How much a page carries through longer and longer square pipes, by modes and by rays."""
+"""Study of the pipe's length: information of a page through longer and longer square pipes, by modes and by rays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far each knob of a device may be off: what a decoder that was kept reads then, re-fitted by two known pages.
+"""Study of tolerances: AIR of a kept decoder, re-fitted by two known pages, as each knob of a device moves.
 
 The device of the simulator is turned at one knob after the other. Three decoders read the same pages of it. All have
 one pass by waves.
@@ -154,7 +154,7 @@ def _part(progress: Progress, first: float, last: float) -> Progress:
 
 
 def _read(settings: Settings, kept: Path, device: Device, work: Path, progress: Progress, least: float) -> Result:
-    """What decoders read of a device.
+    """Measure what decoders read of a device.
 
     Args:
         settings: of the study.
@@ -189,7 +189,7 @@ def _read(settings: Settings, kept: Path, device: Device, work: Path, progress: 
 
 @dataclass(frozen=True)
 class _Curve:
-    """What was read of a device over one of its knobs.
+    """Results for a device over one of its knobs.
 
     Attributes:
         knob: which.
@@ -208,7 +208,7 @@ class _Curve:
         return np.maximum([result[name] for result in self.results], 0.0)
 
     def measured(self, name: str) -> bool:
-        """Whether there is a number at another value than that of the device that was trained on."""
+        """Return whether there is a number at a value other than that of the device that was trained on."""
         return bool(np.count_nonzero(np.isfinite(self.airs(name))) > 1)
 
     @property
@@ -283,7 +283,7 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
 
 
 def _draw(axis: Axes, curve: _Curve) -> None:
-    """One knob: AIR over its values, the range shaded within which `LOSS` is lost."""
+    """Draw AIR over a knob's values, the range shaded within which `LOSS` is lost."""
     within = curve.within("air")
     if within is not None:
         axis.axvspan(within.low, within.high, color="tab:blue", alpha=0.12, label=f"{LOSS:g} bit lost within")
