@@ -30,7 +30,7 @@ HEAD = "# Made by `make lock` for {target}: {platforms}. Do not edit.\n"
 
 @dataclass(frozen=True)
 class Target:
-    """What an image installs.
+    """Target of an image: what it installs, and for which processors it is built.
 
     Args:
         extras: of pyproject.toml.
@@ -61,7 +61,7 @@ class LockError(Exception):
 
 @dataclass(frozen=True)
 class Locked:
-    """What a lock says of a package: its version, and the SHA-256 of each of its files."""
+    """Entry of a lock for a package: its version, and the SHA-256 of each of its files."""
 
     version: str
     hashes: frozenset[str]
