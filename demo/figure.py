@@ -66,7 +66,7 @@ def write_figure(result: DemoResult, path: Path) -> None:
 
 
 def _read(result: DemoResult, phase: Phase) -> str:
-    """How many pages were read in a state, and what came of it."""
+    """Describe how many pages were read in a state, and what they gave."""
     told = "every byte right" if phase.exact else f"{phase.lost} of {result.volume.file_pages} data pages lost"
     restored = f"{phase.restored} restored by parity, " if phase.restored else ""
     return f"{phase.pages - phase.unread} of {phase.pages} pages read\n{restored}{told}"

@@ -1,4 +1,4 @@
-"""What the demo came to: its phases, the drift between them, and the healing."""
+"""Result of the demo: its phases, the drift between them, and the healing."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Phase:
-    """What was decoded in one state of the device.
+    """Phase of the demo: what was decoded in one state of the device.
 
     Attributes:
         name: the state.
@@ -75,7 +75,7 @@ class Phase:
 
 @dataclass(frozen=True)
 class DriftStep:
-    """What one page told while the device drifted.
+    """Step of the drift: what one page told.
 
     Attributes:
         share: of the drift of `drifted`.
@@ -107,7 +107,7 @@ class DemoResult:
     """Shots of the cameras by how they ended; empty without cameras."""
 
     def story(self) -> tuple[str, str, str]:
-        """What happened, for people, in lines of some 120 characters."""
+        """Return the story of the demo for people, in lines of some 120 characters."""
         fresh, lost, again = (phase.air_bits_per_symbol for phase in self.phases)
         margin, healed = self.phases[0].margin_bits, self.healed
         spare = "" if margin is None else f" Their code has a margin of {margin:.2f} bit a symbol."
