@@ -142,7 +142,7 @@ class FakeCamera:
 
     @property
     def waits(self) -> bool:
-        """Whether a trigger makes a frame now: it acquires, and its trigger is on."""
+        """Return whether a trigger makes a frame now: the camera acquires, and its trigger is on."""
         if self._camera is None:
             return False
         return bool(self._library("arv_fake_camera_get_acquisition_status", self._inner)) and bool(

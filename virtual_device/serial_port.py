@@ -23,7 +23,7 @@ _STOP_S = 5.0
 
 
 class Fault(StrEnum):
-    """What goes wrong with a message or with its answer."""
+    """Fault of a message or of its answer."""
 
     SILENCE = "SILENCE"
     """The answer does not come."""
@@ -100,7 +100,7 @@ class VirtualSerialPort(ABC):
     @property
     @abstractmethod
     def address(self) -> str:
-        """What a driver is given as its port."""
+        """Address that a driver is given as its port."""
 
     @abstractmethod
     def _appear(self) -> None: ...
@@ -110,7 +110,7 @@ class VirtualSerialPort(ABC):
 
     @abstractmethod
     def _read(self) -> bytes:
-        """What has come within a poll; empty where nothing has.
+        """Return the bytes that have come within a poll; empty where none have.
 
         Raises:
             OSError: no driver is there any more.
