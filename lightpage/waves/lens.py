@@ -85,7 +85,7 @@ class LensPath:
         return self.beyond(x, y, across, up, a, b) - per_metre * (x * along + y * upward)
 
     def rest(self, x: Any, y: Any, across: Any, up: Any, a: Any = 0.0, b: Any = 0.0) -> Any:
-        """Return the phase, radians, that no factor of the couplings takes in, the term in (x, Y') of a roll included."""
+        """Return the phase, radians, that no factor of the couplings takes in, the roll's term in (x, Y') included."""
         rolled = -self.geometry.wave_number / self.geometry.focal_length_m * self.factors.x_to_y * x * up
         to_x, to_both = self.beyond(x, 0.0, across, 0.0, a, b), self.beyond(0.0, y, across, 0.0, a, b)
         to_y = self.beyond(0.0, y, 0.0, up, a, b)
