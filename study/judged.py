@@ -45,7 +45,7 @@ def estimates(
 def figures_of_p(
     p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.bool_], levels: int
 ) -> dict[str, Any]:
-    """Return AIR, claimed rate and error of von Mises estimates [2, pages, N], means over pages by symbol; their ECE."""
+    """Return AIR, claimed rate and error of von Mises estimates [2, pages, N], means over pages; their ECE."""
     mu, kappa = np.arctan2(p[1], p[0]), np.hypot(p[0], p[1])
     symbols = decide(phases, levels)
     maps = symbol_maps(mu, kappa, symbols, levels, ~mask)

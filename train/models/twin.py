@@ -149,7 +149,7 @@ class RayTwin(nn.Module):
         return torch.stack(landings), torch.stack(phases), positions
 
     def _filled(self, met: Tensor, positions: Tensor, width: Tensor, focal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the places where light through the cells `met` enters and leaves the pipe, both [N, 2], by `positions`.
+        """Return the places where light through the cells `met` enters and leaves the pipe, by exit centroids.
 
         Returns:
             Mean places at entrance and exit, and variance along either axis, [N, 2]; weighted by a symbol's light.
