@@ -219,7 +219,7 @@ class ForeignDevice:
         return cls(draw_parameters(np.random.default_rng([seed, 1])), design)
 
     def with_parameters(self, **changes: object) -> ForeignDevice:
-        """The same device with some parameters changed."""
+        """Return this device with some parameters changed."""
         return dataclasses.replace(self, parameters=dataclasses.replace(self.parameters, **changes))  # type: ignore[arg-type]
 
     # --- geometry -----------------------------------------------------------------------------------------------------

@@ -122,7 +122,7 @@ def _sure(phase: Floats, concentration: Floats, rng: np.random.Generator) -> Non
 
 
 def _few(phase: Floats, concentration: Floats, rng: np.random.Generator) -> None:
-    """Some symbols that say another level."""
+    """Turn the phases of a few symbols to other levels, without lowering their concentration."""
     wrong = rng.random(phase.shape) < 10 ** rng.uniform(-4, -1)
     phase[wrong] += rng.uniform(-np.pi, np.pi, int(wrong.sum()))
 

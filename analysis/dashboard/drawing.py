@@ -184,7 +184,7 @@ def _series(
 
 
 def _locator(unit: str, limits: tuple[float, float]) -> Locator:
-    """Some five marks; of bytes at powers of two."""
+    """Place about five marks on an axis, at powers of two for bytes."""
     if unit not in ("bytes", "Bps"):
         return MaxNLocator(5)
     return MultipleLocator(2.0 ** math.ceil(math.log2(max(1.0, (limits[1] - limits[0]) / 5))))

@@ -227,7 +227,7 @@ class InstantCamera:
         return self._ready.pop(0) if self._ready else None
 
     def arm(self) -> None:
-        """Nothing is to be done."""
+        """Do nothing: the camera needs no arming."""
 
     disarm = close = arm
 
@@ -248,7 +248,7 @@ class Edges:
         return fired
 
     def arm(self) -> None:
-        """Nothing is to be done."""
+        """Do nothing: the cameras need no arming."""
 
     disarm = close = arm
 

@@ -196,7 +196,7 @@ class Untold:
 
 @dataclass(frozen=True)
 class TrueTable:
-    """The same network, fed the table of the device's true state: as good as any calibration could make it.
+    """Decoder with the bundle's network and the true device's table: the best that calibration could do.
 
     Attributes:
         decoder: of the bundle.
@@ -246,5 +246,5 @@ def light_of(parameters: NDArray[np.float64], modulation: Modulation) -> dict[st
 
 
 def true_light(profile: Profile, device: Device) -> dict[str, float]:
-    """The same of a true device."""
+    """Return `light_of` of a device's true parameters and modulation."""
     return light_of(true_parameters(profile, device), true_modulation(device.slm))

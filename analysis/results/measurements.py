@@ -81,7 +81,7 @@ def read_object(path: Path) -> Figures:
 
 
 def kept_measurements(folder: Path = KEPT) -> dict[str, Measurement]:
-    """All that a folder keeps, by name."""
+    """Read all measurements of a folder, by name."""
     return {path.stem: Measurement.read(path) for path in sorted(folder.glob("*.json"))}
 
 

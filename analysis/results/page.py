@@ -120,7 +120,7 @@ def render(results: Results) -> str:
 
 
 def digits(value: float, count: int) -> str:
-    """So many digits behind the point."""
+    """Format a value with so many digits behind the point."""
     return f"{value:.{count}f}"
 
 

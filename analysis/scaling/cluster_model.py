@@ -116,7 +116,7 @@ class _Line:
         self._per_s, self._free = per_s, 0.0
 
     def done(self, now: float, amount: float) -> float:
-        """When it has done what is asked now."""
+        """Queue an amount of work, and return the time at which it is done."""
         self._free = max(now, self._free) + amount / self._per_s
         return self._free
 
@@ -187,7 +187,7 @@ class _Run:
         yield environment.timeout(there - environment.now)
 
     def _moved(self, link: _Line, amount: float) -> float:
-        """When so many bytes have gone between storage and node."""
+        """Move so many bytes between storage and node, and return the time at which they have arrived."""
         now = self.environment.now
         return max(self.storage.done(now, amount), link.done(now, amount))
 

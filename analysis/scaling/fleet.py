@@ -119,7 +119,7 @@ def quick(devices: int, out: Path, workers: int, threads: int) -> dict[str, Any]
 
 
 def deep(devices: int, steps: int, out: Path, threads: int) -> dict[str, Any]:
-    """Both forms on devices whose network may be trained on."""
+    """Recalibrate devices in both forms, where their network may be trained on."""
     profile, before, _ = data_set_of(KEPT)
     run, bundle = out / "kept", out / "kept.zip"
     if not bundle.exists():

@@ -77,7 +77,7 @@ class DriverFigures(Part):
 
 
 class NodeFigures(Part):
-    """All of it.
+    """Figures of a node that the model of a cluster is made from.
 
     Attributes:
         cores: of the machine.
@@ -197,7 +197,7 @@ def _driver(engine: Engine, in_flight: int) -> DriverFigures:
 
 
 def _tasks() -> Iterator[Task]:
-    """Without end, and as long as real ones."""
+    """Yield tasks without end, as long as real ones."""
     recording = Path("/archive/shelf-1/recording-000001.h5")
     task = Task(
         choices=Choices(operation=Operation.DECODE),

@@ -67,7 +67,7 @@ class Service:
         return triton.InferInput(name, list(array.shape), _TYPES[str(array.dtype)]).set_data_from_numpy(array)
 
     def pair(self) -> list[Any]:
-        """Both frames."""
+        """Return both frames as input tensors."""
         return [self.tensor("in_phase"), self.tensor("quadrature")]
 
     def infer(self, inputs: list[Any] | None = None, **options: Any) -> Any:
@@ -186,7 +186,7 @@ def infer_compressed(service: Service) -> None:
 
 
 def infer_again(service: Service) -> None:
-    """The same objects twice."""
+    """Infer twice with the same objects."""
     inputs = service.pair()
     for _ in range(2):
         service.check_answer(service.infer(inputs))

@@ -34,7 +34,7 @@ class Taken:
 
 
 def peak_bytes() -> int:
-    """Most memory that this process has held.
+    """Return the peak memory of this process, bytes.
 
     Linux hands `ru_maxrss` on to a process that another one starts, with the other's peak; its own is told beside it.
     """

@@ -96,7 +96,7 @@ class Bench:
 
     @property
     def pages(self) -> list[int]:
-        """All that is not calibrated on, in order."""
+        """Pages that are not calibrated on, in order."""
         return [*self.training, *self.validation, *self.unseen]
 
     def calibrated_device(self, method: str = "") -> CalibratedDevice:

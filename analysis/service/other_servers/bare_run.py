@@ -29,7 +29,7 @@ _RUN_S = 60.0
 
 
 class BareRuns:
-    """Such a process; use it in a `with` statement.
+    """Process that runs graphs and serves nobody; use it in a `with` statement.
 
     Args:
         folder: of the models.

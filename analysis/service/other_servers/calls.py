@@ -145,7 +145,7 @@ def chunk_caller(target: str, graph: Graph) -> Iterator[Call]:
 
 @contextmanager
 def memory_caller(target: str, graph: Graph) -> Iterator[Call]:
-    """The same over a Unix socket, with memory that is shared: frames are copied into it."""
+    """Call the service over a Unix socket, with shared memory that frames are copied into."""
     with LightpageClient(target, CALL_S) as client, client.frames.share_memory() as memory:
 
         def call() -> Answer:

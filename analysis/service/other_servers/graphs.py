@@ -42,7 +42,7 @@ class Graph:
 
     @property
     def frames(self) -> NDArray[Any]:
-        """Both, [2, rows, columns]."""
+        """Frames of the pair, [2, rows, columns]."""
         return np.stack([self.pair.in_phase, self.pair.quadrature])
 
     @property

@@ -128,7 +128,7 @@ class OtherServer:
         return self
 
     def wait(self, graph: Graph) -> None:
-        """Until it answers a call.
+        """Wait until the server answers a call.
 
         Raises:
             LightpageError: it has ended, or never answers.
