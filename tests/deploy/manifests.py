@@ -39,7 +39,7 @@ def read(path: Path) -> list[dict[str, Any]]:
 
 
 def kustomizations() -> list[Path]:
-    """All of them."""
+    """Return the paths of all kustomizations."""
     return sorted(FOLDER.rglob(KUSTOMIZATION))
 
 

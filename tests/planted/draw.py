@@ -102,7 +102,7 @@ def edits(kind: str, node: ast.AST, source: list[bytes]) -> Iterator[Edit]:
 
 
 def reached(node: ast.AST) -> Iterator[ast.AST]:
-    """All of a tree that computes: no annotations, texts, logs, nor what a constructor stores."""
+    """Yield all nodes that compute: no annotations, texts, logs, nor what a constructor stores."""
     yield node
     for name, value in ast.iter_fields(node):
         for child in value if isinstance(value, list) else [value]:
