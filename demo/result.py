@@ -92,7 +92,7 @@ class DriftStep:
 
 @dataclass(frozen=True)
 class DemoResult:
-    """All of the demo: three phases, the drift and the healing between them, and one frame pair with its page."""
+    """Result of the demo: three phases, the drift and the healing between them, and one frame pair with its page."""
 
     phases: tuple[Phase, ...]
     drift: tuple[DriftStep, ...]

@@ -232,7 +232,7 @@ class StoreError(BundleError):
 
 
 class Reason(StrEnum):
-    """Why a page is lost."""
+    """Reason why a page is lost."""
 
     UNSPECIFIED = "UNSPECIFIED"
     PILOTS_DISAGREE = "PILOTS_DISAGREE"
@@ -288,7 +288,7 @@ class LostPageError(LightpageError):
         self.reason, self.recalibration_due = reason, recalibration_due
 
     def about(self, page: str) -> Self:
-        """The same error, and of which page it is."""
+        """Return this error with the page that it is about."""
         return type(self)(f"{page}: {self.subject}", self.got, self.expected, self.reason, self.recalibration_due)
 
 

@@ -152,7 +152,7 @@ def os_errors(subject: str, expected: object, otherwise: type[LightpageError] = 
 def hdf5_failure(
     subject: str, error: Exception, expected: object, otherwise: type[LightpageError] = StorageError
 ) -> LightpageError:
-    """The same of any error that HDF5 raises; without a number, and with no resource short, data are damaged."""
+    """Return the error that a failure of HDF5 means; damaged data if it has no number and no resource is short."""
     number = error_number(error)
     if number is not None:
         return os_failure(subject, OSError(number, os.strerror(number)), expected, otherwise)

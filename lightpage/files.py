@@ -161,7 +161,7 @@ def move_into_place(made: str | Path, path: Path) -> None:
 
 
 def move_to_new_name(made: str | Path, path: Path) -> None:
-    """The same where nothing has the final name.
+    """Give a file that is closed its final name, which nothing may have; both are on the disk when this returns.
 
     Raises:
         FileExistsError: something has it; both files stay as they are.

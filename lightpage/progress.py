@@ -23,7 +23,7 @@ class Reporter(Protocol):
     def track(
         self, items: Iterable[T], what: str, unit: str, total: int | None, done: int, state: State
     ) -> Iterable[T]:
-        """The same items; `total` of them with the `done` ones that an earlier run has behind it."""
+        """Yield the items, and show progress over `total`, of which an earlier run has done `done`."""
 
     def note(self, what: str) -> None:
         """Tell whoever watches."""
@@ -52,7 +52,7 @@ def note(what: str) -> None:
 
 
 def warn(what: str) -> None:
-    """The same of what may be wrong."""
+    """Warn whoever watches of what may be wrong."""
     if _reporter.get() is None:
         _log.warning(what)
     else:

@@ -97,7 +97,7 @@ class DebianPackage:
 
 @dataclass(frozen=True)
 class Inventory:
-    """All of an image. `faults` are files that are not as their package's list says, and files of no package."""
+    """Inventory of an image. `faults` are files that are not as their package's list says, and files of no package."""
 
     python: tuple[PythonPackage, ...]
     debian: tuple[DebianPackage, ...]
@@ -361,7 +361,7 @@ def facts(inventory: Inventory) -> dict[str, dict[str, str]]:
 
 
 def facts_of_component(component: Mapping[str, Any]) -> dict[str, str]:
-    """The same of an SBOM's component."""
+    """Return what is compared of an SBOM's component, by the names of `facts`."""
     properties = {each["name"]: each["value"] for each in component.get("properties", ())}
     record = {"record": properties.get(f"{PREFIX}record-sha256", "")}
     if component["bom-ref"].startswith("pkg:deb/"):

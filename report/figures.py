@@ -216,7 +216,7 @@ def _mark_passes(axis: Axes, curves: Sequence[Curve]) -> None:
 
 
 def page(golden: Golden) -> list[Picture]:
-    """Both frames and the phase that is decoded from them."""
+    """Draw both frames, and the phase that is decoded from them."""
     pictures = []
     for name, frame in (("In-phase", golden.pair.in_phase), ("Quadrature", golden.pair.quadrature)):
         figure, axis = one_axis(image=True)

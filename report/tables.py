@@ -111,7 +111,7 @@ def _words(name: str, suffix: str) -> str:
 
 
 def _with_deviation(value: float, deviation: float) -> tuple[str, str]:
-    """Both to the second digit of the deviation."""
+    """Format a value and its deviation, both to the second digit of the deviation."""
     digits = 6 if deviation <= 0 else min(9, max(0, 1 - int(np.floor(np.log10(deviation)))))
     return number(value, digits), number(deviation, digits)
 

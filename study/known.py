@@ -52,7 +52,7 @@ class Known:
         return cls(simulator.references(), tuple(simulator.page(page) for page in symbols), tuple(symbols))
 
     def part(self, pages: slice) -> Self:
-        """Some of the pages."""
+        """Return some of the pages."""
         return replace(self, pairs=self.pairs[pages], symbols=self.symbols[pages])
 
     def calibration(self, profile: Profile, progress: Progress) -> Calibration:

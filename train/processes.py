@@ -42,7 +42,7 @@ class Processes:
     strategy: str = AUTO
 
     def checked(self) -> Processes:
-        """The same with what `torchrun` says, where that has started this process.
+        """Check the processes, and return them as `torchrun` says if that has started this process.
 
         Raises:
             InvalidInputError: more devices than there are, nodes that cannot meet, or others than `torchrun` started.

@@ -32,7 +32,7 @@ _TRY_S = 20.0
 
 @functools.cache
 def available() -> str | None:
-    """Why this machine lets the process make no private network, or None where it does; asked once."""
+    """Return why this machine lets the process make no private network, or None where it does; asked once."""
     if shutil.which("unshare") is None:
         return "no unshare (package util-linux)"
     try:

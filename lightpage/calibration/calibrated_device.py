@@ -15,7 +15,7 @@ from lightpage.recording.frame_pair import FramePair
 
 @dataclass(frozen=True)
 class CalibratedDevice:
-    """All that a field and its rays are computed with, beside the frames themselves.
+    """Calibrated device: all that a field and its rays are computed with, beside the frames themselves.
 
     Attributes:
         profile: the nominal device.

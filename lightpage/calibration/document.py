@@ -39,7 +39,7 @@ _OPTIONAL = ("coherence_at_first", "goodness")
 
 
 def _names_problem(values: dict[str, Any], names: tuple[str, ...] = NAMES) -> str:
-    """Which names are missing or unknown, in words; empty when they are just those wanted."""
+    """Name the parameters that are missing or unknown, in words; empty when they are just those wanted."""
     missing = [name for name in names if name not in values]
     unknown = sorted(set(values) - set(names))
     parts = [("no " + ", ".join(missing)) if missing else "", ("unknown " + ", ".join(unknown)) if unknown else ""]

@@ -74,7 +74,7 @@ class Measurement:
 
 
 def patch_edge(profile: Profile) -> int:
-    """About how many symbols a patch is wide and high."""
+    """Return the approximate width and height of a patch, symbols."""
     return max(_EDGE_SYMBOLS, round(_EDGE_PX / profile.page.symbol_size_px))
 
 

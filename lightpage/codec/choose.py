@@ -78,7 +78,7 @@ Draw = Callable[[int, np.random.Generator], Sequence[DrawnPage]]
 
 
 class Drift(NamedTuple):
-    """The same few pages as they are read, and as they are read of a device that has drifted."""
+    """Pages as they are read before and after a drift of the device."""
 
     before: Draw
     after: Draw

@@ -149,7 +149,7 @@ class Volume:
 
 @dataclass(frozen=True)
 class Successor:
-    """Which page should come next, after pages that were read.
+    """Successor of the pages that were read: the page that should come next.
 
     Attributes:
         volume: that the last page belongs to; None where nothing is known.

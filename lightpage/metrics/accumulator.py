@@ -59,7 +59,7 @@ class Accumulator:
         self._rank(mu, kappa, symbols)
 
     def figures(self) -> PageMeasures:
-        """Over the symbols of all pages.
+        """Return the figures over the symbols of all pages.
 
         Raises:
             PageError: no pages.

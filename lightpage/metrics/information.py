@@ -180,7 +180,7 @@ Neighbours = NDArray[np.int64]
 
 
 def _parts(phase: Floats, kappa: Floats, levels: Levels) -> Iterator[tuple[NDArray[np.bool_], Neighbours | None]]:
-    """Which symbols need which levels beside their nearest; None for those that need none."""
+    """Yield masks of symbols with the levels that they need beside their nearest; None for symbols that need none."""
     everything, left = np.arange(levels.count), np.ones(kappa.shape, bool)
     if levels.count > 2 * _WINDOW + 1:
         if levels.is_nominal:

@@ -71,7 +71,7 @@ class Modulation:
         return self.phase(symbol_phases(np.arange(count), count))
 
     def page_levels(self, count: int) -> Levels:
-        """So many levels of a page, as the phases of their light tell them apart.
+        """Return so many levels of a page, as the phases of their light tell them apart.
 
         Raises:
             PageError: a level count outside 2..256.

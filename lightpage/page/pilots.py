@@ -257,7 +257,7 @@ def without_outliers(p: NDArray[np.floating], pilots: Pilots) -> Pilots:
 
 @dataclass(frozen=True)
 class PilotReading:
-    """All that a page's pilots say of it.
+    """Reading of a page's pilots.
 
     Attributes:
         piston: common phase of the page.
@@ -316,5 +316,5 @@ def _errors(p: NDArray[np.floating], pilots: Pilots) -> NDArray[np.complex128]:
 
 
 def _missed(errors: NDArray[np.complex128], angle_rad: float) -> NDArray[np.float64]:
-    """Twice kappa (1 - cos error) of each pilot, less the piston: chi-squared of one degree where claims are true."""
+    """Return 2 kappa (1 - cos error) of each pilot, piston removed: chi-squared of one degree where claims are true."""
     return np.asarray(2 * (np.abs(errors) - (errors * np.exp(-1j * angle_rad)).real), np.float64)

@@ -58,7 +58,7 @@ class Place(NamedTuple):
 
     @property
     def tilt_rad(self) -> tuple[float, float]:
-        """Both tilts."""
+        """Tilts about both axes, radians."""
         return self.tilt_x_rad, self.tilt_y_rad
 
 

@@ -149,7 +149,7 @@ class BulkData:
 
     @property
     def measures(self) -> list[str]:
-        """Which of `MEASURES` are known."""
+        """Names of the known ones of `MEASURES`."""
         return [name for name in MEASURES if self.found.figures[name].value is not None]
 
     @property
@@ -199,7 +199,7 @@ def report_of_bulk(folder: Path) -> BulkData:
 
 
 def begun_s(readings: Sequence[Reading]) -> float:
-    """When the first range was begun, seconds since 1970."""
+    """Return the time at which the first range was begun, seconds since 1970."""
     return min(reading.finished_s - reading.seconds for reading in readings)
 
 
@@ -342,7 +342,7 @@ def _file(told: dict[str, Any]) -> File:
 
 
 def sessions(readings: Sequence[Reading], pause_s: float = PAUSE_S) -> list[tuple[float, float]]:
-    """When somebody was at work: begin and end, seconds since 1970; a pause that is shorter does not count as one."""
+    """Return the times of work, (begin, end), seconds since 1970; shorter pauses do not count."""
     spans = sorted((reading.finished_s - reading.seconds, reading.finished_s) for reading in readings)
     found: list[tuple[float, float]] = []
     for begin, end in spans:

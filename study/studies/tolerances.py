@@ -213,7 +213,7 @@ class _Curve:
 
     @property
     def trained_airs(self) -> Real:
-        """The same of decoders that are trained where a re-fit is not enough, [N]."""
+        """AIR of decoders that are trained where a re-fit is not enough, bits a symbol, [N]."""
         anew, air = self.airs("anew"), self.airs("air")
         enough = air >= air[np.argmin(np.abs(self.values - self.at))] - LOSS
         return np.where(np.isnan(anew) & enough, air, anew)

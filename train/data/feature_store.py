@@ -59,7 +59,7 @@ class FeatureStore(Dataset[Page]):
         return self.part(index, slice(None), slice(None))
 
     def part(self, index: int, rows: slice, columns: slice) -> Page:
-        """Some rows and columns of a page; no more is read."""
+        """Read some rows and columns of a page, and nothing more."""
         number = self._pages[index]
         light, *others = (torch.from_numpy(np.array(array[number][..., rows, columns])) for array in self._arrays)
         return light.flatten(0, -3), *others

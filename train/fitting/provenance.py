@@ -23,7 +23,7 @@ def provenance() -> dict[str, Any]:
 
 
 def provenance_of(folder: Path) -> dict[str, Any]:
-    """The same of work that goes on in a folder: also the commit that it was begun with, where that was another.
+    """Return the provenance of work that goes on in a folder, with the commit that it was begun with if another.
 
     Asked for before the work, it notes there who begins it.
     """

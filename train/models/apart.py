@@ -179,7 +179,7 @@ def _along_rows(images: Tensor, weights: Tensor) -> Tensor:
 
 
 def _along_columns(images: Tensor, weights: Tensor) -> Tensor:
-    """The same of columns."""
+    """Filter blocks of columns, as `_along_rows` filters rows."""
     reach, groups = (weights.shape[2] - BLOCK) // 2, len(images) // weights.shape[1]
     split = functional.conv2d(images, weights[:, :, :, None], stride=(BLOCK, 1), padding=(reach, 0), groups=groups)
     ny, nx = images.shape[1:]

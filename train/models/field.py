@@ -109,7 +109,7 @@ class Measured(NamedTuple):
         return in_phase, (real + self.cos) ** 2 + (imaginary + self.sin) ** 2 + floor
 
     def in_blocks(self, side: int) -> Measured:
-        """The same on whole blocks of so many samples a side, zeros at the right and below where there are none."""
+        """Return the measurements on whole blocks of so many samples a side, zeros added at the right and below."""
         ny, nx = self.a.shape
         missing = (0, -nx % side, 0, -ny % side)
         a, b, amplitude, lit = (functional.pad(plane, missing) for plane in (self.a, self.b, self.amplitude, self.lit))
@@ -196,7 +196,7 @@ class FieldRecovery(nn.Module):
         homodyne: Tensor,
         apart: Tensor | None = None,
     ) -> Measured:
-        """Both cameras' measurements on the common grid.
+        """Measure the field on the common grid by both cameras.
 
         Args:
             in_phase, quadrature: raw frames [H, W], any number type.
@@ -219,7 +219,7 @@ class FieldRecovery(nn.Module):
         return _block_means(_stacked(in_phase, quadrature), self.binning)
 
     def filtered(self, blocks: Tensor) -> Tensor:
-        """Both frames as they are sampled, [2, rows, columns]."""
+        """Return the frames as they are sampled, [2, rows, columns]."""
         return torch.as_tensor(self.prefilter(blocks)) if self.binning == 1 else blocks
 
     def references(self, blocks: Tensor, registration: Tensor) -> References:

@@ -88,7 +88,7 @@ class Residual(nn.Module):
         nn.init.zeros_(self.second.weight)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Same shape [N, C, ny, nx]."""
+        """Map features to features of the same shape [N, C, ny, nx]."""
         inner = self.second(functional.gelu(self.first(functional.gelu(x))))
         return torch.as_tensor(x + inner)
 
@@ -163,7 +163,7 @@ class SymbolUNet(nn.Module):
         return self.behind_places(self.where(self.stem(light), positions))
 
     def behind_places(self, x: Tensor) -> Tensor:
-        """The same of features that are scaled and shifted by where they lie, [N, C, ny, nx]."""
+        """Return the outputs for features that are scaled and shifted by where they lie, [N, C, ny, nx]."""
         kept = []
         for inward, down in zip(self.inward, self.down, strict=True):
             x = inward(x)

@@ -64,7 +64,7 @@ class RayTwin(nn.Module):
     def forward(
         self, parameters: Tensor, points: Tensor, anchors: Tensor, places: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Both questions at once: rays of page points, and pixels of camera-plane places.
+        """Trace rays of page points, and return the pixels of camera-plane places.
 
         Args:
             parameters: [P] float64.

@@ -99,7 +99,7 @@ class TiledPipe(nn.Module):
 
 
 class _Block(nn.Module):
-    """Some modes of both parities along either axis, and their neighbours."""
+    """Block of modes of both parities along either axis, and their neighbours."""
 
     def __init__(
         self,

@@ -81,7 +81,7 @@ class PublishedDecoder(nn.Module):
         return self._p(self.scores(frames, shift_px))
 
     def scores(self, frames: Tensor, shift_px: Tensor) -> Tensor:
-        """The same to what the U-Net says: p itself, or the logit of each class [N, classes, ny, nx]."""
+        """Return the U-Net's outputs: p itself, or the logit of each class [N, classes, ny, nx]."""
         with torch.autocast(frames.device.type, enabled=False):
             seen, level = sample_pair(frames.float(), self.references, self.localizer.grid(), shift_px)
         return self._scores(seen, level)
@@ -117,7 +117,7 @@ def p_of_classes(logits: Tensor) -> Tensor:
 
 
 def sample_pair(frames: Tensor, references: Tensor, grid: Tensor, shift_px: Tensor) -> tuple[Tensor, Tensor]:
-    """Both frames of each pair, and the references at the same pixels, bilinearly; zero outside.
+    """Sample both frames of each pair, and the references at the same pixels, bilinearly; zero outside.
 
     Args:
         frames: [N, 2, H, W].

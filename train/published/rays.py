@@ -289,7 +289,7 @@ def _under_root(surface: Surface, at: Tensor) -> Tensor:
 
 
 def _refracted(rays: _Rays, normal: Tensor, ratio: float) -> _Rays:
-    """Behind a surface with unit normals [N, 3] along the light; `ratio` is the index before it over that behind it."""
+    """Refract rays at a surface with unit normals [N, 3] along the light; `ratio` is index before over index after."""
     along = (rays.direction * normal).sum(-1)
     squared = 1 - ratio**2 * (1 - along**2)
     onward = torch.sqrt(torch.clamp(squared, min=_SMALLEST_SQUARE))

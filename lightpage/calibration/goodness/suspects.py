@@ -33,7 +33,7 @@ NEIGHBOURS = "phases that go with those of the symbols beside: is there crosstal
 
 
 def unlike_profile(parameters: Real) -> str:
-    """Which length of a fitted device [P] lies so far off that its profile is of another one, in words; or none.
+    """Name the length of a fitted device [P] that shows that its profile is another device's, in words; empty if none.
 
     Light that such a fit explains may be read all the same.
     """

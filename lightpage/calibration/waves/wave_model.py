@@ -169,7 +169,7 @@ class FittedWaves:
         return np.asarray(self.channel.camera_field(self.to_exit(field)) * self._camera)
 
     def to_cameras(self, field: Complex) -> Complex:
-        """The same as either camera sees it from where it stands, in-phase and quadrature, [2, Gy, Gx]."""
+        """Return the field as each camera sees it from where it stands, in-phase and quadrature, [2, Gy, Gx]."""
         return self.from_exit(self.to_exit(field))
 
     def from_exit(self, leaving: Complex) -> Complex:
