@@ -432,11 +432,11 @@ class ForeignDevice:
             path: HDF5 file, overwritten.
             pages: how many.
             levels: M, 2 to 256.
-            seed: of symbols, noise and drift.
+            seed: seed of symbols, noise and drift.
             pilots: boolean [ny, nx], written as it is.
             with_symbols: whether the file tells the symbols.
             jumps_px: see `walk`.
-            symbols: what the modulator shows, uint8 [pages, ny, nx]; drawn if left out.
+            symbols: symbols that the modulator shows, uint8 [pages, ny, nx]; drawn if left out.
         """
         rng = np.random.default_rng([seed, 2])
         drawn = rng.integers(0, levels, size=(pages, *self.design.page_shape), dtype=np.uint8)
@@ -488,9 +488,9 @@ def walk(
     """Piston and shift of each page: random walks from a random piston.
 
     Args:
-        p: of the device.
+        p: parameters of the device.
         pages: how many.
-        rng: of the steps.
+        rng: generator of the steps.
         jumps_px: (x, y) by which the image jumps before a page, beside its walk; before page 0, while nobody read.
     """
     pistons = rng.uniform(-np.pi, np.pi) + np.cumsum(p.piston_drift_rad * rng.standard_normal(pages))

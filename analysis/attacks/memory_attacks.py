@@ -54,10 +54,10 @@ class Attacker:
     """Makes tries.
 
     Args:
-        target: of the service.
-        header: of a good pair.
-        pair: it.
-        seed: of all choices.
+        target: address of the service.
+        header: header of a good pair.
+        pair: good pair.
+        seed: seed of all choices.
     """
 
     def __init__(self, target: str, header: pb.DecodeHeader, pair: FramePair, seed: int) -> None:

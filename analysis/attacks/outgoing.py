@@ -69,7 +69,7 @@ class Called:
     """A call to an address.
 
     Args:
-        at: when, seconds since the epoch.
+        at: time of the call, seconds since the epoch.
         call: name of the system call.
         address: numeric, or the path of a socket in the file system.
         port: 0 of such a path.

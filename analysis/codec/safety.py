@@ -53,8 +53,8 @@ class Pages:
     """Pages of random bytes on the bench device.
 
     Args:
-        code: of the pages.
-        seed: of bytes and noise.
+        code: code of the pages.
+        seed: seed of bytes and noise.
     """
 
     def __init__(self, code: Code, seed: int) -> None:

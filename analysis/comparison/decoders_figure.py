@@ -24,7 +24,7 @@ def draw(data_sets: list[dict[str, Any]], out: Path) -> None:
     """Write `figure.png` into the folder of a comparison.
 
     Args:
-        data_sets: as `figures.json` holds them; each outcome's `run` is a folder below `out`, with its `MAP`.
+        data_sets: data sets of `figures.json`; each outcome's `run` is a folder below `out`, with its `MAP`.
         out: the comparison's folder.
     """
     figure = Figure(figsize=(_WIDTH_IN, _DATA_SET_IN * len(data_sets)), layout="constrained")

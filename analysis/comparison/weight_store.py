@@ -34,7 +34,7 @@ class WeightStore:
 
     Attributes:
         data_set: folder of the data set, with its recording.
-        folder: where it is kept, which need not be there.
+        folder: folder of the store, which need not be there.
         adds: whether what is trained now is to be kept too.
     """
 
@@ -65,8 +65,8 @@ class WeightStore:
         Nothing is taken where training has begun, or that was begun with other options or another calibration.
 
         Args:
-            run: its folder below the data set's.
-            options: with which it would be begun.
+            run: folder of the run below the data set's.
+            options: options with which it would be begun.
 
         Returns:
             Whether it was copied.

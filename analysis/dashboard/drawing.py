@@ -65,7 +65,7 @@ class Drawing:
     """The panels of a dashboard, as a Prometheus knows them.
 
     Args:
-        prometheus: that is asked.
+        prometheus: Prometheus that is asked.
         start, end: seconds since 1970.
     """
 

@@ -62,7 +62,7 @@ class Load:
     """Callers that send pairs of the device, now and then two in one call.
 
     Args:
-        service: that they call.
+        service: service that they call.
         rate: calls a second, of all callers together.
     """
 

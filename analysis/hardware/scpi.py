@@ -57,7 +57,7 @@ class Outcome:
         lost: not answered, by reason and by a fault that there was meanwhile.
         faults: injected, by kind.
         unplugged: how often the line was.
-        back_s: from plugging it in again to the first answer.
+        back_s: time from plugging it in again to the first answer.
         seconds: all of it.
     """
 
@@ -85,10 +85,10 @@ class Experiment:
     """A line with faults, and what its answers are worth.
 
     Args:
-        port: of the emulated device, plugged in.
+        port: port of the emulated device, plugged in.
         device: behind it.
-        rate: of faults, for each message.
-        seed: of everything random.
+        rate: rate of faults, for each message.
+        seed: seed of everything random.
     """
 
     def __init__(self, port: VirtualSerialPort, device: PulseGeneratorEmulator, rate: float, seed: int) -> None:

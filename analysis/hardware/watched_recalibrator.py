@@ -17,7 +17,7 @@ class WatchedRecalibrator(Recalibrator):
     """A recalibrator that says when it runs and how it ended.
 
     Args:
-        plane: of the service.
+        plane: data plane of the service.
     """
 
     def __init__(self, plane: DataPlane) -> None:

@@ -39,7 +39,7 @@ class Measurement:
     Attributes:
         figures: under the names that the benchmark gave them.
         source: "measured DATE on COMMIT", or the document that they were copied from.
-        note: what a reader must know of them, if anything.
+        note: remark that a reader must know, if any.
     """
 
     figures: Figures
@@ -89,9 +89,9 @@ def collected(name: str, path: Path, commit: str | None = None) -> Measurement:
     """Collect the figures that a benchmark has written, reduced to those that the pages need.
 
     Args:
-        name: of the measurement.
-        path: of its JSON, whose date is taken for the measurement's.
-        commit: that was measured; the one that is checked out where the JSON lies if None.
+        name: name of the measurement.
+        path: path of its JSON, whose date is taken for the measurement's.
+        commit: commit that was measured; the one that is checked out where the JSON lies if None.
 
     Raises:
         InvalidInputError: no JSON of that benchmark, or a checkout that is younger than it or missing.

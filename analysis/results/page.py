@@ -59,8 +59,8 @@ class Results:
     """Results that a template asks for by name; those that are missing are noted.
 
     Attributes:
-        measurements: by name.
-        missing: what was asked for and is not there.
+        measurements: measurements by name.
+        missing: names that were asked for and are not there.
     """
 
     measurements: Mapping[str, Measurement]

@@ -62,10 +62,10 @@ class BulkRun:
     """`lightpage bulk decode` in a process of its own; it runs in a `with` statement.
 
     Args:
-        job: what it is asked.
-        folder: of the run.
+        job: job of the run.
+        folder: folder of the run.
         options: beside what is asked.
-        mark: in the environment of its workers.
+        mark: mark in the environment of its workers.
     """
 
     def __init__(self, job: Job, folder: Path, options: tuple[str, ...], mark: str) -> None:

@@ -24,9 +24,10 @@ class Work:
     """Work of one worker.
 
     Attributes:
-        page_seconds: of a range's pages in the mean, one for each range that was measured; drawn from at random.
-        read_bytes: of a page, from the storage.
-        written_bytes: of its result, to the storage.
+        page_seconds: mean seconds of a range's pages, one number for each range that was measured; drawn from at
+            random.
+        read_bytes: bytes of a page that are read from the storage.
+        written_bytes: bytes of its result that are written to the storage.
         range_s: a worker's time for a range beside its pages: to be given it, and to write its record.
         range_pages: pages of a range.
     """
@@ -68,9 +69,9 @@ class Cluster:
 
     Attributes:
         nodes: how many.
-        workers: of a node.
-        storage_bytes_per_s: that all nodes share.
-        link_bytes_per_s: of a node.
+        workers: workers of a node.
+        storage_bytes_per_s: bandwidth that all nodes share.
+        link_bytes_per_s: bandwidth of a node.
         mtbf_s: mean time between two failures of a node; None for none.
         repair_s: until a node that failed works again.
     """
@@ -88,9 +89,9 @@ class Rate:
     """Rate at which a cluster reads.
 
     Attributes:
-        nodes: that it has.
-        pages_per_s: of all.
-        efficiency: of what as many workers would read that wait for nothing.
+        nodes: number of nodes.
+        pages_per_s: rate of all nodes together.
+        efficiency: share of the rate of as many workers that wait for nothing.
         driver, storage: how much of the driver's time, and of the storage's bytes a second, is used.
         lost_ranges: ranges that were given out again.
     """

@@ -56,9 +56,9 @@ class Kind:
     """Pages of one size, and the nodes that read them.
 
     Attributes:
-        name: of it.
-        work: of a worker.
-        workers: of a node.
+        name: name of the kind.
+        work: work of a worker.
+        workers: workers of a node.
     """
 
     name: str

@@ -40,11 +40,11 @@ class FleetDevice:
     """A device of the fleet.
 
     Attributes:
-        name: of it.
-        seed: of its drift, pages and noise.
+        name: name of the device.
+        seed: seed of its drift, pages and noise.
         profile: the nominal device.
-        before: its state as its bundle has it.
-        folder: of its recordings.
+        before: state of the device as its bundle has it.
+        folder: folder of its recordings.
         known: how many known pages it has.
     """
 

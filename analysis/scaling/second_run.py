@@ -56,11 +56,11 @@ def finished(folder: Path, recording: Path, operation: Operation, pages: int, ra
     """Make a finished run over links to a recording that is read once; its folder is `folder / "run"`.
 
     Args:
-        folder: where links and run go; it must not be there.
-        recording: what is read.
-        operation: by which.
-        pages: of the run, at least.
-        range_pages: of a range.
+        folder: folder that links and run go into; it must not be there.
+        recording: recording that is read.
+        operation: operation that reads it.
+        pages: least number of pages of the run.
+        range_pages: number of pages of a range.
 
     Returns:
         How many recordings the run has.

@@ -39,7 +39,7 @@ class Entry:
     """A function that was entered.
 
     Attributes:
-        moment: when first, `time.monotonic` seconds, which all processes of a machine share.
+        moment: time of the first entry, `time.monotonic` seconds, which all processes of a machine share.
         file: path in the repository.
         function: qualified name, without functions inside it.
         calls: how often it was entered, lambdas and functions inside it counted with it.
@@ -57,7 +57,7 @@ class Recorder:
     """Notes the functions of the project that are entered while the byte that it watches is set.
 
     Args:
-        switch: one byte, which another process may set.
+        switch: byte, which another process may set.
     """
 
     def __init__(self, switch: mmap.mmap | bytearray) -> None:

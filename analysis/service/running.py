@@ -38,7 +38,7 @@ class RunningService:
     """`lightpage serve` until it is ended; use it in a `with` statement.
 
     Args:
-        arguments: of the command, beside addresses.
+        arguments: arguments of the command, beside addresses.
         environment: variables that it has beside those of this process.
         before: words before the command, of a program that becomes it, as `env` does.
     """

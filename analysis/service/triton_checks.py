@@ -52,7 +52,7 @@ class Service:
     Args:
         target: HOST:PORT of the service.
         health: HOST:PORT of its health checks.
-        folder: with what is expected.
+        folder: folder of what is expected.
     """
 
     def __init__(self, target: str, health: str, folder: Path) -> None:

@@ -40,9 +40,9 @@ class File:
     """File of a bundle.
 
     Attributes:
-        name: of it.
-        unpacked_bytes: its own size.
-        stored_bytes: what it takes in the zip.
+        name: name of the file.
+        unpacked_bytes: size of the file.
+        stored_bytes: size in the zip.
     """
 
     name: str
@@ -56,10 +56,10 @@ class Footprint:
 
     Attributes:
         decoder: name.
-        zip_bytes: of the bundle as one file.
-        files: in it, the largest first.
-        loading: what a process that loads it took.
-        decoding: what one that also decodes pages took.
+        zip_bytes: size of the bundle as one file.
+        files: files in it, the largest first.
+        loading: cost of a process that loads it.
+        decoding: cost of a process that also decodes pages.
     """
 
     decoder: str
@@ -103,11 +103,11 @@ def footprint(name: str, profile: Profile, seen: Seen, pages: int, threads: int)
     """Make, weigh and measure the bundle of one decoder.
 
     Args:
-        name: one of `analysis.speed.untrained_graphs.OWN`.
+        name: name out of `analysis.speed.untrained_graphs.OWN`.
         profile: the nominal device.
-        seen: what its cameras saw.
-        pages: to decode.
-        threads: of one decode.
+        seen: frames of its cameras.
+        pages: number of pages to decode.
+        threads: threads of one decode.
 
     Raises:
         BundleError, InvalidInputError: see `untrained_bundle` and `measured`.

@@ -50,9 +50,9 @@ def taken(bundle: Path, pages: int, threads: int) -> Taken:
     """Load and decode in this process.
 
     Args:
-        bundle: its path.
+        bundle: path of the bundle.
         pages: how often the golden page is decoded, may be 0.
-        threads: of one decode.
+        threads: threads of one decode.
 
     Raises:
         BundleError: no bundle that decodes.

@@ -58,7 +58,7 @@ class Machine:
     """Peak rates that the runtime reaches on this machine.
 
     Attributes:
-        flops_per_s: in a product of large matrices of float32.
+        flops_per_s: rate in a product of large matrices of float32.
         bytes_per_s: read and written together, in a sum of arrays that no cache holds.
     """
 
@@ -71,10 +71,10 @@ class Part:
     """Part of a decoder, with its cost for a page.
 
     Attributes:
-        name: of the part.
-        seconds: that its nodes take.
-        flops: of products and convolutions, two for a multiplication with an addition.
-        bytes: from other parts, weights, and to other parts.
+        name: name of the part.
+        seconds: seconds that its nodes take.
+        flops: operations of products and convolutions, two for a multiplication with an addition.
+        bytes: bytes from other parts, of weights, and to other parts.
         floor_s: see the module.
     """
 
@@ -118,8 +118,8 @@ def parts_of(model: bytes, profile: Path, runs: int, machine: Machine) -> list[P
     Args:
         model: the exported decoder, whose nodes are named after the modules that they come from.
         profile: the runtime's profile of it.
-        runs: that the profile is of; the first is left out where there are more.
-        machine: that it ran on.
+        runs: number of runs in the profile; the first is left out where there are more.
+        machine: machine that it ran on.
 
     Raises:
         InvalidInputError: a profile without nodes.

@@ -58,12 +58,12 @@ class Gpu:
     """A data sheet: peaks of products in each precision, and of the memory.
 
     Attributes:
-        name: of the GPU.
+        name: name of the GPU.
         flops_per_s: dense, by precision; float32 without the rounding of tensor cores.
-        half_flops_per_s: of float16 on tensor cores.
-        bytes_per_s: of its memory.
-        bus_bytes_per_s: from the host.
-        launch_s: from one kernel to the next.
+        half_flops_per_s: peak of float16 on tensor cores.
+        bytes_per_s: bandwidth of its memory.
+        bus_bytes_per_s: bandwidth from the host.
+        launch_s: time from one kernel to the next.
     """
 
     name: str
@@ -84,9 +84,9 @@ class Load:
 
     Attributes:
         nodes: how many.
-        flops: of products and convolutions, in float32 and float16 together.
+        flops: operations of products and convolutions, in float32 and float16 together.
         bytes: read and written.
-        seconds: on the GPU.
+        seconds: seconds on the GPU.
     """
 
     nodes: int
@@ -100,8 +100,8 @@ def loads(decoder: bytes, gpu: Gpu, share: float) -> dict[str, Load]:
 
     Args:
         decoder: decoder.onnx.
-        gpu: what it would run on.
-        share: of the peaks that are reached.
+        gpu: GPU that it would run on.
+        share: share of the peaks that is reached.
     """
     model = shape_inference.infer_shapes(onnx.load_from_string(page_part(decoder)), data_prop=True)
     graph = model.graph
@@ -134,7 +134,7 @@ def estimate(by_kind: dict[str, Load], frame_bytes: int, gpu: Gpu) -> dict[str, 
 
     Args:
         by_kind: see `loads`.
-        frame_bytes: of both frames.
+        frame_bytes: bytes of both frames.
         gpu: the same.
     """
     work = math.fsum(load.seconds for load in by_kind.values())

@@ -43,8 +43,8 @@ class Bench:
         out: folder of everything.
         training, validation, unseen: page numbers.
         levels: numbers of levels of further recordings, on which confidences are judged.
-        seed: of the recording; theirs follow.
-        kept: of this data set.
+        seed: seed of the recording; the methods' seeds follow from it.
+        kept: store of this data set.
         reflections: rounds to the field, of methods that are not `fast`; see `Hyperparameters`.
     """
 

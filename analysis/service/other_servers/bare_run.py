@@ -32,9 +32,9 @@ class BareRuns:
     """Process that runs graphs and serves nobody; use it in a `with` statement.
 
     Args:
-        folder: of the models.
-        graphs: in it.
-        threads: of one run.
+        folder: folder of the models.
+        graphs: graphs in it.
+        threads: threads of one run.
 
     Raises:
         WorkerError: it has ended, or does not answer.

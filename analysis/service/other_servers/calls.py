@@ -45,9 +45,9 @@ def infer_request(
     """A pair in raw contents.
 
     Args:
-        model: its name.
+        model: name of the model.
         pair: uint8 or uint16.
-        outputs: that are wanted.
+        outputs: names of the outputs that are wanted.
         as_bytes: whether a frame goes as one element of type BYTES.
     """
     request = oip.ModelInferRequest(model_name=model)

@@ -37,7 +37,7 @@ class Comparison:
     """The service beside another server.
 
     Attributes:
-        difference: by how much the service is better, of the medians; negative where it is worse.
+        difference: difference of the medians, positive where the service is better.
         spread: the larger one of both.
     """
 

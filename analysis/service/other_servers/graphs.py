@@ -29,10 +29,10 @@ class Graph:
     """A graph that every server carries.
 
     Attributes:
-        name: of the model.
+        name: name of the model.
         pair: frames that it takes.
-        bundle: that holds it, a zip.
-        page_shape: of what it answers.
+        bundle: bundle that holds it, a zip.
+        page_shape: shape of the answer.
     """
 
     name: str
@@ -56,7 +56,7 @@ def write_graphs(folder: Path, threads: int) -> list[Graph]:
 
     Args:
         folder: an empty one.
-        threads: of one run.
+        threads: threads of one run.
     """
     graphs = []
     for name, profile_name in CONSTANT.items():

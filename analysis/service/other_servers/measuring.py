@@ -34,8 +34,8 @@ class Way:
     """Way to call a server.
 
     Attributes:
-        server: its name.
-        marked: its processes.
+        server: name of the server.
+        marked: processes of the server.
         connect: a caller.
     """
 

@@ -29,8 +29,8 @@ class Graphs:
     """The deployment: its methods are those of the protocol, and run in threads.
 
     Args:
-        folder: of the models.
-        threads: of one run.
+        folder: folder of the models.
+        threads: threads of one run.
     """
 
     def __init__(self, folder: Path, threads: int) -> None:

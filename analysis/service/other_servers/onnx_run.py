@@ -32,8 +32,8 @@ class OnnxRun:
     """A graph that is open; calls may come from many threads at once.
 
     Args:
-        path: of the graph.
-        threads: of one run.
+        path: path of the graph.
+        threads: threads of one run.
     """
 
     def __init__(self, path: Path, threads: int) -> None:

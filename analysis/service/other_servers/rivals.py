@@ -85,10 +85,10 @@ def ray_serve(python: Path, models: Path, folder: Path, threads: int, direct: bo
     """Ray Serve.
 
     Args:
-        python: of its environment.
+        python: Python of its environment.
         models: folder of the graphs.
-        folder: where it works.
-        threads: of one run.
+        folder: folder that it works in.
+        threads: threads of one run.
         direct: whether the replica itself listens for callers, in place of a proxy before it.
     """
     temporary = tempfile.mkdtemp(prefix="lightpage-ray-")  # its sockets' paths must be short

@@ -91,9 +91,9 @@ class OtherServer:
     """A server in an environment of its own; use it in a `with` statement.
 
     Args:
-        name: of it.
-        command: that starts it.
-        folder: where it works, and writes NAME.log.
+        name: name of the server.
+        command: command that starts it.
+        folder: folder that it works in, and writes NAME.log to.
         caller: connects a caller to it.
         environment: variables beside those of this process.
     """

@@ -28,10 +28,10 @@ def in_turns(
     """Call in turns, and return the calls' results by name, one a round; each round has an order of its own, by chance.
 
     Args:
-        calls: by name.
-        rounds: that count.
+        calls: calls by name.
+        rounds: rounds that count.
         what: is timed, for the progress.
-        rng: of the orders.
+        rng: generator of the orders.
         warm: rounds before these.
     """
     told: dict[str, list[T]] = {name: [] for name in calls}
@@ -48,8 +48,8 @@ class Timed:
     """A call that was timed.
 
     Attributes:
-        seconds: that it took.
-        work_s: of these, the service's checks and decision; zero of other servers.
+        seconds: seconds of the call.
+        work_s: seconds of these for the service's checks and decision; zero of other servers.
     """
 
     seconds: float
