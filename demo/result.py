@@ -26,13 +26,13 @@ class Phase:
         model_version: the last page's.
         air: per data symbol, bits, mean over the pages that were decoded, [ny, nx]; not a number at pilots.
         confidence: mean over them, [ny, nx].
-        symbol_error_rate: of data symbols.
-        seconds: of one decode in the service, median.
-        pages: that were read.
-        unread: of them, how many gave no bytes.
+        symbol_error_rate: error rate of data symbols.
+        seconds: seconds of one decode in the service, median.
+        pages: number of pages that were read.
+        unread: number of them that gave no bytes.
         restored, lost: pages of the picture that parity gave back, and that are lost.
         margin_bits: least margin of the pages that gave bytes, bits a symbol; None where none did.
-        picture: as it was read, lost bytes black, [rows, columns].
+        picture: picture as it was read, lost bytes black, [rows, columns].
         exact: whether it is the picture that was written.
     """
 
@@ -78,8 +78,8 @@ class DriftStep:
     """Step of the drift: what one page told.
 
     Attributes:
-        share: of the drift of `drifted`.
-        margin_bits: of the page, bits a symbol; None where it was not decoded.
+        share: share of the drift of `drifted`.
+        margin_bits: margin of the page, bits a symbol; None where it was not decoded.
         recalibration_due: whether its pilots show the drift.
         lost: whether it gave no bytes.
     """

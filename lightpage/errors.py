@@ -27,12 +27,12 @@ class LightpageError(Exception):
     """Base of every error that Lightpage raises on purpose.
 
     Args:
-        subject: what the error is about, e.g. ``"recording R.h5: dataset 'in_phase'"``.
-        got: what came; of an error of the operating system, what it says without number and path.
-        expected: what would have been right.
+        subject: thing that the error is about, e.g. ``"recording R.h5: dataset 'in_phase'"``.
+        got: value or state that came; of an error of the operating system, its text without number and path.
+        expected: value or state that would have been right.
 
     Attributes:
-        cause: what errors of the class are about.
+        cause: cause of the class's errors.
     """
 
     cause: ClassVar[Cause] = Cause.SURROUNDINGS
@@ -191,7 +191,7 @@ class SlotsTakenError(BusyError):
 
     Args:
         subject, got, expected: see `LightpageError`.
-        retry_s: when to try again, seconds from now; None where that is of no use.
+        retry_s: seconds after which to try again; None where that is of no use.
     """
 
     def __init__(self, subject: str, got: object, expected: object, retry_s: float | None = None) -> None:
@@ -304,7 +304,7 @@ class UnconfirmedPageError(LostPageError):
     """The pilots of a page do not bear out what the decoder claims of it: its symbols would be noise.
 
     Attributes:
-        page: what was decoded, for figures and never for an answer; None on the client's side. The runtime's
+        page: decoded page, for figures and never for an answer; None on the client's side. The runtime's
             `tracking.unconfirmed_page` says of which class it is.
     """
 

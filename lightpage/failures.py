@@ -93,8 +93,8 @@ def understood(subject: str, error: BaseException) -> LightpageError | None:
     """The error that an exception of another library means; None where it is a mistake of the program.
 
     Args:
-        subject: what was being done.
-        error: what came.
+        subject: work that was being done.
+        error: failure of that work.
     """
     if isinstance(error, LightpageError):
         return error
@@ -117,9 +117,9 @@ def os_failure(
     """The error that a failure of the operating system, or of HDF5, means.
 
     Args:
-        subject: what was to be read or written.
-        error: what came.
-        expected: what would have been right.
+        subject: thing that was to be read or written.
+        error: failure of that.
+        expected: state that would have been right.
         otherwise: class of the error where neither storage nor a short resource is the cause, e.g. no such file.
 
     Returns:

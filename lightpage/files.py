@@ -50,8 +50,8 @@ def new_file(folder: Path, name: str) -> tuple[int, Path]:
     """Make an empty file of a new name in `folder`, with the modes that the process's umask leaves.
 
     Args:
-        folder: where.
-        name: what the new name begins with, behind a dot; it is cut where the whole would be too long.
+        folder: folder of the file.
+        name: beginning of the new name, behind a dot; it is cut where the whole would be too long.
 
     Returns:
         A descriptor that is open for reading and writing, and the path.
@@ -71,8 +71,8 @@ def lock(descriptor: int, subject: str, *, shared: bool = False, ranges: bool = 
     """Lock a file until its descriptor is closed; where its file system has no locks, warn once and go without.
 
     Args:
-        descriptor: of the file.
-        subject: what it is, for the warning.
+        descriptor: descriptor of the file.
+        subject: name of the file, for the warning.
         shared: whether others may have it locked so too.
         ranges: whether with a lock of the kind that ranges of bytes have, which some file systems lack alone.
 
@@ -109,7 +109,7 @@ def replace_file(path: str | Path, write: Callable[[IO[bytes]], object], subject
     Args:
         path: final name, in a folder that exists.
         write: writes the content.
-        subject: what the file is, for the error message.
+        subject: name of the file, for the error message.
 
     Raises:
         InvalidInputError: the path cannot be written.
@@ -232,9 +232,9 @@ def read_text(path: str | Path, subject: str, expected: str, failure: type[Light
     """The text of a file in UTF-8, or in UTF-16 or UTF-32 with a byte order mark; its lines end with LF alone.
 
     Args:
-        path: of the file.
-        subject: what it is, for an error.
-        expected: what would be right, for an error.
+        path: path of the file.
+        subject: name of the file, for an error.
+        expected: file that would be right, for an error.
         failure: class of the error.
 
     Raises:
@@ -319,8 +319,8 @@ def write_json(path: str | Path | None, data: Any) -> None:
     """Write `data` to `path` as JSON, null for what is not a number, replacing what is there in one step.
 
     Args:
-        path: of the file, or `STDOUT`; None where nobody wants it.
-        data: what JSON can hold.
+        path: path of the file, or `STDOUT`; None where nobody wants it.
+        data: value that JSON can hold.
 
     Raises:
         InvalidInputError: the path cannot be written.

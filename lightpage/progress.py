@@ -71,9 +71,9 @@ def track(
     """The items themselves, the way through them shown to whoever watches.
 
     Args:
-        items: what a loop goes through.
-        what: what is being done.
-        unit: what an item is.
+        items: items of a loop.
+        what: name of the work.
+        unit: name of an item.
         total: how many there are, with those that are done already; by default as many as `items` has.
         done: how many of them an earlier run has done, which are not among `items`.
         state: says in a word or two, after each item, how the work stands.

@@ -62,10 +62,10 @@ class PythonPackage:
 
     Args:
         wheel: file name of the wheel that it was installed from.
-        sha256: of that wheel.
-        record_sha256: of the list of its files, which holds a checksum of each.
+        sha256: checksum of that wheel.
+        record_sha256: checksum of the list of its files, which holds a checksum of each.
         libraries: shared objects that it brings for others to link with, path in the environment to SHA-256.
-        licence: what its metadata say: an SPDX expression, or free text, or nothing.
+        licence: licence in its metadata: an SPDX expression, or free text, or nothing.
     """
 
     name: str
@@ -82,8 +82,8 @@ class DebianPackage:
     """An installed package of Debian.
 
     Args:
-        section: with the area before it, unless that is `main`.
-        record_sha256: of the list of its files, which holds an MD5 of each; empty where it has none.
+        section: section with the area before it, unless that is `main`.
+        record_sha256: checksum of the list of its files, which holds an MD5 of each; empty where it has none.
         licences: short names of the machine-readable part of its copyright file.
     """
 

@@ -34,8 +34,8 @@ def spdx(name: str, licence: str) -> str | None:
     """A package's licence as an SPDX expression, None where nobody says one.
 
     Args:
-        name: of the package, normalised.
-        licence: what its metadata say.
+        name: name of the package, normalised.
+        licence: licence in its metadata.
     """
     if name in rules()["named"]:
         return rules()["named"][name]

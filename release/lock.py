@@ -33,7 +33,7 @@ class Target:
     """Target of an image: what it installs, and for which processors it is built.
 
     Args:
-        extras: of pyproject.toml.
+        extras: extras of pyproject.toml.
         machines: the processors that it is built for.
         refused: why it is not built for the others.
     """

@@ -36,7 +36,7 @@ def sbom(inventory: Inventory, labels: Mapping[str, str]) -> str:
     """The SBOM's text.
 
     Args:
-        inventory: what is in the image.
+        inventory: contents of the image.
         labels: the image's, by name.
 
     Raises:

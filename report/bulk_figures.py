@@ -47,7 +47,7 @@ def rates(readings: Sequence[Reading], edges: Real) -> tuple[Real, Real]:
     """Pages a second, and workers at work, between moments; the pages of a range are spread over its time.
 
     Args:
-        readings: what was done, N of them.
+        readings: ranges that were read, N of them.
         edges: the moments, seconds since 1970, [B + 1].
 
     Returns:

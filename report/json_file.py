@@ -48,9 +48,9 @@ class JsonFile:
     """A file of JSON.
 
     Attributes:
-        path: where it lies.
+        path: path of the file.
         text: all of it, JSON.
-        command: which one wrote it, by its keys; None where that is not known.
+        command: command that wrote it, by its keys; None where that is not known.
         found: the same for people.
     """
 

@@ -120,7 +120,7 @@ def zones(data: ReportData, centroids: Real) -> list[Zone]:
     """Return a row for each zone, from top left to bottom right.
 
     Args:
-        data: of the report.
+        data: data of the report.
         centroids: exit centroids over the pipe's width, [2, ny, nx].
     """
     cells = np.rint(centroids).astype(int)

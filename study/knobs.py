@@ -18,12 +18,13 @@ class Knob:
     """Knob: a deviation of a device that one number sets; all else stays as on the device that decoders are trained on.
 
     Attributes:
-        name: on the command line.
-        title: what deviates, in words.
-        unit: of the number.
-        values: that are measured, ascending.
+        name: name on the command line.
+        title: deviation, in words.
+        unit: unit of the number.
+        values: values that are measured, ascending.
         settings: settings of the device's state by `TABLE.KEY`, each as a factor on the number.
-        full_size: what a unit is on the full-size device, and the unit that this is told in; None where it is the same.
+        full_size: value of a unit on the full-size device, and the unit that this is told in; None where it is the
+            same.
         logarithmic: whether values are ratios, not differences.
     """
 

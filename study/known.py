@@ -36,7 +36,7 @@ class Known:
     Attributes:
         references: reference-only frames.
         pairs: frame pairs, one a page.
-        symbols: what was written, uint8 [ny, nx], one a page.
+        symbols: symbols that were written, uint8 [ny, nx], one a page.
     """
 
     references: FramePair

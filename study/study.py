@@ -33,10 +33,10 @@ class Settings:
 
     Attributes:
         profile: the nominal device.
-        quick: as few and as small cases as show that it works; their figures say little.
-        seed: of everything random.
-        share: of the authors' steps that networks are trained for.
-        channels: of the published network at sample pitch, twice as many below; the authors' if left out.
+        quick: whether to measure as few and as small cases as show that it works; their figures say little.
+        seed: seed of everything random.
+        share: share of the authors' steps that networks are trained for.
+        channels: channels of the published network at sample pitch, twice as many below; the authors' if left out.
     """
 
     profile: Profile
@@ -57,10 +57,11 @@ class Study:
     Attributes:
         title: the question, in a line.
         source: figure or table of the published study that it repeats, or where it goes beyond.
-        cases: what is varied.
-        measure: one case to its result; its work may be kept in the folder given, so that it can be gone on with.
-        header: of the table.
-        rows: of the table, from cases and results.
+        cases: cases that are measured.
+        measure: function from a case to its result; its work may be kept in the folder given, so that it can be gone on
+            with.
+        header: header of the table.
+        rows: function from cases and results to rows of the table.
         plot: a picture of all results.
         trains: whether it trains published decoders, which takes hours without a GPU at full scale.
         parts: whether table and picture can be made of some of the cases, with those that say `needed`.

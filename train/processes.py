@@ -32,9 +32,9 @@ class Processes:
     """The processes of one training, a GPU each where there are any.
 
     Attributes:
-        devices: of each node; "auto" for all GPUs, or one process without one.
+        devices: number of devices of each node; "auto" for all GPUs, or one process without one.
         nodes: machines.
-        strategy: of `STRATEGIES`.
+        strategy: name out of `STRATEGIES`.
     """
 
     devices: int | str = AUTO
@@ -111,9 +111,9 @@ def wait_for_first(done: Callable[[], int], count: int, what: str, clock: Clock 
 
     Args:
         done: how much is there.
-        count: that is waited for.
-        what: for the error.
-        clock: to wait by.
+        count: amount of work that is waited for.
+        what: name of the work, for the error.
+        clock: clock to wait by.
 
     Raises:
         LightpageError: no more has come for half an hour.

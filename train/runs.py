@@ -52,7 +52,7 @@ class Run:
         localizer: name.
         profile_toml, calibration_toml: the device.
         hyperparameters: the choices.
-        camera_bit_depth: of the recording.
+        camera_bit_depth: bit depth of the recording.
         trained_pages: hashes of the pages that were trained on or used to stop.
         validation_air: bits per data symbol.
         pages: recorded pages for training, for validation, and left for evaluation.
@@ -125,8 +125,8 @@ def begin(folder: Path, options: dict[str, Any]) -> None:
     """Note what a run is begun with, or check that it goes on with just that.
 
     Args:
-        folder: of the run, which is there.
-        options: by name, as JSON can keep them.
+        folder: folder of the run, which is there.
+        options: options by name, as JSON can keep them.
 
     Raises:
         InvalidInputError: the folder holds a run that was begun with other options.

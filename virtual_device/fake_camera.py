@@ -62,11 +62,11 @@ class FakeCamera:
     an acquisition may be up to 0.1 s late.
 
     Args:
-        address: to listen on, of an interface of this machine.
-        serial: its number.
+        address: address to listen on, of an interface of this machine.
+        serial: serial number of the camera.
         picture: the whole sensor [row, column], called by the camera's own thread; the region that is set is sent.
         sensor_shape: (rows, columns).
-        more_bytes: by how much its PayloadSize is larger than the pixels that it sends.
+        more_bytes: bytes by which its PayloadSize is larger than the pixels that it sends.
 
     Raises:
         SourceError: no library, or the address cannot be listened on.

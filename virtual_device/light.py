@@ -24,7 +24,7 @@ class Light:
     Args:
         profile: nominal device.
         device: true state.
-        seed: of noise and drift.
+        seed: seed of noise and drift.
         black_level: counts that both cameras add.
     """
 

@@ -85,7 +85,7 @@ class PulseGeneratorEmulator:
     Not emulated: delays and widths of its pulses in time, and the train of pulses of a running T0 in `NORMal` mode.
 
     Args:
-        cables: by channel, what is called at every shot while the channel is on.
+        cables: functions by channel, each called at every shot while its channel is on.
     """
 
     def __init__(self, cables: Mapping[int, Callable[[], None]] | None = None) -> None:

@@ -43,15 +43,15 @@ class VirtualSerialPort(ABC):
     """Bytes in, bytes out, by a thread; `Pty` and `TcpPort` say where.
 
     Args:
-        answer: of the device to a line without its end.
-        seed: of faults.
+        answer: function from a line without its end to the device's answer.
+        seed: seed of faults.
 
     Attributes:
         fault: chosen for each message; None for a sound one.
         echo: whether the port sends back what it receives.
         late_s: least and longest delay of a late answer.
-        line_end: what ends the device's lines.
-        before_line: what comes before each of them.
+        line_end: bytes that end the device's lines.
+        before_line: bytes that come before each of them.
         faults: how many there were of each.
     """
 

@@ -108,7 +108,7 @@ class Registered:
         coherence_before, coherence_after: mean over the pages, at the start's geometry and at the fitted one.
         cost: mean squared normalised residual of the last fit of patches.
         significant: share of the measured patches that were found, in the last stage.
-        modulation: what the modulator makes of its levels.
+        modulation: light that the modulator makes of its levels.
         modulation_deviations: standard deviations of its coefficients.
         goodness: how well all that explains the first page's light; None where that was not measured.
     """
@@ -178,7 +178,7 @@ def calibrate(
         solve_field: recovers the complex field from registered frames.
         profile: the nominal device.
         references: reference-only frames.
-        pages: one to a few known pages; the first is fitted, all are judged by.
+        pages: one known page, or a few; the first is fitted, and all judge the fit.
         progress: told of every stage, and within it of every patch or derivative, so that it may stop the work soon.
         any_orientation: whether cameras that show the image mirrored or turned are taken.
 
@@ -218,7 +218,7 @@ def refine(
         start: [P] earlier parameters.
         quadrature_phase: earlier angle between the homodyne arms.
         modulation: earlier one, which is fitted again, see `DRIFTS`.
-        twin, solve_field, profile, references, pages, progress: as for `calibrate`.
+        twin, solve_field, profile, references, pages, progress: see `calibrate`.
 
     Raises:
         CalibrationError: the pages do not fit near the earlier calibration.
@@ -243,7 +243,7 @@ def check_found(coherence: float, significant: float, symbols: int, reflected: M
     """Check that a registration ended at the device and not at a guess.
 
     Args:
-        coherence: of the known pages with the fitted geometry.
+        coherence: coherence of the known pages with the fitted geometry.
         significant: share of the patches that were found in the last stage.
         symbols: number of symbols on a page.
         reflected: the same share for each reflected branch.
@@ -333,7 +333,7 @@ class _Registration:
         """Look for the image of a camera that has not found it as it may show it otherwise.
 
         Args:
-            stage: of the search.
+            stage: stage of the search.
             found: measurements of either camera.
 
         Returns:
@@ -509,7 +509,7 @@ class _Registration:
         """The first page's patches as each of `samplers` sees them.
 
         Args:
-            stage: what to look for.
+            stage: patches, branches and ranges to measure.
             samplers: the field, or one camera's light, by the cameras that it is seen through.
         """
         window = search_window(stage.reach_px * self._pixel, stage.step_px * self._pixel)

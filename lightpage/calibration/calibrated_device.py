@@ -22,7 +22,7 @@ class CalibratedDevice:
         parameters: [P] fitted, see `lightpage.calibration.parameters`.
         quadrature_phase_rad: phase between the two cameras, about 90 degrees, negative where Q is inverted.
         references: reference-only frames.
-        modulation: what the modulator makes of its levels.
+        modulation: light that the modulator makes of its levels.
     """
 
     profile: Profile

@@ -57,7 +57,7 @@ def branch_shares(positions: Real, branches: Sequence[str] = COHERENT_BRANCHES) 
 
     Args:
         positions: exit centroid over the pipe's width, (x, y') last, [N, 2].
-        branches: of them; the two mixed ones are given half of their light each.
+        branches: names out of `BRANCHES`; the two mixed ones are given half of their light each.
 
     Returns:
         [branches, N]; those of all of `BRANCHES` add up to one.

@@ -67,8 +67,8 @@ class _Template:
     """The light of the pilots that is looked for.
 
     Attributes:
-        places: where to sample the field, grid samples (column, row), [B, N, S, 2].
-        conjugate: what takes off the path's and the symbol's phase, over the branch's share, [B, N, S].
+        places: places at which the field is sampled, grid samples (column, row), [B, N, S, 2].
+        conjugate: factors that remove the path's and the symbol's phase, over the branch's share, [B, N, S].
     """
 
     places: Real

@@ -20,7 +20,7 @@ class Rays(NamedTuple):
     """Rays of points on the page, as the twin traces them.
 
     Attributes:
-        places: where each branch lands on the camera plane, [B, N, 2] as (x, y), metres from the optical axis.
+        places: points where each branch lands on the camera plane, [B, N, 2] as (x, y), metres from the optical axis.
         phases: phase that the branch's path adds to the symbol's, against the reference, [B, N] radians, unwrapped.
         positions: exit centroid of the beam over the pipe's width, (x, y'), [N, 2], dimensionless.
     """
@@ -62,7 +62,7 @@ class RememberingTwin:
     """A twin that remembers its last trace: either camera is looked at for the same one.
 
     Args:
-        twin: what traces.
+        twin: ray tracer.
     """
 
     def __init__(self, twin: Twin) -> None:

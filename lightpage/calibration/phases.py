@@ -56,7 +56,7 @@ def tilt_of_shift(
     Args:
         value: parameters by name.
         shift_m: (x, y) by which the image moves in the camera plane, metres.
-        half_width_m, half_height_m: of the page.
+        half_width_m, half_height_m: half sizes of the page.
 
     Returns:
         (camera_tilt_x_rad, camera_tilt_y_rad), [2].

@@ -34,7 +34,7 @@ class FrameSampler:
     Args:
         frame, reference: counts [H, W].
         camera: 0 in-phase, 1 quadrature.
-        twin, parameters: where the camera plane lies on the camera.
+        twin, parameters: registration of the camera plane on the camera.
     """
 
     def __init__(

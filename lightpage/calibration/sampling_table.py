@@ -76,7 +76,7 @@ def orientations(linear: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return how cameras flip and swap the axes from (x, y) to (column, row), without small turns and scales.
 
     Args:
-        linear: what they truly do, in any unit, [..., 2, 2].
+        linear: linear part of the cameras' maps, in any unit, [..., 2, 2].
 
     Returns:
         Zeros, and in each row and column one of 1 and -1, [..., 2, 2].

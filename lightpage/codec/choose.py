@@ -63,8 +63,8 @@ class DrawnPage:
     Attributes:
         phase: decoded, radians, of the data symbols, [symbols].
         concentration: kappa, [symbols].
-        symbols: what was drawn.
-        levels: that they were drawn from.
+        symbols: symbols that were drawn.
+        levels: levels that they were drawn from.
     """
 
     phase: NDArray[np.float64]
@@ -89,14 +89,14 @@ class Choice:
     """A code with what was found of it.
 
     Attributes:
-        code: its parameters.
-        user_bytes: of a page.
+        code: parameters of the code.
+        user_bytes: user bytes of a page.
         information: mean information of a coded bit.
-        deviation: its standard deviation from page to page.
+        deviation: standard deviation of the information from page to page.
         upper_errors: mean wrong upper numbers of a page.
         kept: information of a coded bit that was to be kept for drift.
-        spare: what the weakest page of a thousand carries of it beyond the need: `kept`, and what steps of the rate
-            leave.
+        spare: information that the weakest page of a thousand carries beyond the need: `kept`, and what steps of the
+            rate leave.
     """
 
     code: Code
@@ -133,11 +133,11 @@ def choose(
 
     Args:
         draw: draws the known pages.
-        air_bits: what a symbol carries, bits: level counts near it are tried, and fewer levels where none carries.
+        air_bits: information of a symbol, bits: level counts near it are tried, and fewer levels where none carries.
         pilots: bool [ny, nx].
         headroom: share of what a symbol carries that is kept for drift.
-        seed: of what is drawn.
-        drift: that pages are to survive, where it costs more than that share.
+        seed: seed of the draws.
+        drift: drift that pages are to survive, where it costs more than that share.
 
     Raises:
         InvalidInputError: too few pages, or no code carries a page.
@@ -297,10 +297,10 @@ def needed_information(code: LdpcCode, pages: Sequence[DrawnPage], coded: int, r
     """Information per bit from which nearly all blocks decode: the pages' light is made noisier until 2% of them fail.
 
     Args:
-        code: of the blocks.
-        pages: with their light.
+        code: code of the blocks.
+        pages: pages with their light.
         coded: b.
-        rng: of noise.
+        rng: generator of noise.
     """
     low, high = 0.0, 3.0
     needed = 1.0

@@ -84,7 +84,7 @@ def encode_headers(headers: list[Header], levels: int) -> NDArray[np.uint8]:
     """The symbols of headers, uint8 [headers, header symbols].
 
     Args:
-        headers: of pages.
+        headers: headers of the pages.
         levels: M of the page.
     """
     text = np.array([np.frombuffer(header.to_bytes(), np.uint8) for header in headers])

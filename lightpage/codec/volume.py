@@ -119,7 +119,7 @@ class Volume:
         """The volume that a page says it belongs to; None of a lost page, or where no volume is such.
 
         Args:
-            page: as it was read.
+            page: page that was read.
         """
         header, data, file = page.header, page.data, page.file
         if header is None or data is None or file is None:
@@ -152,8 +152,8 @@ class Successor:
     """Successor of the pages that were read: the page that should come next.
 
     Attributes:
-        volume: that the last page belongs to; None where nothing is known.
-        header: of the page that should come; None where nothing is known, or after the last one.
+        volume: volume that the last page belongs to; None where nothing is known.
+        header: header of the page that should come; None where nothing is known, or after the last one.
     """
 
     volume: Volume | None = None
@@ -173,7 +173,7 @@ def encode_volume(
     """Pages of a file, some at a time, in the order of their numbers.
 
     Args:
-        codec: of the pages.
+        codec: codec of the pages.
         volume: how the file lies on them.
         file: read once, from where it stands.
         pilots: levels of the pilots.
@@ -218,9 +218,9 @@ def restore_group(volume: Volume, group: int, pages: dict[int, bytes]) -> list[b
     """The data pages of a group that are written, restored where they are lost; None where too many are.
 
     Args:
-        volume: of the file.
-        group: which.
-        pages: what was read, by page number.
+        volume: volume of the file.
+        group: number of the group.
+        pages: pages that were read, by page number.
     """
     first = group * volume.group_pages
     places = {number - first: page for number, page in pages.items()}

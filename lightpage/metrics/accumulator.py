@@ -22,7 +22,7 @@ class Accumulator:
 
     Args:
         levels: M, or uneven levels.
-        data: where the data symbols are, bool [ny, nx].
+        data: mask of the data symbols, bool [ny, nx].
         pages: the most that are added.
     """
 

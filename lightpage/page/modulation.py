@@ -40,7 +40,7 @@ class Modulation:
     """The light that a modulator makes of its levels.
 
     Attributes:
-        coefficients: by `NAMES`.
+        coefficients: coefficients in the order of `NAMES`.
     """
 
     coefficients: tuple[float, ...] = (0.0,) * len(NAMES)

@@ -47,8 +47,8 @@ class Pilots:
     """Known symbols of a page.
 
     Attributes:
-        mask: where they are, bool [ny, nx].
-        phases: what they are, radians, one a True in `mask` in row order.
+        mask: mask of the pilots, bool [ny, nx].
+        phases: phases of the pilots, radians, one a True in `mask` in row order.
     """
 
     mask: NDArray[np.bool_]
@@ -89,7 +89,7 @@ class Piston:
     """The common phase of a page.
 
     Attributes:
-        angle_rad: to be taken off every decoded phase, -pi..pi.
+        angle_rad: angle to be taken off every decoded phase, -pi..pi.
         coherence: 1 where all pilots agree on it, near 1/sqrt(number of pilots) where they say nothing.
     """
 
@@ -107,7 +107,7 @@ class PilotCheck:
         confirmed_bits: information per pilot that the known phases show, the claims scaled by the trust that they
             deserve: log2 of the density at the true phase over that of no knowledge.
         noise_bits: standard deviation of `confirmed_bits` where the claims are true.
-        gained_nats: what fitting the piston, and drift where it was read, to the same pilots gains by chance.
+        gained_nats: gain by chance from fitting the piston, and drift where it was read, to the same pilots.
     """
 
     pilots: int
@@ -262,7 +262,7 @@ class PilotReading:
     Attributes:
         piston: common phase of the page.
         trust: factor on the claimed concentrations, 0..1.
-        check: what the decoder claims, and what of it the pilots confirm.
+        check: claims of the decoder, and the part that the pilots confirm.
         sound: the pilots that were read.
     """
 

@@ -105,7 +105,7 @@ def _behind_dust(shape: tuple[int, int], drawn: Real) -> Real:
 
     Args:
         shape: (rows, columns).
-        drawn: of each speck four numbers from 0 to 1: row, column, radius and depth of its shadow, [n, 4].
+        drawn: four numbers from 0 to 1 for each speck: row, column, radius and depth of its shadow, [n, 4].
     """
     passed = np.ones(shape, np.float32)
     for row, column, size, depth in drawn:

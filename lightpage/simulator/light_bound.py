@@ -26,9 +26,9 @@ class _View:
     """Light of a page on one camera, on the plane and at the pitch of the computed optics.
 
     Attributes:
-        pose: of the camera.
+        pose: pose of the camera.
         amplitude: signal and reference, complex [y, x].
-        electrons_per_unit: of its intensity.
+        electrons_per_unit: electrons for a unit of intensity.
         weight: 1 over the variance of a pixel's electrons, [y, x]; 0 beside the frame and where the pixel is full.
     """
 
@@ -48,7 +48,7 @@ class LightBound:
 
     Args:
         profile, device: nominal and true.
-        symbols: of the page, [ny, nx].
+        symbols: symbols of the page, [ny, nx].
         levels: M.
     """
 

@@ -28,9 +28,9 @@ class RecordingJob:
 
     Args:
         profile: the nominal device.
-        device: its true state.
+        device: true state of the device.
         levels: M.
-        seed: of symbols, noise and drift.
+        seed: seed of symbols, noise and drift.
         truth: whether to keep what only a simulator knows beside the pages.
         out: the recording.
         written: pages that the modulator shows; random ones if left out.

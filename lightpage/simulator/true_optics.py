@@ -145,7 +145,7 @@ class TrueOptics:
         """Nominal phase written on the SLM [ny, nx], radians, to the field on the exit facet.
 
         Args:
-            page_phase: of the levels, as their numbers say.
+            page_phase: nominal phases of the levels, as their numbers say.
             noise_rad: phase that is added to what the SLM makes of them.
             flicker_rad: phase that is added to one of 2 pi, and to others in proportion.
         """

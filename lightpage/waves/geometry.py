@@ -64,7 +64,7 @@ def taper_defocus(wave_number: float, length_m: float, taper: float) -> tuple[fl
 
     Args:
         wave_number: k in the glass, rad/m.
-        length_m: of the pipe.
+        length_m: length of the pipe.
         taper: see `WaveGeometry`.
     """
     bend = wave_number * taper / (2 * length_m)
@@ -164,8 +164,8 @@ def highest_frequencies(geometry: WaveGeometry, path: SeidelTerms, x_m: Real, y_
 
     Args:
         geometry: the device.
-        path: of that lens.
-        x_m, y_m: what is looked at of the plane.
+        path: path of that lens.
+        x_m, y_m: points of the plane that are used.
     """
     (height, width), factors = geometry.facet_sides_m(second=True), np.abs(couplings(geometry))
     furthest = on_facet(Couplings(*factors), width / 2, height / 2)

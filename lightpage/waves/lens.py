@@ -41,7 +41,7 @@ def entrance_window(
         geometry: the device.
         facet_x_m, facet_y_m: sample positions along the facet's axes, [fx] and [fy].
         envelope_m, blur_m: see `WaveChannel`.
-        xp: as for `couplings`.
+        xp: see `couplings`.
     """
     per_metre = 1 / (geometry.wavelength_m * geometry.focal_length_m)
     along = on_facet(couplings(geometry, xp), facet_x_m, facet_y_m[:, None])
@@ -107,7 +107,7 @@ class FourierLens:
 
     Attributes:
         x_to_x, y_and_x, y_to_y: the three couplings that factor, [nx, fx], [ny, fx] and [fy, ny].
-        terms: of the rest, between plane and facet.
+        terms: terms of the rest, between plane and facet.
         on_plane, on_facet: phasors of the lens's path that depend on one of them alone, [ny, nx] and [fy, fx], or one.
     """
 

@@ -93,9 +93,9 @@ class Interpolation:
         """Choose as few nodes as reach the tolerance, the same number in each tile.
 
         Args:
-            phases: of each tile some phases, for these and what lies between them, places told within the tile.
+            phases: some phases of each tile, for these and what lies between them, places told within the tile.
             tile: sample places of one tile.
-            second: of the other plane.
+            second: sample places of the other plane.
             tolerance: root mean square error over all tiles, as an integral over them.
         """
         by_axis = zip(*(_axes(phase, tile, second, _SPARE_IN_TILES) for some in phases for phase in some), strict=True)
@@ -135,7 +135,7 @@ class _Axis:
     """Gauss's nodes on one axis, and Legendre's polynomials at its samples.
 
     Attributes:
-        nodes, weights: of Gauss's quadrature from -1 to 1, [D].
+        nodes, weights: nodes and weights of Gauss's quadrature from -1 to 1, [D].
         places: the nodes on the axis, [D].
         at_samples: polynomials there, [samples, D].
     """

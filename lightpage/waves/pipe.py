@@ -32,7 +32,7 @@ class PipePropagator:
     Attributes:
         bases: sine modes along (y', x), by parity.
         half: phasors of half a step, [2, 2, Ky, Kx] by parity.
-        cos, sin: of the turn of each pair of modes in a step, [Ky, Kx].
+        cos, sin: cosine and sine of the turn of each pair of modes in a step, [Ky, Kx].
         steps: splitting steps.
         sheared: whether modes couple at all.
     """
@@ -83,7 +83,7 @@ class ParityBasis:
     Args:
         cells: sample intervals.
         lag: phase in radians by which a mode falls behind in a step, over the square of its number.
-        chosen: which modes of each parity, all if left out.
+        chosen: modes of each parity to take, all if left out.
 
     Attributes:
         sine_by_parity: samples of the modes, [2, K, cells - 1], zero where a parity has one mode less.

@@ -35,7 +35,7 @@ class Rays:
     """Parameters of the optics that rays are drawn through.
 
     Attributes:
-        angle_deg: of the pipe.
+        angle_deg: angle of the pipe.
         origin: whose angle that is.
         lens: prescription of both lenses; None for ideal ones.
         own: whether the decoder trained the angle itself.
@@ -52,16 +52,16 @@ class ReportData:
     """Everything that a report shows. For what is missing stands a sentence that says why.
 
     Attributes:
-        title: of the page.
-        pages: which pages were measured, in sentences.
+        title: title of the page.
+        pages: sentences that say which pages were measured.
         facts: decoder and provenance, (name, value).
         profile, calibration: nominal and fitted device.
-        rays: what rays are drawn through.
+        rays: parameters of the optics that rays are drawn through.
         measures: over the data symbols of all pages together.
         maps: means over the pages at every place.
-        confidence_bins, concentration_bins: what was claimed against what happened.
-        curves: of the training, by TensorBoard's tag, for each validation at the light.
-        golden: one page.
+        confidence_bins, concentration_bins: claims against results.
+        curves: curves of the training, by TensorBoard's tag, for each validation at the light.
+        golden: golden page with its decoded phase.
     """
 
     title: str

@@ -38,9 +38,9 @@ class Device:
     """A device, or a recording where there is no fleet.
 
     Attributes:
-        name: of it.
-        group: what was found of it.
-        told: its first problem, for people.
+        name: name of the device.
+        group: findings about the device.
+        told: first problem of the device, for people.
     """
 
     name: str
@@ -64,12 +64,12 @@ class Recalibration:
     """Outcome of a device's recalibration.
 
     Attributes:
-        name: of the device, or its recording where there is no fleet.
-        recordings: that it has.
-        state: in a word.
-        air_before: by the bundle before, bit/symbol; None where it is not known.
-        air_after: by the new bundle.
-        version: of that; empty without one.
+        name: name of the device, or its recording where there is no fleet.
+        recordings: number of the device's recordings.
+        state: state of the recalibration, in a word.
+        air_before: AIR by the bundle before, bit/symbol; None where it is not known.
+        air_after: AIR by the new bundle.
+        version: version of the new bundle; empty without one.
         reason: why there is none, for people.
     """
 
@@ -89,7 +89,7 @@ class Worker:
     Attributes:
         name: host and process.
         ranges, pages: how many.
-        seconds: that they took it.
+        seconds: time that it took for them.
     """
 
     name: str
@@ -103,9 +103,9 @@ class File:
     """A file of a run that recovers user bytes.
 
     Attributes:
-        volume: its number.
-        size: in bytes.
-        result: what became of it, for people.
+        volume: number of the volume.
+        size: size in bytes.
+        result: outcome of the file, for people.
         whole: whether all of it is there.
     """
 
@@ -120,18 +120,18 @@ class BulkData:
     """Everything that the report of a bulk run shows.
 
     Attributes:
-        title: of the page.
+        title: title of the page.
         told: how the run stands, in a sentence or two.
         cards: the figures that matter most, (name, value, unit).
         facts: the others, (name, value).
-        unit: what a piece of the work is, in the plural: pages or devices.
-        found: what the run has found.
-        causes: of losses: cause, how many, their share of all, and the first one.
+        unit: name of the pieces of the work, in the plural: pages or devices.
+        found: findings of the run.
+        causes: causes of losses: cause, how many, their share of all, and the first one.
         devices: the worst first; none where devices are recalibrated.
         fleet: whether these are devices of a fleet.
-        recalibrations: of devices, the worst first; None of another operation.
+        recalibrations: recalibrations of devices, the worst first; None of another operation.
         workers: the busiest first.
-        files: of a recovery; None where no run has ended yet, or of another operation.
+        files: files of a recovery; None where no run has ended yet, or of another operation.
     """
 
     title: str

@@ -35,8 +35,8 @@ def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportDat
     """Decode the validation pages of a run and measure them.
 
     Args:
-        folder: of the run.
-        recording_path: that it was trained on; needed for a published decoder, which reads its frames.
+        folder: folder of the run.
+        recording_path: recording that it was trained on; needed for a published decoder, which reads its frames.
 
     Raises:
         InvalidInputError: no finished run, or one that lacks a part; a recording that is missing or not the run's.
@@ -82,8 +82,8 @@ def levels_of(phases: NDArray[np.floating], modulation: Modulation = NOMINAL) ->
     """The fewest levels that hold all of these phases, radians: M where thousands of symbols were drawn from M.
 
     Args:
-        phases: of light.
-        modulation: of the modulator that showed them.
+        phases: phases of light.
+        modulation: modulation of the modulator that showed them.
 
     Raises:
         InvalidInputError: no level count up to 256 does.

@@ -67,7 +67,7 @@ def shared_with_others(places: NDArray[np.float64], zones: NDArray[np.int64], ce
     """Return whether each ray shares its cell of the camera plane with a ray of another zone, [N].
 
     Args:
-        places: on the camera plane, metres, [N, 2].
+        places: places on the camera plane, metres, [N, 2].
         zones: reflections of each ray, [N, 2].
         cell_m: edge of a cell.
     """

@@ -67,7 +67,7 @@ class Range:
     """Values of a knob at which no more than so much is lost.
 
     Attributes:
-        low, high: its ends.
+        low, high: ends of the range.
         below, above: whether it ends there because more is lost beyond, and not because no more was measured.
     """
 
@@ -81,7 +81,7 @@ class Range:
         """Find the range about a value from AIRs, ascending values; between two values the AIR is a straight line.
 
         Args:
-            values: of the knob, [N], ascending.
+            values: values of the knob, [N], ascending.
             airs: bits a symbol, [N].
             at: value from which the range is looked for outwards.
             least: AIR that it must have.
@@ -95,7 +95,7 @@ class Range:
         """Tell both ends; `<` and `>` say that no more was lost as far as was measured.
 
         Args:
-            factor: on the numbers, for another unit.
+            factor: factor on the numbers, for another unit.
             least: value below which there is none.
         """
         low = "" if self.below or self.low == least else "<"
@@ -157,9 +157,9 @@ def _read(settings: Settings, kept: Path, device: Device, work: Path, progress: 
     """Measure what decoders read of a device.
 
     Args:
-        settings: of the study.
+        settings: settings of the study.
         kept: run of the decoder that is kept.
-        device: that is read.
+        device: device that is read.
         work: folder of the case.
         progress: told of every step.
         least: AIR below which it is trained anew.
@@ -192,10 +192,10 @@ class _Curve:
     """Results for a device over one of its knobs.
 
     Attributes:
-        knob: which.
-        at: its value on the device that was trained on.
-        values: of the knob, [N], ascending; that one is among them.
-        results: of each.
+        knob: knob that is turned.
+        at: value of the knob on the device that was trained on.
+        values: values of the knob, [N], ascending; that one is among them.
+        results: results at each value.
     """
 
     knob: Knob

@@ -35,12 +35,12 @@ class Choice:
     """An option that says how to train.
 
     Attributes:
-        flag: on the command line.
+        flag: name on the command line.
         type: click's.
-        what: it does.
-        default: what holds without it at symbol pitch; the value of `Hyperparameters` if left out.
-        published: what holds without it for the published decoders, where they have it.
-        localizers: that have it.
+        what: effect of the option.
+        default: value without the option at symbol pitch; that of `Hyperparameters` if left out.
+        published: value without the option for the published decoders, where they have it.
+        localizers: localizers that have the option.
         of_preset: whether it is set by `--preset`; `--help` does not list it then, but it may be given too.
     """
 
@@ -240,7 +240,7 @@ def chosen_trainer(
     Args:
         localizer: name.
         profile: the nominal device.
-        pages: to train on.
+        pages: number of pages to train on.
         given: see `given_choices`.
 
     Raises:

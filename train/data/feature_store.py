@@ -40,8 +40,8 @@ class FeatureStore(Dataset[Page]):
     [2, ny, nx] if there was one, and true phases [ny, nx].
 
     Args:
-        folder: with arrays that `fill` has completed.
-        pages: which of them, all if left out.
+        folder: folder of arrays that `fill` has completed.
+        pages: numbers of the pages to show, all if left out.
     """
 
     def __init__(self, folder: Path, pages: range | None = None) -> None:
@@ -83,7 +83,7 @@ def fill(folder: Path, key: str, count: int, make: Maker, what: str) -> float:
         key: everything that the features depend on.
         count: pages.
         make: makes them, from a page on.
-        what: for the progress bar.
+        what: name of the work, for the progress bar.
 
     Raises:
         LightpageError: the folder cannot be written or has no room, or the first process has made no page for half an

@@ -71,9 +71,9 @@ class FeatureExtractor:
     """Turns frame pairs of one calibrated device into features.
 
     Args:
-        device: as calibrated.
+        device: device as it was calibrated.
         localizer: `coherent` or `wave`.
-        choices: of the decoder that the features are for.
+        choices: hyperparameters of the decoder that the features are for.
         with_signal_power: see `FieldRecovery`.
     """
 
@@ -122,7 +122,7 @@ class FeatureExtractor:
         """Check that a known page shows its symbols where this calibration says.
 
         Args:
-            page: of the recording.
+            page: number of the page in the recording.
             calibrated: coherence of the pages that were calibrated on.
 
         Raises:

@@ -31,9 +31,9 @@ class Explained:
 
     Attributes:
         measured: both equations of the field.
-        field: that solves them, complex [Gy, Gx].
+        field: field that solves them, complex [Gy, Gx].
         illumination: factors of `illumination_terms` over the first, complex [6], with which the waves explain most.
-        expected: what they say then, complex [Gy, Gx], of the field's strength and piston.
+        expected: field that the waves predict then, complex [Gy, Gx], with the measured field's strength and piston.
     """
 
     measured: Measured
@@ -53,8 +53,8 @@ def explained(extractor: FeatureExtractor, pages: Sequence[KnownPage]) -> list[E
     The waves are as exact as those of a decoder that makes another pass.
 
     Args:
-        extractor: of the device.
-        pages: of the device.
+        extractor: extractor of the device.
+        pages: known pages of the device.
     """
     profile, parameters = extractor.device.profile, extractor.device.parameters
     modulation, samples = extractor.device.modulation, symbol_samples(profile)

@@ -38,7 +38,7 @@ class Patches(Dataset[Page]):
     `with_page_coordinates`), and phases that are not to be learnt from are NaN: pilots, and a rim.
 
     Args:
-        stores, mask: as for `training_pages`.
+        stores, mask: see `training_pages`.
         side: symbols along an edge.
         rim: symbols along a patch's edge that are shown and not asked for: the network misses their neighbours.
         step: places lie on multiples of it, as the network's coarser grids do.

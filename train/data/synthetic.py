@@ -67,7 +67,7 @@ class ModelMatch:
     Attributes:
         illumination: complex factor on the modulator as a quadratic in the page's coordinates (-1 to 1), [6].
         noise: power of what is left unexplained over the field's power.
-        seen: where both cameras look at the common grid, bool [Gy, Gx].
+        seen: mask of the common grid's samples that both cameras see, bool [Gy, Gx].
     """
 
     illumination: Complex
@@ -89,10 +89,10 @@ class SyntheticPages:
     """Features of pages that the fitted device would show after drifts of its own.
 
     Args:
-        device: as calibrated.
-        like: what recorded pages show over that geometry.
+        device: device as it was calibrated.
+        like: discrepancy between recorded pages and that geometry.
         localizer: the coherent one; None for that by waves.
-        seed: of drifts, symbols and noise.
+        seed: seed of drifts, symbols and noise.
         grid: the common grid, where it is not the usual one.
     """
 

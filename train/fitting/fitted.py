@@ -37,9 +37,9 @@ class Fitted(Generic[M]):
 
     Attributes:
         module: the best one, in float32.
-        validation_air: its AIR on the validation pages, bits per data symbol.
-        seconds: of training, all stretches of an interrupted run together.
-        curves: of `lightpage.train.fitting.curves.CURVES`, thinned.
+        validation_air: AIR on the validation pages, bits per data symbol.
+        seconds: seconds of training, all stretches of an interrupted run together.
+        curves: curves of `lightpage.train.fitting.curves.CURVES`, thinned.
     """
 
     module: M

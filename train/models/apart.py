@@ -77,7 +77,7 @@ class CamerasApart(NamedTuple):
 
         Args:
             left: sides of the equations, [2, ny, nx].
-            arms, amplitude, inverse_amplitude, band: as for `reflected`.
+            arms, amplitude, inverse_amplitude, band: see `reflected`.
 
         Returns:
             e, [2, ny, nx]; on the ring of the determinant's zero, what one of two real numbers says of it.
@@ -116,12 +116,12 @@ def reflected(
     """The field that both cameras have seen.
 
     Args:
-        cameras: what each sees of a field.
-        rounds: of averaged reflections.
+        cameras: map of a field to what each camera sees.
+        rounds: number of averaged reflections.
         start: estimate of e, [2, ny, nx].
         brightness: measured |1 + D e|^2 and |arm + D* e|^2, [2, ny, nx].
-        arms: of both cameras, [4, 1, 1].
-        amplitude, inverse_amplitude: by which e becomes E, which defocus and band are about, and back, [ny, nx].
+        arms: phasors of both cameras, [4, 1, 1].
+        amplitude, inverse_amplitude: factors from e to E, which defocus and band are about, and back, [ny, nx].
         band: filter of E to the pipe's band.
 
     Returns:

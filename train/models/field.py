@@ -48,9 +48,9 @@ class Measured(NamedTuple):
 
     Attributes:
         a, b: left sides of the two equations, zero where a camera has no reference.
-        cos, sin: of the turn between the arms.
+        cos, sin: cosine and sine of the turn between the arms.
         amplitude: the reference's over its mean, by which e becomes E.
-        lit: one where both cameras have a reference, else zero.
+        lit: mask: 1 where both cameras have a reference, else 0.
         apart: the defocus of the cameras; None where both see the same plane.
     """
 
@@ -138,7 +138,7 @@ class FieldRecovery(nn.Module):
         profile: the nominal device.
         with_signal_power: whether the frames hold |E|^2; an oracle takes it off beforehand, and the equations are then
             linear.
-        rounds: of descent.
+        rounds: number of steps of descent.
         reflections: rounds of averaged reflections in place of descent; none for descent. Where cameras stand apart,
             reflections serve in any case.
         binning: camera pixels along each axis whose mean is sampled; one filters the frames first instead, which takes
@@ -253,7 +253,7 @@ class FieldRecovery(nn.Module):
         """Return the change of a predicted field that the measurements ask for.
 
         Args:
-            measured: of the frames.
+            measured: measurements of the frames.
             field: predicted E [2, ny, nx], as `solve` returns it.
             floor: see `Measured.pull`.
 

@@ -24,15 +24,16 @@ class Hyperparameters:
     Attributes:
         channels, blocks, depth: size of the network, see `SymbolUNet`.
         refinements: further passes of the decoder, see `lightpage.train.trainers.refinement`.
-        field_rounds, reflections, binning: of the field's recovery, see `lightpage.train.models.field.FieldRecovery`.
+        field_rounds, reflections, binning: settings of the field's recovery, see
+            `lightpage.train.models.field.FieldRecovery`.
         field_step: pitch of the common grid, camera pixels.
         samples, interpolation: see `CoherentLocalizer`.
         steps: optimiser steps.
         batch: pages a step, or patches of large ones.
         patch: symbols along a patch's edge; smaller pages are trained on whole.
         learning_rate: peak of the one-cycle schedule.
-        weight_decay: of AdamW.
-        seed: of initial weights, batches and rotations.
+        weight_decay: weight decay of AdamW.
+        seed: seed of initial weights, batches and rotations.
         precision: see `lightpage.train.fitting.precision`.
     """
 

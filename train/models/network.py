@@ -26,8 +26,8 @@ def with_page_coordinates(positions: Tensor, shape: tuple[int, ...], part: tuple
 
     Args:
         positions: exit centroids.
-        shape: of the page, rows and columns of symbols.
-        part: which rows and columns of it.
+        shape: shape of the page, rows and columns of symbols.
+        part: slices of the page's rows and columns.
     """
     rows, columns = (
         torch.linspace(-1, 1, count, device=positions.device)[some] for count, some in zip(shape, part, strict=True)
@@ -43,7 +43,7 @@ class PositionModulation(nn.Module):
     makes a filter for each place; without it, a single one has to serve all.
 
     Args:
-        channels: of the features.
+        channels: number of channels of the features.
     """
 
     def __init__(self, channels: int) -> None:
@@ -106,7 +106,7 @@ def estimate(outputs: Tensor, before: Tensor | float = 0.0) -> Tensor:
     From a page's dark edge to its middle concentration grows a hundredfold: a factor says so more easily than a sum.
 
     Args:
-        outputs: of the network; zeros leave p as it was before.
+        outputs: outputs of the network; zeros leave p as it was before.
         before: p of an earlier pass, [N, 2, ny, nx].
     """
     log_factor = torch.clamp(_LOG_KAPPA_UNIT * outputs[:, 2:], max=_MOST_LOG_FACTOR)
@@ -184,7 +184,7 @@ class Refiner(nn.Module):
     does. Who to trust is learnt.
 
     Args:
-        light_channels, channels, blocks, depth: as for `SymbolUNet`.
+        light_channels, channels, blocks, depth: see `SymbolUNet`.
     """
 
     def __init__(self, light_channels: int, channels: int = 96, blocks: int = 2, depth: int = 0) -> None:

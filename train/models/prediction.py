@@ -68,8 +68,8 @@ class Prediction(nn.Module):
         """Light that an estimated page leaves unexplained.
 
         Args:
-            recovery: of the same device.
-            measured, field: of the page; the field says how strong its light is.
+            recovery: field recovery of the same device.
+            measured, field: measurements and field of the page; the field says how strong its light is.
             p: [2, ny, nx].
             parameters: [P] of a device that has drifted since.
 

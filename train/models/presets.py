@@ -19,7 +19,7 @@ class Preset:
     """A decoder to choose.
 
     Attributes:
-        localizer: of its first pass, where none is chosen.
+        localizer: localizer of the first pass, where none is chosen.
         choices: all else.
     """
 

@@ -62,8 +62,8 @@ class TiledLens(nn.Module):
 
     Args:
         geometry: the device.
-        path: of this lens, beyond an ideal one's.
-        plane: its sample positions (x, y), uniform, metres.
+        path: path of this lens, beyond an ideal one's.
+        plane: sample positions (x, y) on the lens's plane, uniform, metres.
         cells: sample intervals of the pipe along (y', x).
         roll_margin: radians of roll to either side that are to be served.
         tolerance: error of the expansion.

@@ -45,7 +45,7 @@ class TiledPipe(nn.Module):
     Args:
         geometry: the device.
         cells: sample intervals along (y', x).
-        error: of the splitting, wanted.
+        error: wanted error of the splitting.
     """
 
     def __init__(self, geometry: WaveGeometry, cells: tuple[int, int], error: float) -> None:

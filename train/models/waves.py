@@ -67,7 +67,7 @@ class Waves(nn.Module):
         profile: the nominal device.
         parameters: [P] of the ray twin, fitted (or, for an oracle, true): they say how finely the pipe is sampled
             and which of its modes couple.
-        samples: on the modulator, per symbol and axis.
+        samples: number of samples on the modulator, per symbol and axis.
         fidelity: how exactly light is followed.
         filled, grid: see `FittedWaves`. One filled sample per symbol stands for all of it.
     """

@@ -27,11 +27,11 @@ def make_localizer(
     """A published localizer by name.
 
     Args:
-        name: of `NAMES`.
+        name: name out of `NAMES`.
         profile: the nominal device.
         samples: samples per symbol and axis.
-        lenses: of `LENS_CHOICES`, for rays.
-        quadrature_sign: for modes, see `ModeLocalizer`.
+        lenses: name out of `LENS_CHOICES`, for rays.
+        quadrature_sign: sign of the quadrature, for modes, see `ModeLocalizer`.
 
     Raises:
         InvalidInputError: no such localizer or lens.
@@ -54,7 +54,7 @@ class PublishedDecoder(nn.Module):
         profile: the nominal device.
         references: reference-only frames.
         localizer: see `make_localizer`.
-        channels: of the U-Net.
+        channels: channels of the U-Net.
         classes: levels that it tells apart as classes; 0 for p itself.
     """
 

@@ -37,8 +37,8 @@ class Traced(NamedTuple):
     """Landing places of rays.
 
     Attributes:
-        places: on the camera plane, metres from the axis, the flip of the two lenses taken out, [N, 2] float64. That of
-            a lost ray is finite and means nothing.
+        places: places on the camera plane, metres from the axis, the flip of the two lenses taken out, [N, 2] float64.
+            That of a lost ray is finite and means nothing.
         valid: whether the ray gets there, [N] bool.
         reflections: how often it was reflected at the walls x = +-w/2 and at the walls y' = +-w/2, [N, 2] int64.
     """
@@ -102,7 +102,7 @@ class RayTracer(nn.Module):
         """Trace one ray for each point. The places can be differentiated, once, by both arguments.
 
         Args:
-            points: on the page (x, y), metres from its centre, [N, 2] float64.
+            points: points on the page (x, y), metres from its centre, [N, 2] float64.
             angle: the pipe's angle in place of the profile's, radians, scalar float64.
 
         Raises:

@@ -30,7 +30,7 @@ class PublishedUNet(nn.Module):
 
     Args:
         samples: samples per symbol and axis: 4, 8 or 16.
-        channels: at sample pitch and below it.
+        channels: channels at sample pitch and below it.
         outputs: numbers for each symbol.
 
     Raises:

@@ -46,7 +46,7 @@ class SymbolTrainer:
     """Trains the network at symbol pitch.
 
     Attributes:
-        localizer: of `LOCALIZERS`.
+        localizer: name out of `LOCALIZERS`.
         choices: the run's.
         synthetic_pages: pages of the drifted device to train on beside the recorded ones.
         start: finished run whose weights are begun with.

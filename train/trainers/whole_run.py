@@ -51,7 +51,7 @@ class Split:
 
     Attributes:
         training, validation, left: page numbers.
-        validation_share, test_share: of all.
+        validation_share, test_share: shares of all pages.
     """
 
     training: list[int]
@@ -105,12 +105,12 @@ def make_run(
     """Train, or go on with, a run whose folder belongs to this command; a finished one is told again.
 
     Args:
-        out: its folder.
-        recording: with symbols, open.
+        out: folder of the run.
+        recording: open recording with symbols.
         profile: the nominal device.
         trainer: the way of training.
         usable: see `usable_pages`.
-        split: of these pages.
+        split: split of these pages.
         calibrate: gives the device's calibration; it is called once the options are known to be those of before.
         processes: see `lightpage.train.fitting.fit.fit`.
 

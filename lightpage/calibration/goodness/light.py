@@ -44,8 +44,8 @@ class SeenLight:
     Attributes:
         waves: the fitted ones.
         page: light on the modulator, [ny samples, nx samples].
-        fields: what either camera should see.
-        counts: what it saw beyond its reference, over twice that, [2, Gy, Gx].
+        fields: light that the model predicts for each camera.
+        counts: frames less references, over twice the references, [2, Gy, Gx].
         references: counts of the references, [2, Gy, Gx].
     """
 

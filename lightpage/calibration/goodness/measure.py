@@ -54,10 +54,10 @@ def measure_goodness(
 
     Args:
         twin: ray tracer of the nominal device.
-        device: as it was fitted.
+        device: device as it was fitted.
         illumination: coefficients [T] of the page's, as `WaveFitted` has them.
         pair: frames of the page.
-        symbols: its unit phasors [ny, nx].
+        symbols: unit phasors of the page's symbols [ny, nx].
         progress: told of the share that is behind.
     """
     light = SeenLight(twin, device, illumination, pair, symbols)

@@ -49,8 +49,8 @@ def likeliest(light: SeenLight, errors: Complex) -> str:
     """Name the likeliest error of the model or of the page, in words.
 
     Args:
-        light: of a known page.
-        errors: of its symbols, less what is smooth in them.
+        light: light of a known page.
+        errors: errors of its symbols, less their smooth part.
     """
     fitted = scipy.linalg.orth(_of_unit_length(list(light.equations_of_fit())), rcond=_RANK)
     left = _beside(fitted, light.left_of_equations[:, None])[:, 0]

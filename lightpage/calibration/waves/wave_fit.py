@@ -73,7 +73,8 @@ class WaveFitted:
         quadrature_phase: angle between the homodyne arms, radians.
         residual: root mean square of what is left of the equations, in standard deviations of the reference's noise
             times an unknown factor: it says which of two fits is better.
-        modulation: what the modulator makes of its levels; the prior's centre where a page does not tell it from that.
+        modulation: light that the modulator makes of its levels; the prior's centre where a page does not tell it from
+            that.
         modulation_deviations: standard deviations of its coefficients, zero where held.
         illumination: coefficients [T] of the terms of the page's illumination.
     """
@@ -119,10 +120,12 @@ class _Slopes(NamedTuple):
     """Derivatives at the places of the equations [...], of the light that each of both cameras sees.
 
     Attributes:
-        by_term: of the light by the illumination's terms, [T, 2, ...].
-        by_level: of the light by what the logarithm of the modulation is made of, [K, 2, ...]; none where it is held.
-        of_light: of the light by parameters that change it, [2, ...] each.
-        of_cameras: of the places (x, y), grid samples, by parameters that move the cameras, [2, ..., 2] each.
+        by_term: derivatives of the light by the illumination's terms, [T, 2, ...].
+        by_level: derivatives of the light by the terms of the modulation's logarithm, [K, 2, ...]; none where it is
+            held.
+        of_light: derivatives of the light by parameters that change it, [2, ...] each.
+        of_cameras: derivatives of the places (x, y), grid samples, by parameters that move the cameras, [2, ..., 2]
+            each.
     """
 
     by_term: Complex
@@ -141,7 +144,7 @@ class WaveFit:
         twin: ray tracer of the nominal device, for the cameras' poses.
         profile: the nominal device.
         pair, references: frames of a known page, and reference-only frames.
-        symbols: its unit phasors, complex [ny, nx].
+        symbols: unit phasors of the page's symbols, complex [ny, nx].
     """
 
     def __init__(
@@ -181,14 +184,14 @@ class WaveFit:
         Args:
             start: [P], right to within about a speckle and a radian.
             quadrature_phase: angle between the arms to start from, good to some tens of degrees.
-            groups: of `lightpage.calibration.parameters`. Without ``launch``, the illumination may bend the page's
-                phases instead.
+            groups: groups of `lightpage.calibration.parameters`. Without ``launch``, the illumination may bend the
+                page's phases instead.
             centre: [P] centre of the priors, nominal (zero) if None.
             prior_scale: factor on the priors' standard deviations, one for all or [P].
             progress: told of every round and of every derivative, with the share of the most rounds that is behind,
                 0 to 1. It may raise to stop the work.
-            modulation: what the modulator makes of its levels, to start from.
-            levels: what is known of it beforehand where it is fitted too, None where it is held.
+            modulation: light that the modulator makes of its levels, to start from.
+            levels: prior of the modulation where it is fitted too, None where it is held.
         """
         without_effect = _OF_REAL_LENSES if self._profile.ideal_lenses else ()
         of_light = [index for index in indices(*groups) if index not in (*SEEN_BY_CAMERAS, *without_effect)]

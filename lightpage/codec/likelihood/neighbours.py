@@ -50,7 +50,7 @@ class LevelTable:
     """Table of levels, neighbours and cosets that the LLRs of a page's label bits are computed from.
 
     Args:
-        levels: of the page, a power of two.
+        levels: levels of the page, a power of two.
         bits: b.
     """
 
@@ -124,7 +124,7 @@ def searches_of(levels: Levels, bits: int) -> tuple[object, ...]:
     """Return the search tables for the nearest uneven level of each coset, in the form that the compiled code takes.
 
     Args:
-        levels: of the page, more than there are cosets.
+        levels: levels of the page, more than there are cosets.
         bits: b, of 2^b cosets.
     """
     cosets = [levels.every(1 << bits, coset) for coset in range(1 << bits)]

@@ -19,8 +19,8 @@ class CoherentLocalizer(nn.Module):
     Args:
         profile: the nominal device.
         samples: per symbol and axis; 0 takes as many as the field has, see `symbol_samples`.
-        interpolation: of the field between the grid's samples, `bicubic` or `bilinear`: an error of -32 or -23 dB on
-            the usual grid.
+        interpolation: interpolation of the field between the grid's samples, `bicubic` or `bilinear`: an error of -32
+            or -23 dB on the usual grid.
         grid: the common grid, where it is not the usual one.
     """
 
@@ -54,7 +54,7 @@ class CoherentLocalizer(nn.Module):
 
         Args:
             field: [2, Gy, Gx] on the common grid.
-            places, gradients, phases: as `lightpage.calibration.sampling_table.sampling_table` makes them.
+            places, gradients, phases: arrays that `lightpage.calibration.sampling_table.sampling_table` makes.
 
         Returns:
             [2, B, S, ny, nx]: real and imaginary part, S samples of each symbol row by row, over the field's root
