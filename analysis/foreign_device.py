@@ -34,7 +34,7 @@ CAMERA_PITCH = 2.4e-3
 IMAGE_PITCH = 3e-3
 """Pitch of the camera-plane field, a quarter of what its band asks for, so that cubic splines are good to -60 dB."""
 IMAGE_MARGIN = 0.09
-"""How far beyond the nominal frame the camera-plane field is computed, mm: shift, scale, rotation and distortion."""
+"""Margin of the computed camera-plane field around the nominal frame, mm: shift, scale, rotation and distortion."""
 TAYLOR_TERMS = 4
 REFERENCE_EXPOSURES = 64
 
@@ -133,7 +133,7 @@ class Parameters:
     quadrature_gain: float = 1.0
     quadrature_sign: int = 1
     stroke_error: float = 0.0
-    """Of the modulator, relative to a whole turn."""
+    """Stroke error of the modulator, relative to a whole turn."""
     level_sine_rad: float = 0.0
     level_cosine_rad: float = 0.0
     """Amplitudes of a smooth error of its phase over the levels."""

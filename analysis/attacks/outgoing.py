@@ -38,7 +38,7 @@ from lightpage.runtime.commands.service.healthcheck import is_serving
 
 CALLS = ("connect", "sendto", "sendmsg", "sendmmsg")
 UNSEEN = "io_uring_setup"
-"""Of system calls: what is sent through a ring is in no trace. Nobody may make one."""
+"""System call that is not seen: what is sent through a ring is in no trace. Nobody may make one."""
 TRACE = (
     *("strace", "--follow-forks", "--timestamps=unix,us", "--quiet=attach", "--signal=none"),
     *("--trace", ",".join((*CALLS, UNSEEN))),

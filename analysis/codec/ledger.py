@@ -43,7 +43,7 @@ from lightpage.train.models.presets import FAST
 
 WEIGHTS = Path("analysis/weights")
 LOSS = 1e-6
-"""Of a data page behind the outer code."""
+"""Probability that a data page is lost behind the outer code."""
 VOLUME = 7
 _SEED = 90_000
 

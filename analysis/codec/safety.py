@@ -32,7 +32,7 @@ Floats = NDArray[np.float64]
 Damage = Callable[[Floats, Floats, np.random.Generator], None]
 
 NOISES = (0.97, 0.99, 1.0, 1.01, 1.03, 1.1, 1.3, 2.0)
-"""Of the noise at which half of the pages are lost: from just below it to far beyond."""
+"""Factors on the noise at which half of the pages are lost: from just below it to far beyond."""
 _LIMIT_PAGES, _LIMIT_STEPS = 20, 10
 
 

@@ -15,7 +15,7 @@ from lightpage.report.contents.data import exit_centroids
 from lightpage.train.fitting.curves import Curve
 
 WALLS = {"no wall": (0, 0), "x": (1, 0), "y": (0, 1), "both": (1, 1)}
-"""Whether a symbol's light meets walls of a pair, as the columns of the table say it."""
+"""Columns of the table: whether a symbol's light meets walls of pair x, and of pair y."""
 
 LAST_SHARE = 0.2
 SETTLED_BITS = 0.02

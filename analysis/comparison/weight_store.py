@@ -25,7 +25,7 @@ from lightpage.train.runs import BEGUN, FORMAT, renamed
 TRAINED = Path(__file__).parents[1] / "weights"
 CALIBRATION = "calibration.toml"
 KEPT_WEIGHTS = "fitted.xz"
-"""Of a kept run, in place of its `FITTED_WEIGHTS`."""
+"""File of a kept run, in place of its `FITTED_WEIGHTS`."""
 
 
 @dataclass(frozen=True)

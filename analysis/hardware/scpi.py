@@ -100,7 +100,7 @@ class Experiment:
         self._given: set[float] = set()
         """Every value that a setting was given."""
         self._away = False
-        """Whether no answer has come since the line was unplugged."""
+        """True until an answer has come after the line was unplugged."""
         for channel in range(1, CHANNELS + 1):
             for setting in _SETTINGS:
                 device.answer(self._command(channel, setting))

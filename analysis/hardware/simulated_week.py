@@ -41,10 +41,10 @@ DAILY_UNITS = 0.7
 0.13 to spare."""
 
 WARM_UP_UNITS, WARM_UP_PAGES = 3.0, 144.0
-"""Of the warm-up, 0.9 bit in all, and the pages (twelve hours) in which it falls to 1/e."""
+"""Size of the warm-up, 0.9 bit in all, and the pages (twelve hours) in which it falls to 1/e."""
 
 KNOCK_SHARE = 0.5
-"""Of the week, when somebody knocks against the table."""
+"""Share of the week after which somebody knocks against the table."""
 KNOCK_PX, KNOCK_DEG = (2.0, -2.0), 0.02
 """Shift of the image on both cameras, and turn of the pipe."""
 

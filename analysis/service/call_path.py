@@ -49,9 +49,9 @@ APART = {
 have the same answer but for the times in it."""
 
 _KNOWN_PAGES = 2
-"""Of a recalibration, which holds back one more."""
+"""Known pages of a recalibration, which holds back one more."""
 _DRIFTED = "geometry.pipe_angle_deg=-0.61"
-"""Of the device that is recalibrated: a re-fit that brings nothing would be refused."""
+"""Setting of the device that is recalibrated: a re-fit that brings nothing would be refused."""
 _CALL_S = 1800.0
 _SHOWN = 4
 """Functions of a file that are printed."""

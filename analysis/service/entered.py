@@ -28,9 +28,10 @@ _FOLDER = "LIGHTPAGE_ENTERED"
 """Variable that names the folder of a program that is traced."""
 _SWITCH = "switch"
 _OTHER = (".", f"analysis{os.sep}", f"tests{os.sep}")
-"""How paths in the repository begin that serve nothing, those of an environment's packages among them."""
+"""Beginnings of paths in the repository that serve nothing, those of an environment's packages among them."""
 _START = bytes([opmap["RESUME"], 0])
-"""Where a function begins; a generator or a coroutine goes on at a RESUME of another number. Source: module `dis`."""
+"""Instruction at which a function begins; a generator or a coroutine goes on at a RESUME of another number. Source:
+module `dis`."""
 _PARTS = frozenset(["<listcomp>", "<setcomp>", "<dictcomp>", "<genexpr>"])
 
 

@@ -32,7 +32,7 @@ from lightpage.runtime.model.execution.cpus import available_cpus
 
 _PROCESS = "analysis.speed.footprint_process"
 _PATIENCE_S = 900
-"""For one process: a full-size page of two passes takes a few seconds."""
+"""Limit for one process: a full-size page of two passes takes a few seconds."""
 
 
 @dataclass(frozen=True)

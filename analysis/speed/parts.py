@@ -23,7 +23,7 @@ from lightpage.errors import InvalidInputError
 from lightpage.runtime.model.execution.session import open_session
 
 _SIDE = 2048
-"""Of the square matrices whose product measures the peak."""
+"""Side of the square matrices whose product measures the peak."""
 _LARGE = 1 << 25
 """Numbers that the measurement of the bandwidth reads twice and writes once: far more than a cache holds."""
 _REPEATS = 5
@@ -50,7 +50,7 @@ _ORDER = (
     *(part for _, part in _PARTS if part.startswith("second")),
     OTHER,
 )
-"""In which a page passes them."""
+"""Order in which a page passes the parts."""
 
 
 @dataclass(frozen=True)

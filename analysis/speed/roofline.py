@@ -47,7 +47,7 @@ _KINDS = {
     "GridSample": SAMPLING,
     **dict.fromkeys(("Concat", "Gather", "GatherND", "Pad", "Slice", "Split", "Transpose"), LAYOUT),
 }
-"""Of operators; all others work number by number, or sum."""
+"""Kinds of operators; all others work number by number, or sum."""
 _DECODERS = "As `analysis.speed.speed` names it: wave is the preset standard, refined is accurate."
 _FREE = frozenset(["Constant", "Flatten", "Identity", "Reshape", "Squeeze", "Unsqueeze"])
 """Operators that move nothing."""
@@ -75,7 +75,7 @@ class Gpu:
 
 
 H100 = Gpu("H100 SXM", 67e12, 989e12, 3.35e12, 55e9, 4e-6)
-"""By NVIDIA's data sheet; bus and launches as commonly measured."""
+"""Figures of NVIDIA's data sheet; bus and launches as commonly measured."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ _STUBS = "lightpage.runtime.client.pb.inference.open_inference_pb2_grpc.add_GRPC
 _ONGOING = 64
 """Requests that the replica has taken at once: more than there are callers."""
 _STORE_BYTES = 1 << 30
-"""Of Ray's memory for objects: room for a dozen pairs of 42 MB."""
+"""Size of Ray's memory for objects: room for a dozen pairs of 42 MB."""
 
 
 class Graphs:

@@ -18,7 +18,7 @@ os.environ["ORT_DISABLE_TELEMETRY"] = "1"  # read once, on import
 import onnxruntime  # type: ignore[import-untyped]
 
 GRAPH = "graph.onnx"
-"""In the folder of a model, which is named as the model is."""
+"""Name of the graph in the folder of a model, which is named as the model is."""
 FRAMES = "frames.npy"
 """Beside it: a pair that the model takes, [2, rows, columns]."""
 OUTPUT = "p"

@@ -18,9 +18,9 @@ MLSERVER_PORT, MLSERVER_HTTP_PORT = 18081, 18080
 """Ports are in a network that nothing else is in. These are in mlserver-settings.json too."""
 KSERVE_PORT, KSERVE_HTTP_PORT = 18181, 18180
 RAY_PORT, RAY_HTTP_PORT = 18281, 18280
-"""Of its proxy."""
+"""Ports of Ray's proxy."""
 RAY_DIRECT_PORT, RAY_DIRECT_HTTP_PORT = 18301, 18311
-"""Of the replica."""
+"""Ports of the replica."""
 _MESSAGE_BYTES = 128 << 20
 
 Caller = Callable[[Graph], AbstractContextManager[Call]]
