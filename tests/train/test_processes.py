@@ -19,7 +19,7 @@ from tests.train.node import STEPS, train
 
 SECONDS = 240
 ROUNDING = 1e-5
-"""Of float32: sums of four pages and of twice two come in another order. Weights were found to differ by 2e-7."""
+"""Rounding of float32: sums of four pages and of twice two differ in order. Weights were found to differ by 2e-7."""
 
 
 def on_two_nodes(out: Path) -> list[str]:
