@@ -20,7 +20,7 @@ class Cause(StrEnum):
     STORAGE = "storage"
     """The storage under a file, which gave nothing or damaged data: another try may go well."""
     SURROUNDINGS = "surroundings"
-    """What the program needs to run: memory, threads, a worker, a provider."""
+    """Things that the program needs to run: memory, threads, a worker, a provider."""
 
 
 class LightpageError(Exception):
@@ -238,7 +238,8 @@ class Reason(StrEnum):
     PILOTS_DISAGREE = "PILOTS_DISAGREE"
     """The pilots contradict what was decoded; the image was found, or nobody looked for it."""
     IMAGE_NOT_FOUND = "IMAGE_NOT_FOUND"
-    """The same, and a search did not find the image: it lies further off, or the frames are not this page's."""
+    """The pilots contradict what was decoded, and a search did not find the image: it lies further off, or the frames
+    are not this page's."""
     TOO_FEW_PILOTS = "TOO_FEW_PILOTS"
     """The pilots agree, but are too few, or too dim, to tell a page from chance."""
     MISSING_FRAME = "MISSING_FRAME"
@@ -250,7 +251,7 @@ class Reason(StrEnum):
     STRAY_FRAME = "STRAY_FRAME"
     """A frame came that no trigger was waiting for."""
     OTHER_SHOT = "OTHER_SHOT"
-    """By its camera's clock a frame is not of this trigger."""
+    """A frame is not of this trigger, by its camera's clock."""
     NOT_SYNCHRONISED = "NOT_SYNCHRONISED"
     """The cameras' clocks do not agree with the trigger's for long enough to tell whose a frame is."""
     CAMERA_GONE = "CAMERA_GONE"

@@ -24,7 +24,7 @@ from lightpage.failures import os_failure
 from lightpage.progress import warn
 
 STDOUT = Path("-")
-"""In place of a JSON file, stdout, as users write it; in place of a file to read, stdin."""
+"""Name that users write for stdout in place of a JSON file, and for stdin in place of a file to read."""
 
 _results: ContextVar[TextIO | None] = ContextVar("results", default=None)
 

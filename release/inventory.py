@@ -25,9 +25,9 @@ from typing import Any
 from lock import BUILT_FROM_SOURCE, normal, read_lock
 
 ENVIRONMENT = Path("opt/lightpage")
-"""Of Python, in the image."""
+"""Environment of Python in the image."""
 PYTHON_FOLDER = Path("/usr/bin")
-"""Of the image's Python, which the environment names and links to."""
+"""Folder of the image's Python, which the environment names and links to."""
 WHEELS = "wheels.sha256"
 """The list of installed wheels, in the environment."""
 OWN_FILES = frozenset(
@@ -35,7 +35,7 @@ OWN_FILES = frozenset(
 )
 """Files of the environment that come with no package: of venv, and the list of wheels."""
 MOST_LINKS = 40
-"""On the way to a file, as in Linux."""
+"""Most links on the way to a file, as in Linux."""
 INTERPRETER = re.compile(r"python3?|python3\.\d+")
 """Names of venv's links to Python."""
 LEFT_OUT = (
@@ -51,9 +51,9 @@ LEFT_OUT = (
 SHARED_OBJECT = re.compile(r"(.+?)\.so(\.[\w.]+)?")
 OWN = "lightpage"
 LONGEST_NAME = 200
-"""Of a licence, characters."""
+"""Longest name of a licence, characters."""
 PREFIX = "lightpage:"
-"""Of the names of this project's properties in an SBOM."""
+"""Prefix of the names of this project's properties in an SBOM."""
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from license_expression import AND, OR, ExpressionError, get_spdx_licensing
 RULES = Path(__file__).with_name("licences.toml")
 _SPDX = get_spdx_licensing()
 _OWN_WORDS = re.compile(r"LicenseRef-[A-Za-z0-9.-]+")
-"""What SPDX calls a licence that is in none of its lists."""
+"""Name in SPDX of a licence that is in none of its lists."""
 
 
 @functools.cache

@@ -22,7 +22,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 LOCKS = ROOT / "release" / "locks"
 PYTHON, GLIBC = "3.11", "2_36"
-"""Of Debian bookworm, which the images are made from."""
+"""Versions of Debian bookworm, which the images are made from."""
 BUILT_FROM_SOURCE = ("xcffib",)
 """Packages without a wheel. They are pure Python, and the tools of the lock `build` make their wheels."""
 HEAD = "# Made by `make lock` for {target}: {platforms}. Do not edit.\n"

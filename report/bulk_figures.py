@@ -17,7 +17,7 @@ from lightpage.runtime.archives.run.totals import Reading
 TEMPLATE = "bulk.html.j2"
 
 _POINTS = 120
-"""Of a curve over time."""
+"""Points of a curve over time."""
 _DRAWN = 30
 """Devices that are drawn; the worst of more."""
 

@@ -461,4 +461,4 @@ def _knobs() -> tuple[Knob, ...]:
 
 
 KNOBS = {knob.name: knob for knob in _knobs()}
-"""By name, those that cost a usual device most first."""
+"""Knobs by name, those that cost a usual device most first."""

@@ -24,7 +24,7 @@ from lightpage.train.models.twin import RayTwin, TorchTwin
 FITTED_PAGES = 2
 """Known pages of a calibration, as `lightpage calibrate` takes them."""
 _FIRST_SEED = 10_000
-"""Of the pages that decoders are judged by, far from those that they are trained on."""
+"""First seed of the pages that decoders are judged by, far from those that they are trained on."""
 _SYMBOLS = 3
 """Random stream of their symbols, beside those of the simulator."""
 

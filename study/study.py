@@ -21,9 +21,9 @@ from lightpage.train.runs import load_arrays, save_arrays
 RESULTS = 4
 """Raised when results that were kept by an earlier version do not go together with those of this one."""
 Case = Mapping[str, Any]
-"""What is varied, by name; `name` tells it from the others and names its files."""
+"""Values that are varied, by name; `name` tells it from the others and names its files."""
 Result = Mapping[str, Any]
-"""What was measured, by name: numbers, texts, and arrays."""
+"""Values that were measured, by name: numbers, texts, and arrays."""
 Row = Sequence[object]
 
 

@@ -24,7 +24,7 @@ STRATEGIES = (AUTO, DDP)
 _MOST_ON_A_NODE = 1024
 _MEETING = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK")
 _PATIENCE_S, _LOOK_S = 1800.0, 0.2
-"""How long a process waits for the next piece of another's work, and how often it looks."""
+"""Longest wait of a process for the next piece of another's work, and time between two looks."""
 
 
 @dataclass(frozen=True)

@@ -36,9 +36,9 @@ WEIGHTS = "decoder.pt"
 REFERENCES = "references.npz"
 GOLDEN = "golden.npz"
 FORMAT = 8
-"""Of what a run keeps while it is made: raised when features, network or checkpoints of an earlier version would not go
-together with those of this one, or when the simulator's light changes (as the simulator's `LIGHT` is then), or which
-pages the comparison trains on."""
+"""Version of what a run keeps while it is made: raised when features, network or checkpoints of an earlier version
+would not go together with those of this one, or when the simulator's light changes (as the simulator's `LIGHT` is
+then), or which pages the comparison trains on."""
 
 _RENAMED = {"levels": "depth"}
 """Choices that runs in analysis/weights keep under other names: the depth of the network was called its levels."""

@@ -45,14 +45,14 @@ _SENSOR_ROWS, _SENSOR_COLUMNS = 0x118, 0x11C
 _PIXEL_FORMAT, _PERIOD_US = 0x128, 0x138
 _TRIGGER_MODE, _LIBRARY_TRIGGER_SOURCE, _SHOOT = 0x300, 0x304, 0x30C
 _TRIGGER_SOURCE = 0x3F4
-"""Where the edited description keeps the trigger's source. The library shoots on a command only while its own register
-says ``Software``, and it would read that back whatever was chosen."""
+"""Address of the trigger's source in the edited description. The library shoots on a command only while its own
+register says ``Software``, and it would read that back whatever was chosen."""
 _SOFTWARE = 1
 _LINES = {"Line0": 0, "Line1": 2}
 _PAYLOAD = "WIDTH * HEIGHT * ((PIXELFORMAT>>16)&amp;0xFF) / 8"
 """Formula of its PayloadSize."""
 _POLLS_HZ = 250.0
-"""How often a waiting camera looks for a trigger."""
+"""Rate at which a waiting camera looks for a trigger."""
 
 
 class FakeCamera:

@@ -78,7 +78,7 @@ ORIENTATIONS: Mapping[str, tuple[tuple[int, int], tuple[int, int]]] = {
     "mirrored along the falling diagonal": ((0, 1), (1, 0)),
     "mirrored along the rising diagonal": ((0, -1), (-1, 0)),
 }
-"""How a camera may show an image, by name, and the matrix from (x, y) to (column, row) that does so."""
+"""Orientations in which a camera may show an image, by name: matrices from (x, y) to (column, row)."""
 _SHOWS = 0.5
 """Share of the patches in the middle that a camera finds which shows the image as it is looked for; another way of
 showing it is looked for where fewer are found."""
@@ -154,11 +154,11 @@ _PHASES = (_Stage("phases", 2, 1, _ALL_GROUPS, COHERENT_BRANCHES, use_phase=True
 """Each round halves what is left of the error, since patches are measured about the current geometry; two bring it
 within reach of the waves."""
 _DRIFTED = (_Stage("follow the drift", 6, 2, _ALL_GROUPS, COHERENT_BRANCHES, half_rate=True),)
-"""From an earlier calibration: the complex field is right from the start, so nothing is searched camera by camera."""
+"""Stages from an earlier calibration: the complex field is right from the start, so no camera is searched alone."""
 _DRIFT_SHARES = {"angle": 1.0, "lengths": 0.2, "in_phase": 0.3, "quadrature": 0.3, "axial": 0.2}
 _DRIFT_SCALE: Real = np.array([_DRIFT_SHARES.get(parameter.group, 0.05) for parameter in PARAMETERS])
-"""How far a device drifts, as a share of what it may lie from nominal. What a fit cannot tell well stays as it was: a
-decoder has learned the earlier calibration's errors, and loses 0.1 bit a symbol where a re-fit draws others."""
+"""Drift of a device, as a share of the prior about nominal. What a fit cannot tell well stays as it was: a decoder
+has learned the earlier calibration's errors, and loses 0.1 bit a symbol where a re-fit draws others."""
 
 
 def calibrate(

@@ -32,7 +32,7 @@ _ADDED = {
     "parameters": {"lens_path_relative": -1.0, **dict.fromkeys(_LATER, 0.0)},
     "deviations": dict.fromkeys(("lens_path_relative", *_LATER), 0.0),
 }
-"""What documents lack that were written before it: they took lenses for ideal, and planes for those of the profile."""
+"""Fields that older documents lack: they took lenses for ideal, and planes for those of the profile."""
 
 
 _OPTIONAL = ("coherence_at_first", "goodness")

@@ -20,7 +20,7 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
 REACH_PX = 12.0
-"""How far from where it is looked for the image is found, camera pixels, along either axis."""
+"""Reach of the search from where the image is expected, camera pixels, along either axis."""
 
 COARSE_PX = 2.0
 """Step of the coarse search, camera pixels. The light's correlation falls to half within 3: at most a fifth is lost."""
@@ -32,7 +32,7 @@ _FINE_PX = (1.0, 0.4, 0.15)
 """Steps of the lattices of 3x3 shifts, each about the vertex of the one before, whose last vertex is the answer."""
 
 FALSE_ALARMS = 1e-5
-"""How often light that is not this page's may pass for it in one search."""
+"""Probability that one search takes another page's light for this page's."""
 
 FEWEST_SEARCHED = 4
 """Fewer agree by chance wherever they are looked at."""

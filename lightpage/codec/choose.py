@@ -41,7 +41,7 @@ _CODED_BITS = 2
 protects more where wrong upper numbers are more than Reed-Solomon mends."""
 _CORRECTIONS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 _PAGE_LOSS = 1e-3
-"""Of a page whose upper bits Reed-Solomon does not mend: small beside the loss that the rate allows."""
+"""Share of pages whose upper bits Reed-Solomon does not mend: small beside the loss that the rate allows."""
 _UNSEEN = 3.0
 """Errors that may have been there where so many pages show none, with 95% confidence."""
 _SPREAD = 2
@@ -49,7 +49,7 @@ _SPREAD = 2
 _BISECTIONS = 7
 _LOWEST_RATE, _HIGHEST_RATE = 340, 960
 _LOWEST_RATE_OF_TWO_LEVELS = 460
-"""Where a symbol has one bit, the header's code is no better than the body's would be below."""
+"""Lowest rate, per mille, where a symbol has one bit: the header's code is no better than the body's would be below."""
 _FIRST_GAP, _MOST_TRIED = 0.04, 30
 """Information beyond the rate that a code is first thought to need; rates that are tried."""
 _DRAWS = 3

@@ -23,7 +23,7 @@ from lightpage.page.levels import Levels
 
 MOST_PAGES = 1 << 24
 MOST_BYTES = (1 << 40) - 1
-"""Of a volume."""
+"""Largest volume."""
 FIELD_BYTES = 15
 HEADER_BYTES = FIELD_BYTES + 2
 _SENT_BITS, _SENT_BITS_OF_FEW_LEVELS = 204, 408

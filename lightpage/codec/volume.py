@@ -23,7 +23,7 @@ from lightpage.codec.page_codec import PageCodec
 from lightpage.errors import InvalidInputError
 
 DATA_PAGES, PARITY_PAGES = 60, 4
-"""Of a group, unless told otherwise: enough parity for a page in a hundred to be lost."""
+"""Pages of a group, unless told otherwise: enough parity for a page in a hundred to be lost."""
 
 _PAGES_AT_ONCE = 32
 _READ_BYTES = 1 << 20

@@ -35,7 +35,7 @@ _LEFT_OUT = 1e-12
 _CHUNK = 8192
 
 _LEAST_WEIGHT = 1e-200
-"""Of all levels with the right bit together, beside the most probable one: a smaller sum of floats has lost digits."""
+"""Least weight of all levels with the right bit, over the most probable level's: a smaller sum has lost digits."""
 
 
 def own_information(mu: NDArray[np.floating], kappa: NDArray[np.floating], levels: int | Levels) -> Floats:

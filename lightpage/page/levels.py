@@ -17,7 +17,7 @@ MAX_LEVELS = 256
 Real = NDArray[np.float64]
 
 _STEPS = 4096
-"""Of a turn, to find the nearest of uneven levels by: a sixteenth of the distance of 256 levels."""
+"""Steps in a turn, to find the nearest of uneven levels by: a sixteenth of the distance of 256 levels."""
 
 
 def check_levels(levels: int, subject: str = "levels") -> None:

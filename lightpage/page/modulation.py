@@ -19,14 +19,15 @@ from lightpage.page.symbols import symbol_phases
 Real = NDArray[np.float64]
 
 HARMONICS = 3
-"""Of the Fourier series: a fifth of unmodulated light leaves an error of 4e-4."""
+"""Order of the Fourier series: a fifth of unmodulated light leaves an error of 4e-4."""
 _SERIES = tuple(f"{function}_{number}" for number in range(1, HARMONICS + 1) for function in ("cos", "sin"))
 NAMES = ("stroke_relative", *(f"phase_{name}_rad" for name in _SERIES), *(f"amplitude_{name}_log" for name in _SERIES))
-"""Of the coefficients, each zero nominally."""
+"""Names of the coefficients, each zero nominally."""
 PRIORS: Real = np.array([0.02, *[0.2 / number for number in range(1, HARMONICS + 1) for _ in "cs"] * 2])
 """Standard deviations of the coefficients about nominal, before data are seen."""
 DRIFTS: Real = PRIORS * [1.0, *[0.1] * (len(NAMES) - 1)]
-"""The same about those of an earlier day: a stroke changes with temperature, a lookup table hardly."""
+"""Standard deviations of the coefficients about those of an earlier day: a stroke changes with temperature, a lookup
+table hardly."""
 
 
 def basis(phases: Real) -> Real:

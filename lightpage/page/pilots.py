@@ -20,10 +20,10 @@ _CREDIT = 20.0
 _OUTLIERS = 0.01
 """Share of pilots that are expected to say nothing: a dead place of the modulator, a value that was not written."""
 _MOST_OUTLIERS = 0.05
-"""Where more of them contradict the rest, it is the device that has changed, and all of them count."""
+"""Largest share of outliers; where more pilots contradict the rest, the device has changed, and all of them count."""
 _ROUNDS = 10
 _MEDIAN_CHI2 = 0.4549
-"""Of the chi-squared distribution with one degree of freedom."""
+"""Median of the chi-squared distribution with one degree of freedom."""
 
 LEAST_CONFIRMED_SHARE = 0.25
 """Share of the claimed information that the pilots of a page must confirm. A page whose image lies a pixel off confirms

@@ -41,7 +41,7 @@ _RIPPLE = 1
 """The random stream of the reference's ripple; a simulator draws others from a seed of its own."""
 
 _STEP = 1e-4
-"""Of a derivative, radians; exact to 1e-8 in double precision."""
+"""Step of a derivative, radians; exact to 1e-8 in double precision."""
 
 
 class Place(NamedTuple):

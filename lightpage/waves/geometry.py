@@ -41,9 +41,9 @@ class WaveGeometry:
     pipe_taper: float = 0.0
     """Both distances at the exit over those at the entrance, less one; `taper_defocus` belongs to the lenses' paths."""
     lens_path: SeidelTerms = IDEAL
-    """Of the first lens, the modulator's axial place included."""
+    """Path of the first lens, the modulator's axial place included."""
     camera_path: SeidelTerms = IDEAL
-    """Of the second lens, the cameras' axial place included, as a lens from camera plane to facet (`mirrored`)."""
+    """Path of the second lens, the cameras' axial place included, as a lens from camera plane to facet (`mirrored`)."""
 
     @property
     def wave_number(self) -> float:

@@ -27,7 +27,7 @@ _BAND_TAPS = 31
 _BAND_HEADROOM = 1.06
 """Pass band over the pipe's nominal band, for misalignment of the pipe against the lens axes."""
 _BAND_STOP = 1.36
-"""Where its stop band begins, over the same."""
+"""Beginning of its stop band, over the same."""
 _NYQUIST = 0.5
 """Cycles per sample."""
 

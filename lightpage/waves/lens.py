@@ -24,7 +24,7 @@ _TOLERANCE = 1e-7
 """Singular values of an ideal lens's expansion are dropped below this share of the largest: less than rounding."""
 
 TOLERANCE_WITH_PATH = 1e-3
-"""The same for a real lens, a field error of about 0.002; 1e-5 would take twice the terms."""
+"""Tolerance for a real lens, a field error of about 0.002; 1e-5 would take twice the terms."""
 
 
 def lens_kernel(geometry: WaveGeometry, rows: Real, columns: Real) -> Complex:

@@ -20,7 +20,7 @@ Phase = Callable[[Real, Real, Real, Real], Real]
 _SPARE_DEGREES = 12
 """Degrees beyond the steepest phase along an axis, in radians over half of the axis, that its polynomials need."""
 _SPARE_IN_TILES = 4
-"""The same where a tolerance of a percent serves."""
+"""Spare nodes where a tolerance of a percent serves."""
 _PROBES = 9
 """Places along an axis that are asked how steep the phase is."""
 _FLAT = 1e-9

@@ -22,9 +22,9 @@ from lightpage.words import counted
 
 MARGIN = "margin_bits"
 MEASURES = {AIR: "AIR", MARGIN: "margin", CONFIRMED: "confirmed by pilots"}
-"""What is told of a device, bits a symbol, where it is known."""
+"""Figures of a device, bits a symbol, where it is known."""
 PAUSE_S = 15.0
-"""With nobody at work for longer, a run had stopped."""
+"""Longest pause in which a run counts as going on."""
 LISTED = 200
 """Devices, workers or files that are listed; the worst, or the first, of more."""
 _NAMED = 20

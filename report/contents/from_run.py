@@ -28,7 +28,7 @@ from lightpage.train.published.training import PublishedChoices
 from lightpage.train.runs import GOLDEN, REFERENCES, Run, load_arrays, load_run
 
 _PHASE_TOLERANCE = 1e-2
-"""Of a level: phases are kept in float32, which knows 2 pi to 1e-5 of 256 levels."""
+"""Tolerance of a level's phase: phases are kept in float32, which knows 2 pi to 1e-5 of 256 levels."""
 
 
 def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportData:

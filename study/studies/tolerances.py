@@ -51,7 +51,7 @@ _JUDGED = 2
 """Pages that are read: ten thousand symbols of the bench device, whose AIR is known to 0.01 bit."""
 _QUICK_KNOBS = ("stroke", "modulator-axial", "keystone", "phase-noise")
 _QUICK_VALUES = (2, -1)
-"""Of a knob's values, by place."""
+"""Places of a knob's values."""
 _ANEW_VALUES = 3
 _COLUMNS, _TITLE, _MOST_BITS, _TICKS = 5, 32, 8, 5
 _CURVES = {
@@ -59,7 +59,7 @@ _CURVES = {
     "told": ("told", ".--", "tab:orange"),
     "anew": ("trained anew", "^", "tab:green"),
 }
-"""Of a picture, by the names of results: label, style, colour."""
+"""Curves of a picture, by the names of results: label, style, colour."""
 
 
 @dataclass(frozen=True)

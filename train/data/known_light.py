@@ -19,7 +19,7 @@ from lightpage.waves.grid import symbol_samples
 ACCURACY = 3 / 8
 """Share of a simulation's splitting steps."""
 _EQUATIONS = 100_000
-"""About how many samples of the common grid say by which factors the illumination varies: six unknowns."""
+"""Approximate number of samples of the common grid that say by which factors the illumination varies: six unknowns."""
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]

@@ -12,7 +12,7 @@ TENSORBOARD = "tensorboard"
 """Folder of a run's TensorBoard files."""
 
 CURVES = ("train_nll", "train_air", "val_air", "angle_deg")
-"""What training logs; the angle is that of a decoder by rays."""
+"""Quantities that training logs; the angle is that of a decoder by rays."""
 
 Curve = Sequence[tuple[int, float]]
 """Values by step."""

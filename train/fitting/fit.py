@@ -35,13 +35,13 @@ from lightpage.train.processes import AS_IT_IS, Processes, is_first_process, pro
 _LAST = "last.ckpt"
 
 VALIDATIONS = 60
-"""How often a run is judged by its validation pages."""
+"""Number of validations of a run."""
 
 _SEEDS_APART = 1_000_003
-"""Of two processes of one run: further than any run has steps."""
+"""Distance of the seeds of two processes of one run: further than any run has steps."""
 
 _SEEDS = 2**32
-"""That Lightning takes."""
+"""Number of seeds that Lightning takes."""
 
 
 def fit_network(

@@ -21,12 +21,12 @@ CHECKPOINTS = "checkpoints"
 """Folder of a run's checkpoints."""
 
 FITTED, FITTED_WEIGHTS = "fitted.json", "fitted.pt"
-"""Of a run whose training is finished: what it reached, and the weights. They stand in for its checkpoints."""
+"""Files of a run whose training is finished: what it reached, and the weights. They stand in for its checkpoints."""
 
 _WANTED = f"{FITTED} and {FITTED_WEIGHTS} of one training, or neither, to train from the last checkpoint on"
 
 KEPT_POINTS = 60
-"""Of each curve in what a finished training keeps."""
+"""Points of each curve that a finished training keeps."""
 
 M = TypeVar("M", bound=DecoderTraining[Any])
 

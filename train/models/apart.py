@@ -24,10 +24,10 @@ from lightpage.train.models.filters import BLOCK, block_weights
 
 ROUNDS = 14
 WEIGHT = 0.75
-"""Of the likelihood against staying: a larger one takes fewer rounds and, in dim light, lets more noise in."""
+"""Weight of the likelihood against staying: a larger one takes fewer rounds and, in dim light, lets more noise in."""
 STIFF = 1 + 2 * WEIGHT
 RELAXATION = 1.4
-"""Of a round's step; below 2."""
+"""Factor on a round's step; below 2."""
 _DARK = 1e-9
 _LINEAR_ROUNDS = 30
 _LINEAR_STEP = 0.7

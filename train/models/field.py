@@ -30,7 +30,7 @@ from lightpage.waves.defocus import resampled_taps
 from lightpage.waves.grid import GRID_STEP_PX, FieldGrid, field_grid
 
 ROUNDS = 6
-"""Of descent; beyond these the band filter's ripple adds up."""
+"""Steps of descent; beyond these the band filter's ripple adds up."""
 STEP = 0.9
 """Along the weighted gradient: the weights bound the curvature by 2, and step times curvature must stay below 2."""
 MOMENTUM = 0.5

@@ -14,7 +14,7 @@ _REFINEMENT_STEPS = 0.25
 """Steps of a refinement's network over those of the first."""
 
 _FEWEST_STEPS = 2
-"""That a learning rate can rise and fall in."""
+"""Fewest steps in which a learning rate can rise and fall."""
 
 
 @dataclass(frozen=True)

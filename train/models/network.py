@@ -14,11 +14,11 @@ _CONDITIONS = 6 + 4 * len(_HARMONICS)
 _CONDITION_WIDTH = 64
 _TYPICAL_LOG_KAPPA = 5.0
 _KAPPA_UNIT = 100.0
-"""What an output of one adds to p: with concentrations in the hundreds, the net need not learn large numbers."""
+"""Change of p by an output of one: with concentrations in the hundreds, the net need not learn large numbers."""
 _LOG_KAPPA_UNIT = 10.0
-"""What an output of one adds to the logarithm of p's length: few steps are to make large factors."""
+"""Change of the logarithm of p's length by an output of one: few steps are to make large factors."""
 _MOST_LOG_FACTOR = 15.0
-"""Of that factor: light unlike any that was trained on shall not make p infinite."""
+"""Largest logarithm of that factor: light unlike any that was trained on shall not make p infinite."""
 
 
 def with_page_coordinates(positions: Tensor, shape: tuple[int, ...], part: tuple[slice, slice]) -> Tensor:

@@ -26,7 +26,7 @@ from lightpage.waves.sinc_interpolation import interpolation, sparse_axis
 Real = NDArray[np.floating]
 
 OVERSAMPLING = 1.1
-"""Of light on sparse samples: an error of 0.003."""
+"""Oversampling of light on sparse samples: an error of 0.003."""
 WAVES_A_TILE = 170
 """Waves that a tile of the lens is wide, about: more need more samples of the facet, fewer need more tiles."""
 ROLL_MARGIN = np.deg2rad(0.05)

@@ -45,9 +45,9 @@ class Fidelity(NamedTuple):
 
 
 EXACT = Fidelity(0.01, 0.015)
-"""For light that is taken off what was seen: twice the error of the pipe costs a full-size page 0.02 bit."""
+"""Fidelity for light that is taken off what was seen: twice the error of the pipe costs a full-size page 0.02 bit."""
 ROUGH = Fidelity(0.06, 0.05)
-"""For light that is but a small rest: half the errors bring 0.006 bit."""
+"""Fidelity for light that is but a small rest: half the errors bring 0.006 bit."""
 
 
 class WaveMatrices(NamedTuple):

@@ -17,7 +17,7 @@ AFFINE_START = (0.98, 0.95)
 """Page over camera along x and y, roughly: where each camera's affine starts."""
 NAMES = ("none", "mode", "ray")
 _FAR = 10.0
-"""In page half extents: off every camera, where samples are zero."""
+"""Place in page half extents: off every camera, where samples are zero."""
 
 
 class Registration(nn.Module):

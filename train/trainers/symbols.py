@@ -29,7 +29,7 @@ from lightpage.train.trainers.refinement import Refined, RefinementPages, fit_pr
 from lightpage.waves.grid import symbol_samples
 
 _SYNTHETIC_SYMBOLS = 470_000
-"""Of all synthetic pages together, unless told otherwise: 96 pages of the bench device."""
+"""Symbols of all synthetic pages together, unless told otherwise: 96 pages of the bench device."""
 _SYNTHETIC_PAGES = 12, 96
 """Fewest and most: few large ones would show few drifted states, and more small ones teach no more."""
 MATCHED_PAGES = 2

@@ -40,7 +40,7 @@ from lightpage.train.runs import (
 from lightpage.train.trainers.symbols import MATCHED_PAGES, SymbolTrainer
 
 FEWEST_PAGES = 6
-"""To train, validate and evaluate with."""
+"""Fewest pages to train, validate and evaluate with."""
 
 _RECORDED = "--recording (SHA-256 of its frames and symbols)"
 

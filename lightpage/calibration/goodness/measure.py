@@ -39,7 +39,7 @@ _NOTHING = 1e-30
 _BLOCKS = (6, 8)
 """Rows and columns of the maps, at most."""
 _MOST_RATIO = 1e6
-"""In the maps."""
+"""Largest ratio in the maps."""
 
 
 def measure_goodness(

@@ -48,7 +48,7 @@ itself, and on the bench device three of them cost a twentieth of a bit."""
 _LARGEST_MOVE_PX = 1.5
 """A round's largest step: the model is linear in the displacement over about a speckle."""
 _EQUATIONS = 100_000
-"""Of each camera, at most about: more say nothing new of a few dozen unknowns."""
+"""Approximate limit of equations for each camera: more say nothing new of a few dozen unknowns."""
 _LEAST_STRIDE = 2
 """Grid samples from one equation to the next: the grid has twice the rate that the light needs."""
 _INSIDE = 0.98

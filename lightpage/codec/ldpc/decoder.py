@@ -22,7 +22,7 @@ OFFSET = np.float32(0.5)
 MOST_LLR = 40.0
 """Log-likelihood ratios are clipped here: a bit that is certain and wrong must not outvote all checks."""
 _KNOWN = np.float32(1e4)
-"""Of a filler, which both sides know to be 0."""
+"""LLR of a filler, which both sides know to be 0."""
 _SIGN = np.uint32(0x80000000)
 _BLOCKS_AT_ONCE = 16
 """More leave the cache and are slower a block."""

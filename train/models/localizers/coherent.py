@@ -35,7 +35,7 @@ class CoherentLocalizer(nn.Module):
         self._last = tuple(count - 1 for count in usual.shape)
         """Row and column of the usual grid's last sample, in whose units a table's places are."""
         self._span = tuple((count - 1) * own.pitch_m / usual.pitch_m for count in own.shape)
-        """From the first to the last sample of its own grid, in the same units; both have the same middle."""
+        """Distance from the first to the last sample of its own grid, in the same units; both have the same middle."""
         self.page_shape = profile.page_shape
         self.samples = samples or symbol_samples(profile)
         steps = (torch.arange(self.samples, dtype=torch.float32) + 0.5) / self.samples - 0.5
