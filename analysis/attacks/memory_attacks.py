@@ -91,7 +91,7 @@ class Attacker:
         return self._ended(self._memory.handle, 0) == "OK"
 
     def close(self) -> None:
-        """Leave."""
+        """Close the connection and the region."""
         self._memory.close()
         self._channel.close()
 
@@ -100,7 +100,7 @@ class Attacker:
         return self._chance.choice([*far, self._chance.randrange(1, 1 << 64)])
 
     def _begun(self, region: bytes, offset: int, rows_px: int | None = None) -> Any:
-        """A call that is on its way."""
+        """Begin a call."""
         header = pb.DecodeHeader()
         header.CopyFrom(self._header)
         header.shared.region, header.shared.offset = region, offset
@@ -113,20 +113,24 @@ class Attacker:
         return str(self._begun(region, offset, rows_px).code().name)
 
     def _cancelled(self) -> str:
-        """The whole pair is there, so a page may come of it; its bytes of the receive budget must be given back."""
+        """Cancel a call whose whole pair is there: a page may come of it, and its bytes of the receive budget come
+        back.
+        """
         call = self._begun(self._memory.handle, 0)
         time.sleep(self._chance.uniform(0, _CANCEL_S))
         call.cancel()
         return str(call.code().name)
 
     def _bad(self, region: bytes, offset: int, larger: int = 0) -> str:
-        """A try of which no page may come."""
+        """Make a call of which no page may come, and count one that does."""
         ended = self._ended(region, offset, self._header.rows_px + 1 if larger else None)
         self.outside += ended == "OK"
         return ended
 
     def _dropped(self) -> str:
-        """The whole pair is there when the call begins, so a page may come of it; a crash may not."""
+        """Drop a region during a call. The whole pair is there when it begins, so a page may come of it; a crash may
+        not.
+        """
         memory = SharedMemory(self._target, self._size)
         memory.write(self._pair)
         closing = threading.Timer(self._chance.uniform(0, 2e-3), memory.close)
@@ -138,7 +142,7 @@ class Attacker:
             self._gone = [*self._gone[-20:], memory.handle]
 
     def _resized(self) -> str:
-        """A region is asked for by hand, its descriptor is cut, and a call reads where its end would have been."""
+        """Ask for a region by hand, cut its descriptor, and have a call read where its end would have been."""
         with socket.socket(socket.AF_UNIX) as connection:
             connection.settimeout(CALL_S)
             connection.connect(memory_path(self._target))
