@@ -26,7 +26,7 @@ class Reporter(Protocol):
         """Yield the items, and show progress over `total`, of which an earlier run has done `done`."""
 
     def note(self, what: str) -> None:
-        """Tell whoever watches."""
+        """Show a note."""
 
 
 _reporter: ContextVar[Reporter | None] = ContextVar("reporter", default=None)
@@ -34,7 +34,7 @@ _reporter: ContextVar[Reporter | None] = ContextVar("reporter", default=None)
 
 @contextmanager
 def reporting(reporter: Reporter | None) -> Iterator[None]:
-    """Have loops of this thread that `track` their items shown by `reporter`, or by nobody, in the `with` statement."""
+    """Show the loops of this thread that `track` their items by `reporter`, or not at all, in the `with` statement."""
     token = _reporter.set(reporter)
     try:
         yield
@@ -43,7 +43,7 @@ def reporting(reporter: Reporter | None) -> Iterator[None]:
 
 
 def note(what: str) -> None:
-    """Tell whoever watches what they should know of work that goes on."""
+    """Note what those who watch the work should know."""
     reporter = _reporter.get()
     if reporter is None:
         _log.info(what)

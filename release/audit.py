@@ -65,7 +65,7 @@ def judged(packages: Sequence[str], printed: str, said: str) -> tuple[int, list[
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Do what the head of the file says."""
+    """Run the command that the head of the file describes."""
     locks = [Path(each) for each in arguments] or sorted(LOCKS.glob("*.txt"))
     statuses = set()
     for lock in locks:

@@ -389,7 +389,7 @@ def differences_from_lock(inventory: Inventory, lock: Path) -> list[str]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Do what the head of the file says."""
+    """Run the command that the head of the file describes."""
     inventory = take(Path(arguments[0]))
     if arguments[1:2] != ["--against"]:
         print(json.dumps(asdict(inventory), indent=1))

@@ -87,7 +87,7 @@ def _name(licence: Mapping[str, str]) -> str:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Do what the head of the file says."""
+    """Run the command that the head of the file describes."""
     path = Path(arguments[0])
     if not path.is_file():
         print(f"{path}: no such file; `make sbom` writes it", file=sys.stderr)

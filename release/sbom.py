@@ -117,7 +117,7 @@ def debian_component(package: DebianPackage, release: str) -> Component:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Do what the head of the file says."""
+    """Run the command that the head of the file describes."""
     parser = argparse.ArgumentParser(description="Write an SBOM of an image.")
     parser.add_argument("root", type=Path)
     parser.add_argument("--out", type=Path, required=True)

@@ -195,7 +195,7 @@ class FakeCamera:
 
 
 def _check_free(address: str) -> None:
-    """A second camera on an address would claim to run, and hear nothing."""
+    """Check that no other camera has the address: a second one would claim to run, and hear nothing."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.bind((address, PORT))

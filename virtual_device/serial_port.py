@@ -67,7 +67,7 @@ class VirtualSerialPort(ABC):
         self._thread: threading.Thread | None = None
 
     def plug(self) -> None:
-        """Be there, under the usual address.
+        """Appear under the usual address.
 
         Raises:
             LightpageError: the address is taken, or cannot be made.
@@ -82,7 +82,7 @@ class VirtualSerialPort(ABC):
         self._thread.start()
 
     def unplug(self) -> None:
-        """Be gone; what was on its way is lost."""
+        """Disappear; what was on its way is lost."""
         thread, self._thread = self._thread, None
         if thread is None:
             return

@@ -313,12 +313,12 @@ class _Registration:
         self._found: list[Measurement] = []
 
     def _begin(self, what: str) -> None:
-        """Tell of the next stage."""
+        """Begin the next stage, and report it."""
         self._stage, self._done = what, self._done + 1
         self._tell(0.0)
 
     def _tell(self, share: float) -> None:
-        """Tell what share of the present stage is behind."""
+        """Report progress: the share of the present stage that is done."""
         self.progress(self._stage, (self._done - 1 + share) / self.total)
 
     def single_camera(self, stage: _Stage) -> None:
@@ -330,7 +330,7 @@ class _Registration:
         self._fit(stage, found[0] + found[1])
 
     def _orient(self, stage: _Stage, found: list[list[Measurement]]) -> list[list[Measurement]]:
-        """Look for the image of a camera that has not found it as it may show it otherwise.
+        """Search the other orientations of a camera that has not found the image in its own.
 
         Args:
             stage: stage of the search.
@@ -369,7 +369,7 @@ class _Registration:
         return found
 
     def _set_orientation(self, camera: int, how: str) -> None:
-        """Begin anew with a camera that shows the image so."""
+        """Start the parameters of a camera, and the centres of their priors, from an orientation."""
         (xx, xy), (yx, yy) = ORIENTATIONS[how]
         name = ("in_phase", "quadrature")[camera]
         values = {"scale_x_relative": xx - 1, "turn_xy_slope": xy, "turn_yx_slope": yx, "scale_y_relative": yy - 1}
