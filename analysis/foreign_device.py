@@ -34,7 +34,7 @@ CAMERA_PITCH = 2.4e-3
 IMAGE_PITCH = 3e-3
 """Pitch of the camera-plane field, a quarter of what its band asks for, so that cubic splines are good to -60 dB."""
 IMAGE_MARGIN = 0.09
-"""How far beyond the nominal frame the camera-plane field is computed, mm: shift, scale, rotation and distortion."""
+"""Margin of the computed camera-plane field around the nominal frame, mm: shift, scale, rotation and distortion."""
 TAYLOR_TERMS = 4
 REFERENCE_EXPOSURES = 64
 
@@ -133,7 +133,7 @@ class Parameters:
     quadrature_gain: float = 1.0
     quadrature_sign: int = 1
     stroke_error: float = 0.0
-    """Of the modulator, relative to a whole turn."""
+    """Stroke error of the modulator, relative to a whole turn."""
     level_sine_rad: float = 0.0
     level_cosine_rad: float = 0.0
     """Amplitudes of a smooth error of its phase over the levels."""
@@ -219,7 +219,7 @@ class ForeignDevice:
         return cls(draw_parameters(np.random.default_rng([seed, 1])), design)
 
     def with_parameters(self, **changes: object) -> ForeignDevice:
-        """The same device with some parameters changed."""
+        """Return this device with some parameters changed."""
         return dataclasses.replace(self, parameters=dataclasses.replace(self.parameters, **changes))  # type: ignore[arg-type]
 
     # --- geometry -----------------------------------------------------------------------------------------------------
@@ -432,11 +432,11 @@ class ForeignDevice:
             path: HDF5 file, overwritten.
             pages: how many.
             levels: M, 2 to 256.
-            seed: of symbols, noise and drift.
+            seed: seed of symbols, noise and drift.
             pilots: boolean [ny, nx], written as it is.
             with_symbols: whether the file tells the symbols.
             jumps_px: see `walk`.
-            symbols: what the modulator shows, uint8 [pages, ny, nx]; drawn if left out.
+            symbols: symbols that the modulator shows, uint8 [pages, ny, nx]; drawn if left out.
         """
         rng = np.random.default_rng([seed, 2])
         drawn = rng.integers(0, levels, size=(pages, *self.design.page_shape), dtype=np.uint8)
@@ -477,7 +477,7 @@ def plane_coordinates(design: Design, camera: Camera, drift: PageDrift) -> tuple
 
 
 def out_of_focus(points: tuple[FloatArray, FloatArray], focal_length: float, distance: float) -> ComplexArray:
-    """What a plane so far from its focal plane, mm, does to the field at points (x, y) of a facet, mm."""
+    """Return the factors by which a defocus of `distance` mm changes the field at points (x, y) mm of a facet."""
     sine2 = (points[0] ** 2 + points[1] ** 2) / focal_length**2
     return np.asarray(np.exp(1j * WAVENUMBER * distance * (np.sqrt(1 - sine2) - 1)))
 
@@ -488,9 +488,9 @@ def walk(
     """Piston and shift of each page: random walks from a random piston.
 
     Args:
-        p: of the device.
+        p: parameters of the device.
         pages: how many.
-        rng: of the steps.
+        rng: generator of the steps.
         jumps_px: (x, y) by which the image jumps before a page, beside its walk; before page 0, while nobody read.
     """
     pistons = rng.uniform(-np.pi, np.pi) + np.cumsum(p.piston_drift_rad * rng.standard_normal(pages))

@@ -1,4 +1,4 @@
-"""What no decoder exceeds: the information of a page's light on one symbol, where all else of page and device is known.
+"""Bound that no decoder exceeds: information of a page's light on one symbol, all else of page and device being known.
 
 It is Fisher's, against shot noise, read noise, quantisation and the noise of the modulator's pixels. Hot pixels, dust
 and what a camera bends are left out: each takes information away.
@@ -23,12 +23,12 @@ Complex = NDArray[np.complexfloating]
 
 @dataclass(frozen=True)
 class _View:
-    """One camera's light of a page, on the plane and at the pitch that the optics are computed on.
+    """Light of a page on one camera, on the plane and at the pitch of the computed optics.
 
     Attributes:
-        pose: of the camera.
+        pose: pose of the camera.
         amplitude: signal and reference, complex [y, x].
-        electrons_per_unit: of its intensity.
+        electrons_per_unit: electrons for a unit of intensity.
         weight: 1 over the variance of a pixel's electrons, [y, x]; 0 beside the frame and where the pixel is full.
     """
 
@@ -48,7 +48,7 @@ class LightBound:
 
     Args:
         profile, device: nominal and true.
-        symbols: of the page, [ny, nx].
+        symbols: symbols of the page, [ny, nx].
         levels: M.
     """
 

@@ -41,11 +41,11 @@ _RIPPLE = 1
 """The random stream of the reference's ripple; a simulator draws others from a seed of its own."""
 
 _STEP = 1e-4
-"""Of a derivative, radians; exact to 1e-8 in double precision."""
+"""Step of a derivative, radians; exact to 1e-8 in double precision."""
 
 
 class Place(NamedTuple):
-    """How a camera stands against its focal plane, by the numbers of its pose."""
+    """Place of a camera against its focal plane, by the numbers of its pose."""
 
     axial_rad: float
     tilt_x_rad: float
@@ -58,7 +58,7 @@ class Place(NamedTuple):
 
     @property
     def tilt_rad(self) -> tuple[float, float]:
-        """Both tilts."""
+        """Tilts about both axes, radians."""
         return self.tilt_x_rad, self.tilt_y_rad
 
 
@@ -146,7 +146,7 @@ class TrueOptics:
         """Nominal phase written on the SLM [ny, nx], radians, to the field on the exit facet.
 
         Args:
-            page_phase: of the levels, as their numbers say.
+            page_phase: nominal phases of the levels, as their numbers say.
             noise_rad: phase that is added to what the SLM makes of them.
             flicker_rad: phase that is added to one of 2 pi, and to others in proportion.
         """
@@ -283,7 +283,7 @@ def true_geometry(profile: Profile, device: Device, camera_tilt_rad: tuple[float
 
 
 def _like_taper(profile: Profile, device: Device) -> tuple[float, float, float]:
-    """What a taper does, told by parameters that a twin has, to first order.
+    """Express a taper by parameters that a twin has, to first order.
 
     Returns:
         Relative change of the focal length, and what is added to the axial places of modulator and cameras, radians.
