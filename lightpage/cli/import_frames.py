@@ -13,6 +13,7 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.cli.main import RESUME_KEY
 from lightpage.cli.options import named_profile
 from lightpage.cli.paths import NewPath, OutputFile
 from lightpage.device.profile import Profile
@@ -85,6 +86,7 @@ def import_frames(out: Path, force: bool, keep_unlit: bool, json_path: Path | No
 
     Interrupted, the same command goes on where it stopped.
     """
+    click.get_current_context().meta[RESUME_KEY] = "run the same command again; it goes on where it was"
     if out.exists() and not force:
         raise InvalidInputError(f"--out {out}", "a file that exists", "a new name, or --force")
     with ExitStack() as opened:
@@ -132,7 +134,7 @@ def import_frames(out: Path, force: bool, keep_unlit: bool, json_path: Path | No
 
 @dataclass(frozen=True)
 class _Sources:
-    """What the options name.
+    """The files that the options name.
 
     Attributes:
         given: the options.

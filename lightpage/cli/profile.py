@@ -12,7 +12,7 @@ from lightpage.cli.groups import Group
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import Profile, load_profile
 from lightpage.device.profile_keys import commented_toml, key_table
-from lightpage.errors import InvalidInputError
+from lightpage.errors import InvalidInputError, ProfileError, raised_as
 from lightpage.files import replace_text, write_json
 from lightpage.progress import warn
 from lightpage.recording.reader import Recording
@@ -71,7 +71,8 @@ def check(name: str, recording: Path | None, json_path: Path | None) -> None:
     if recording is not None:
         with Recording.open(recording) as file:
             file.header.check_against(found)
-    check_camera(found)
+    with raised_as(ProfileError, ProfileError, about=f"{name}: "):
+        check_camera(found)
     for doubt in told.doubts:
         warn(f"profile {name}: {doubt}")
 

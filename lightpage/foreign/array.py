@@ -16,7 +16,7 @@ from lightpage.failures import os_failure, understood
 SEPARATOR = "::"
 """Between a file and the array in it: `FILE::NAME`."""
 MOST_BYTES = 1 << 30
-"""Of an array that can be read as a whole alone."""
+"""Most bytes of an array that can be read as a whole alone."""
 
 
 class ForeignArray(ABC):

@@ -24,7 +24,7 @@ _MOST_COUNT = 65_535
 
 
 class Arrangement(StrEnum):
-    """How one array holds the frames of both cameras."""
+    """Ways in which one array holds the frames of both cameras."""
 
     INTERLEAVED = "interleaved"
     """In-phase and quadrature frame take turns; of four axes, the two cameras are the inner one."""
@@ -38,7 +38,7 @@ class Arrangement(StrEnum):
 
 @dataclass(frozen=True)
 class Upright:
-    """How a frame is set upright: first flipped, then turned.
+    """A way of setting a frame upright: it is flipped first, then turned.
 
     Attributes:
         flip: ``x`` exchanges left and right, ``y`` top and bottom, ``xy`` both.

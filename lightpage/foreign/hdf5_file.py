@@ -16,7 +16,7 @@ from lightpage.recording.hdf5 import DATA, hdf, open_hdf5, patiently
 from lightpage.recording.stored import ArrayFile, StoredArray
 
 _MOST_OBJECTS = 10_000
-"""Of a file that are looked at; nobody names more."""
+"""Objects of a file that are looked at; nobody names more."""
 _NUMBERS = "buif"
 
 

@@ -29,7 +29,7 @@ from lightpage.recording.writer import RecordingWriter
 _SAMPLED = 16
 """Frames of either camera that are looked at before the work begins."""
 _DEPTHS = (8, 10, 12, 14, 16)
-"""Of cameras, bits."""
+"""Bit depths of cameras."""
 _PEDESTAL = 0.02
 """Share of full scale that no count of the sampled frames lies below, where a camera's black level is in them."""
 _MOST_REFERENCES = 1000
@@ -37,7 +37,7 @@ _MOST_REFERENCES = 1000
 
 @dataclass(frozen=True)
 class Exposure:
-    """What the counts of both cameras are.
+    """Kind of the counts of both cameras.
 
     Attributes:
         bit_depth: of a count, right-aligned.
@@ -68,7 +68,7 @@ class Unlit:
 
 @dataclass(frozen=True)
 class Material:
-    """What a recording is made of.
+    """Files that a recording is made of, opened.
 
     Attributes:
         profile: the nominal device.
@@ -91,7 +91,7 @@ class Material:
 
     @property
     def pages(self) -> int:
-        """How many there are."""
+        """Number of pages."""
         return len(self.frames[0])
 
     def check(self) -> None:

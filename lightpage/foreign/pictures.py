@@ -16,7 +16,7 @@ from lightpage.errors import InvalidInputError
 from lightpage.foreign.array import ForeignArray, readable
 
 SUFFIXES = frozenset({".png", ".tif", ".tiff", ".bmp", ".pgm"})
-"""Of pictures that lose nothing."""
+"""Endings of pictures that lose nothing."""
 _GREY = {"L": np.uint8, "I;16": np.uint16, "I;16L": np.uint16, "I;16B": np.uint16, "I": np.int32}
 _EXPECTED = f"a grey picture ({', '.join(sorted(SUFFIXES))})"
 

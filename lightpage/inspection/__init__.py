@@ -1,1 +1,1 @@
-"""What a file is, how it fits a device, and what can be done with it next; by samples, in about a second."""
+"""Looks at any file: its kind, its fit to a device, and what can be done with it next; by samples, in a second."""

@@ -18,7 +18,7 @@ from lightpage.inspection.finding import Finding
 from lightpage.waves.consequences import consequences
 
 MOST_BYTES = 16 << 20
-"""Of a text."""
+"""Most bytes of a text."""
 _TABLES = ("light", "lens", "pipe", "slm", "page", "camera")
 _SERVICE = {"service", "limits", "metrics", "tls", "logs", "audit", "self_calibration", "flight_recorder"}
 _FIGURES = {"air_bits_per_symbol", "share_of_air"}

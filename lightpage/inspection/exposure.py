@@ -1,4 +1,4 @@
-"""How frames are exposed, by samples: a histogram of counts, saturation, black frames, the contrast of fringes."""
+"""Measures exposure by samples: a histogram of counts, saturation, the contrast of fringes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lightpage.inspection.finding import Histogram
 
 _BINS = 16
 _PIXELS = 1 << 18
-"""Of a frame that are counted."""
+"""Pixels of a frame that are counted."""
 _BAR = 40
 _TOLD = 0.0005
 """Share of the pixels from which on the last bins are shown."""

@@ -1,4 +1,4 @@
-"""What was found of a file."""
+"""The finding: all that is told of a file."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.cli.main import missing
 from lightpage.device.profile import Profile
 from lightpage.errors import LightpageError
 from lightpage.foreign.array import readable
@@ -22,7 +23,7 @@ Picture = tuple[str, NDArray[Any]]
 
 @dataclass(frozen=True)
 class Histogram:
-    """How often counts came in the frames that were looked at.
+    """Histogram of the counts in the frames that were looked at.
 
     Attributes:
         edges: first count of each bin, and the one after the last.
@@ -39,7 +40,7 @@ class Histogram:
 
 @dataclass
 class Finding:
-    """What was found of a file; whoever looks at it adds to it.
+    """Facts and problems of a file; whoever looks at it adds to them.
 
     Attributes:
         path: of the file.
@@ -75,7 +76,7 @@ class Finding:
         except LightpageError as error:
             self.problems.append(str(error))
         except ModuleNotFoundError as error:
-            self.problems.append(f"no module {error.name}: pip install 'lightpage[import]'")
+            self.problems.append(str(missing(f"{self.kind} {self.path}", error)))
 
     def to_json(self) -> dict[str, object]:
         """Return all but the pictures, as JSON can hold it."""

@@ -20,7 +20,7 @@ from lightpage.runtime.model.bundle.manifest import MANIFEST
 _HEAD = 4096
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _PLACES = (0, 512, 1024, 2048)
-"""Where an HDF5 file may begin behind a block of a user's."""
+"""Offsets at which an HDF5 file may begin, behind a block of a user's."""
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _KNOWN = "a recording, pages, a bundle, a run, a calibration, a profile, or frames of another program"
 _SPECIAL = {

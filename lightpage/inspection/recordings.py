@@ -179,7 +179,7 @@ def _next(found: Finding, recording: Recording, coded: bool) -> None:
 
 
 def _pictures(path: Path) -> list[Picture]:
-    """Frames and references, fringes of the in-phase camera, and a page."""
+    """Return frames and references, fringes of the in-phase camera, and a page."""
     with Recording.open(path) as recording:
         pair, reference = recording.frames(0), recording.references()
         lit = np.maximum(reference.in_phase, 1)

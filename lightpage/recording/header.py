@@ -95,7 +95,7 @@ class Header:
 
 
 def _differences(own: Profile, given: Profile) -> list[str]:
-    """What a recording's own profile says otherwise than the one that was given, a line each."""
+    """Return what a recording's own profile says otherwise than the one that was given, a line each."""
     told, expected = own.model_dump(), given.model_dump()
     return [
         f"{table}.{key} = {value} (profile {given.name}: {expected[table][key]})"

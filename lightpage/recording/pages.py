@@ -138,7 +138,7 @@ class Pages:
 
     @staticmethod
     def are_in(path: Path) -> bool:
-        """Whether an HDF5 file says that it holds pages to write.
+        """Return whether an HDF5 file says that it holds pages to write.
 
         Raises:
             RecordingError: it is no HDF5 file, or cannot be read.

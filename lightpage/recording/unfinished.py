@@ -80,7 +80,7 @@ def partial_path(path: Path) -> Path:
 
 
 def settings_path(path: Path) -> Path:
-    """Where it stands what the pages of the unfinished recording `path` are made of."""
+    """Return the file that says what the pages of the unfinished recording `path` are made of."""
     return path.with_name(path.name + ".partial.toml")
 
 

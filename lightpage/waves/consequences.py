@@ -1,4 +1,4 @@
-"""What follows from a profile: how the image lies on cameras, what the pipe does to its light, what a page takes."""
+"""Consequences of a profile: the image on the cameras, its light in the pipe, what a page takes."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ _DECODERS = {
     "standard": ((4_872, 0.0905), (78_750, 2.343), 2.34e9),
     "accurate": ((4_872, 0.132), (78_750, 3.410), 3.59e9),
 }
-"""By preset: symbols and seconds a page of either shipped device on two cores, and bytes at the larger one's peak
-(docs/experiments/full-size.md)."""
+"""Costs by preset: symbols and seconds a page of either shipped device on two cores, and bytes at the larger one's
+peak (docs/experiments/full-size.md)."""
 _BASE_BYTES = 0.25e9
-"""Of a process that holds a bundle and no page yet."""
+"""Memory of a process that holds a bundle and no page yet."""
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What a page takes on two cores, about.
+    """Cost of a page on two cores, about.
 
     Attributes:
         seconds: to decode it.
@@ -39,7 +39,7 @@ class Cost:
 
 @dataclass(frozen=True)
 class Consequences:
-    """What follows from a profile.
+    """Consequences of a profile.
 
     Attributes:
         symbols: of a page.

@@ -31,13 +31,7 @@ from tests.runtime import coded, toy
 LEVELS, PAGES = 16, 4
 TURNS = [Upright("", turn) for turn in (180, 270, 90)]
 WAYS = [Upright("x"), Upright("y"), *TURNS, Upright("x", 270), Upright("x", 90)]
-    Upright("x"),
-    Upright("y"),
-    *(Upright("", turn) for turn in (180, 270, 90)),
-    Upright("x", 270),
-    Upright("x", 90),
-]
-"""Those that docs/your-device.md names, in the order of `ORIENTATIONS`."""
+"""Options that docs/your-device.md names, in the order of `ORIENTATIONS`."""
 Arrays = dict[str, np.ndarray]
 
 
@@ -56,7 +50,7 @@ def arrays(recording: Path) -> Arrays:
 
 @pytest.fixture
 def folder(arrays: Arrays, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where each array lies as NAME.npy, and the profile; the current folder."""
+    """Folder of each array as NAME.npy, and of the profile; the current one."""
     for name, data in arrays.items():
         np.save(tmp_path / f"{name}.npy", data)
     (tmp_path / "toy.toml").write_text(toy.PROFILE_TOML)
@@ -173,7 +167,7 @@ def test_the_pages_that_were_encoded_bring_profile_levels_and_code(folder: Path)
 
 
 class TestRefused:
-    """What came and what was wanted, by file and frame; nothing is left under the final name."""
+    """Refusals name file and frame; nothing is left under the final name."""
 
     @pytest.fixture(autouse=True)
     def nothing_is_written(self, folder: Path) -> Iterator[None]:

@@ -1,4 +1,4 @@
-"""What follows from a profile: the same light whatever shows it to the cameras, and what to change otherwise."""
+"""Consequences of a profile: the same light whatever shows it to the cameras, and what to change otherwise."""
 
 import numpy as np
 import pytest
