@@ -47,7 +47,11 @@ def _upright(camera: str) -> Decorator:
         f"--flip-{camera}", type=click.Choice(FLIPS), default="none", show_default=True, help="x: left for right."
     )
     turn = click.option(
-        f"--turn-{camera}", type=click.Choice(TURNS), default="0", show_default=True, help="Degrees clockwise, after it."
+        f"--turn-{camera}",
+        type=click.Choice(TURNS),
+        default="0",
+        show_default=True,
+        help="Degrees clockwise, after it.",
     )
     return lambda command: flip(turn(command))
 

@@ -49,20 +49,6 @@ class ForeignArray(ABC):
         """Close the file."""
 
 
-class WholeArray(ForeignArray):
-    """An array of MATLAB that lies in memory."""
-
-    pages_last = True  # MATLAB's
-
-    def __init__(self, subject: str, data: NDArray[Any]) -> None:
-        self.subject, self._data = subject, data
-        self.shape, self.dtype = data.shape, data.dtype
-
-    def take(self, axis: int, start: int, stop: int) -> NDArray[Any]:
-        """See `ForeignArray`."""
-        return self._data[(slice(None),) * axis + (slice(start, stop),)]
-
-
 @contextmanager
 def readable(subject: str, expected: str) -> Iterator[None]:
     """Have whatever a reader of files raises of a damaged one end as one error that names the file.

@@ -1,8 +1,7 @@
-"""Arrays of HDF5 files under any name, and of MATLAB's .mat files of either kind."""
+"""Arrays of HDF5 files under any name."""
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.errors import InvalidInputError
-from lightpage.foreign.array import MOST_BYTES, ForeignArray, WholeArray, chosen, readable
-from lightpage.recording.hdf5 import DATA, hdf, open_hdf5, patiently
+from lightpage.foreign.array import ForeignArray, chosen, readable
+from lightpage.recording.hdf5 import DATA, open_hdf5, patiently
 from lightpage.recording.stored import ArrayFile, StoredArray
 
 _MOST_OBJECTS = 10_000
@@ -86,37 +85,3 @@ def _holds_numbers(item: h5py.Dataset) -> bool:
     if item.shape is None or not 2 <= len(item.shape) <= 4:
         return False
     return item.dtype.kind in _NUMBERS and 0 not in item.shape
-
-
-def open_mat(path: Path, name: str | None) -> ForeignArray:
-    """Open an array of a .mat file, of version 7.3 (which is HDF5) or an earlier one.
-
-    Raises:
-        InvalidInputError: damaged, no such array, or one of an earlier version that is too large to be read whole.
-    """
-    if hdf.is_hdf5(path):
-        return Hdf5Array(path, name, reversed_axes=True)
-    from scipy.io import loadmat  # a tenth of a second
-
-    subject, expected = f"file {path}", "a .mat file of MATLAB"
-    found = mat_arrays(path)
-    name = chosen(subject, name, found)
-    if (size := math.prod(found[name])) > MOST_BYTES // 4:
-        got = f"an array of {size:,} elements, which can only be read whole"
-        raise InvalidInputError(f"{subject}: array '{name}'", got, "save(..., '-v7.3')")
-    with readable(subject, expected):
-        data = np.asarray(loadmat(path, variable_names=[name])[name])
-    return WholeArray(f"{subject}: array '{name}'", data)
-
-
-def mat_arrays(path: Path) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the arrays of numbers in a .mat file before version 7.3, by name.
-
-    Raises:
-        InvalidInputError: the file is damaged, or none.
-    """
-    from scipy.io import whosmat
-
-    kinds = {"double", "single", "logical", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64"}
-    with readable(f"file {path}", "a .mat file of MATLAB"):
-        return {name: tuple(shape) for name, shape, kind in whosmat(path) if kind in kinds and len(shape) <= 4}

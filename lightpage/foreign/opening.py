@@ -8,7 +8,8 @@ from lightpage.errors import InvalidInputError
 from lightpage.failures import os_errors
 from lightpage.files import matching
 from lightpage.foreign.array import SEPARATOR, ForeignArray
-from lightpage.foreign.hdf5_file import Hdf5Array, open_mat
+from lightpage.foreign.hdf5_file import Hdf5Array
+from lightpage.foreign.mat_file import open_mat
 from lightpage.foreign.numpy_file import open_npy, open_npz
 from lightpage.foreign.pictures import SUFFIXES, Pictures, natural, pictures_in
 from lightpage.foreign.tiff_file import TiffArray

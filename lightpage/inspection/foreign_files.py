@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile
 from lightpage.foreign.array import MOST_BYTES, SEPARATOR, ForeignArray
-from lightpage.foreign.hdf5_file import arrays_in, mat_arrays
+from lightpage.foreign.hdf5_file import arrays_in
+from lightpage.foreign.mat_file import mat_arrays
 from lightpage.foreign.numpy_file import arrays_of
 from lightpage.foreign.opening import open_array
 from lightpage.inspection.exposure import histogram, sampled
