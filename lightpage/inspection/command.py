@@ -10,9 +10,9 @@ from lightpage.cli.main import EXIT_ERROR
 from lightpage.cli.options import named_profile
 from lightpage.cli.paths import OutputFile
 from lightpage.files import write_json
+from lightpage.inspection.apart import look_apart
 from lightpage.inspection.exposure import bars
 from lightpage.inspection.finding import Finding, printable
-from lightpage.inspection.look import look
 
 
 @click.command()
@@ -26,13 +26,13 @@ def inspect(file: Path, profile_name: str | None, picture: Path | None, json_pat
     FILE is a recording, pages, a bundle, the folder of a run, a calibration, a profile, or frames of another program.
     Frames are looked at by samples. What is broken or does not fit makes the exit status 2.
     """
-    found = look(file, named_profile(profile_name))
+    found, pictures = look_apart(file, named_profile(profile_name), drawn=picture is not None)
     write_json(json_path, found.to_json())
     click.echo(table(found))
     if picture is not None:
         from lightpage.inspection.picture import draw  # matplotlib takes half a second
 
-        draw(found, picture)
+        draw(found, pictures, picture)
     if found.problems:
         click.get_current_context().exit(EXIT_ERROR)
 

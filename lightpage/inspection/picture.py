@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from lightpage.errors import InvalidInputError
 from lightpage.files import replace_file
 from lightpage.inspection.exposure import sampled
-from lightpage.inspection.finding import Finding, printable
+from lightpage.inspection.finding import Finding, Picture, printable
 from lightpage.pictures import write_figure_png
 
 _COLUMNS = 3
@@ -22,15 +22,14 @@ _SHADES = (0.2, 99.5)
 _DOTS = 110
 
 
-def draw(found: Finding, out: Path) -> None:
+def draw(found: Finding, pictures: list[Picture], out: Path) -> None:
     """Draw what was found to a PNG file.
 
     Raises:
         InvalidInputError: there is nothing to draw, or the file cannot be written.
     """
-    if found.pictures is None:
+    if not pictures:
         raise InvalidInputError(f"--picture {out}", f"a {found.kind}", "a file with frames or symbols")
-    pictures = found.pictures()
     panels = len(pictures) + bool(found.histograms)
     rows = math.ceil(panels / _COLUMNS)
     figure = Figure(figsize=(4.6 * _COLUMNS, 3.4 * rows), layout="constrained")

@@ -15,8 +15,12 @@ from PIL import Image
 from scipy.io import savemat
 
 from lightpage.cli import main
-from lightpage.inspection.command import inspect
+from lightpage.errors import InvalidInputError
+from lightpage.inspection.apart import look_apart
+from lightpage.inspection.command import inspect, table
+from lightpage.inspection.look import look
 from lightpage.recording.decoded_file import DecodedWriter
+from tests.lightpage.refused import refused
 from tests.lightpage.small import small_profile
 from tests.runtime import coded, toy
 
@@ -116,22 +120,30 @@ MADE: dict[str, tuple[str, int, Callable[[Path], object]]] = {
     "pipe": ("a pipe", 2, os.mkfifo),
     "loop": ("loop", 2, lambda path: path.symlink_to(path.name)),
     "folders": ("inner", 2, folder_loop),
-    "new\nline": ("\\nline", 2, lambda path: path.write_bytes(b"\0\1\2")),
+    "new\nline": ("new\\nline", 2, lambda path: path.write_bytes(b"\0\1\2")),
     "zero": ("a device", 2, lambda path: path.symlink_to("/dev/zero")),
     "none": ("none", 2, lambda path: None),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", MADE)
-def test_it_says_what_a_file_is_or_what_is_wrong(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_says_what_a_file_is_or_what_is_wrong(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told, status, make = MADE[name]
     make(tmp_path / name)
     monkeypatch.chdir(tmp_path)
-    assert main.run(inspect, [name]) == status
-    said = capsys.readouterr()
-    assert told in (said.out + said.err).replace("new line", "new\\nline")
+    try:
+        found = look(Path(name))
+        said, problems = table(found), bool(found.problems)
+    except InvalidInputError as error:
+        said, problems = ascii(str(error)), True
+    assert told in said
+    assert problems == (status == 2)
+
+
+def test_a_file_that_is_never_read_to_its_end_is_given_up(tmp_path: Path) -> None:
+    (tmp_path / "p.toml").write_text(PROFILE)
+    with refused("p.toml", "does not come to its end"):
+        look_apart(tmp_path / "p.toml", None, drawn=False, longest_s=0.0)
 
 
 def test_a_recording_is_looked_at_and_drawn(small_device: list[str], tmp_path: Path) -> None:
