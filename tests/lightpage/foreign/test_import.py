@@ -127,9 +127,7 @@ def hdf5(a: Arrays) -> None:
 
 
 def archive(a: Arrays) -> None:
-    taken = np.stack([a["in_phase"], a["quadrature"]], axis=1)
-    np.savez_compressed("both.npz", frames=taken, references=np.stack([a["reference_in_phase"]] * 2))
-    np.save("ref.npy", np.stack([a["reference_in_phase"], a["reference_quadrature"]]))
+    np.savez_compressed("both.npz", frames=np.stack([a["in_phase"], a["quadrature"]], axis=1), other=a["symbols"])
 
 
 @pytest.mark.parametrize(
