@@ -23,13 +23,13 @@ from lightpage.calibration.document import Calibration, parse_calibration
 from lightpage.device.profile import Profile, parse_profile
 from lightpage.errors import InvalidInputError
 from lightpage.files import lock, replace_file, replace_text
+from lightpage.run_files import BEGUN, DESCRIPTION
 from lightpage.train.fitting.fitted import CHECKPOINTS, FITTED
 from lightpage.train.models.decoder import SymbolDecoder
 from lightpage.train.models.hyperparameters import Hyperparameters
 from lightpage.train.processes import is_first_process
 from lightpage.train.published.localizers import NAMES as PUBLISHED
 from lightpage.train.published.training import PublishedChoices
-from lightpage.train.run_files import BEGUN, DESCRIPTION
 
 WEIGHTS = "decoder.pt"
 REFERENCES = "references.npz"

@@ -17,10 +17,10 @@ from lightpage.foreign.pictures import SUFFIXES
 from lightpage.inspection.documents import MOST_BYTES
 from lightpage.inspection.finding import Finding, printable
 from lightpage.inspection.foreign_files import look_at_array
+from lightpage.run_files import BEGUN, DESCRIPTION
 from lightpage.runtime.archives.run.job import FILE as JOB
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import MANIFEST
-from lightpage.train.run_files import BEGUN, DESCRIPTION
 
 _MOST_ENTRIES = 10_000
 _READ_WHOLE = 64 << 20
