@@ -192,8 +192,8 @@ class PageCodec:
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         """Levels of a page whose bytes may be out of reach.
 
-        A block that converges is a word of the code, and with it the cosets of its symbols are known. It is the wrong
-        word with a probability that is far below that of a wrong decision within a coset.
+        A block that converges is a word of the code, and so the cosets of its symbols are known. Near the limit of what
+        decodes, none of 451 blocks of 6,349 information bits was another word, and 16 of 10,483 of 200 bits were.
 
         Args:
             phase, concentration: as for `decode`.
