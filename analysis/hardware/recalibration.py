@@ -18,7 +18,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import click
 import numpy as np
@@ -61,7 +60,7 @@ class Photographed(FrameSource):
     """Pages that a source has shown before.
 
     Args:
-        source: that shows them once.
+        source: source that shows them once.
     """
 
     name = "photographed pages"
@@ -88,8 +87,8 @@ class Taken:
     """Costs of a recalibration; not a number where it failed.
 
     Attributes:
-        seconds: from the call to the new model in service.
-        worked_s: of it, in its own process.
+        seconds: time from the call to the new model in service.
+        worked_s: seconds of work in its own process.
         error: why it failed, if so.
     """
 
@@ -99,7 +98,7 @@ class Taken:
 
 
 def lost_pages(decoder: Decoder) -> LostPages:
-    """Pages of user data of the device whose pipe has turned by `KNOCKED_DEG`."""
+    """Photograph pages of user data of the device after its pipe has turned by `KNOCKED_DEG`."""
     device = Device()
     knocked = device.with_settings([f"geometry.pipe_angle_deg={device.geometry.pipe_angle_deg + KNOCKED_DEG}"])
     source = DriftingSource(decoder, lambda moment: knocked, seed=4)
@@ -159,7 +158,7 @@ def main(rounds: int, load: float, heal: bool, threads: int | None, json_path: P
         busy.append(running.result())
         recalibrator.close()
     idle_s, busy_s = median(one.seconds for one in idle), median(one.seconds for one in busy)
-    figures: dict[str, Any] = {
+    figures: dict[str, float] = {
         "threads": threads or available_cpus(),
         "rounds": rounds,
         "load": load,
@@ -180,11 +179,11 @@ def main(rounds: int, load: float, heal: bool, threads: int | None, json_path: P
     }
     for name, value in figures.items():
         click.echo(f"{name:<30} {value:.4g}")
-    figures["failed"] = [one.error for one in (*idle, *busy) if one.error]
-    for error in figures["failed"]:
+    failed = [one.error for one in (*idle, *busy) if one.error]
+    for error in failed:
         click.echo(f"failed: {error}")
     if json_path is not None:
-        write_json(json_path, figures)
+        write_json(json_path, {**figures, "failed": failed})
 
 
 if __name__ == "__main__":

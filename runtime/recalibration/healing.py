@@ -211,7 +211,7 @@ class _Healing:
         return _Model(self._decoder.of_bundle(refitted_bundle(self._decoder.bundle, result)), result, fitted)
 
     def _read(self, model: _Model) -> tuple[PageBytes, ...]:
-        """What the pages give a model."""
+        """Return what the pages give a model."""
         return self._shown.look(model.decoder, model.fitted).read
 
     def count(self, model: _Model) -> int:
@@ -238,7 +238,7 @@ class _Healing:
         return KnownPages(pairs, symbols, self._levels, self._references, mask, image_px, near)
 
     def _near(self, model: _Model) -> CalibratedDevice:
-        """The device as a model has it."""
+        """Return the device as a model has it."""
         bundle = model.decoder.bundle
         return bundle.calibration.device(bundle.profile, self._references)
 

@@ -26,7 +26,7 @@ from lightpage.runtime.model.decoding.tracking import Tracker, unconfirmed_page
 
 
 class Look(NamedTuple):
-    """What a model makes of pages: decoded, and their bytes."""
+    """Pages as one model decodes them, and their bytes."""
 
     pages: tuple[DecodedPage, ...]
     read: tuple[PageBytes, ...]
@@ -65,12 +65,12 @@ class UnknownPages:
         return PageCodec(self._code, decoder.bundle.pilot_mask, decoder.bundle.levels(self._code.levels))
 
     def look(self, decoder: Decoder, fitted: FramePair | None = None) -> Look:
-        """What a decoder makes of the pages.
+        """Decode the pages, and read their bytes.
 
         Args:
             decoder: of a model.
-            fitted: the page that it was fitted to. From there the image is followed to the others, as a service
-                follows it; not for a model that was fitted to none of them.
+            fitted: the page that it was fitted to, from which the image is followed to the others as a service follows
+                it; None for a model that was fitted to none of them.
 
         Raises:
             FrameError: frames that show no page.
@@ -86,7 +86,7 @@ class UnknownPages:
         return self._seen[decoder]
 
     def _tracker(self, decoder: Decoder, fitted: FramePair | None) -> Tracker | None:
-        """Follows the image; what a shift does is as good as the same for all models, and the first one shows it."""
+        """Return what follows the image. A shift does the same in all models, so the first one is measured."""
         if fitted is None:
             return None
         if self._drift is None:

@@ -49,20 +49,20 @@ class CameraView:
 
     @cached_property
     def _rim(self) -> Real:
-        """Terms of the symbols about the page's rim: where both cameras show these, they show all."""
+        """Monomials of the symbols about the page's rim: where both cameras show these, they show all."""
         assert self._places is not None
         rows, columns = self._places[:, [0, -1]], self._places[:, :, [0, -1]]
         return _terms(self._profile, np.concatenate([rows.reshape(2, -1), columns.reshape(2, -1)], axis=1))
 
     def _shown(self, registration: NDArray[np.float32], terms: Real) -> NDArray[np.bool_]:
-        """Whether both frames show places whose terms are [10, ...], bool [...]."""
+        """Return whether both frames show places whose terms are [10, ...], bool [...]."""
         pixels = np.moveaxis(np.tensordot(registration, terms, 1), 1, -1)
         end = np.array(self._profile.frame_shape[::-1]) - 0.5
         return np.asarray(np.all((pixels >= -0.5) & (pixels <= end), axis=(0, -1)))
 
 
 def _terms(profile: Profile, places: Real) -> Real:
-    """What a registration multiplies at places [2, ...] in grid samples, [10, ...]."""
+    """Return the monomials of places [2, ...] in grid samples, [10, ...], in the order of a registration."""
     grid = field_grid(profile)
     x, y = (axis[0] + place * grid.pitch_m for axis, place in zip((grid.x_m, grid.y_m), places, strict=True))
     return np.stack([(x / profile.corner_m) ** i * (y / profile.corner_m) ** j for i, j in monomial_powers()])

@@ -175,7 +175,7 @@ def test_pages_wait_for_others_and_for_twice_as_many_where_that_brought_none(
 
 def test_a_bundle_without_a_calibration_is_not_healed(small_bundle: Path, drifted: Path) -> None:
     bundle = Bundle.open(small_bundle)
-    manifest = bundle.manifest.model_copy(update={"calibration": None})
+    manifest = bundle.manifest.model_copy(update={"calibration": ""})
     with Recording.open(drifted / "R.h5") as recording:
         lost = LostPages((recording.frames(0),), CODE, references=recording.references())
     with pytest.raises(RecalibrationRefusedError):
