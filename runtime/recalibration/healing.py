@@ -21,7 +21,7 @@ from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.parameters import as_dict
 from lightpage.calibration.sampling_table import moved_cameras
 from lightpage.codec.code import Code
-from lightpage.codec.page_bytes import Header, PageBytes
+from lightpage.codec.page_bytes import Header, Loss, PageBytes
 from lightpage.errors import (
     CalibrationError,
     FrameError,
@@ -219,10 +219,12 @@ class _Healing:
         return sum(page.loss is None for page in self._read(model))
 
     def unread(self, model: _Model) -> str:
-        """That no page is read, and how far the one is from it that is nearest."""
-        lacking = min(-page.margin_bits for page in self._read(model))
-        least = f"the nearest lacks {lacking:.2f} bit a symbol by its own claims"
-        return f"{len(self.pairs)} pages of which none is read after {MOST_ROUNDS} rounds; {least}"
+        """Return that no page is read, and how far the one is from it that is nearest."""
+        pages = self._read(model)
+        told = f"the nearest lacks {min(-page.margin_bits for page in pages):.2f} bit a symbol by its own claims"
+        if decoded := sum(page.loss is Loss.CHECKSUM for page in pages):
+            told = f"{decoded} fail in bits that their LDPC blocks, which all converge, leave out"
+        return f"{len(pages)} pages of which none is read after {MOST_ROUNDS} rounds; {told}"
 
     def known(self, model: _Model) -> KnownPages | None:
         """The pages that come right, the fitted one first, then by what they have to spare; None if none does."""
