@@ -236,7 +236,7 @@ class _Healing:
         symbols = tuple(codec.encode_again(page, self._shown.pilots) for page, _ in read)
         image_px = self._image.shift_x_px, self._image.shift_y_px
         pairs = tuple(pair for _, pair in read)
-        mask, near = model.decoder.bundle.pilot_mask, self._near(model) if model.fitted else None
+        mask, near = model.decoder.bundle.pilot_mask, None if model.fitted is None else self._near(model)
         return KnownPages(pairs, symbols, self._levels, self._references, mask, image_px, near)
 
     def _near(self, model: _Model) -> CalibratedDevice:
