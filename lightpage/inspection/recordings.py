@@ -125,7 +125,7 @@ def _recording(path: Path, profile: Profile | None) -> Finding:
         }
         coded = _tell_code(found, header.code_text)
         with found.trying("a profile that fits"):
-            found.profile = header.device(profile)
+            found.profile = header.device(profile, found.problems.append)
             check_camera(found.profile)
             found.facts["profile"] = f"{found.profile.name}{' (its own)' if profile is None else ''}"
         _exposure(found, recording)
