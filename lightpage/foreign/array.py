@@ -104,3 +104,8 @@ def chosen(subject: str, name: str | None, found: dict[str, tuple[int, ...]]) ->
         got = f"{len(found)} arrays: {told}" if found else "no array of numbers"
         raise InvalidInputError(subject, got, f"one, or FILE{SEPARATOR}NAME")
     return next(iter(found))
+
+
+def spread(count: int, most: int) -> list[int]:
+    """Return some of so many numbers, from first to last."""
+    return [int(number) for number in np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.errors import FrameError, InvalidInputError
-from lightpage.foreign.array import ForeignArray
+from lightpage.foreign.array import ForeignArray, spread
 
 Counts = NDArray[np.unsignedinteger[Any]]
 Flip = Literal["", "x", "y", "xy"]
@@ -159,9 +159,8 @@ class Frames:
         return self._upright(data)
 
     def sample(self, most: int) -> Iterator[Counts]:
-        """Yield some frames from first to last."""
-        for page in np.unique(np.linspace(0, len(self) - 1, min(most, len(self))).astype(int)):
-            yield self.frame(int(page))
+        """Return an iterator over some frames from first to last."""
+        return map(self.frame, spread(len(self), most))
 
 
 def _first_axis_of_pages(array: ForeignArray, shape: tuple[int, int]) -> Literal[0, 2] | None:

@@ -142,7 +142,7 @@ def exposure_of(material: Material, bit_depth: int | None) -> Exposure:
 
     Raises:
         FrameError: values that are no counts.
-        InvalidInputError, StorageError, SurroundingsError: a frame cannot be read.
+        InvalidInputError, StorageError, SurroundingsError: a frame cannot be read, or the black level is no count.
     """
     peak, unused, darkest = 0, MAX_BIT_DEPTH, (1 << MAX_BIT_DEPTH) - 1
     for frames in (*material.frames, *material.references):
@@ -162,6 +162,8 @@ def exposure_of(material: Material, bit_depth: int | None) -> Exposure:
         frames.shift = unused
     brightest = peak >> unused
     depth = bit_depth or (MAX_BIT_DEPTH - unused if unused else next(bits for bits in _DEPTHS if peak < 1 << bits))
+    if material.black_level >= (most := 2**depth - 1):
+        raise InvalidInputError(f"--black-level {material.black_level}", f"counts of {depth} bits", f"0 to {most - 1}")
     return Exposure(depth, unused, bit_depth is not None, darkest >> unused, brightest)
 
 

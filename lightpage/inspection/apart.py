@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from signal import SIGKILL
 
 from lightpage.cli.main import missing
 from lightpage.device.profile import Profile
-from lightpage.errors import InvalidInputError, WorkerError
+from lightpage.errors import InvalidInputError, StorageError, SurroundingsError, WorkerError
 from lightpage.helper_process import Helper, HelperProcess, same_packages
 from lightpage.inspection.finding import Finding, Picture
 
@@ -46,15 +47,28 @@ def look_apart(
         longest_s: time after which the process is ended.
 
     Raises:
-        InvalidInputError: it is nothing that is known here, or reading it crashes or takes too long.
-        StorageError, SurroundingsError: it cannot be read.
+        InvalidInputError: it is nothing that is known here, or reading it crashes.
+        StorageError: it cannot be read, or not in time.
+        SurroundingsError: a resource is short.
+        WorkerError: the process cannot be started, or fails by itself.
     """
-    process = HelperProcess(f"{__name__}:Inspector", subject=f"file {path}", environment=same_packages(1))
+    subject = f"file {path}"
+    process = HelperProcess(f"{__name__}:Inspector", subject=subject, environment=same_packages(1))
     try:
-        found, pictures = process.ask("look", path, profile, drawn, timeout_s=longest_s)
+        process.send("look", path, profile, drawn)
+        if not process.poll(longest_s):
+            raise StorageError(
+                subject, f"no end of it within {longest_s:g} s", "a file that is whole, on quick storage"
+            )
+        found, pictures = process.answer()
         return found, pictures
     except WorkerError as error:
-        got = f"data at which reading does not come to its end ({error.got})"
-        raise InvalidInputError(f"file {path}", got, "a file that is whole") from None
+        if process.status == -SIGKILL:  # which the system sends where memory is short
+            raise SurroundingsError(subject, error.got, "more memory") from None
+        if process.status is not None and process.status < 0:
+            raise InvalidInputError(
+                subject, f"data that reading crashes at ({error.got})", "a file that is whole"
+            ) from None
+        raise
     finally:
         process.end()
