@@ -26,12 +26,13 @@ from lightpage.runtime.model.bundle.manifest import GOLDEN
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.page import DecodedPage, Timings
 from lightpage.runtime.model.decoding.tracking import Tracker
+from lightpage.words import brief, counted
 
 _MAP_DECIMALS = 4
 """Of maps in JSON: finer than the noise of any number of pages, and short enough to write."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Evaluation:
     """Figures over the data symbols of held-out pages.
 
@@ -68,6 +69,11 @@ class Evaluation:
     pages_recalibration_due: int = 0
     refused: tuple[RefusedPage, ...] = ()
     air_before_refit_bits_per_symbol: float = float("nan")
+
+    def __repr__(self) -> str:
+        air = f"AIR {self.figures.air_bits_per_symbol:.3f} bits a symbol"
+        page = f"{self.page_kb:.2f} kB a page"
+        return brief(self, f"of {self.bundle_version}", air, page, f"by {counted(self.pages, 'page')}")
 
     @property
     def page_kb(self) -> float:

@@ -37,6 +37,7 @@ from lightpage.runtime.model.execution.providers import ON_CPU, Provider
 from lightpage.runtime.model.execution.session import Port, open_session, running
 from lightpage.runtime.model.execution.table_graph import GraphFile, TableGraph
 from lightpage.waves.grid import field_grid
+from lightpage.words import brief
 
 if TYPE_CHECKING:
     from lightpage.codec.page_codec import PageCodec
@@ -102,6 +103,9 @@ class Decoder:
             if bundle.code is not None:
                 _ = self.page_codec
             self._check_golden()
+
+    def __repr__(self) -> str:
+        return brief(self, self.version, f"profile {self.bundle.profile.name}", f"on {self.graph.provider}")
 
     @classmethod
     def load(cls, path: str | Path, threads: int | None = None, provider: Provider = ON_CPU) -> Decoder:

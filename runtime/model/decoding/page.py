@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from lightpage.page.pilots import PilotCheck
 from lightpage.runtime.model.decoding.image_position import ImagePosition
 from lightpage.von_mises import information
+from lightpage.words import brief, sides
 
 _SYMBOLS = 4096
 """Symbols at most by which a page's information is estimated: their mean is exact to a few thousandths, and soon taken.
@@ -58,7 +59,7 @@ class Timings:
         return self.check_s + self.inference_s + self.decision_s + self.search_s
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class DecodedPage:
     """A page of symbols with what is known about each.
 
@@ -94,6 +95,11 @@ class DecodedPage:
     level_phases: tuple[float, ...] | None = None
     image: ImagePosition | None = None
     stroke_relative: float = np.nan
+
+    def __repr__(self) -> str:
+        symbols = f"{sides(self.symbols.shape)} symbols of {self.levels} levels"
+        claimed = f"confidence {self.confidence.mean():.3f}, {self.information_bits:.2f} bits a symbol"
+        return brief(self, symbols, claimed, f"pilot coherence {self.pilot_coherence:.2f}")
 
     @cached_property
     def information_bits(self) -> float:
