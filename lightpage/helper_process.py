@@ -25,6 +25,7 @@ from typing import IO, Any, ClassVar
 
 from lightpage.errors import LightpageError, WorkerError
 from lightpage.failures import short_resource
+from lightpage.systems import NEEDS_LINUX
 
 _PROGRESS, _ANSWER, _ERROR, _END = "progress", "answer", "error", "end"
 _END_S = 5.0
@@ -75,6 +76,8 @@ class HelperProcess:
         environment: Mapping[str, str] | None = None,
         log: IO[bytes] | None = None,
     ) -> None:
+        if sys.platform == "win32":
+            raise WorkerError(subject, "Windows", NEEDS_LINUX)
         self._subject = subject
         self._requests = SimpleQueue[list[Any]]()
         self._told = SimpleQueue[tuple[str, Any]]()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import signal
 import sys
 import threading
@@ -28,11 +29,13 @@ from lightpage.errors import (
     LostDataError,
     MissingResultsError,
     StorageError,
+    SurroundingsError,
     TakenError,
 )
 from lightpage.failures import understood
 from lightpage.files import results_on_stdout
 from lightpage.progress import reporting
+from lightpage.systems import ENDING, LINUX_MODULES, NEEDS_LINUX
 from lightpage.temporary import settle_matplotlib
 
 GROUP = "lightpage.commands"
@@ -126,7 +129,7 @@ class LazyGroup(click.Group):
         except ModuleNotFoundError as error:
             if not ctx.meta.get(HELP_KEY):
                 raise missing(f"lightpage {cmd_name}", error) from error
-            with stand_ins(EXTRA_MODULES):
+            with stand_ins(EXTRA_MODULES | LINUX_MODULES):
                 command = self.points[cmd_name].load()
         if not isinstance(command, click.Command):
             raise LightpageError(f"command {cmd_name}", type(command).__name__, "a click command")
@@ -162,6 +165,8 @@ def _checked(command: click.Command) -> click.Command:
 def missing(subject: str, error: ModuleNotFoundError) -> LightpageError:
     """The error that says which extra to install for a module that is not there."""
     top = (error.name or "").partition(".")[0]
+    if top in LINUX_MODULES:
+        return SurroundingsError(subject, f"{platform.system()} without Python's module {top}", NEEDS_LINUX)
     if top == RUNTIME:
         expected = "the extra cpu, or the extra gpu on a machine with an NVIDIA GPU: pip install 'lightpage[cpu]'"
         return LightpageError(subject, f"no module {top}", expected)
@@ -223,7 +228,7 @@ def run(command: click.Command, arguments: Sequence[str] | None = None, name: st
     except LightpageError as error:
         return _fail(error)
     except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] not in EXTRA_MODULES:
+        if (error.name or "").partition(".")[0] not in EXTRA_MODULES | LINUX_MODULES:
             raise
         return _fail(missing("lightpage", error))
     except (KeyboardInterrupt, click.Abort):
@@ -250,7 +255,7 @@ class _Termination:
     def __enter__(self) -> Self:
         self._before: dict[int, Any] = {}
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGTERM, signal.SIGHUP):
+            for number in ENDING:
                 if signal.getsignal(number) != signal.SIG_IGN:
                     self._before[number] = signal.signal(number, self._interrupt)
         return self
@@ -261,8 +266,8 @@ class _Termination:
 
     def _interrupt(self, number: int, _: FrameType | None) -> NoReturn:
         self.came = number
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # it may come with SIGTERM, and is not impatience
+        for other in ENDING:  # a hangup may come with SIGTERM, and is not impatience
+            signal.signal(other, signal.SIG_DFL if other == signal.SIGTERM else signal.SIG_IGN)
         raise KeyboardInterrupt
 
 

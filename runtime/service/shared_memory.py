@@ -21,8 +21,6 @@ from lightpage.errors import InvalidInputError, LightpageError, LimitError, Over
 from lightpage.runtime.client.shared_memory import GRANTED, HANDLE_BYTES, REFUSED, SIZE, WHY_BYTES
 from lightpage.runtime.client.wire.address import check_free
 
-_SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
-"""Nobody changes the size of a region any more: reading beyond the end of a shrunken one would end the service."""
 _LOOK_S = 0.1
 _PAUSE_S = 0.01
 """After trouble, so that one that lasts takes no core."""
@@ -48,7 +46,9 @@ class Region:
         self.descriptor = os.memfd_create("lightpage", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         try:
             os.ftruncate(self.descriptor, size)
-            fcntl.fcntl(self.descriptor, fcntl.F_ADD_SEALS, _SEALS)
+            # Nobody changes its size any more: reading beyond the end of a shrunken one would end the service.
+            seals = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
+            fcntl.fcntl(self.descriptor, fcntl.F_ADD_SEALS, seals)
             self._memory = mmap.mmap(self.descriptor, size, mmap.MAP_SHARED, mmap.PROT_READ)
         except BaseException:
             os.close(self.descriptor)
@@ -189,10 +189,8 @@ class SharedMemory:
         """Listen.
 
         Raises:
-            InvalidInputError: the socket cannot be made, or this system has no memory to share.
+            InvalidInputError: the socket cannot be made.
         """
-        if not hasattr(os, "memfd_create"):
-            raise InvalidInputError("service.shared_memory", "a system without memfd_create", "Linux")
         check_free("socket", f"unix:{self._path}")
         try:
             self._path.unlink(missing_ok=True)  # left behind by a process that was killed

@@ -38,6 +38,7 @@ from lightpage.runtime.service.settings import (
     ServiceTable,
     service_settings,
 )
+from lightpage.systems import check_linux
 
 _log = logging.getLogger(__name__)
 _Command = TypeVar("_Command", bound=Callable[..., Any])
@@ -99,6 +100,7 @@ def serve(context: click.Context, /, config: Path | None, print_config: bool, **
     if print_config:
         click.echo(effective.to_toml(), nl=False)
         return
+    check_linux("lightpage serve")
     settings = effective.settings
     settings.check_paths()
     share_freed_memory()
