@@ -190,7 +190,7 @@ results: $(STAMP)  ## write docs/results.md from analysis/results: RESULTS_ARGS=
 	$(BIN)/python -m analysis.results.page $(RESULTS_ARGS)
 
 proto: $(STAMP)  ## regenerate the gRPC stubs from proto/
-	$(BIN)/python proto/generate.py
+	$(BIN)/uv run --quiet --python $(BIN)/python proto/generate.py
 
 image:  ## build the container image (IMAGE_TARGET=runtime, camera, deep, gpu or ray; RELEASE=1 BASE=NAME@sha256:DIGEST; IMAGE_PLATFORM)
 	LIGHTPAGE_RELEASE=$(RELEASE) LIGHTPAGE_BASE=$(BASE) LIGHTPAGE_PLATFORM=$(IMAGE_PLATFORM) \
