@@ -347,7 +347,7 @@ def _coarse(frame: NDArray[np.integer[Any]], step: int) -> NDArray[np.integer[An
 def npz(**arrays: NDArray[Any]) -> bytes:
     """Arrays as the bytes of a compressed .npz file, for `write_bundle`."""
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    np.savez_compressed(buffer, **arrays)
     return buffer.getvalue()
 
 
