@@ -62,7 +62,8 @@ COMPLETE = "_LIGHTPAGE_COMPLETE"
 RUNTIME = "onnxruntime"
 """What computes pages; either of two extras brings it."""
 EXTRAS = {
-    "train": frozenset({"torch", "torchmetrics", "lightning", "tensorboard", "jinja2", "onnx", "onnxscript"}),
+    "train": frozenset({"torch", "torchmetrics", "lightning", "tensorboard", "onnx", "onnxscript"}),
+    "report": frozenset({"jinja2"}),
     "camera": frozenset({"harvesters", "genicam"}),
     "cluster": frozenset({"ray"}),
 }
