@@ -16,13 +16,15 @@ from types import FrameType
 from typing import Any, NoReturn, Self
 
 import click
-from click.shell_completion import shell_complete
+from click.shell_completion import CompletionItem, shell_complete
 
 from lightpage.cli.groups import help_at
+from lightpage.cli.options import alike
 from lightpage.cli.paths import check_outputs, writes_to_stdout
 from lightpage.cli.progress_bar import Bars
 from lightpage.cli.stand_ins import stand_ins
 from lightpage.cli.streams import LastingStream, take_streams
+from lightpage.cli.usage import misused
 from lightpage.errors import (
     InvalidInputError,
     LightpageError,
@@ -68,6 +70,8 @@ EXTRAS = {
     "cluster": frozenset({"ray"}),
 }
 EXTRA_MODULES = frozenset({RUNTIME}).union(*EXTRAS.values())
+SLOW = frozenset({"h5py", "matplotlib", "scipy"})
+"""Packages that take long to import, and that no help needs."""
 
 SUMMARIES = {
     "bench": "Measure speed: inference alone, whole decode, through gRPC.",
@@ -125,6 +129,10 @@ class LazyGroup(click.Group):
         """
         if cmd_name not in self.points:
             return None
+        if ctx.resilient_parsing:  # a shell asks what may follow, and somebody waits
+            with stand_ins(LINUX_MODULES), stand_ins(EXTRA_MODULES | SLOW, even_installed=True):
+                found: click.Command = self.points[cmd_name].load()
+            return found
         try:
             command = self.points[cmd_name].load()
         except ModuleNotFoundError as error:
@@ -136,6 +144,12 @@ class LazyGroup(click.Group):
             raise LightpageError(f"command {cmd_name}", type(command).__name__, "a click command")
         return _checked(command)
 
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        """What may follow, without importing a command."""
+        names = [name for name in self.list_commands(ctx) if name.startswith(incomplete)]
+        options = click.Command.shell_complete(self, ctx, incomplete)
+        return [*(CompletionItem(name, help=SUMMARIES.get(name)) for name in names), *options]
+
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the overview without importing a command."""
         rows = [(name, SUMMARIES.get(name, "")) for name in self.list_commands(ctx)]
@@ -146,6 +160,8 @@ class LazyGroup(click.Group):
 
 def _checked(command: click.Command) -> click.Command:
     """The command, which sees to it that it overwrites nothing that it reads, and what it may print on stdout."""
+    for param in command.params:
+        alike(param)
     checked, run_it = copy(command), command.callback
     if isinstance(checked, click.Group):
         checked.commands = {name: _checked(each) for name, each in checked.commands.items()}
@@ -223,6 +239,8 @@ def run(command: click.Command, arguments: Sequence[str] | None = None, name: st
             command.invoke(ctx)
     except click.exceptions.Exit as end:
         return end.exit_code
+    except click.UsageError as error:
+        return _fail(misused(error))
     except click.ClickException as error:
         error.show()
         return error.exit_code

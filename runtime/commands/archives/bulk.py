@@ -11,7 +11,7 @@ import click
 
 from lightpage.cli.groups import Group
 from lightpage.cli.main import RESUME_KEY
-from lightpage.cli.options import FiniteRange
+from lightpage.cli.options import JSON, FiniteRange
 from lightpage.cli.paths import OutputFile, OutputFolder
 from lightpage.clock import SYSTEM
 from lightpage.codec.code import Code, load_code
@@ -65,7 +65,7 @@ _options = _together(
     click.option("--metrics-file", type=OutputFile(), help="Write metrics at the end, for node_exporter: *.prom."),
     click.option("--metrics-insecure", is_flag=True, help="Let other machines read the metrics, without TLS."),
     click.option("--metrics", "metrics_address", metavar="HOST:PORT", help="Show metrics there while it runs."),
-    click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file."),
+    JSON,
     click.option(
         "--part", metavar="K/N", help="Do every Nth recording or device from the Kth, K from 0; others do the rest."
     ),

@@ -5,14 +5,29 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import click
 
 from lightpage.errors import InvalidInputError
 from lightpage.runtime.client.wire.channel import TlsFiles
 
-TARGET = click.option("--target", metavar="HOST:PORT", required=True, help="The running service.")
+_Command = TypeVar("_Command", bound=Callable[..., Any])
+
+
+def target_option(*, required: bool, help: str = "The running service.") -> Callable[[_Command], _Command]:
+    """Gives a command the option that names a service, which a variable of the environment gives too."""
+    return click.option(
+        "--target",
+        metavar="HOST:PORT",
+        required=required,
+        envvar="LIGHTPAGE_CLIENT_TARGET",
+        show_envvar=True,
+        help=help,
+    )
+
+
+TARGET = target_option(required=True)
 
 _FILES = {
     "ca": "authorities that the service's certificate may come from",
