@@ -83,7 +83,7 @@ def _products() -> _Bytes:
         powers[exponent] = powers[exponent + 255] = power
         logarithms[power] = exponent
         power = power << 1 ^ (_POLYNOMIAL if power & 0x80 else 0)
-    products = powers[logarithms[:, None] + logarithms]
+    products: _Bytes = powers[logarithms[:, None] + logarithms]
     products[0] = products[:, 0] = 0
     return products
 

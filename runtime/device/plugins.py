@@ -43,8 +43,8 @@ def driver_of(group: str, name: str, subject: str) -> Callable[..., Any]:
     return opener
 
 
-def opened_by_driver(group: str, name: str, subject: str, kind: type[T], *arguments: object) -> T:
-    """A thing that a driver opens, once it has all that `kind` names.
+def opened_by_driver(group: str, name: str, subject: str, kind: Callable[..., T], *arguments: object) -> T:
+    """A thing that a driver opens, once it has all that the protocol `kind` names.
 
     Raises:
         InvalidInputError: see `driver_of`; or the driver fails, or lacks something.

@@ -58,14 +58,7 @@ def jobs(
             click.echo(table(data))
         else:
             found = client.jobs.list() if cancel is None else [client.jobs.cancel(cancel)]
-            write_json(
-                json_path,
-                {
-                    "jobs": [
-                        {**asdict(replace(job, error=None)), "error": job.error and str(job.error)} for job in found
-                    ]
-                },
-            )
+            write_json(json_path, {"jobs": list(map(_figures, found))})
             click.echo("\n".join(map(_line, found)) if found else "no jobs")
 
 

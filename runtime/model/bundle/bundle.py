@@ -344,7 +344,7 @@ def _coarse(frame: NDArray[np.integer[Any]], step: int) -> NDArray[np.integer[An
     return np.ascontiguousarray(rounded.repeat(_SIDE_PX, 0).repeat(_SIDE_PX, 1)[:rows, :columns])
 
 
-def npz(**arrays: NDArray[Any]) -> bytes:
+def npz(**arrays: Any) -> bytes:
     """Arrays as the bytes of a compressed .npz file, for `write_bundle`."""
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
