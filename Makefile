@@ -75,7 +75,7 @@ test-lowest: $(STAMP)  ## a share of the tests with the lowest versions that pyp
 	    tests/lightpage/cli tests/lightpage/codec/test_erasure.py tests/runtime/model tests/runtime/client tests/runtime/commands/test_commands.py \
 	    tests/runtime/commands/test_user_bytes.py tests/runtime/archives/run/test_storage.py tests/runtime/service/frames
 
-lint: $(STAMP)  ## ruff, layers of imports, mypy --strict, rules of the tests, hadolint
+lint: $(STAMP)  ## ruff, layers of imports, mypy --strict, rules of tests and words, hadolint
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-cache --no-logo

@@ -19,7 +19,7 @@ _RAYS = 15
 
 
 def exit_centroids(profile: Profile, calibration: Calibration) -> Real:
-    """Where each symbol's beam would leave a pipe without walls, over its width, (x, y') [2, ny, nx].
+    """Return the exit centroid of each symbol in a pipe without walls, over its width, (x, y') [2, ny, nx].
 
     Rounded, these are the symbol's zone: how often it meets the walls x and y', with the sign of the side.
     """

@@ -110,7 +110,7 @@ def test_a_bundle_without_the_graph_is_refused_and_serves_pages(decoder: Decoder
 
 
 def graph_for_batches(preset: str) -> BatchFile:
-    """That of an untrained decoder of a preset."""
+    """Return the batch graph of an untrained decoder of a preset."""
     torch.manual_seed(0)
     device, chosen = Device(), PRESETS[preset]
     parameters = true_parameters(PROFILE, device)
