@@ -1,4 +1,4 @@
-"""What Linux, macOS and Windows do differently: files that are renamed while open, locks, signals, cores."""
+"""Differences of Linux, macOS and Windows: files that are renamed while open, locks, signals, cores."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasatt
 NEEDS_LINUX = "Linux: a container or WSL will do"
 
 _BEYOND = 1 << 60
-"""Where Windows locks a byte: nobody reads or writes a locked one, and no file is so long."""
+"""Place of the byte that Windows locks: nobody reads or writes a locked one, and no file is so long."""
 
 
 def check_linux(subject: str) -> None:
@@ -39,7 +39,7 @@ def check_linux(subject: str) -> None:
 
 
 def open_file(path: str | Path, *, make: bool = True, new: bool = False) -> int:
-    """A descriptor to read and write a file by, which may be renamed and removed while it is open.
+    """Return a descriptor to read and write a file by, which may be renamed and removed while it is open.
 
     Args:
         path: of the file.
@@ -61,7 +61,7 @@ def open_file(path: str | Path, *, make: bool = True, new: bool = False) -> int:
 
 
 def open_folder_to_lock(folder: Path) -> int:
-    """A descriptor to lock a folder by: its own, or that of a file in it, which goes when it is closed.
+    """Return a descriptor to lock a folder by: its own, or that of a file in it, which goes when it is closed.
 
     Raises:
         OSError: the system does not let it.
@@ -100,5 +100,5 @@ def try_lock(descriptor: int, *, shared: bool = False, ranges: bool = False) -> 
 
 
 def cores() -> int:
-    """Processor cores that this process may use."""
+    """Return the number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -9,10 +9,10 @@ def counted(number: int, noun: str) -> str:
 
 
 def sides(shape: tuple[int, ...]) -> str:
-    """The sides of an array, e.g. ``56 x 87``."""
+    """Return the sides of an array, e.g. ``56 x 87``."""
     return " x ".join(map(str, shape))
 
 
 def brief(thing: object, *facts: str) -> str:
-    """A repr of one line, e.g. ``<Recording mine.h5, 30 pages>``: arrays are told by their sizes."""
+    """Return a repr of one line, e.g. ``<Recording mine.h5, 30 pages>``: arrays are told by their sizes."""
     return f"<{type(thing).__name__} {', '.join(facts)}>"

@@ -1,4 +1,4 @@
-"""What a report traces through the device, by the ray tracer in torch."""
+"""Rays that a report traces through the device, in torch."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def exit_centroids(profile: Profile, calibration: Calibration) -> Real:
 
 
 def ray_paths(data: ReportData) -> list[tuple[Real, NDArray[np.int64]]]:
-    """Rays of a row and of a column of the page: paths [K, N, 3] in millimetres, and reflections [N] at their walls."""
+    """Return rays of a row and of a column: paths [K, N, 3] in millimetres, and reflections [N] at their walls."""
     tracer = RayTracer(data.profile, data.rays.lens)
     angle = torch.tensor(math.radians(data.rays.angle_deg), dtype=torch.float64)
     found = []

@@ -145,7 +145,7 @@ class LazyGroup(click.Group):
         return _checked(command)
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """What may follow, without importing a command."""
+        """Return what may follow, without importing a command."""
         names = [name for name in self.list_commands(ctx) if name.startswith(incomplete)]
         options = click.Command.shell_complete(self, ctx, incomplete)
         return [*(CompletionItem(name, help=SUMMARIES.get(name)) for name in names), *options]

@@ -1,4 +1,4 @@
-"""What options of several commands have in common: `--json`, types, and what stands for their values in help."""
+"""Parts that options of several commands share: `--json`, types, and what stands for their values in help."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lightpage.errors import InvalidInputError
 JSON = click.option(
     "--json", "json_path", type=OutputFile(), help="Write the figures to this file as JSON; - is stdout."
 )
-"""Of every command that reports something; its argument is `json_path`."""
+"""Option of every command that reports something; the command's argument is `json_path`."""
 
 _NAMED = {
     "--address": "HOST:PORT",
@@ -30,7 +30,7 @@ _NAMED = {
     "--source": "SOURCE",
     "--version": "VERSION",
 }
-"""What stands for the value of an option of this name, whichever command has it."""
+"""Stand-ins for the value of an option of this name, whichever command has it."""
 
 
 class FiniteRange(click.FloatRange):
@@ -48,7 +48,7 @@ class _NamedPath(click.Path):
     """A path that is named: an empty one would be the working folder."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The path.
+        """Return the path.
 
         Raises:
             InvalidInputError: it is empty.

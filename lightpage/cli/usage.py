@@ -12,7 +12,7 @@ _NO_COMMAND = "No such command "
 
 
 def misused(error: click.UsageError) -> InvalidInputError:
-    """The error that names what came and what was wanted, in place of click's."""
+    """Return the error that names what came and what was wanted, in place of click's."""
     path = "lightpage" if error.ctx is None else error.ctx.command_path
     told = f"what {path} --help says"
     if isinstance(error, click.NoSuchOption):

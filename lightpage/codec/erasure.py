@@ -77,7 +77,7 @@ def restore(pages: Mapping[int, bytes], data_pages: int, parity_pages: int) -> l
 
 @cache
 def _products() -> _Bytes:
-    """The product of every two elements of the field, [256, 256]."""
+    """Return the products of all pairs of elements of the field, [256, 256]."""
     powers, logarithms, power = np.empty(510, np.uint8), np.zeros(256, np.intp), 1
     for exponent in range(255):
         powers[exponent] = powers[exponent + 255] = power
@@ -89,7 +89,7 @@ def _products() -> _Bytes:
 
 
 def _coefficients(parity: Sequence[int], data: Sequence[int], data_pages: int) -> _Bytes:
-    """What parity pages take of data pages, [parity, data]."""
+    """Return the coefficients of data pages in parity pages, [parity, data]."""
     inverses = np.argmax(_products() == 1, axis=1).astype(np.uint8)
     matrix: _Bytes = inverses[(data_pages + np.array(parity, np.intp))[:, None] ^ np.array(data, np.intp)]
     return matrix
@@ -103,7 +103,7 @@ def _add(sums: Sequence[_Bytes], coefficients: _Bytes, pages: Sequence[_Bytes]) 
 
 
 def _inverse(matrix: _Bytes) -> _Bytes:
-    """The inverse of a square part of the Cauchy matrix: all of its parts have one, so no pivot is zero."""
+    """Return the inverse of a square part of the Cauchy matrix; all parts have one, so no pivot is zero."""
     size, products = len(matrix), _products()
     work = np.concatenate([matrix, np.eye(size, dtype=np.uint8)], axis=1)
     for place in range(size):

@@ -17,12 +17,12 @@ T = TypeVar("T")
 
 
 def names_of(group: str) -> list[str]:
-    """Names of the drivers of a group that are installed."""
+    """Return the names of the drivers of a group that are installed."""
     return sorted({point.name for point in entry_points(group=group)})
 
 
 def driver_of(group: str, name: str, subject: str) -> Callable[..., Any]:
-    """What opens a thing by a driver.
+    """Return what opens a thing by a driver.
 
     Args:
         group: of entry points.
@@ -44,7 +44,7 @@ def driver_of(group: str, name: str, subject: str) -> Callable[..., Any]:
 
 
 def opened_by_driver(group: str, name: str, subject: str, kind: Callable[..., T], *arguments: object) -> T:
-    """A thing that a driver opens, once it has all that the protocol `kind` names.
+    """Return a thing that a driver opens, once it has all that the protocol `kind` names.
 
     Raises:
         InvalidInputError: see `driver_of`; or the driver fails, or lacks something.

@@ -70,7 +70,7 @@ def test_the_readmes_script_reads_a_recording_and_follows_its_image(
 
 
 def test_its_types_are_found_in_an_installed_wheel(tmp_path: Path) -> None:
-    """A checker takes them from a package beside others if `py.typed` says that it may."""
+    """Checkers take them from a package beside others if `py.typed` says that it may."""
     environment = tmp_path / "environment"
     venv.create(environment)
     (packages,) = environment.glob("lib/*/site-packages")

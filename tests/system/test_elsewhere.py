@@ -1,4 +1,4 @@
-"""What needs no Linux runs where Linux's calls are absent; what needs them says so. No other system is at hand."""
+"""Commands that need no Linux run where its calls are absent, and others say so. No other system is at hand."""
 
 import json
 import subprocess

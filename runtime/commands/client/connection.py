@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import click
+from click.core import ParameterSource
 
 from lightpage.errors import InvalidInputError
 from lightpage.runtime.client.wire.channel import TlsFiles
@@ -25,6 +26,11 @@ def target_option(*, required: bool, help: str = "The running service.") -> Call
         show_envvar=True,
         help=help,
     )
+
+
+def from_environment(name: str) -> bool:
+    """Return whether a variable of the environment gave an argument of the command that runs."""
+    return click.get_current_context().get_parameter_source(name) is ParameterSource.ENVIRONMENT
 
 
 TARGET = target_option(required=True)

@@ -63,7 +63,7 @@ def jobs(
 
 
 def _figures(job: JobInfo) -> dict[str, Any]:
-    """A job under the names that other programs read."""
+    """Return a job under the names that other programs read."""
     return {**asdict(replace(job, error=None)), "error": job.error and str(job.error)}
 
 

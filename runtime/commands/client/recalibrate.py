@@ -8,7 +8,6 @@ from dataclasses import asdict
 from pathlib import Path
 
 import click
-from click.core import ParameterSource
 
 from lightpage.calibration.known_pages import first_lit_pages
 from lightpage.cli.options import JSON, FiniteRange
@@ -25,7 +24,7 @@ from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.client.jobs import RECALIBRATION_S
 from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.client.wire.messages import answer_of
-from lightpage.runtime.commands.client.connection import TARGET, target_option, with_tls
+from lightpage.runtime.commands.client.connection import TARGET, from_environment, target_option, with_tls
 from lightpage.runtime.model.bundle.manifest import check_version
 from lightpage.runtime.model.bundle.shipped import bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
@@ -93,8 +92,7 @@ def recalibrate(
     the pilots of the first eight pages, and then healed by the pages themselves.
     """
     start, report = time.perf_counter(), RefitReport()
-    context = click.get_current_context()
-    if bundle and context.get_parameter_source("target") is ParameterSource.ENVIRONMENT:
+    if bundle and from_environment("target"):
         target = None
     if target is not None:
         if bundle or out or version is not None or other_device:

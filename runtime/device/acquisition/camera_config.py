@@ -44,7 +44,7 @@ class PluginTable(StrictTable):
 
 
 class PluginCameraTable(View, PluginTable):
-    """Such a camera, and how it sees the image."""
+    """Camera by such a driver, and how it sees the image."""
 
 
 def _kind_of_camera(table: object) -> object:
