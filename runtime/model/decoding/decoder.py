@@ -71,6 +71,8 @@ def open_graph(bundle: Bundle, threads: int | None = None, provider: Provider = 
 class Decoder:
     """The decoder of one bundle. Its methods may be called from many threads at once.
 
+    It does not follow the image as it moves: a `FollowingDecoder`, which `lightpage.load` gives, does.
+
     Args:
         bundle: an opened bundle.
         threads: threads of one inference; by default the cores that this process may use.
