@@ -76,7 +76,7 @@ class HelperProcess:
         environment: Mapping[str, str] | None = None,
         log: IO[bytes] | None = None,
     ) -> None:
-        if sys.platform == "win32":
+        if os.name == "nt":
             raise WorkerError(subject, "Windows", NEEDS_LINUX)
         self._subject = subject
         self._requests = SimpleQueue[list[Any]]()

@@ -54,7 +54,7 @@ def open_file(path: str | Path, *, make: bool = True, new: bool = False) -> int:
         import msvcrt
 
         access, share = _winapi.GENERIC_READ | _winapi.GENERIC_WRITE, 0x7  # to read, to write, to rename and remove
-        disposition = _winapi.CREATE_NEW if new else _winapi.OPEN_ALWAYS if make else _winapi.OPEN_EXISTING
+        disposition = 1 if new else 4 if make else 3  # CREATE_NEW, OPEN_ALWAYS, OPEN_EXISTING of the Windows API
         handle = _winapi.CreateFile(str(path), access, share, 0, disposition, 0, 0)
         return msvcrt.open_osfhandle(handle, os.O_RDWR | os.O_BINARY)
     return os.open(path, os.O_RDWR | (os.O_CREAT if make or new else 0) | (os.O_EXCL if new else 0), 0o666)

@@ -83,7 +83,7 @@ class Volume:
         return [*data, *range(first + self.data_pages, first + self.group_pages)]
 
     def bytes_of(self, numbers: Iterable[int]) -> list[tuple[int, int]]:
-        """Return spans of the file that data pages hold: first byte, and the one behind the last; neighbours together."""
+        """Return the bytes of the file that data pages hold: first, and behind the last; neighbours together."""
         spans: list[tuple[int, int]] = []
         for number in sorted(numbers):
             group, place = divmod(number, self.group_pages)

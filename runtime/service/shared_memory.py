@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from lightpage.errors import InvalidInputError, LightpageError, LimitError, OverloadedError
 from lightpage.runtime.client.shared_memory import GRANTED, HANDLE_BYTES, REFUSED, SIZE, WHY_BYTES
@@ -100,7 +100,13 @@ def unknown_region() -> InvalidInputError:
     return InvalidInputError("header.shared.region", "an unknown handle", expected)
 
 
-class _Server(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):
+if TYPE_CHECKING:
+    _UnixServer = socketserver.UnixStreamServer
+else:
+    _UnixServer = getattr(socketserver, "UnixStreamServer", object)  # Windows has none, and shows help all the same
+
+
+class _Server(socketserver.ThreadingMixIn, _UnixServer):
     """Listens for clients, each of which has a thread for as long as it is connected."""
 
     daemon_threads, block_on_close = True, False
