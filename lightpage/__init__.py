@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from lightpage.errors import LightpageError
     from lightpage.metrics.measures import PageMeasures, measure
     from lightpage.page.pilots import Pilots
-    from lightpage.plots import plot
     from lightpage.recording.frame_pair import FramePair
     from lightpage.recording.reader import Recording
     from lightpage.recording.writer import RecordingWriter
+    from lightpage.report.plots import plot
     from lightpage.runtime.archives.recordings.decoding import decode_recording
     from lightpage.runtime.archives.recordings.evaluation import Evaluation, evaluate
     from lightpage.runtime.archives.recordings.refused import RefusedPage
@@ -68,7 +68,7 @@ _HOMES = {
     "load_device": "lightpage.device.state",
     "load_profile": "lightpage.device.profile",
     "measure": "lightpage.metrics.measures",
-    "plot": "lightpage.plots",
+    "plot": "lightpage.report.plots",
     "tracker_for": "lightpage.runtime.model.decoding.image_tracker",
 }
 

@@ -23,6 +23,7 @@ from lightpage.calibration.document import Calibration, parse_calibration
 from lightpage.device.profile import Profile, parse_profile
 from lightpage.errors import InvalidInputError
 from lightpage.files import lock, replace_file, replace_text
+from lightpage.run_files import BEGUN, DESCRIPTION
 from lightpage.systems import open_folder_to_lock
 from lightpage.train.fitting.fitted import CHECKPOINTS, FITTED
 from lightpage.train.models.decoder import SymbolDecoder
@@ -31,8 +32,6 @@ from lightpage.train.processes import is_first_process
 from lightpage.train.published.localizers import NAMES as PUBLISHED
 from lightpage.train.published.training import PublishedChoices
 
-BEGUN = "begun.json"
-DESCRIPTION = "run.json"
 WEIGHTS = "decoder.pt"
 REFERENCES = "references.npz"
 GOLDEN = "golden.npz"

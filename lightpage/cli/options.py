@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from lightpage.cli.paths import NewPath, OutputFile, OutputFolder
+from lightpage.device.profile import Profile, load_profile
 from lightpage.errors import InvalidInputError
 
 JSON = click.option(
@@ -21,6 +22,7 @@ _NAMED = {
     "--address": "HOST:PORT",
     "--bundle": "BUNDLE",
     "--health-address": "HOST:PORT",
+    "--like": "PROFILE",
     "--metrics-host": "HOST",
     "--name": "NAME",
     "--pixel-format": "FORMAT",
@@ -83,3 +85,16 @@ def _metavar(kind: click.ParamType[Any]) -> str | None:
         case click.Path():
             return "FILE" if kind.file_okay else "FOLDER"
     return None  # choices show themselves
+
+
+profile_option = click.option(
+    "--profile",
+    "profile_name",
+    metavar="P",
+    help="Nominal device: a shipped name or a file.  [default: the recording's own]",
+)
+
+
+def named_profile(name: str | None) -> Profile | None:
+    """Return the profile that `profile_option` names; None where it names none."""
+    return None if name is None else load_profile(name)

@@ -74,4 +74,4 @@ class BatchDecoder:
         read = [Inference(p, phase, length, float(residual)) for p, phase, length, residual in answers[: len(pairs)]]
         for page in read:
             check_residual(page.residual, self.decoder.bundle.manifest.residual_limit, doubtful=doubtful)
-        return read
+        return [self.decoder.view.seen(page) for page in read]

@@ -31,6 +31,7 @@ from lightpage.recording.exposure import check_light
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import DECODER, FIELD, FLOAT16, FLOAT32, GOLDEN, Precision
+from lightpage.runtime.model.decoding.camera_view import CameraView
 from lightpage.runtime.model.decoding.page import DecodedPage, Inference, Timings
 from lightpage.runtime.model.decoding.phase_refit import PhaseRefit
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
@@ -66,6 +67,12 @@ def open_graph(bundle: Bundle, threads: int | None = None, provider: Provider = 
         raise BundleError(f"{subject}: table inputs", sorted(file.table_inputs), sorted(bundle.manifest.table_inputs))
     with raised_as(BundleError, InvalidInputError, about=f"{bundle.subject}: "):
         return TableGraph(file, subject, PAGE_INPUTS, threads, bundle.table, provider=provider)
+
+
+def _told(decoder: Decoder) -> str:
+    """Return what a decoder says of itself."""
+    profile = f"profile {decoder.bundle.profile.name}"
+    return brief(decoder, decoder.version, profile, f"on {decoder.graph.provider}")
 
 
 class Decoder:
@@ -106,8 +113,7 @@ class Decoder:
                 _ = self.page_codec
             self._check_golden()
 
-    def __repr__(self) -> str:
-        return brief(self, self.version, f"profile {self.bundle.profile.name}", f"on {self.graph.provider}")
+    __repr__ = _told
 
     @classmethod
     def load(cls, path: str | Path, threads: int | None = None, provider: Provider = ON_CPU) -> Decoder:
@@ -216,7 +222,7 @@ class Decoder:
         p, phase, concentration, *rest = self.graph.run(self._outputs, feeds)
         residual = float(np.max(rest[0])) if rest else 0.0
         check_residual(residual, self.bundle.manifest.residual_limit, doubtful=doubtful)
-        return Inference(p, phase, concentration, residual)
+        return self.view.seen(Inference(p, phase, concentration, residual), table.get("registration"))
 
     @cached_property
     def field_solver(self) -> BundleFieldSolver:
@@ -226,6 +232,13 @@ class Decoder:
             BundleError: no graph of the bundle shows the field.
         """
         return BundleFieldSolver(self.bundle, self.graph, self.threads)
+
+    @cached_property
+    def view(self) -> CameraView:
+        """Says which symbols the cameras show."""
+        ports, told = self.graph.ports, ("registration", "places")
+        values = [self.graph.value(name) for name in told] if ports.keys() >= set(told) else None
+        return CameraView(self.bundle.profile, *(values or (None, None)))
 
     @cached_property
     def phase_refit(self) -> PhaseRefit:
@@ -280,7 +293,7 @@ class Decoder:
     def post_process(self, inference: Inference, levels: int, pilots: Pilots | None = None) -> DecodedPage:
         """Piston, smooth phase error, trust and decision: all that is behind the graph, timings left at zero."""
         known, shown = pilots or self.pilots(levels), self.bundle.levels(levels)
-        reading = read_pilots(inference.p, known)
+        reading = read_pilots(inference.p * (inference.concentration > 0), known)
         phase = remove_piston(inference.phase, reading.piston.angle_rad)
         error = self.phase_refit.error(phase, inference.concentration, shown, known)
         phase = remove_piston(phase, error)
