@@ -6,6 +6,7 @@ import errno
 import os
 import platform
 import signal
+import socket
 import sys
 from pathlib import Path
 
@@ -21,6 +22,9 @@ LINUX_MODULES = frozenset({"fcntl", "termios"})
 
 ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 """Signals by which a system asks a program to end."""
+
+INHERITS_SOCKETS = hasattr(socket, "AF_UNIX")
+"""Whether a process may have a socket for its standard input, as helper processes do; not on Windows."""
 
 NEEDS_LINUX = "Linux: a container or WSL will do"
 

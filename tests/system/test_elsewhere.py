@@ -49,6 +49,7 @@ def test_what_needs_no_linux_runs_without_its_calls(toy_zip: Path, tmp_path: Pat
     coded.recording(tmp_path / "pages.h5", coded.pages(bundle, tmp_path))
     lines = [
         "simulate --profile small.toml --pages 2 --out R.h5",
+        "inspect R.h5 --json I.json",
         f"evaluate --bundle {toy_zip} --recording toy.h5 --json E.json",
         f"recover --bundle {bundle} --recording pages.h5 --out read.bin --no-tracking",
         "train --help",
@@ -58,7 +59,7 @@ def test_what_needs_no_linux_runs_without_its_calls(toy_zip: Path, tmp_path: Pat
     command = [sys.executable, "-c", ELSEWHERE, json.dumps(lines)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout.splitlines()[-1]) == [0, 0, 0, 0, 0, 2], done.stderr
+    assert json.loads(done.stdout.splitlines()[-1]) == [0, 0, 0, 0, 0, 0, 2], done.stderr
     assert "fcntl" in done.stderr.splitlines()[-1]
     with Recording.open(tmp_path / "R.h5") as recording:
         assert np.ptp(recording.frames(1).in_phase) > 0
