@@ -13,7 +13,7 @@ import pytest
 import tqdm.std
 
 from lightpage.cli import progress_bar
-from lightpage.cli.main import EXIT_ERROR, lightpage, run
+from lightpage.cli.main import EXIT_ERROR, HELP_KEY, lightpage, run
 from lightpage.errors import RecordingError, SurroundingsError
 from lightpage.failures import os_failure, understood
 from tests.clock import HandClock
@@ -146,6 +146,7 @@ def test_shells_complete_commands_and_options_and_import_nothing_heavy(tmp_path:
 def parameters() -> Iterator[tuple[str, click.Parameter]]:
     """Every parameter of every command, with the command's name."""
     context = click.Context(lightpage)
+    context.meta[HELP_KEY] = True
     for name in lightpage.list_commands(context):
         command = lightpage.get_command(context, name)
         for each in (command, *getattr(command, "commands", {}).values()):
@@ -175,7 +176,7 @@ def test_options_say_alike_what_their_values_are_and_what_reports_has_json() -> 
         ("evaluate --bundel x", "lightpage evaluate", "--bundel", "--bundle"),
         ("evaluate", "lightpage evaluate", "--recording", "RECORDING"),
         ("simulate --pages 0", "lightpage simulate --pages", "0", "x>=1"),
-        ("train --preset no", "lightpage train --preset", "no", "standard"),
+        ("bulk evaluate out --engine no", "lightpage bulk evaluate --engine", "no", "local"),
         ("evaluate --recording= ", "--recording", "empty", "path"),
         ("evaluate --bundle nosuch --recording R.h5", "bundle nosuch", "no such", "bench"),
     ],
