@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 import shutil
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from lightpage.errors import BundleError, InvalidInputError
 from lightpage.export.batched import batched_onnx
@@ -41,7 +41,9 @@ from lightpage.runtime.model.bundle.manifest import (
     check_version,
     sha256,
 )
-from lightpage.runtime.model.decoding.decoder import GOLDEN_TOLERANCE, PAGE_INPUTS, Decoder
+from lightpage.runtime.model.decoding.batch_graph import with_proven_batches
+from lightpage.runtime.model.decoding.decoder import PAGE_INPUTS, Decoder
+from lightpage.runtime.model.decoding.golden import GOLDEN_TOLERANCE
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.execution.session import open_session
 from lightpage.train.models.twin import RayTwin
@@ -144,41 +146,29 @@ def export_run(
     }
     if batches and isinstance(graph, DecoderGraph):
         progress("decoder for many pages to ONNX", 0.7)
-        files |= _for_batches(graph, frame_dtype, defaults, pair, expected["p"], str(out))
+        files |= _for_batches(graph, frame_dtype, defaults)
     progress("load the bundle as the service does", 0.8)
-    manifest = _proven(out, manifest, files, recording, progress)
+    manifest, files = _proven(out, manifest, files, recording, progress)
     write_bundle(out, manifest, files)
     return Bundle.open(out), error
 
 
-def _for_batches(
-    graph: DecoderGraph, frame_dtype: str, defaults: Tensors, pair: FramePair, expected: NDArray[np.float32], out: str
-) -> dict[str, bytes]:
-    """Files of the decoder for many pages, proven on the golden page; none where there is no such decoder."""
+def _for_batches(graph: DecoderGraph, frame_dtype: str, defaults: Tensors) -> dict[str, bytes]:
+    """Files of the decoder for many pages; none for a device that it does not decode."""
     made = batched_onnx(graph, frame_dtype, defaults, torch.float16)
     if made is None:
         warn("no decoder for many pages: the cameras of this device stand apart")
         return {}
-    names = CONSTANTS, BATCH
-    first, second = (open_session(model, f"{out}: {name}", pages=2) for model, name in zip(made, names, strict=True))
-    outputs = [node.name for node in first.get_outputs()]
-    table = {node.name: defaults[node.name] for node in first.get_inputs()}
-    feeds = dict(zip(outputs, first.run(outputs, table), strict=True))
-    pages = [pair, FramePair(pair.quadrature, pair.in_phase)]  # another one beside it
-    feeds |= {name: np.stack([getattr(each, name) for each in pages]) for name in ("in_phase", "quadrature")}
-    (answer,) = second.run(["p"], feeds)
-    try:
-        check_parity(expected, answer[0], f"{out}, {BATCH}", GOLDEN_TOLERANCE[FLOAT16])
-    except BundleError as differing:
-        warn(f"no decoder for many pages: {differing}")
-        return {}
-    return dict(zip(names, made, strict=True))
+    return dict(zip((CONSTANTS, BATCH), made, strict=True))
 
 
 def _proven(
     out: Path, manifest: Manifest, files: dict[str, bytes], recording: Path | None, progress: Progress
-) -> Manifest:
-    """Load the bundle beside `out` as the service does; returns its manifest, with a code where a recording chose one.
+) -> tuple[Manifest, dict[str, bytes]]:
+    """Load the bundle beside `out` as the service does.
+
+    Returns:
+        its manifest, with a code where a recording chose one, and its files, those for many pages only if they decode.
 
     Raises:
         RecordingError: the recording is of another device.
@@ -189,18 +179,19 @@ def _proven(
     try:
         write_bundle(partial, manifest, files)
         proven = Decoder.load(partial)
+        files = dict(with_proven_batches(replace(proven.bundle, files=files), proven.graph).files)
         if recording is not None:
             progress("choose the code of user bytes", 0.9)
             with Recording.open(recording) as pages:
                 check_recording(proven, pages)
                 try:
                     best, _ = choose_code(proven, pages, tracker_for(proven))
-                    return manifest.model_copy(update={"code": best.code.to_toml()})
+                    manifest = manifest.model_copy(update={"code": best.code.to_toml()})
                 except InvalidInputError as lacking:
                     warn(f"no code for user bytes: {lacking}")
     finally:
         _remove(partial)
-    return manifest
+    return manifest, files
 
 
 def _version(name: str, created: datetime, decoder: bytes) -> str:
