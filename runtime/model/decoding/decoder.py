@@ -27,7 +27,8 @@ from lightpage.recording.exposure import check_light
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import DECODER, FIELD
-from lightpage.runtime.model.decoding.batches import NO_BATCHES, REGISTRATION, Batches, Batching
+from lightpage.runtime.model.decoding.batch_graph import REGISTRATION
+from lightpage.runtime.model.decoding.batches import NO_BATCHES, Batches, Batching
 from lightpage.runtime.model.decoding.golden import check_golden
 from lightpage.runtime.model.decoding.page import OUTPUTS, DecodedPage, Inference, Timings, check_residual
 from lightpage.runtime.model.decoding.phase_refit import PhaseRefit
