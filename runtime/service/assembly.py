@@ -15,6 +15,7 @@ from lightpage.runtime.device.acquisition.source import FrameSource, open_source
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.shipped import bundle_path
 from lightpage.runtime.model.bundle.signature import BundleKey
+from lightpage.runtime.model.decoding.batches import Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.decoding.tracking import NoTracker
@@ -70,8 +71,12 @@ def assembled(settings: ServiceSettings, observer: Observer) -> Iterator[Assembl
     key = None if service.bundle_key is None else BundleKey(service.bundle_key)
     provider = Provider.parse(service.provider, service.engine_cache)
     bundle = Bundle.open(bundle_path(service.bundle), key=key)
-    base = Decoder(bundle, service.threads, provider=provider, code_threads=service.code_threads)
+    together = Batching(settings.batches.largest, settings.batches.longest_wait_ms / 1e3)
+    codes = service.code_threads
+    base = Decoder(bundle, service.threads, provider=provider, code_threads=codes, batching=together)
     metrics = ServiceMetrics()
+    if base.batches is not None:
+        metrics.watch_batches(together.pages)
     monitor = Monitor(metrics=metrics)
     own = settings.self_calibration
     kept = KeptPages(settings.limits.kept_bytes) if own.is_on and not own.pages else None

@@ -1,4 +1,4 @@
-"""Reading a recording while its pages are decoded: disk, unpacking and transfer beside the arithmetic."""
+"""Working ahead: pages are read while others are decoded, or several are decoded at a time."""
 
 from __future__ import annotations
 
@@ -8,25 +8,30 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
 T = TypeVar("T")
+Key = TypeVar("Key")
 
 
-def read_ahead(read: Callable[[int], T], pages: Iterable[int]) -> Generator[tuple[int, Future[T]], None, None]:
-    """Every page's number and what is read of it, in order; the next page is read while the caller works on one.
+def read_ahead(
+    read: Callable[[Key], T], pages: Iterable[Key], ahead: int = 1
+) -> Generator[tuple[Key, Future[T]], None, None]:
+    """Every page and what is read of it, in order; the next ones are read while the caller works on one.
 
-    One page is held beside the caller's, whatever a page weighs. A recording has one lock for all that is read of it,
+    So many are held beside the caller's, whatever a page weighs. A recording has one lock for all that is read of it,
     so what the caller reads of it meanwhile waits.
 
     Args:
         read: what is wanted of a page; `result()` raises what it raises.
-        pages: their numbers.
+        pages: their numbers, or whatever names them.
+        ahead: threads that read, each one page at a time.
     """
-    reader = ThreadPoolExecutor(1, "read-ahead")
-    ahead: deque[tuple[int, Future[T]]] = deque()
+    reader = ThreadPoolExecutor(ahead, "read-ahead")
+    begun: deque[tuple[Key, Future[T]]] = deque()
     try:
         for page in pages:
-            ahead.append((page, reader.submit(read, page)))
-            if len(ahead) > 1:
-                yield ahead.popleft()
-        yield from ahead
+            begun.append((page, reader.submit(read, page)))
+            if len(begun) > ahead:
+                yield begun.popleft()
+        while begun:
+            yield begun.popleft()
     finally:
         reader.shutdown(cancel_futures=True)

@@ -230,6 +230,11 @@ class Decoder:
         """The decoder with the same table that computes each page by itself, as exactly as the golden page says."""
         return Decoder(self.bundle, self.threads, self.graph, code_threads=self._code_threads)
 
+    @property
+    def together(self) -> int:
+        """Pages that are computed together at most, 1 where each is by itself."""
+        return 1 if self.batches is None else self.batches.largest
+
     def under_way(self) -> AbstractContextManager[None]:
         """A page is decoded within the `with` statement; until it is inferred, a batch may wait for it."""
         return nullcontext() if self.batches is None else self.batches.under_way()

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 
 class Turn:
-    """A page's place among the pages of its device; closed once it has been taken in, or will never be.
+    """A page's place among others; closed once the next one may go on. In a `with` statement, it is its turn.
 
     Args:
         turns: that it is one of.
@@ -25,6 +25,13 @@ class Turn:
     def close(self) -> None:
         """Let the page behind have its turn."""
         self._turns.close(self._number)
+
+    def __enter__(self) -> Turn:
+        self.wait(lambda: False)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 class Turns:
