@@ -1,5 +1,6 @@
 """The decoder for many pages in a bundle: it reads as that for one page does, and a GPU has nothing slow to do."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from torch import nn
 
 from lightpage.calibration.sampling_table import sampling_table, shifted
 from lightpage.device.state import Device
-from lightpage.errors import BundleError
+from lightpage.errors import BundleError, UnconfirmedPageError
 from lightpage.export.batched import batched_onnx, traced
 from lightpage.export.graph import DecoderGraph, table_tensors
 from lightpage.export.half import deviation
@@ -24,7 +25,9 @@ from lightpage.recording.reader import Recording
 from lightpage.runtime.model.bundle.bundle import npz
 from lightpage.runtime.model.bundle.manifest import BATCH, CONSTANTS, GOLDEN
 from lightpage.runtime.model.decoding.batch_graph import REGISTRATION, BatchGraph, Constants, with_proven_batches
+from lightpage.runtime.model.decoding.batches import Batches, Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.decoding.page import Inference
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
@@ -127,6 +130,42 @@ def test_a_graph_that_says_something_else_to_the_golden_page_is_left_out(decoder
     files = decoder.bundle.files | {GOLDEN: npz(**vars(golden.pair), p=1.1 * golden.p)}
     left = with_proven_batches(replace(decoder.bundle, files=files), decoder.graph)
     assert files.keys() - left.files.keys() == {BATCH, CONSTANTS}
+
+
+def test_a_stream_is_read_in_batches_as_page_by_page(small_bundle: Path, small_device: list[str]) -> None:
+    """Its image walks, jumps before the fifth page, and the third one is not of this device."""
+    alone = Decoder.load(small_bundle, threads=1)
+    mask, lost, jump = alone.bundle.pilot_mask, 2, 4
+    with Recording.open(small_device[3]) as recording:
+        pages = [(recording.frames(page), np.asarray(recording.symbols(page))) for page in range(7)]
+    known = [Pilots.of_symbols(mask, symbols, 256) for _, symbols in pages]
+    known[lost] = Pilots(mask, known[lost].phases[::-1])
+    pairs = [
+        FramePair(*(np.roll(frame, page >= jump, 1) for frame in (pair.in_phase, pair.quadrature)))
+        for page, (pair, _) in enumerate(pages)
+    ]
+    tracker, batching = tracker_for(alone), Batching(4)
+    decoder = Decoder(alone.bundle, 1, alone.graph, batches=Batches.opened(alone.bundle, alone.graph, batching, 1))
+    trackers, rates = (tracker, tracker.refitted(decoder)), []
+    for each, threads in zip(trackers, (1, 7), strict=True):
+        with ThreadPoolExecutor(threads) as pool:
+            read = [
+                pool.submit(each.decode, pair, 256, pilots, each.turn())
+                for pair, pilots in zip(pairs, known, strict=True)
+            ]
+        assert [page for page, one in enumerate(read) if isinstance(one.exception(), UnconfirmedPageError)] == [lost]
+        right = [(one.result(), symbols) for one, (_, symbols) in zip(read, pages, strict=True) if not one.exception()]
+        rates.append(
+            np.mean(
+                [
+                    measure(page.phase[~mask], page.concentration[~mask], symbols[~mask], 256).air_bits_per_symbol
+                    for page, symbols in right
+                ]
+            )
+        )
+    assert max(batching.pages.runs) > 1
+    assert rates[1] == pytest.approx(rates[0], abs=0.01)
+    assert trackers[1].image_px == pytest.approx(trackers[0].image_px, abs=0.02)
 
 
 def graph_for_batches(preset: str) -> BatchFile:

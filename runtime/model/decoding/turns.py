@@ -18,8 +18,12 @@ class Turn:
     def __init__(self, turns: Turns, number: int) -> None:
         self._turns, self._number = turns, number
 
-    def wait(self, interrupts: Callable[[], bool]) -> bool:
-        """Wait until all pages before are closed, or something interrupts that, and return whether they are."""
+    def wait(self, interrupts: Callable[[int], bool] = lambda before: False) -> bool:
+        """Wait until all pages before are closed, and return whether they are.
+
+        Args:
+            interrupts: whether to go on with so many pages before; it is asked again behind each change.
+        """
         return self._turns.wait(self._number, interrupts)
 
     def close(self) -> None:
@@ -27,7 +31,7 @@ class Turn:
         self._turns.close(self._number)
 
     def __enter__(self) -> Turn:
-        self.wait(lambda: False)
+        self.wait()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -59,11 +63,15 @@ class Turns:
         finally:
             turn.close()
 
-    def wait(self, number: int, interrupts: Callable[[], bool]) -> bool:
+    def wait(self, number: int, interrupts: Callable[[int], bool]) -> bool:
         """See `Turn.wait`."""
+
+        def before() -> int:
+            return sum(one < number for one in self._open)
+
         with self.changed:
-            self.changed.wait_for(lambda: number == min(self._open) or interrupts())
-            return number == min(self._open)
+            self.changed.wait_for(lambda: not before() or interrupts(before()))
+            return not before()
 
     def close(self, number: int) -> None:
         """See `Turn.close`."""
