@@ -5,11 +5,10 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +27,6 @@ from lightpage.errors import (
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.page.pilots import Pilots
 from lightpage.recording.frame_pair import FramePair
-from lightpage.runtime.archives.recordings.read_ahead import read_ahead
 from lightpage.runtime.device.acquisition.source import FrameSource
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.page import DecodedPage
@@ -45,8 +43,6 @@ from lightpage.runtime.service.shared_memory import SharedMemory
 from lightpage.runtime.service.stages import Stage, Stages
 
 _log = logging.getLogger(__name__)
-T = TypeVar("T")
-Key = TypeVar("Key")
 
 _LEAST_WAIT_S = 1e-3
 """A page that waited for its batch, or its turn, for less is not told to have queued."""
@@ -211,7 +207,7 @@ class DataPlane:
         """Whether `read_page` can work."""
         return self._source is not None
 
-    def ahead(self, alone: int) -> int:
+    def ahead(self, alone: int = 1) -> int:
         """Pages of one call that are on their way at a time: so many `alone`, or else a batch and the next one.
 
         As many at most as their frames fill half of the memory for what is received.
@@ -221,13 +217,6 @@ class DataPlane:
         frames = self.models.current.decoder.bundle
         pair = 2 * math.prod(frames.profile.frame_shape) * np.dtype(frames.manifest.frame_dtype).itemsize
         return max(alone, min(2 * self.together, self.received.size // (2 * pair)))
-
-    def beside(self, read: Callable[[Key], T], pages: Iterable[Key]) -> Iterator[tuple[Key, Callable[[], T]]]:
-        """Yield every page of a range and what reads it: at once, or, where pages are computed together, ahead."""
-        if self.together == 1:
-            yield from ((page, partial(read, page)) for page in pages)
-        else:
-            yield from ((page, begun.result) for page, begun in read_ahead(read, pages, self.ahead(1)))
 
     @property
     def default_levels(self) -> int:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -35,3 +36,17 @@ def read_ahead(
             yield begun.popleft()
     finally:
         reader.shutdown(cancel_futures=True)
+
+
+def beside(work: Callable[[Key], T], pages: Iterable[Key], threads: int) -> Iterator[tuple[Key, Callable[[], T]]]:
+    """Every page, in order, and what does its work: now, or, with several threads, that waits for what is done ahead.
+
+    Args:
+        work: what is done with a page.
+        pages: their numbers, or whatever names them.
+        threads: that work.
+    """
+    if threads == 1:
+        yield from ((page, partial(work, page)) for page in pages)
+    else:
+        yield from ((page, begun.result) for page, begun in read_ahead(work, pages, threads))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,7 +133,7 @@ class ImageState:
     @property
     def untraced(self) -> Real:
         """Drift that the table does not hold, [4]."""
-        return self.drift - np.concatenate([self.looked_px, self.traced_tilt])
+        return np.asarray(self.drift - np.concatenate([self.looked_px, self.traced_tilt]))
 
 
 @dataclass(frozen=True)
@@ -273,10 +274,14 @@ class ImageTracker:
             if state.settled:
                 inference = state.decoder.infer(pair, state.table)
                 clock.add("inference_s", inference.waited_s)
-            is_next = turn.wait(lambda before, looked=state: before < self._ahead and self._has_left(looked))
+            is_next = turn.wait(partial(self._must_look_again, state))
             clock.add("waiting_s")
             if is_next and not self._has_left(state):
                 return replace(self.state, table=state.table, looked_px=state.looked_px), inference
+
+    def _must_look_again(self, state: ImageState, before: int) -> bool:
+        """Whether a page with so many before it, that was decoded with a state, is now to be decoded anew."""
+        return before < self._ahead and self._has_left(state)
 
     def _has_left(self, state: ImageState) -> bool:
         """Whether a page that was decoded with a state is to be decoded anew."""

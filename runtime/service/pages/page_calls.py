@@ -8,6 +8,7 @@ from functools import partial
 
 from lightpage.clock import Clock
 from lightpage.errors import CallerLeft, InvalidInputError, LimitError, SlotsTakenError
+from lightpage.runtime.archives.recordings.read_ahead import beside
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import message_of
 from lightpage.runtime.client.wire.status import detail_of, reason_told, refusal_of
@@ -74,7 +75,7 @@ class PageCalls:
         caller = _caller(request.options, call)
         numbers: list[int | None] = list(request.pages) or [None] * request.count
         turns, read = Turns(), partial(self._of_range, request, caller, call)
-        pages = self._plane.beside(read, ((number, turns.take()) for number in numbers))
+        pages = beside(read, ((number, turns.take()) for number in numbers), self._plane.ahead())
         for _ in numbers:
             with self._plane.ranges.held(caller):  # not while the caller takes its time to read the reply
                 _, result = next(pages)

@@ -22,6 +22,7 @@ from lightpage.errors import (
     SourceError,
 )
 from lightpage.page.pilots import Pilots
+from lightpage.runtime.archives.recordings.read_ahead import beside
 from lightpage.runtime.device.acquisition.source import FrameSource, Shot, own_fault
 from lightpage.runtime.model.decoding.turns import Turn, Turns
 from lightpage.runtime.service.caller import Caller
@@ -240,7 +241,7 @@ def read_data(
         return _data_page(plane, index, expected.header, caller, timed(), order), expected.header
 
     numbers = ((index, turns.take()) for index in range(first, first + count))
-    for (index, _), result in plane.beside(read, numbers):
+    for (index, _), result in beside(read, numbers, plane.ahead()):
         try:
             page, expected = result()
             if _lacks_header(page) and successor.header not in (None, expected):  # it was not known yet
