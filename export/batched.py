@@ -22,6 +22,8 @@ from torch import Tensor, nn
 
 from lightpage.export.graph import ANSWERS, APART, FRAME_INPUTS, DecoderGraph, answers
 from lightpage.export.onnx_files import FOLDED, OPSET, anonymous, halved, sharing
+from lightpage.progress import warn
+from lightpage.runtime.model.bundle.manifest import BATCH, CONSTANTS
 from lightpage.runtime.model.decoding.batch_graph import SHIFT
 from lightpage.train.models.batched.decoder import BatchedDecoder
 
@@ -106,6 +108,17 @@ def batched_onnx(
     constants.names = tuple(name for name in constants.names if name in taken)
     first = traced(constants, tuple(tensors), constants.inputs, constants.names)
     return bytes(first.SerializeToString()), bytes(second.SerializeToString())
+
+
+def files_for_batches(
+    graph: DecoderGraph, frame_dtype: str, defaults: dict[str, NDArray[np.generic]]
+) -> dict[str, bytes]:
+    """Both graphs in float16 as files of a bundle; none, with a warning, for a device that they do not decode."""
+    made = batched_onnx(graph, frame_dtype, defaults, torch.float16)
+    if made is None:
+        warn("no decoder for many pages: the cameras of this device stand apart")
+        return {}
+    return dict(zip((CONSTANTS, BATCH), made, strict=True))
 
 
 def traced(

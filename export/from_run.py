@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import re
 import shutil
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from lightpage.errors import BundleError, InvalidInputError
-from lightpage.export.batched import batched_onnx
+from lightpage.export.batched import files_for_batches
 from lightpage.export.graph import APART, FRAME_INPUTS, DecoderGraph, FieldGraph
 from lightpage.export.half import LARGEST_DEVIATION, check_deviation, in_half, rounded
 from lightpage.export.onnx_files import decoder_onnx, field_onnx, twin_onnx
 from lightpage.export.parity import check_parity
-from lightpage.export.run_graph import Tensors, golden_of, graph_of
+from lightpage.export.run_graph import golden_of, graph_of
 from lightpage.progress import Progress, note, warn
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import narrow
@@ -26,8 +24,6 @@ from lightpage.runtime.archives.recordings.coded_pages import choose_code
 from lightpage.runtime.archives.recordings.evaluation import check_recording
 from lightpage.runtime.model.bundle.bundle import Bundle, npz, write_bundle
 from lightpage.runtime.model.bundle.manifest import (
-    BATCH,
-    CONSTANTS,
     DECODER,
     FIELD,
     FLOAT16,
@@ -146,20 +142,11 @@ def export_run(
     }
     if batches and isinstance(graph, DecoderGraph):
         progress("decoder for many pages to ONNX", 0.7)
-        files |= _for_batches(graph, frame_dtype, defaults)
+        files |= files_for_batches(graph, frame_dtype, defaults)
     progress("load the bundle as the service does", 0.8)
     manifest, files = _proven(out, manifest, files, recording, progress)
     write_bundle(out, manifest, files)
     return Bundle.open(out), error
-
-
-def _for_batches(graph: DecoderGraph, frame_dtype: str, defaults: Tensors) -> dict[str, bytes]:
-    """Files of the decoder for many pages; none for a device that it does not decode."""
-    made = batched_onnx(graph, frame_dtype, defaults, torch.float16)
-    if made is None:
-        warn("no decoder for many pages: the cameras of this device stand apart")
-        return {}
-    return dict(zip((CONSTANTS, BATCH), made, strict=True))
 
 
 def _proven(
@@ -179,7 +166,7 @@ def _proven(
     try:
         write_bundle(partial, manifest, files)
         proven = Decoder.load(partial)
-        files = dict(with_proven_batches(replace(proven.bundle, files=files), proven.graph).files)
+        files = dict(with_proven_batches(proven.bundle, proven.graph).files)
         if recording is not None:
             progress("choose the code of user bytes", 0.9)
             with Recording.open(recording) as pages:

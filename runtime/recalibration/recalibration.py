@@ -182,10 +182,14 @@ def recalibrate(
 
 def _golden(decoder: Decoder, pair: FramePair) -> tuple[FramePair, NDArray[np.float32]]:
     """The golden page's frames, in few counts where they still show a page, and the answer to them."""
-    manifest, decoder = decoder.bundle.manifest, decoder.alone
-    coarse, answer, limit = in_few_counts(pair, manifest.camera_bit_depth), decoder.infer(pair), manifest.residual_limit
+    manifest = decoder.bundle.manifest
+    coarse, answer, limit = (
+        in_few_counts(pair, manifest.camera_bit_depth),
+        decoder.infer(pair, alone=True),
+        manifest.residual_limit,
+    )
     try:
-        to_coarse = decoder.infer(coarse)
+        to_coarse = decoder.infer(coarse, alone=True)
     except FrameError:
         return pair, answer.p
     if limit is not None and not shows_page(to_coarse.residual, limit):

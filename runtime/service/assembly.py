@@ -15,7 +15,6 @@ from lightpage.runtime.device.acquisition.source import FrameSource, open_source
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.shipped import bundle_path
 from lightpage.runtime.model.bundle.signature import BundleKey
-from lightpage.runtime.model.decoding.batches import Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.decoding.tracking import NoTracker
@@ -71,11 +70,10 @@ def assembled(settings: ServiceSettings, observer: Observer) -> Iterator[Assembl
     key = None if service.bundle_key is None else BundleKey(service.bundle_key)
     provider = Provider.parse(service.provider, service.engine_cache)
     bundle = Bundle.open(bundle_path(service.bundle), key=key)
-    together = Batching(settings.batches.largest, settings.batches.longest_wait_ms / 1e3)
-    codes = service.code_threads
+    together, codes = settings.batches.batching(), service.code_threads
     base = Decoder(bundle, service.threads, provider=provider, code_threads=codes, batching=together)
     metrics = ServiceMetrics()
-    if base.batches is not None:
+    if base.batches.largest > 1:
         metrics.watch_batches(together.pages)
     monitor = Monitor(metrics=metrics)
     own = settings.self_calibration

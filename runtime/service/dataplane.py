@@ -174,7 +174,7 @@ class DataPlane:
         self.heal: Callable[[Caller, str, int], bool] | None = None
         """Makes the model fit the device again and waits for that, see `SelfCalibration.heal`; None where none does."""
         self.heart = Heart(self.limits.decode_s, clock.now)
-        self.together = models.current.decoder.together
+        self.together = models.current.decoder.batches.largest
         """Pages that may be computed together, 1 for none: a batch runs while the next one is gathered."""
         slots = max(self.limits.concurrent_decodes, 2 * self.together if self.together > 1 else 1)
         self.decodes = Slots(slots, "decodes", self.limits.deadline_s, clock)

@@ -23,6 +23,7 @@ from lightpage.progress import warn
 from lightpage.runtime.client.wire.address import check_address, is_local
 from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.model.bundle.shipped import DEFAULT
+from lightpage.runtime.model.decoding.batches import Batching
 from lightpage.runtime.model.execution.providers import CPU, Provider
 from lightpage.runtime.service.caller import named_session
 from lightpage.runtime.service.jobs.self_calibration import SelfCalibrationSettings
@@ -105,6 +106,10 @@ class BatchesTable(SettingsTable):
     longest_wait_ms: Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)] = 5.0
     """For which a batch waits for pages whose frames are there and are being checked: it bounds what one slow caller
     costs the others."""
+
+    def batching(self) -> Batching:
+        """Return how pages are gathered."""
+        return Batching(self.largest, self.longest_wait_ms / 1e3)
 
 
 class TlsTable(SettingsTable):

@@ -186,7 +186,7 @@ def unseen_pages(
     def decode(page: Shown, frames: FramePair, symbols: Symbols) -> DecodedPage | None:
         return decode_unseen(decoder, recording, tracker, mask, frames, symbols, page.turn)
 
-    pages = decoded_ahead(recording, range(recording.pages), lambda: tracker, decoder.together, decode)
+    pages = decoded_ahead(recording, range(recording.pages), lambda: tracker, decoder.batches.largest, decode)
     for index, result in track(pages, what, total=recording.pages):
         try:
             page, symbols = result()

@@ -195,7 +195,7 @@ class PageReader:
             found = page.tracker.decode(pair, self._levels.count, self._pilots, page.turn)
             return found, time.perf_counter() - start
 
-        return decoded_ahead(self._recording, pages, lambda: self._tracker, self._decoder.together, decode)
+        return decoded_ahead(self._recording, pages, lambda: self._tracker, self._decoder.batches.largest, decode)
 
     def _read(self, index: int, result: Callable[[], Decoded], expected: Header | None, take: Take) -> RecoveredPage:
         """Read a page.

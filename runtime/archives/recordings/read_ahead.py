@@ -34,8 +34,10 @@ def read_ahead(
                 yield begun.popleft()
         while begun:
             yield begun.popleft()
-    finally:
+    except BaseException:  # the caller wants no more; those that were handed out are read to the end otherwise
         reader.shutdown(cancel_futures=True)
+        raise
+    reader.shutdown()
 
 
 def beside(work: Callable[[Key], T], pages: Iterable[Key], threads: int) -> Iterator[tuple[Key, Callable[[], T]]]:

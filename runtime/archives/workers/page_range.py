@@ -125,7 +125,7 @@ class PageRange:
         findings: tuple[type[LightpageError], ...] = (InvalidInputError, LostPageError)
         if self.task.give_up:
             findings += (StorageError,)
-        together = self.decoder.together
+        together = self.decoder.batches.largest
         pages = decoded_ahead(self.recording, self.task.pages, lambda: self.tracker, together, decode)
         for page, result in pages:
             try:

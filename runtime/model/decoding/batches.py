@@ -6,7 +6,7 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from copy import copy
 from dataclasses import dataclass, field, replace
 
@@ -143,7 +143,32 @@ class HeldConstants:
         return len(self._held) < KEPT or self._asked - oldest >= _STALE
 
 
-class Batches:
+class OneByOne:
+    """Gathers nothing: each page is computed alone."""
+
+    largest = 1
+
+    def under_way(self) -> AbstractContextManager[None]:
+        """A page is decoded within the `with` statement; until it is inferred, a batch may wait for it."""
+        return nullcontext()
+
+    def infer(
+        self, table: TableGraph, pair: FramePair, registration: NDArray[np.float32] | None = None
+    ) -> Inference | None:
+        """What the graph says of a page that is computed with others; None where it must be computed alone.
+
+        Args:
+            table: that it is decoded with.
+            pair: its frames, checked.
+            registration: of the page; None for the table's.
+
+        Raises:
+            BundleError, ProviderError, SurroundingsError: see `BatchGraph.run`; each page of the run hears of it.
+        """
+        return None
+
+
+class Batches(OneByOne):
     """Gathers pages of one bundle's graph for batches, and runs it. For many threads; the callers' own compute.
 
     A page that comes while nothing runs is computed at once, alone, unless frames of others are being checked. Pages
@@ -170,24 +195,24 @@ class Batches:
         self._is_running = False
 
     @classmethod
-    def opened(cls, bundle: Bundle, table: TableGraph, batching: Batching, threads: int | None) -> Batches | None:
-        """Open a bundle's graph for batches; None where none are wanted, or it has no such graph, which is logged.
+    def opened(cls, bundle: Bundle, table: TableGraph, batching: Batching, threads: int | None) -> OneByOne:
+        """Open a bundle's graph for batches; pages go one by one where it has none, which is logged, or none is wanted.
 
         Raises:
             BundleError, ProviderError: see `BatchGraph`.
         """
         if batching.largest == 1:
-            return None
+            return OneByOne()
         if not holds_batches(bundle):
             _log.warning(
                 "%s: no %s, so pages are computed one by one (lightpage export --batches)", bundle.subject, BATCH
             )
-            return None
+            return OneByOne()
         return cls(BatchGraph(bundle, table, batching.largest, threads), table, batching)
 
     @contextmanager
     def under_way(self) -> Iterator[None]:
-        """See `lightpage.runtime.model.decoding.decoder.Decoder.under_way`."""
+        """See `OneByOne`."""
         self._pages.move(Phase.COMING, thread := threading.get_ident())
         try:
             yield
@@ -199,16 +224,7 @@ class Batches:
     def infer(
         self, table: TableGraph, pair: FramePair, registration: NDArray[np.float32] | None = None
     ) -> Inference | None:
-        """What the graph says of a page that is computed with others; None where it must be computed alone.
-
-        Args:
-            table: that it is decoded with.
-            pair: its frames, checked.
-            registration: of the page; None for the table's.
-
-        Raises:
-            BundleError, ProviderError, SurroundingsError: see `BatchGraph.run`; each page of the run hears of it.
-        """
+        """See `OneByOne`."""
         came, thread = self._clock.now(), threading.get_ident()
         behind = Phase.BEHIND if self._pages.knows(thread) else None
         if (found := self._constants.of(table, registration)) is None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -28,7 +27,7 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import DECODER, FIELD
 from lightpage.runtime.model.decoding.batch_graph import REGISTRATION
-from lightpage.runtime.model.decoding.batches import NO_BATCHES, Batches, Batching
+from lightpage.runtime.model.decoding.batches import NO_BATCHES, Batches, Batching, OneByOne
 from lightpage.runtime.model.decoding.golden import check_golden
 from lightpage.runtime.model.decoding.page import OUTPUTS, DecodedPage, Inference, Timings, check_residual
 from lightpage.runtime.model.decoding.phase_refit import PhaseRefit
@@ -88,11 +87,11 @@ class Decoder:
         provider: Provider = ON_CPU,
         code_threads: int = 1,
         batching: Batching = NO_BATCHES,
-        batches: Batches | None = None,
+        batches: OneByOne | None = None,
     ) -> None:
         self.bundle, self.threads, self._code_threads = bundle, threads, code_threads
         self.graph = graph or open_graph(bundle, threads, provider)
-        self.batches, self._batching = batches, batching
+        self.batches, self._batching = batches or OneByOne(), batching
         residual = bundle.manifest.residual_output
         self._outputs = [*OUTPUTS, *([residual] if residual else [])]
         self._pilots: dict[int, Pilots] = {}
@@ -200,13 +199,16 @@ class Decoder:
                 raise FrameError(name, f"type {frame.dtype}", dtype)
             check_light(name, frame, self.bundle.manifest.camera_bit_depth)
 
-    def infer(self, pair: FramePair, table: SamplingTable | None = None, *, doubtful: bool = False) -> Inference:
+    def infer(
+        self, pair: FramePair, table: SamplingTable | None = None, *, doubtful: bool = False, alone: bool = False
+    ) -> Inference:
         """Run the graph on a checked pair, together with other callers' where pages are computed in batches.
 
         Args:
             pair: both frames, as `check` accepts them.
             table: tensors for this page alone, of `PAGE_INPUTS`; all others take `with_table`.
             doubtful: whether frames that contradict the homodyne equations are taken too.
+            alone: whether it is computed by itself, as exactly as the golden page says.
 
         Raises:
             InvalidInputError: a table that does not fit.
@@ -217,27 +219,13 @@ class Decoder:
         self.graph.check(table)
         if others := set(table) - PAGE_INPUTS:
             raise InvalidInputError("table of a page", ", ".join(sorted(others)), f"only {', '.join(PAGE_INPUTS)}")
-        page = None if self.batches is None else self.batches.infer(self.graph, pair, table.get(REGISTRATION))
+        page = None if alone else self.batches.infer(self.graph, pair, table.get(REGISTRATION))
         if page is None:
             feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **table}
             p, phase, concentration, *rest = self.graph.run(self._outputs, feeds)
             page = Inference(p, phase, concentration, float(np.max(rest[0])) if rest else 0.0)
         check_residual(page.residual, self.bundle.manifest.residual_limit, doubtful=doubtful)
         return page
-
-    @cached_property
-    def alone(self) -> Decoder:
-        """The decoder with the same table that computes each page by itself, as exactly as the golden page says."""
-        return Decoder(self.bundle, self.threads, self.graph, code_threads=self._code_threads)
-
-    @property
-    def together(self) -> int:
-        """Pages that are computed together at most, 1 where each is by itself."""
-        return 1 if self.batches is None else self.batches.largest
-
-    def under_way(self) -> AbstractContextManager[None]:
-        """A page is decoded within the `with` statement; until it is inferred, a batch may wait for it."""
-        return nullcontext() if self.batches is None else self.batches.under_way()
 
     @cached_property
     def field_solver(self) -> BundleFieldSolver:
@@ -291,7 +279,7 @@ class Decoder:
         """
         start = time.perf_counter()
         check_levels(levels)
-        with self.under_way():
+        with self.batches.under_way():
             self.check(pair)
             checked = time.perf_counter()
             inference = self.infer(pair)

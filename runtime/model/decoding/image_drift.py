@@ -174,7 +174,7 @@ def drift_slopes(decoder: Decoder, twin: Twin, parameters: Real) -> Real:
 
     def phase(shift_px: Real) -> NDArray[np.float32]:
         try:
-            return decoder.alone.infer(pair, {"registration": shifted(registration, shift_px)}).phase
+            return decoder.infer(pair, {"registration": shifted(registration, shift_px)}, alone=True).phase
         except FrameError as error:
             subject = f"{decoder.bundle.subject}: golden page, moved by {PROBE_PX} px"
             raise BundleError(subject, error.got, error.expected) from None

@@ -186,7 +186,7 @@ class ImageTracker:
         self._decoder, self._model, self._tables, self._search = decoder, model, tables, search
         start = np.diag([SEARCH_ERROR_PX, SEARCH_ERROR_PX, START_TILT, START_TILT]) ** 2
         self._turns = Turns()
-        self._in_batches, self._ahead = decoder.together > 1, MOST_AHEAD
+        self._in_batches, self._ahead = decoder.batches.largest > 1, MOST_AHEAD
         self.state = ImageState(np.zeros(4), start, decoder, {}, np.zeros(2), np.zeros(2), WALK**2)
         """What the next page is decoded with."""
         if memory is not None:
@@ -247,7 +247,7 @@ class ImageTracker:
         device's moves nothing. Pages that are decoded at the same time are taken in their order, whatever they wait
         for: each begins with what the one before it has taught.
         """
-        with self._turns.taken(turn) as turn, self._decoder.under_way():
+        with self._turns.taken(turn) as turn, self._decoder.batches.under_way():
             _ = (
                 self._model.slopes
             )  # of a new tracker still being measured; two inferences at once may not fit the memory
@@ -274,17 +274,15 @@ class ImageTracker:
             if state.settled:
                 inference = state.decoder.infer(pair, state.table)
                 clock.add("inference_s", inference.waited_s)
-            is_next = turn.wait(partial(self._must_look_again, state))
+            is_next = turn.wait(partial(self._has_left, state))
             clock.add("waiting_s")
             if is_next and not self._has_left(state):
                 return replace(self.state, table=state.table, looked_px=state.looked_px), inference
 
-    def _must_look_again(self, state: ImageState, before: int) -> bool:
+    def _has_left(self, state: ImageState, before: int = 0) -> bool:
         """Whether a page with so many before it, that was decoded with a state, is now to be decoded anew."""
-        return before < self._ahead and self._has_left(state)
-
-    def _has_left(self, state: ImageState) -> bool:
-        """Whether a page that was decoded with a state is to be decoded anew."""
+        if before >= self._ahead:
+            return False
         now, moved = self.state, np.abs(self.state.looked_px - state.looked_px).max()
         at_most = 0.0 if self._in_batches else STALE_PX
         return now.settled != state.settled or now.decoder is not state.decoder or bool(moved > at_most)

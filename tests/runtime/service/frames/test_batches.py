@@ -4,8 +4,6 @@ from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
-from threading import Event
-from typing import cast
 
 import grpc
 import numpy as np
@@ -14,37 +12,14 @@ import pytest
 from lightpage.errors import FrameError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.answers import RemotePage
-from lightpage.runtime.model.decoding.batch_graph import BatchGraph, Constants, FrameBuffer
-from lightpage.runtime.model.decoding.batches import Batches, Batching
+from lightpage.runtime.model.decoding.batches import Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.model.decoding.page import Inference
 from lightpage.runtime.model.decoding.under_way import Phase
-from lightpage.runtime.model.execution.session import BoundSession
 from tests.runtime import toy
 from tests.runtime.conftest import begun
+from tests.runtime.held_graph import LARGEST, HeldGraph
 from tests.runtime.service.stage import Running, a_page, parts, refused
 from tests.waiting import LIMIT_S, eventually
-
-LARGEST = 4
-
-
-class HeldGraph:
-    """Decodes each page of a batch as the toy does, once it may."""
-
-    subject, pages = "bundle toy: batch.onnx", LARGEST
-
-    def __init__(self, decoder: Decoder) -> None:
-        self._decoder, self.may_run = decoder.alone, Event()
-        nowhere = np.zeros((2, 2, 10), np.float32)
-        self.constants_of_bundle = Constants(nowhere, cast(BoundSession, None), reach_px=1.0)
-
-    def buffer(self) -> FrameBuffer:
-        return FrameBuffer(self.pages, toy.SHAPE, "uint8")
-
-    def run(self, constants: Constants, buffer: FrameBuffer, pages: slice) -> list[Inference]:
-        assert self.may_run.wait(LIMIT_S)
-        shown = zip(*(buffer.frames[name][pages] for name in ("in_phase", "quadrature")), strict=True)
-        return [self._decoder.infer(FramePair(*frames), doubtful=True) for frames in shown]
 
 
 class Stage:
@@ -52,8 +27,7 @@ class Stage:
 
     def __init__(self, decoder: Decoder) -> None:
         self.graph, self.batching = HeldGraph(decoder), Batching(LARGEST)
-        batches = Batches(cast(BatchGraph, self.graph), decoder.graph, self.batching)
-        self.service: Running = begun(Decoder(decoder.bundle, decoder.threads, decoder.graph, batches=batches))
+        self.service: Running = begun(self.graph.gathering(self.batching))
         self.service.plane.metrics.watch_batches(self.batching.pages)
         self.pool = ThreadPoolExecutor(8)
 
