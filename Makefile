@@ -74,7 +74,7 @@ test-lowest: $(STAMP)  ## a share of the tests with the lowest versions that pyp
 	$(ONE_THREAD) $(LOWEST)/bin/python -m pytest -q -p no:cacheprovider tests/lightpage/recording tests/lightpage/test_files.py \
 	    tests/runtime/model/bundle tests/runtime/model/decoding/test_following.py tests/runtime/client/wire tests/runtime/archives/run/test_storage.py
 
-lint: $(STAMP)  ## ruff, layers of imports, mypy --strict, rules of the tests, hadolint
+lint: $(STAMP)  ## ruff, layers of imports, mypy --strict, rules of tests and words, hadolint
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-cache --no-logo

@@ -34,7 +34,7 @@ CAMERA_PITCH = 2.4e-3
 IMAGE_PITCH = 3e-3
 """Pitch of the camera-plane field, a quarter of what its band asks for, so that cubic splines are good to -60 dB."""
 IMAGE_MARGIN = 0.09
-"""How far beyond the nominal frame the camera-plane field is computed, mm: shift, scale, rotation and distortion."""
+"""Margin of the computed camera-plane field around the nominal frame, mm: shift, scale, rotation and distortion."""
 TAYLOR_TERMS = 4
 REFERENCE_EXPOSURES = 64
 
@@ -94,6 +94,10 @@ class Camera:
     rotation_deg: float = 0.0
     shift_px: tuple[float, float] = (0.0, 0.0)
     """(x, y)."""
+    behind_mm: float = 0.0
+    """Distance from the focal plane."""
+    keystone: tuple[float, float] = (0.0, 0.0)
+    """Relative growth of the scale from the image's centre to its edge, along x and y."""
 
 
 @dataclass(frozen=True)
@@ -128,6 +132,17 @@ class Parameters:
     quadrature_error_deg: float = 0.0
     quadrature_gain: float = 1.0
     quadrature_sign: int = 1
+    stroke_error: float = 0.0
+    """Stroke error of the modulator, relative to a whole turn."""
+    level_sine_rad: float = 0.0
+    level_cosine_rad: float = 0.0
+    """Amplitudes of a smooth error of its phase over the levels."""
+    unmodulated: float = 0.0
+    """Amplitude of the light that it leaves as it is, relative."""
+    modulator_behind_mm: float = 0.0
+    """Distance from the focal plane."""
+    nonlinearity: float = 0.0
+    """Counts that a camera lacks at its full well, relative."""
     phase_noise_rad: float = 0.0
     blur_px: float = 0.0
     falloff: float = 0.0
@@ -204,7 +219,7 @@ class ForeignDevice:
         return cls(draw_parameters(np.random.default_rng([seed, 1])), design)
 
     def with_parameters(self, **changes: object) -> ForeignDevice:
-        """The same device with some parameters changed."""
+        """Return this device with some parameters changed."""
         return dataclasses.replace(self, parameters=dataclasses.replace(self.parameters, **changes))  # type: ignore[arg-type]
 
     # --- geometry -----------------------------------------------------------------------------------------------------
@@ -241,19 +256,30 @@ class ForeignDevice:
             np.arange(n) * d - self.pipe_width / 2 for n, d in zip(self.design.facet, self.pitches, strict=True)
         )  # type: ignore[return-value]
 
+    @cached_property
+    def facet_points(self) -> tuple[FloatArray, FloatArray]:
+        """(x, y) of the facet's samples along the axes of the page's rows and columns before its roll, [y', x], mm."""
+        facet_y, facet_x = self.facet_coordinates
+        y = (facet_y[:, None] - facet_x[None, :] * np.sin(self.angle)) / np.cos(self.angle)
+        return np.broadcast_to(facet_x, y.shape), y
+
     # --- light --------------------------------------------------------------------------------------------------------
 
     def modulate(self, symbols: NDArray[np.integer], levels: int, rng: np.random.Generator) -> ComplexArray:
         """The field on the SLM's pixels, with illumination, phase noise and aberrations."""
         p = self.parameters
-        phase = np.kron(symbols * (2 * np.pi / levels), np.ones((SYMBOL_PX, SYMBOL_PX)))
-        phase = phase + p.phase_noise_rad * rng.standard_normal(phase.shape)
+        turn = symbols * (2 * np.pi / levels)
+        shown = turn * (1 + p.stroke_error) + p.level_sine_rad * np.sin(turn) + p.level_cosine_rad * np.cos(turn)
+        written = np.kron(shown, np.ones((SYMBOL_PX, SYMBOL_PX)))
+        written = written + p.phase_noise_rad * rng.standard_normal(written.shape)
+        light = np.exp(1j * written) + p.unmodulated
+        phase = np.zeros(light.shape)
         y, x = np.meshgrid(*((np.arange(n) - (n - 1) / 2) * SLM_PITCH for n in self.design.page_px), indexing="ij")
         rho, phi = np.hypot(x, y) / self.design.corner, np.arctan2(y, x)
         phase += p.defocus_rad * rho**2
         phase += p.astigmatism_rad * rho**2 * np.cos(2 * (phi - np.deg2rad(p.astigmatism_axis_deg)))
         phase += p.coma_rad * rho**3 * np.cos(phi - np.deg2rad(p.coma_axis_deg))
-        return np.asarray((1 - p.falloff * rho**2) * np.exp(1j * phase))
+        return np.asarray((1 - p.falloff * rho**2) * light * np.exp(1j * phase))
 
     def launch(self, page: ComplexArray) -> ComplexArray:
         """Return the field on the entrance facet [y', x] of SLM pixels, as the pipe sees it."""
@@ -276,12 +302,16 @@ class ForeignDevice:
         field = fourier_sum(
             field, (y0, SLM_PITCH), (facet_y[0], dy, self.design.facet[0]), -WAVENUMBER / (f * cosine), axis=0
         )
-        y = (facet_y[:, None] - facet_x[None, :] * np.sin(self.angle)) / cosine
-        x = np.broadcast_to(facet_x, y.shape)
+        x, y = self.facet_points
         # Cycles a pixel along the SLM's own axes: they set what a square pixel and the blur let through.
         u, v = (c * SLM_PITCH / (WAVELENGTH * f) for c in rotate(x, y, roll))
         field *= np.sinc(u) * np.sinc(v) * np.exp(-2 * (np.pi * self.parameters.blur_px) ** 2 * (u**2 + v**2))
-        return field * SLM_PITCH**2 / (WAVELENGTH * f)
+        return (
+            field
+            * out_of_focus(self.facet_points, f, self.parameters.modulator_behind_mm)
+            * SLM_PITCH**2
+            / (WAVELENGTH * f)
+        )
 
     def delaunch(self, facet: ComplexArray) -> Image:
         """Return the field on the camera plane of that on the exit facet, in the pipe's axes."""
@@ -298,10 +328,16 @@ class ForeignDevice:
         field = fourier_sum(field, (facet_x[0], dx), (x0, IMAGE_PITCH, counts[1]), WAVENUMBER / f, axis=1)
         return Image(field * (dy * dx / cosine / (WAVELENGTH * f)), y0, x0)
 
-    def image(self, symbols: NDArray[np.integer], levels: int, rng: np.random.Generator) -> Image:
-        """The whole way of one page's light, from symbols to the camera plane."""
+    def images(self, symbols: NDArray[np.integer], levels: int, rng: np.random.Generator) -> list[Image]:
+        """The whole way of one page's light, from symbols to the planes of the in-phase and the quadrature camera."""
         facet = self.launch(self.modulate(symbols, levels, rng))
-        return self.delaunch(propagate_pipe(facet, self.pipe_width, self.pipe_length, self.angle, self.design.steps))
+        leaving = propagate_pipe(facet, self.pipe_width, self.pipe_length, self.angle, self.design.steps)
+        behind = [camera.behind_mm for camera in (self.parameters.in_phase_camera, self.parameters.quadrature_camera)]
+        made = {
+            distance: self.delaunch(leaving * out_of_focus(self.facet_points, self.focal_length, distance))
+            for distance in behind
+        }
+        return [made[distance] for distance in behind]
 
     # --- cameras ------------------------------------------------------------------------------------------------------
 
@@ -313,17 +349,9 @@ class ForeignDevice:
         power = np.sum(np.abs(facet) ** 2) * np.prod(self.pitches) / np.cos(self.angle)
         return float(np.sqrt(power / (np.prod(self.design.page_px) * SLM_PITCH**2)))
 
-    def plane_coordinates(self, camera: Camera, drift: PageDrift) -> tuple[FloatArray, FloatArray]:
-        """(x, y) in the camera plane, mm, that each pixel of a frame looks at."""
-        rows, columns = (np.arange(n) - (n - 1) / 2 for n in self.design.frame_shape)
-        x = columns[None, :] - camera.shift_px[0] - drift.shift_px[0]
-        y = rows[:, None] - camera.shift_px[1] - drift.shift_px[1]
-        scale = CAMERA_PITCH / (1 + camera.scale)
-        return rotate(x * scale, y * scale, -np.deg2rad(camera.rotation_deg))
-
     def signal(self, image: Image, camera: Camera, drift: PageDrift) -> ComplexArray:
         """The signal on a camera's pixels."""
-        x, y = self.plane_coordinates(camera, drift)
+        x, y = plane_coordinates(self.design, camera, drift)
         stretch = 1 + self.parameters.distortion * (x**2 + y**2) / self.design.corner**2
         x, y = rotate(x * stretch, y * stretch, -np.deg2rad(self.parameters.pipe_roll_deg))
         return np.asarray(image.at(x, y) * np.exp(1j * drift.piston_rad))
@@ -331,7 +359,7 @@ class ForeignDevice:
     def reference(self, camera: Camera) -> ComplexArray:
         """The reference on a camera's pixels."""
         p = self.parameters
-        x, y = self.plane_coordinates(camera, PageDrift())
+        x, y = plane_coordinates(self.design, camera, PageDrift())
         rng = np.random.default_rng(p.ripple_seed)
         fringes = np.zeros(self.design.frame_shape)
         for amplitude in (0.5, 0.3, 0.2):
@@ -360,25 +388,28 @@ class ForeignDevice:
             intensity.shape, dtype=np.float32
         )
         full_scale = 2**p.bit_depth - 1
+        electrons *= 1 - np.float32(p.nonlinearity / (p.full_well_e * exposures)) * np.abs(electrons)
         counts = np.rint(electrons * (full_scale / (p.full_well_e * exposures)))
         frame_type = np.uint8 if p.bit_depth == 8 else np.uint16
         return np.asarray(np.clip(counts, 0, full_scale).astype(frame_type), frame_type)
 
-    def intensities(self, image: Image | None, drift: PageDrift = PageDrift()) -> tuple[FloatArray, FloatArray]:
-        """Light on the in-phase and the quadrature camera; of the reference alone where there is no image."""
+    def intensities(self, images: list[Image], drift: PageDrift = PageDrift()) -> tuple[FloatArray, FloatArray]:
+        """Light on the in-phase and the quadrature camera; of the reference alone where there are no images."""
         p = self.parameters
         result = []
-        for camera, phase, gain in (
-            (p.in_phase_camera, 0.0, 1.0),
+        for number, (camera, phase, gain) in enumerate(
             (
-                p.quadrature_camera,
-                p.quadrature_sign * (np.pi / 2 + np.deg2rad(p.quadrature_error_deg)),
-                p.quadrature_gain,
-            ),
+                (p.in_phase_camera, 0.0, 1.0),
+                (
+                    p.quadrature_camera,
+                    p.quadrature_sign * (np.pi / 2 + np.deg2rad(p.quadrature_error_deg)),
+                    p.quadrature_gain,
+                ),
+            )
         ):
             field = self.reference(camera) * np.exp(1j * phase)
-            if image is not None:
-                field += self.signal(image, camera, drift)
+            if images:
+                field += self.signal(images[number], camera, drift)
             result.append(gain * (field.real**2 + field.imag**2))
         return result[0], result[1]
 
@@ -401,11 +432,11 @@ class ForeignDevice:
             path: HDF5 file, overwritten.
             pages: how many.
             levels: M, 2 to 256.
-            seed: of symbols, noise and drift.
+            seed: seed of symbols, noise and drift.
             pilots: boolean [ny, nx], written as it is.
             with_symbols: whether the file tells the symbols.
             jumps_px: see `walk`.
-            symbols: what the modulator shows, uint8 [pages, ny, nx]; drawn if left out.
+            symbols: symbols that the modulator shows, uint8 [pages, ny, nx]; drawn if left out.
         """
         rng = np.random.default_rng([seed, 2])
         drawn = rng.integers(0, levels, size=(pages, *self.design.page_shape), dtype=np.uint8)
@@ -422,16 +453,33 @@ class ForeignDevice:
                 file["pilots"] = pilots
             names = ("in_phase", "quadrature")
             dtype = np.uint8 if self.parameters.bit_depth == 8 else np.uint16
-            for name, intensity in zip(names, self.intensities(None), strict=True):
+            for name, intensity in zip(names, self.intensities([]), strict=True):
                 file[f"reference_{name}"] = self.expose(intensity, rng, REFERENCE_EXPOSURES)
                 file.create_dataset(
                     name, (pages, *self.design.frame_shape), dtype, chunks=(1, *self.design.frame_shape)
                 )
             for page in range(pages):
-                image = self.image(symbols[page], levels, rng)
-                for name, intensity in zip(names, self.intensities(image, drifts[page]), strict=True):
+                images = self.images(symbols[page], levels, rng)
+                for name, intensity in zip(names, self.intensities(images, drifts[page]), strict=True):
                     file[name][page] = self.expose(intensity, rng)
         return symbols
+
+
+def plane_coordinates(design: Design, camera: Camera, drift: PageDrift) -> tuple[FloatArray, FloatArray]:
+    """(x, y) in the camera plane, mm, that each pixel of a frame looks at."""
+    rows, columns = (np.arange(n) - (n - 1) / 2 for n in design.frame_shape)
+    x = columns[None, :] - camera.shift_px[0] - drift.shift_px[0]
+    y = rows[:, None] - camera.shift_px[1] - drift.shift_px[1]
+    half_height, half_width = (n * SLM_PITCH / CAMERA_PITCH / 2 for n in design.page_px)
+    growth = camera.keystone[0] * columns[None, :] / half_width + camera.keystone[1] * rows[:, None] / half_height
+    scale = CAMERA_PITCH / (1 + camera.scale) * (1 + growth)
+    return rotate(x * scale, y * scale, -np.deg2rad(camera.rotation_deg))
+
+
+def out_of_focus(points: tuple[FloatArray, FloatArray], focal_length: float, distance: float) -> ComplexArray:
+    """Return the factors by which a defocus of `distance` mm changes the field at points (x, y) mm of a facet."""
+    sine2 = (points[0] ** 2 + points[1] ** 2) / focal_length**2
+    return np.asarray(np.exp(1j * WAVENUMBER * distance * (np.sqrt(1 - sine2) - 1)))
 
 
 def walk(
@@ -440,9 +488,9 @@ def walk(
     """Piston and shift of each page: random walks from a random piston.
 
     Args:
-        p: of the device.
+        p: parameters of the device.
         pages: how many.
-        rng: of the steps.
+        rng: generator of the steps.
         jumps_px: (x, y) by which the image jumps before a page, beside its walk; before page 0, while nobody read.
     """
     pistons = rng.uniform(-np.pi, np.pi) + np.cumsum(p.piston_drift_rad * rng.standard_normal(pages))

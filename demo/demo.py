@@ -51,9 +51,9 @@ def run_demo(
     """Write a picture and read it back in three states of the device, through a client of a service on this machine.
 
     Args:
-        bundle: of the bench device, with a code.
+        bundle: bundle of the bench device, with a code.
         out: folder that exists, for the pages and the pictures.
-        seed: of the volume's number and the damage: other pages are written.
+        seed: seed of the volume's number and the damage: other pages are written.
         progress: told of every step, with the share of all that is done.
         spec: see `simulated_device`.
 

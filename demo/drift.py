@@ -17,7 +17,7 @@ from lightpage.runtime.device.acquisition.source import FrameSource, open_source
 from lightpage.runtime.device.modulator.simulated import SimulatedModulator
 
 DRIFT_STEPS = (0.04, 0.08, 0.15, 0.3)
-"""Of the change of temperature of `drifted`: the code's margin lasts for the first, and nobody recalibrates."""
+"""Shares of the change of temperature of `drifted`: the code's margin lasts for the first, and nobody recalibrates."""
 
 
 def drifted(device: Device, share: float = 1.0) -> Device:

@@ -14,11 +14,11 @@ from lightpage.demo.result import DemoResult, Phase
 from lightpage.pictures import write_figure_png
 
 _LOWEST_PERCENT = 2
-"""Of symbols, below the scale of AIR: its few worst symbols would hide what differs."""
+"""Share of symbols below the scale of AIR: its few worst symbols would hide what differs."""
 _BRIGHTEST_PERCENT = 99
-"""Of pixels, that the scale of frames shows: a few bright ones would leave the others dark."""
+"""Share of pixels that the scale of frames shows: a few bright ones would leave the others dark."""
 _SHADES = 32
-"""Of a map or frame: few colours make a small file."""
+"""Shades of a map or frame: few colours make a small file."""
 _PILOTS = "white"
 
 
@@ -66,7 +66,7 @@ def write_figure(result: DemoResult, path: Path) -> None:
 
 
 def _read(result: DemoResult, phase: Phase) -> str:
-    """How many pages were read in a state, and what came of it."""
+    """Describe how many pages were read in a state, and what they gave."""
     told = "every byte right" if phase.exact else f"{phase.lost} of {result.volume.file_pages} data pages lost"
     restored = f"{phase.restored} restored by parity, " if phase.restored else ""
     return f"{phase.pages - phase.unread} of {phase.pages} pages read\n{restored}{told}"

@@ -17,7 +17,7 @@ PARITY_PAGES = 2
 SPOILT_PAGE = 1
 """Page whose symbols are damaged, of those that are written."""
 SPOILT_SHARE = 0.4
-"""Of its symbols: far more than its code mends."""
+"""Spoilt share of its symbols: far more than its code mends."""
 
 
 def write_pages(decoder: Decoder, grey: NDArray[np.uint8], path: Path, seed: int) -> Volume:

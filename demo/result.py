@@ -1,4 +1,4 @@
-"""What the demo came to: its phases, the drift between them, and the healing."""
+"""Result of the demo: its phases, the drift between them, and the healing."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Phase:
-    """What was decoded in one state of the device.
+    """Phase of the demo: what was decoded in one state of the device.
 
     Attributes:
         name: the state.
         model_version: the last page's.
         air: per data symbol, bits, mean over the pages that were decoded, [ny, nx]; not a number at pilots.
         confidence: mean over them, [ny, nx].
-        symbol_error_rate: of data symbols.
-        seconds: of one decode in the service, median.
-        pages: that were read.
-        unread: of them, how many gave no bytes.
+        symbol_error_rate: error rate of data symbols.
+        seconds: seconds of one decode in the service, median.
+        pages: number of pages that were read.
+        unread: number of them that gave no bytes.
         restored, lost: pages of the picture that parity gave back, and that are lost.
         margin_bits: least margin of the pages that gave bytes, bits a symbol; None where none did.
-        picture: as it was read, lost bytes black, [rows, columns].
+        picture: picture as it was read, lost bytes black, [rows, columns].
         exact: whether it is the picture that was written.
     """
 
@@ -75,11 +75,11 @@ class Phase:
 
 @dataclass(frozen=True)
 class DriftStep:
-    """What one page told while the device drifted.
+    """Step of the drift: what one page told.
 
     Attributes:
-        share: of the drift of `drifted`.
-        margin_bits: of the page, bits a symbol; None where it was not decoded.
+        share: share of the drift of `drifted`.
+        margin_bits: margin of the page, bits a symbol; None where it was not decoded.
         recalibration_due: whether its pilots show the drift.
         lost: whether it gave no bytes.
     """
@@ -92,7 +92,7 @@ class DriftStep:
 
 @dataclass(frozen=True)
 class DemoResult:
-    """All of the demo: three phases, the drift and the healing between them, and one frame pair with its page."""
+    """Result of the demo: three phases, the drift and the healing between them, and one frame pair with its page."""
 
     phases: tuple[Phase, ...]
     drift: tuple[DriftStep, ...]
@@ -107,7 +107,7 @@ class DemoResult:
     """Shots of the cameras by how they ended; empty without cameras."""
 
     def story(self) -> tuple[str, str, str]:
-        """What happened, for people, in lines of some 120 characters."""
+        """Return the story of the demo for people, in lines of some 120 characters."""
         fresh, lost, again = (phase.air_bits_per_symbol for phase in self.phases)
         margin, healed = self.phases[0].margin_bits, self.healed
         spare = "" if margin is None else f" Their code has a margin of {margin:.2f} bit a symbol."

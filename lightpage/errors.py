@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self
 
 
 class Cause(StrEnum):
-    """What a failure is about; `lightpage.failures.cause_of` says it of any failure."""
+    """Cause of a failure; `lightpage.failures.cause_of` finds that of any exception."""
 
     LIGHT = "light"
     """The light of a page: it was read as it is, and cannot be decoded. A finding, which stays."""
@@ -20,19 +20,19 @@ class Cause(StrEnum):
     STORAGE = "storage"
     """The storage under a file, which gave nothing or damaged data: another try may go well."""
     SURROUNDINGS = "surroundings"
-    """What the program needs to run: memory, threads, a worker, a provider."""
+    """Things that the program needs to run: memory, threads, a worker, a provider."""
 
 
 class LightpageError(Exception):
     """Base of every error that Lightpage raises on purpose.
 
     Args:
-        subject: what the error is about, e.g. ``"recording R.h5: dataset 'in_phase'"``.
-        got: what came; of an error of the operating system, what it says without number and path.
-        expected: what would have been right.
+        subject: thing that the error is about, e.g. ``"recording R.h5: dataset 'in_phase'"``.
+        got: value or state that came; of an error of the operating system, its text without number and path.
+        expected: value or state that would have been right.
 
     Attributes:
-        cause: what errors of the class are about.
+        cause: cause of the class's errors.
     """
 
     cause: ClassVar[Cause] = Cause.SURROUNDINGS
@@ -191,7 +191,7 @@ class SlotsTakenError(BusyError):
 
     Args:
         subject, got, expected: see `LightpageError`.
-        retry_s: when to try again, seconds from now; None where that is of no use.
+        retry_s: seconds after which to try again; None where that is of no use.
     """
 
     def __init__(self, subject: str, got: object, expected: object, retry_s: float | None = None) -> None:
@@ -200,7 +200,7 @@ class SlotsTakenError(BusyError):
 
 
 class OverloadedError(SlotsTakenError):
-    """What the caller wants could not be done before its deadline, so it is not begun."""
+    """Refusal of work that could not be done before the caller's deadline, so that it is not begun."""
 
 
 class StalledError(LightpageError):
@@ -232,13 +232,14 @@ class StoreError(BundleError):
 
 
 class Reason(StrEnum):
-    """Why a page is lost."""
+    """Reason why a page is lost."""
 
     UNSPECIFIED = "UNSPECIFIED"
     PILOTS_DISAGREE = "PILOTS_DISAGREE"
     """The pilots contradict what was decoded; the image was found, or nobody looked for it."""
     IMAGE_NOT_FOUND = "IMAGE_NOT_FOUND"
-    """The same, and a search did not find the image: it lies further off, or the frames are not this page's."""
+    """The pilots contradict what was decoded, and a search did not find the image: it lies further off, or the frames
+    are not this page's."""
     TOO_FEW_PILOTS = "TOO_FEW_PILOTS"
     """The pilots agree, but are too few, or too dim, to tell a page from chance."""
     MISSING_FRAME = "MISSING_FRAME"
@@ -250,7 +251,7 @@ class Reason(StrEnum):
     STRAY_FRAME = "STRAY_FRAME"
     """A frame came that no trigger was waiting for."""
     OTHER_SHOT = "OTHER_SHOT"
-    """By its camera's clock a frame is not of this trigger."""
+    """A frame is not of this trigger, by its camera's clock."""
     NOT_SYNCHRONISED = "NOT_SYNCHRONISED"
     """The cameras' clocks do not agree with the trigger's for long enough to tell whose a frame is."""
     CAMERA_GONE = "CAMERA_GONE"
@@ -288,7 +289,7 @@ class LostPageError(LightpageError):
         self.reason, self.recalibration_due = reason, recalibration_due
 
     def about(self, page: str) -> Self:
-        """The same error, and of which page it is."""
+        """Return this error with the page that it is about."""
         return type(self)(f"{page}: {self.subject}", self.got, self.expected, self.reason, self.recalibration_due)
 
 
@@ -304,7 +305,7 @@ class UnconfirmedPageError(LostPageError):
     """The pilots of a page do not bear out what the decoder claims of it: its symbols would be noise.
 
     Attributes:
-        page: what was decoded, for figures and never for an answer; None on the client's side. The runtime's
+        page: decoded page, for figures and never for an answer; None on the client's side. The runtime's
             `tracking.unconfirmed_page` says of which class it is.
     """
 

@@ -1,4 +1,4 @@
-"""What a failure means: light, content, storage or surroundings, told apart in this one place."""
+"""Causes of failures: the one place where light, content, storage and surroundings are told apart."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def cause_of(error: BaseException) -> Cause:
 
 
 def may_pass(error: BaseException) -> bool:
-    """Whether a failure finds nothing about a page, and the same work may go well a moment later."""
+    """Return whether a failure finds nothing about a page, so that the same work may succeed a moment later."""
     return isinstance(error, (StorageError, SurroundingsError))
 
 
@@ -93,8 +93,8 @@ def understood(subject: str, error: BaseException) -> LightpageError | None:
     """The error that an exception of another library means; None where it is a mistake of the program.
 
     Args:
-        subject: what was being done.
-        error: what came.
+        subject: work that was being done.
+        error: failure of that work.
     """
     if isinstance(error, LightpageError):
         return error
@@ -117,9 +117,9 @@ def os_failure(
     """The error that a failure of the operating system, or of HDF5, means.
 
     Args:
-        subject: what was to be read or written.
-        error: what came.
-        expected: what would have been right.
+        subject: thing that was to be read or written.
+        error: failure of that.
+        expected: state that would have been right.
         otherwise: class of the error where neither storage nor a short resource is the cause, e.g. no such file.
 
     Returns:
@@ -152,7 +152,7 @@ def os_errors(subject: str, expected: object, otherwise: type[LightpageError] = 
 def hdf5_failure(
     subject: str, error: Exception, expected: object, otherwise: type[LightpageError] = StorageError
 ) -> LightpageError:
-    """The same of any error that HDF5 raises; without a number, and with no resource short, data are damaged."""
+    """Return the error that a failure of HDF5 means; damaged data if it has no number and no resource is short."""
     number = error_number(error)
     if number is not None:
         return os_failure(subject, OSError(number, os.strerror(number)), expected, otherwise)

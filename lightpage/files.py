@@ -24,7 +24,7 @@ from lightpage.failures import os_failure
 from lightpage.progress import warn
 
 STDOUT = Path("-")
-"""In place of a JSON file, stdout, as users write it; in place of a file to read, stdin."""
+"""Name that users write for stdout in place of a JSON file, and for stdin in place of a file to read."""
 
 _results: ContextVar[TextIO | None] = ContextVar("results", default=None)
 
@@ -50,8 +50,8 @@ def new_file(folder: Path, name: str) -> tuple[int, Path]:
     """Make an empty file of a new name in `folder`, with the modes that the process's umask leaves.
 
     Args:
-        folder: where.
-        name: what the new name begins with, behind a dot; it is cut where the whole would be too long.
+        folder: folder of the file.
+        name: beginning of the new name, behind a dot; it is cut where the whole would be too long.
 
     Returns:
         A descriptor that is open for reading and writing, and the path.
@@ -71,8 +71,8 @@ def lock(descriptor: int, subject: str, *, shared: bool = False, ranges: bool = 
     """Lock a file until its descriptor is closed; where its file system has no locks, warn once and go without.
 
     Args:
-        descriptor: of the file.
-        subject: what it is, for the warning.
+        descriptor: descriptor of the file.
+        subject: name of the file, for the warning.
         shared: whether others may have it locked so too.
         ranges: whether with a lock of the kind that ranges of bytes have, which some file systems lack alone.
 
@@ -109,7 +109,7 @@ def replace_file(path: str | Path, write: Callable[[IO[bytes]], object], subject
     Args:
         path: final name, in a folder that exists.
         write: writes the content.
-        subject: what the file is, for the error message.
+        subject: name of the file, for the error message.
 
     Raises:
         InvalidInputError: the path cannot be written.
@@ -140,7 +140,7 @@ def replace_file(path: str | Path, write: Callable[[IO[bytes]], object], subject
 
 
 def is_special(path: Path) -> bool:
-    """Whether something is at `path` that is written to and not replaced: a device, a pipe or a socket.
+    """Return whether `path` is a device, a pipe or a socket, which is written to and not replaced.
 
     Raises:
         OSError: the system does not say, e.g. since the name is too long.
@@ -161,7 +161,7 @@ def move_into_place(made: str | Path, path: Path) -> None:
 
 
 def move_to_new_name(made: str | Path, path: Path) -> None:
-    """The same where nothing has the final name.
+    """Give a file that is closed its final name, which nothing may have; both are on the disk when this returns.
 
     Raises:
         FileExistsError: something has it; both files stay as they are.
@@ -232,9 +232,9 @@ def read_text(path: str | Path, subject: str, expected: str, failure: type[Light
     """The text of a file in UTF-8, or in UTF-16 or UTF-32 with a byte order mark; its lines end with LF alone.
 
     Args:
-        path: of the file.
-        subject: what it is, for an error.
-        expected: what would be right, for an error.
+        path: path of the file.
+        subject: name of the file, for an error.
+        expected: file that would be right, for an error.
         failure: class of the error.
 
     Raises:
@@ -260,7 +260,7 @@ def read_text(path: str | Path, subject: str, expected: str, failure: type[Light
 
 
 def read_toml(path: str | Path, subject: str, expected: str) -> dict[str, Any]:
-    """What a TOML file says.
+    """Read a TOML file into a dictionary.
 
     Raises:
         InvalidInputError, StorageError, SurroundingsError: it cannot be read, or is no TOML.
@@ -319,8 +319,8 @@ def write_json(path: str | Path | None, data: Any) -> None:
     """Write `data` to `path` as JSON, null for what is not a number, replacing what is there in one step.
 
     Args:
-        path: of the file, or `STDOUT`; None where nobody wants it.
-        data: what JSON can hold.
+        path: path of the file, or `STDOUT`; None where nobody wants it.
+        data: value that JSON can hold.
 
     Raises:
         InvalidInputError: the path cannot be written.

@@ -57,9 +57,9 @@ class HelperProcess:
 
     Args:
         target: the helper, as ``package.module:Class``; it takes no arguments, and only that process imports it.
-        subject: what it does, for errors, e.g. ``recalibration``.
+        subject: work of the process, for errors, e.g. ``recalibration``.
         files: file descriptors that it inherits under the same numbers.
-        environment: its variables; those of this process if left out.
+        environment: environment of the process; that of this process if left out.
         log: takes what it prints on its standard error; that of this process if left out.
 
     Raises:
@@ -122,8 +122,8 @@ class HelperProcess:
         """Have it call a method; `poll` says when it has.
 
         Args:
-            method: of the helper.
-            arguments: of the method; arrays among them stay as they are until then.
+            method: method of the helper.
+            arguments: arguments of the method; arrays among them stay as they are until then.
             progress: called by `poll` with the words of progress. The method gets what tells them as `progress`.
 
         Raises:
@@ -219,7 +219,7 @@ def same_packages(threads: int) -> dict[str, str]:
     """Environment of a process that finds the same packages as this one.
 
     Args:
-        threads: of its numerical libraries.
+        threads: number of threads of its numerical libraries.
     """
     own = str(Path(__file__).resolve().parents[1])
     paths = [own, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
@@ -228,7 +228,7 @@ def same_packages(threads: int) -> dict[str, str]:
 
 
 def serve(target: str) -> None:
-    """In such a process: make the helper, and do what the parent asks for until it has gone or wants no more.
+    """Run a helper in this process: make it, and do what the parent asks until the parent has gone or asks to end.
 
     The kernel's own signal for that (PR_SET_PDEATHSIG) comes when the thread ends that has started the process. An
     error that nobody foresaw ends the process.

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 _COLOURS = 256
 _UNSEEN = 8
-"""Of 255, by which a palette may change the colours of a pixel; beyond, gradients show bands."""
+"""Largest change of a pixel's colours by a palette, of 255; beyond, gradients show bands."""
 
 
 def write_png(path: Path | IO[bytes], png: bytes) -> None:

@@ -1,4 +1,4 @@
-"""How long work tells of itself; whoever runs it decides how it is shown, and by default nobody sees it."""
+"""Progress of long work; its caller decides how it is shown, and by default it is not."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class Reporter(Protocol):
     def track(
         self, items: Iterable[T], what: str, unit: str, total: int | None, done: int, state: State
     ) -> Iterable[T]:
-        """The same items; `total` of them with the `done` ones that an earlier run has behind it."""
+        """Yield the items, and show progress over `total`, of which an earlier run has done `done`."""
 
     def note(self, what: str) -> None:
-        """Tell whoever watches."""
+        """Show a note."""
 
 
 _reporter: ContextVar[Reporter | None] = ContextVar("reporter", default=None)
@@ -34,7 +34,7 @@ _reporter: ContextVar[Reporter | None] = ContextVar("reporter", default=None)
 
 @contextmanager
 def reporting(reporter: Reporter | None) -> Iterator[None]:
-    """Have loops of this thread that `track` their items shown by `reporter`, or by nobody, in the `with` statement."""
+    """Show the loops of this thread that `track` their items by `reporter`, or not at all, in the `with` statement."""
     token = _reporter.set(reporter)
     try:
         yield
@@ -43,7 +43,7 @@ def reporting(reporter: Reporter | None) -> Iterator[None]:
 
 
 def note(what: str) -> None:
-    """Tell whoever watches what they should know of work that goes on."""
+    """Note what those who watch the work should know."""
     reporter = _reporter.get()
     if reporter is None:
         _log.info(what)
@@ -52,7 +52,7 @@ def note(what: str) -> None:
 
 
 def warn(what: str) -> None:
-    """The same of what may be wrong."""
+    """Warn whoever watches of what may be wrong."""
     if _reporter.get() is None:
         _log.warning(what)
     else:
@@ -71,9 +71,9 @@ def track(
     """The items themselves, the way through them shown to whoever watches.
 
     Args:
-        items: what a loop goes through.
-        what: what is being done.
-        unit: what an item is.
+        items: items of a loop.
+        what: name of the work.
+        unit: name of an item.
         total: how many there are, with those that are done already; by default as many as `items` has.
         done: how many of them an earlier run has done, which are not among `items`.
         state: says in a word or two, after each item, how the work stands.

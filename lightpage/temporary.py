@@ -29,7 +29,7 @@ def temporary_folder(
     """An empty folder that this user alone sees; it goes with the `with` statement, or with the process.
 
     Args:
-        subject: what wants it, for the error.
+        subject: user of the folder, for the error.
         prefix: beginning of its name.
         within: the folder that it is made in; by default that for temporary files.
 

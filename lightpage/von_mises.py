@@ -15,6 +15,6 @@ def mean_resultant(kappa: Floats) -> Floats:
 
 
 def information(kappa: Floats) -> Floats:
-    """What a concentration claims to tell of an angle, nats: log of the density over the uniform one, its own mean."""
+    """Return the information on an angle that a concentration claims, nats: mean log density over the uniform one."""
     scaled = i0e(kappa)
     return np.asarray(kappa * (i1e(kappa) / scaled - 1) - np.log(scaled), np.float64)

@@ -4,5 +4,5 @@ from __future__ import annotations
 
 
 def counted(number: int, noun: str) -> str:
-    """So many of something, e.g. ``1 page``, ``2 pages``."""
+    """Format a number with its noun, e.g. ``1 page``, ``2 pages``."""
     return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -30,7 +30,7 @@ def pins(lock: Path) -> list[str]:
 
 
 def ask(packages: Sequence[str]) -> tuple[str, str]:
-    """What pip-audit prints of packages, and what it says to stderr. It resolves and installs nothing."""
+    """Run pip-audit on packages, and return its output and its stderr. It resolves and installs nothing."""
     words = ["--disable-pip", "--no-deps", "--progress-spinner", "off", "--format", "json"]
     with tempfile.NamedTemporaryFile("w", suffix=".txt") as file:
         file.writelines(f"{package}\n" for package in packages)
@@ -65,7 +65,7 @@ def judged(packages: Sequence[str], printed: str, said: str) -> tuple[int, list[
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Do what the head of the file says."""
+    """Run the command that the head of the file describes."""
     locks = [Path(each) for each in arguments] or sorted(LOCKS.glob("*.txt"))
     statuses = set()
     for lock in locks:

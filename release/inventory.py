@@ -1,4 +1,4 @@
-"""What is in an image: reads its files from outside, and compares them with an SBOM and a lock.
+"""Inventory of an image: reads its files from outside, and compares them with an SBOM and a lock.
 
     python3 release/inventory.py ROOT                         # as JSON
     python3 release/inventory.py ROOT --against SBOM LOCK     # exit status 1, and a line for each difference
@@ -25,9 +25,9 @@ from typing import Any
 from lock import BUILT_FROM_SOURCE, normal, read_lock
 
 ENVIRONMENT = Path("opt/lightpage")
-"""Of Python, in the image."""
+"""Environment of Python in the image."""
 PYTHON_FOLDER = Path("/usr/bin")
-"""Of the image's Python, which the environment names and links to."""
+"""Folder of the image's Python, which the environment names and links to."""
 WHEELS = "wheels.sha256"
 """The list of installed wheels, in the environment."""
 OWN_FILES = frozenset(
@@ -35,7 +35,7 @@ OWN_FILES = frozenset(
 )
 """Files of the environment that come with no package: of venv, and the list of wheels."""
 MOST_LINKS = 40
-"""On the way to a file, as in Linux."""
+"""Most links on the way to a file, as in Linux."""
 INTERPRETER = re.compile(r"python3?|python3\.\d+")
 """Names of venv's links to Python."""
 LEFT_OUT = (
@@ -51,9 +51,9 @@ LEFT_OUT = (
 SHARED_OBJECT = re.compile(r"(.+?)\.so(\.[\w.]+)?")
 OWN = "lightpage"
 LONGEST_NAME = 200
-"""Of a licence, characters."""
+"""Longest name of a licence, characters."""
 PREFIX = "lightpage:"
-"""Of the names of this project's properties in an SBOM."""
+"""Prefix of the names of this project's properties in an SBOM."""
 
 
 @dataclass(frozen=True)
@@ -62,10 +62,10 @@ class PythonPackage:
 
     Args:
         wheel: file name of the wheel that it was installed from.
-        sha256: of that wheel.
-        record_sha256: of the list of its files, which holds a checksum of each.
+        sha256: checksum of that wheel.
+        record_sha256: checksum of the list of its files, which holds a checksum of each.
         libraries: shared objects that it brings for others to link with, path in the environment to SHA-256.
-        licence: what its metadata say: an SPDX expression, or free text, or nothing.
+        licence: licence in its metadata: an SPDX expression, or free text, or nothing.
     """
 
     name: str
@@ -82,8 +82,8 @@ class DebianPackage:
     """An installed package of Debian.
 
     Args:
-        section: with the area before it, unless that is `main`.
-        record_sha256: of the list of its files, which holds an MD5 of each; empty where it has none.
+        section: section with the area before it, unless that is `main`.
+        record_sha256: checksum of the list of its files, which holds an MD5 of each; empty where it has none.
         licences: short names of the machine-readable part of its copyright file.
     """
 
@@ -97,7 +97,7 @@ class DebianPackage:
 
 @dataclass(frozen=True)
 class Inventory:
-    """All of an image. `faults` are files that are not as their package's list says, and files of no package."""
+    """Inventory of an image. `faults` are files that are not as their package's list says, and files of no package."""
 
     python: tuple[PythonPackage, ...]
     debian: tuple[DebianPackage, ...]
@@ -106,7 +106,7 @@ class Inventory:
 
 
 def sha256(path: Path) -> str:
-    """Of a file, hexadecimal."""
+    """Return the SHA-256 of a file, hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -162,7 +162,7 @@ def walk(environment: Path) -> tuple[set[Path], list[str]]:
 
 
 def is_of_venv(link: Path, target: Path) -> bool:
-    """Whether venv makes such a link, named within the environment."""
+    """Return whether venv makes such a link, named within the environment."""
     if link == Path("lib64"):
         return target == Path("lib")
     known = link.parent == Path("bin") and target.parent in (Path(), PYTHON_FOLDER)
@@ -170,7 +170,7 @@ def is_of_venv(link: Path, target: Path) -> bool:
 
 
 def check_settings(path: Path) -> Iterator[str]:
-    """What is wrong with the file that says which Python an environment has."""
+    """Yield the faults of the file that says which Python an environment has."""
     pairs = (line.partition("=") for line in path.read_text().splitlines())
     settings = {key.strip().lower(): value.strip() for key, _, value in pairs}
     for key, expected in (("home", str(PYTHON_FOLDER)), ("include-system-site-packages", "false")):
@@ -208,17 +208,17 @@ def check_files(found: Distribution, site: Path, files: set[Path]) -> tuple[set[
 
 
 def installed(site: Path, entry: PurePath) -> Path:
-    """Where a file of a distribution's list is; scripts are outside `site`."""
+    """Return the path of a file of a distribution's list; scripts are outside `site`."""
     return Path(os.path.normpath(site / entry))
 
 
 def folder_of(found: Distribution) -> Path:
-    """Where a distribution has its metadata."""
+    """Return the folder of a distribution's metadata."""
     return Path(str(found._path))  # type: ignore[attr-defined]  # it has no public name
 
 
 def python_package(found: Distribution, site: Path, wheels: dict[str, str], files: set[Path]) -> PythonPackage:
-    """What there is to say of one distribution; arguments as for `check_files`, and SHA-256 of wheels by file name."""
+    """Describe one distribution; arguments as for `check_files`, and SHA-256 of wheels by file name."""
     name, version = normal(found.name), found.version
     wheel = next((file for file in wheels if is_wheel_of(file, name, version)), "")
     libraries = {
@@ -231,7 +231,7 @@ def python_package(found: Distribution, site: Path, wheels: dict[str, str], file
 
 
 def licence_of(found: Distribution) -> str:
-    """What a distribution's metadata say of its licence: an SPDX expression, a few words, or nothing."""
+    """Return the licence in a distribution's metadata: an SPDX expression, a few words, or nothing."""
     metadata = found.metadata
     licence: str = next(iter(metadata.get_all("License-Expression") or metadata.get_all("License") or [""])).strip()
     if licence and "\n" not in licence and len(licence) <= LONGEST_NAME:
@@ -241,19 +241,19 @@ def licence_of(found: Distribution) -> str:
 
 
 def is_wheel_of(file: str, name: str, version: str) -> bool:
-    """Whether a wheel's file name says this distribution."""
+    """Return whether a wheel's file name is that of this distribution."""
     its_name, its_version, *_ = file.split("-")
     return (normal(its_name), its_version) == (name, version)
 
 
 def is_library(name: str) -> bool:
-    """Whether a file is a shared object for others to link with, not a module of Python."""
+    """Return whether a file is a shared object for others to link with, not a module of Python."""
     matched = SHARED_OBJECT.fullmatch(name)
     return matched is not None and name.startswith("lib") and not matched[1].endswith((".abi3", "-linux-gnu"))
 
 
 def debian_packages(root: Path) -> Iterator[DebianPackage]:
-    """What dpkg says is installed, by name."""
+    """Yield the packages that dpkg lists as installed, by name."""
     paragraphs = (root / "var/lib/dpkg/status").read_text().strip().split("\n\n")
     found = [dict(re.findall(r"^([\w-]+): (.*)$", paragraph, re.MULTILINE)) for paragraph in paragraphs]
     for fields in sorted(found, key=lambda each: each["Package"]):
@@ -278,7 +278,7 @@ def debian_record(root: Path, name: str, architecture: str) -> Path | None:
 
 
 def check_debian_files(root: Path, package: DebianPackage) -> Iterator[str]:
-    """What is wrong with a package's files. Those that a slim Debian leaves out may be missing."""
+    """Yield the faults of a package's files. Those that a slim Debian leaves out may be missing."""
     record = debian_record(root, package.name, package.architecture)
     for line in record.read_text().splitlines() if record is not None else ():
         expected, name = line.split(maxsplit=1)
@@ -324,7 +324,7 @@ def licence_names(path: Path) -> tuple[str, ...]:
 
 
 def differences(inventory: Inventory, sbom: Mapping[str, Any]) -> list[str]:
-    """How an image differs from what an SBOM says of it, a line each."""
+    """List the differences between an image and an SBOM, a line each."""
     said = {component["bom-ref"]: facts_of_component(component) for component in sbom["components"]}
     found = facts(inventory)
     lines = [f"{ref}: in the image, not in the SBOM" for ref in found if ref not in said]
@@ -349,7 +349,7 @@ def debian_ref(package: DebianPackage, release: str) -> str:
 
 
 def facts(inventory: Inventory) -> dict[str, dict[str, str]]:
-    """What is compared, by package URL: checksums of the list of its files, and of a wheel and its libraries."""
+    """Return what is compared, by package URL: checksums of its list of files, its wheel and its libraries."""
     found = {debian_ref(each, inventory.release): {"record": each.record_sha256} for each in inventory.debian}
     for package in inventory.python:
         found[python_ref(package)] = {
@@ -361,7 +361,7 @@ def facts(inventory: Inventory) -> dict[str, dict[str, str]]:
 
 
 def facts_of_component(component: Mapping[str, Any]) -> dict[str, str]:
-    """The same of an SBOM's component."""
+    """Return what is compared of an SBOM's component, by the names of `facts`."""
     properties = {each["name"]: each["value"] for each in component.get("properties", ())}
     record = {"record": properties.get(f"{PREFIX}record-sha256", "")}
     if component["bom-ref"].startswith("pkg:deb/"):
@@ -372,7 +372,7 @@ def facts_of_component(component: Mapping[str, Any]) -> dict[str, str]:
 
 
 def differences_from_lock(inventory: Inventory, lock: Path) -> list[str]:
-    """How an image's Python packages differ from what a lock names, a line each. Our own is in no lock."""
+    """List the differences between an image's Python packages and a lock, a line each. Our own is in no lock."""
     locked = read_lock(lock)
     found = {package.name: package for package in inventory.python if package.name != OWN}
     lines = [f"{name}: is in {lock.name}, not in the image" for name in locked.keys() - found.keys()]
@@ -389,7 +389,7 @@ def differences_from_lock(inventory: Inventory, lock: Path) -> list[str]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Do what the head of the file says."""
+    """Run the command that the head of the file describes."""
     inventory = take(Path(arguments[0]))
     if arguments[1:2] != ["--against"]:
         print(json.dumps(asdict(inventory), indent=1))

@@ -64,7 +64,7 @@ def moved(value: str, folders: list[Path]) -> str:
 
 
 def main() -> None:
-    """Do what the head of the file says."""
+    """Run the command that the head of the file describes."""
     out = Path(sys.argv[1])
     settings = parse(sys.stdin.read())
     folders = local_folders(settings)

@@ -21,7 +21,7 @@ from license_expression import AND, OR, ExpressionError, get_spdx_licensing
 RULES = Path(__file__).with_name("licences.toml")
 _SPDX = get_spdx_licensing()
 _OWN_WORDS = re.compile(r"LicenseRef-[A-Za-z0-9.-]+")
-"""What SPDX calls a licence that is in none of its lists."""
+"""Name in SPDX of a licence that is in none of its lists."""
 
 
 @functools.cache
@@ -34,8 +34,8 @@ def spdx(name: str, licence: str) -> str | None:
     """A package's licence as an SPDX expression, None where nobody says one.
 
     Args:
-        name: of the package, normalised.
-        licence: what its metadata say.
+        name: name of the package, normalised.
+        licence: licence in its metadata.
     """
     if name in rules()["named"]:
         return rules()["named"][name]
@@ -87,7 +87,7 @@ def _name(licence: Mapping[str, str]) -> str:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Do what the head of the file says."""
+    """Run the command that the head of the file describes."""
     path = Path(arguments[0])
     if not path.is_file():
         print(f"{path}: no such file; `make sbom` writes it", file=sys.stderr)

@@ -22,7 +22,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 LOCKS = ROOT / "release" / "locks"
 PYTHON, GLIBC = "3.11", "2_36"
-"""Of Debian bookworm, which the images are made from."""
+"""Versions of Debian bookworm, which the images are made from."""
 BUILT_FROM_SOURCE = ("xcffib",)
 """Packages without a wheel. They are pure Python, and the tools of the lock `build` make their wheels."""
 HEAD = "# Made by `make lock` for {target}: {platforms}. Do not edit.\n"
@@ -30,10 +30,10 @@ HEAD = "# Made by `make lock` for {target}: {platforms}. Do not edit.\n"
 
 @dataclass(frozen=True)
 class Target:
-    """What an image installs.
+    """Target of an image: what it installs, and for which processors it is built.
 
     Args:
-        extras: of pyproject.toml.
+        extras: extras of pyproject.toml.
         machines: the processors that it is built for.
         refused: why it is not built for the others.
     """
@@ -61,7 +61,7 @@ class LockError(Exception):
 
 @dataclass(frozen=True)
 class Locked:
-    """What a lock says of a package: its version, and the SHA-256 of each of its files."""
+    """Entry of a lock for a package: its version, and the SHA-256 of each of its files."""
 
     version: str
     hashes: frozenset[str]

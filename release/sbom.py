@@ -36,7 +36,7 @@ def sbom(inventory: Inventory, labels: Mapping[str, str]) -> str:
     """The SBOM's text.
 
     Args:
-        inventory: what is in the image.
+        inventory: contents of the image.
         labels: the image's, by name.
 
     Raises:
@@ -117,7 +117,7 @@ def debian_component(package: DebianPackage, release: str) -> Component:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Do what the head of the file says."""
+    """Run the command that the head of the file describes."""
     parser = argparse.ArgumentParser(description="Write an SBOM of an image.")
     parser.add_argument("root", type=Path)
     parser.add_argument("--out", type=Path, required=True)

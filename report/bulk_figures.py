@@ -17,7 +17,7 @@ from lightpage.runtime.archives.run.totals import Reading
 TEMPLATE = "bulk.html.j2"
 
 _POINTS = 120
-"""Of a curve over time."""
+"""Points of a curve over time."""
 _DRAWN = 30
 """Devices that are drawn; the worst of more."""
 
@@ -47,7 +47,7 @@ def rates(readings: Sequence[Reading], edges: Real) -> tuple[Real, Real]:
     """Pages a second, and workers at work, between moments; the pages of a range are spread over its time.
 
     Args:
-        readings: what was done, N of them.
+        readings: ranges that were read, N of them.
         edges: the moments, seconds since 1970, [B + 1].
 
     Returns:
@@ -99,7 +99,7 @@ def speed(readings: Sequence[Reading], unit: str) -> Picture:
 
 
 def page_seconds(readings: Sequence[Reading], unit: str) -> Picture:
-    """How long ranges took, by the page: stragglers lie to the right."""
+    """Draw the histogram of ranges' times by the page: stragglers lie to the right."""
     seconds = np.array([reading.seconds / max(1, reading.pages) for reading in readings])
     median, slow = np.quantile(seconds, (0.5, 0.99))
     figure, axis = one_axis()
@@ -118,7 +118,7 @@ def page_seconds(readings: Sequence[Reading], unit: str) -> Picture:
 
 
 def losses(causes: Sequence[tuple[str, int, float, str]], unit: str, lost: str) -> Picture:
-    """How many were lost, or refused, by each cause."""
+    """Draw how many were lost, or refused, by each cause."""
     figure, axis = one_axis()
     names, counts = [cause for cause, *_ in causes][::-1], [count for _, count, *_ in causes][::-1]
     bars = axis.barh(range(len(names)), counts, color=ORANGE, height=0.6)

@@ -1,4 +1,4 @@
-"""What the page of a training run or of an evaluation is made of."""
+"""Page of a training run or of an evaluation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How all figures of a report look: small, on white, as data that a page carries in itself."""
+"""Style of a report's figures: small, on white, as data that a page carries in itself."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class Picture:
 
     Attributes:
         uri: the image itself, as a data URI.
-        alt: what it shows, for whom it is not shown.
-        caption: what to see in it.
+        alt: content of the figure, for those who cannot see it.
+        caption: caption: what to see in the figure.
     """
 
     uri: str

@@ -69,7 +69,7 @@ def maps(data: ReportData, centroids: Real) -> list[Picture]:
 
 
 def goodness(data: ReportData) -> list[Picture]:
-    """Where the light lies that the calibration does not explain; none where that was not measured."""
+    """Draw maps of the light that the calibration does not explain; none where that was not measured."""
     found = data.calibration.goodness
     if found is None:
         return []
@@ -136,7 +136,7 @@ def reliability(data: ReportData) -> Picture:
 
 
 def concentration(data: ReportData) -> Picture:
-    """What concentrations promise against what happened, as distances from a perfect cosine."""
+    """Draw promised concentrations against observed ones, as distances from a perfect cosine."""
     bins = data.concentration_bins
     figure, axis = one_axis()
     ends = np.maximum(np.array([(b.low, b.high) for b in bins]), _LEAST_KAPPA)
@@ -216,7 +216,7 @@ def _mark_passes(axis: Axes, curves: Sequence[Curve]) -> None:
 
 
 def page(golden: Golden) -> list[Picture]:
-    """Both frames and the phase that is decoded from them."""
+    """Draw both frames, and the phase that is decoded from them."""
     pictures = []
     for name, frame in (("In-phase", golden.pair.in_phase), ("Quadrature", golden.pair.quadrature)):
         figure, axis = one_axis(image=True)
@@ -252,7 +252,7 @@ def rays(data: ReportData) -> list[Picture]:
 def _side(
     data: ReportData, path: Real, met: NDArray[np.int64], axis: int, name: str, wall: str, *, inside: bool
 ) -> Picture:
-    """One side view; `path` [K, N, 3] in millimetres, `met` reflections [N] at the walls of this view."""
+    """Draw a side view; `path` [K, N, 3] in millimetres, `met` reflections [N] at the walls of this view."""
     lens, pipe = data.rays.lens, data.profile.pipe
     surfaces = 1 if lens is None else len(lens.surfaces)
     middle = path[:, path.shape[1] // 2, 2]  # along the axis, where no ray is lost

@@ -48,9 +48,9 @@ class JsonFile:
     """A file of JSON.
 
     Attributes:
-        path: where it lies.
+        path: path of the file.
         text: all of it, JSON.
-        command: which one wrote it, by its keys; None where that is not known.
+        command: command that wrote it, by its keys; None where that is not known.
         found: the same for people.
     """
 
@@ -77,7 +77,7 @@ class JsonFile:
         return cls(path, text, command, _keys(content) if command is None else f"the JSON of `lightpage {command}`")
 
     def checked(self, model: type[Model]) -> Model:
-        """What is in it.
+        """Parse the file as `model`.
 
         Raises:
             InvalidInputError: something is missing, of another type or out of range; the first problems are named.

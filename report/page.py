@@ -21,7 +21,7 @@ def render(template: str, data: Data, shown: Callable[[Data], dict[str, Any]]) -
 
     Args:
         template: name of a file beside this one.
-        data: what is reported; the template knows it by this name.
+        data: data of the report; the template knows it by this name.
         shown: makes what the template takes besides, pictures among it.
     """
     environment = Environment(

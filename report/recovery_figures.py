@@ -22,7 +22,7 @@ _LOST_STYLE: dict[str, Any] = {"linestyle": "none", "color": ORANGE, "fillstyle"
 _MOST_LINES = 2000
 """Pages that are drawn as lines; more are drawn as an image, which does not grow with them."""
 _EDGE = 0.03
-"""Of the height: where pages without a margin are marked."""
+"""Share of the height at which pages without a margin are marked."""
 
 
 def shown(data: RecoveryData) -> dict[str, Any]:

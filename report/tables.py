@@ -111,16 +111,16 @@ def _words(name: str, suffix: str) -> str:
 
 
 def _with_deviation(value: float, deviation: float) -> tuple[str, str]:
-    """Both to the second digit of the deviation."""
+    """Format a value and its deviation, both to the second digit of the deviation."""
     digits = 6 if deviation <= 0 else min(9, max(0, 1 - int(np.floor(np.log10(deviation)))))
     return number(value, digits), number(deviation, digits)
 
 
 def zones(data: ReportData, centroids: Real) -> list[Zone]:
-    """One row a zone, from top left to bottom right.
+    """Return a row for each zone, from top left to bottom right.
 
     Args:
-        data: of the report.
+        data: data of the report.
         centroids: exit centroids over the pipe's width, [2, ny, nx].
     """
     cells = np.rint(centroids).astype(int)

@@ -34,4 +34,4 @@ STUDIES: dict[str, Study] = {
     "heads": heads.STUDY,
     "tolerances": tolerances.STUDY,
 }
-"""By the names of the command line."""
+"""Studies by the names of the command line."""

@@ -1,4 +1,4 @@
-"""What a published decoder that was trained for a study carries, claims and misses on held-out pages."""
+"""Figures of a study's published decoder on held-out pages: rates, claimed rates and errors."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def estimates(
 def figures_of_p(
     p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.bool_], levels: int
 ) -> dict[str, Any]:
-    """What von Mises estimates [2, pages, N] carry, claim and miss, as means over the pages by symbol; their ECE."""
+    """Return AIR, claimed rate and error of von Mises estimates [2, pages, N], means over pages; their ECE."""
     mu, kappa = np.arctan2(p[1], p[0]), np.hypot(p[0], p[1])
     symbols = decide(phases, levels)
     maps = symbol_maps(mu, kappa, symbols, levels, ~mask)
@@ -56,7 +56,7 @@ def figures_of_p(
 def figures_of_classes(
     module: PublishedTraining, validation: FramePages, unseen: FramePages, mask: NDArray[np.bool_]
 ) -> dict[str, Any]:
-    """What posteriors over classes carry, claim and miss, as `figures_of_p` says it, but for phase errors.
+    """Return the figures of posteriors over classes, as `figures_of_p` names them, without phase errors.
 
     The validation pages choose their temperature.
     """

@@ -37,12 +37,12 @@ _VALIDATION_SHARE = 0.1
 
 @dataclass(frozen=True)
 class Teaching:
-    """How much a decoder is taught.
+    """Amount of training of a decoder.
 
     Attributes:
         pages: recorded pages.
         synthetic_pages: beside them, of the same device after drifts: they teach what other geometries have in common.
-        steps: of the optimiser.
+        steps: steps of the optimiser.
     """
 
     pages: int
@@ -55,7 +55,7 @@ class KeptDecoder:
     """A trained decoder whose weights stay, whatever device it reads.
 
     Attributes:
-        run: of its training.
+        run: run of its training.
         decoder: trained.
     """
 
@@ -109,11 +109,11 @@ def taught(
     """Train a decoder of one pass on pages of a simulated device, or go on with it; only its run stays in `folder`.
 
     Args:
-        folder: of recording and run.
+        folder: folder of recording and run.
         profile, device: nominal and true.
         teaching: how much.
-        seed: of pages and training.
-        calibration: of the device.
+        seed: seed of pages and training.
+        calibration: calibration of the device.
         start: finished run whose weights are begun with.
 
     Raises:

@@ -15,15 +15,16 @@ _CAMERAS = ("in_phase_camera", "quadrature_camera")
 
 @dataclass(frozen=True)
 class Knob:
-    """One deviation of a device, told by one number; all else stays as on the device that decoders are trained on.
+    """Knob: a deviation of a device that one number sets; all else stays as on the device that decoders are trained on.
 
     Attributes:
-        name: on the command line.
-        title: what deviates, in words.
-        unit: of the number.
-        values: that are measured, ascending.
+        name: name on the command line.
+        title: deviation, in words.
+        unit: unit of the number.
+        values: values that are measured, ascending.
         settings: settings of the device's state by `TABLE.KEY`, each as a factor on the number.
-        full_size: what a unit is on the full-size device, and the unit that this is told in; None where it is the same.
+        full_size: value of a unit on the full-size device, and the unit that this is told in; None where it is the
+            same.
         logarithmic: whether values are ratios, not differences.
     """
 
@@ -48,7 +49,7 @@ class Knob:
 
 @dataclass(frozen=True)
 class _FullSize:
-    """What numbers of the full-size device are in millimetres and degrees."""
+    """Conversion of the knobs' numbers to millimetres and degrees of the full-size device."""
 
     profile: Profile
 
@@ -460,4 +461,4 @@ def _knobs() -> tuple[Knob, ...]:
 
 
 KNOBS = {knob.name: knob for knob in _knobs()}
-"""By name, those that cost a usual device most first."""
+"""Knobs by name, those that cost a usual device most first."""

@@ -24,7 +24,7 @@ from lightpage.train.models.twin import RayTwin, TorchTwin
 FITTED_PAGES = 2
 """Known pages of a calibration, as `lightpage calibrate` takes them."""
 _FIRST_SEED = 10_000
-"""Of the pages that decoders are judged by, far from those that they are trained on."""
+"""First seed of the pages that decoders are judged by, far from those that they are trained on."""
 _SYMBOLS = 3
 """Random stream of their symbols, beside those of the simulator."""
 
@@ -36,7 +36,7 @@ class Known:
     Attributes:
         references: reference-only frames.
         pairs: frame pairs, one a page.
-        symbols: what was written, uint8 [ny, nx], one a page.
+        symbols: symbols that were written, uint8 [ny, nx], one a page.
     """
 
     references: FramePair
@@ -52,7 +52,7 @@ class Known:
         return cls(simulator.references(), tuple(simulator.page(page) for page in symbols), tuple(symbols))
 
     def part(self, pages: slice) -> Self:
-        """Some of the pages."""
+        """Return some of the pages."""
         return replace(self, pairs=self.pairs[pages], symbols=self.symbols[pages])
 
     def calibration(self, profile: Profile, progress: Progress) -> Calibration:

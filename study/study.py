@@ -1,4 +1,4 @@
-"""What a study is: cases that are measured one by one and kept, then a table and a picture of all of them."""
+"""Studies: cases that are measured one by one and kept, then a table and a picture of all of them."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from lightpage.train.runs import load_arrays, save_arrays
 RESULTS = 4
 """Raised when results that were kept by an earlier version do not go together with those of this one."""
 Case = Mapping[str, Any]
-"""What is varied, by name; `name` tells it from the others and names its files."""
+"""Values that are varied, by name; `name` tells it from the others and names its files."""
 Result = Mapping[str, Any]
-"""What was measured, by name: numbers, texts, and arrays."""
+"""Values that were measured, by name: numbers, texts, and arrays."""
 Row = Sequence[object]
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What every study is told.
+    """Settings that every study is given.
 
     Attributes:
         profile: the nominal device.
-        quick: as few and as small cases as show that it works; their figures say little.
-        seed: of everything random.
-        share: of the authors' steps that networks are trained for.
-        channels: of the published network at sample pitch, twice as many below; the authors' if left out.
+        quick: whether to measure as few and as small cases as show that it works; their figures say little.
+        seed: seed of everything random.
+        share: share of the authors' steps that networks are trained for.
+        channels: channels of the published network at sample pitch, twice as many below; the authors' if left out.
     """
 
     profile: Profile
@@ -57,10 +57,11 @@ class Study:
     Attributes:
         title: the question, in a line.
         source: figure or table of the published study that it repeats, or where it goes beyond.
-        cases: what is varied.
-        measure: one case to its result; its work may be kept in the folder given, so that it can be gone on with.
-        header: of the table.
-        rows: of the table, from cases and results.
+        cases: cases that are measured.
+        measure: function from a case to its result; its work may be kept in the folder given, so that it can be gone on
+            with.
+        header: header of the table.
+        rows: function from cases and results to rows of the table.
         plot: a picture of all results.
         trains: whether it trains published decoders, which takes hours without a GPU at full scale.
         parts: whether table and picture can be made of some of the cases, with those that say `needed`.

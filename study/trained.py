@@ -42,7 +42,7 @@ class DataSet:
     """A recording of a simulated device that several decoders are trained on.
 
     Attributes:
-        name: of its file, beside the folders of the cases; it stays, so that an interrupted study finds it again.
+        name: name of its file, beside the folders of the cases; it stays, so that an interrupted study finds it again.
         profile, device: nominal and true.
         levels: M of its pages.
     """
@@ -63,20 +63,20 @@ def trained(
     knows_piston: bool = False,
     **changes: Any,
 ) -> Result:
-    """What a published decoder reaches on held-out pages of a simulated device, trained as its authors did.
+    """Train a published decoder on a simulated device as its authors did, and return its figures on held-out pages.
 
     Piston and shift of the pages are those that were simulated. Recordings are large: those of other data sets are
     dropped, so cases on one data set should follow each other.
 
     Args:
-        settings: of the study.
-        data_set: what is recorded.
+        settings: settings of the study.
+        data_set: recording to train on.
         localizer: none, mode or ray.
         work: folder of the case.
         progress: told of the steps.
         knows_piston: whether a page's piston is told when the decoder is judged too, as classes need it; else pilots
             show it.
-        changes: to `PublishedChoices`, where the study asks for others than the authors'.
+        changes: changes to `PublishedChoices`, where the study asks for others than the authors'.
 
     Returns:
         air, own_mi: bits per data symbol; air_kB, own_mi_kB a page; ece; steps; the maps air_map, own_mi_map and

@@ -79,7 +79,7 @@ def small_bundle(small_run: Path, tmp_path_factory: pytest.TempPathFactory) -> P
 
 @pytest.fixture
 def ready_twin(small_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Has exports take the graph of the small profile's rays from there: making it takes half a minute."""
+    """Let exports take the graph of the small profile's rays from a bundle, since making it takes half a minute."""
     from lightpage.export import from_run
 
     graph = Bundle.open(small_bundle).files[TWIN]

@@ -1,4 +1,4 @@
-"""How large the house is: `python -m tests.house` prints its figures beside their limits, those of `limits.toml`."""
+"""Sizes of the house: `python -m tests.house` prints its figures beside their limits, those of `limits.toml`."""
 
 import ast
 import io

@@ -4,7 +4,7 @@ from pathlib import Path
 
 
 def runs(process: int) -> bool:
-    """Whether it has not ended."""
+    """Return whether a process has not ended."""
     try:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:

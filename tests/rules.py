@@ -1,4 +1,4 @@
-"""Rules that the tests keep, as a part of lint: `python -m tests.rules` names each line that breaks one.
+"""Rules of tests and words, as a part of lint: `python -m tests.rules` names each line of a test that breaks one.
 
 - A claim is never about wall-clock time: what waits is given a clock (`tests.clock`), and what other threads and
   processes do is awaited by `tests.waiting.eventually`, which alone compares times.
@@ -7,15 +7,19 @@
   they can be improved.
 - Private attributes of what is tested are left alone.
 - There are no more lines than `limits.toml` allows, and what git tracks has no more bytes.
+- Words have limits there too: of pages, of long sentences, and of docstrings that begin without their subject.
 """
 
 import ast
+import math
 import re
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+
+from tests.house import python_files
 
 HERE = Path(__file__).parent
 CLOCKS = {"monotonic", "perf_counter", "time", "monotonic_ns", "perf_counter_ns", "time_ns", "process_time"}
@@ -24,6 +28,11 @@ LONGEST_SLEEP_S = 0.2
 MOST_WORDS = 3
 TEXTS = {"output", "stdout", "stderr", "message", "details", "text"}
 """Attributes that hold what a program tells people."""
+LONGEST_SENTENCE = 25
+_NO_SUBJECT = re.compile(
+    r"(Of|Those|That|With|What|Who|Whoever|As|In|By|For|From|At|On|One|Where|Whether|How|It|Its|To)\b"
+)
+_DOCUMENTED = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
 _SLEEP_IN_A_SCRIPT = re.compile(r"\bsleep\((\d+(?:\.\d*)?)\)")
 
 
@@ -85,20 +94,20 @@ def _reads_clock(node: ast.AST) -> bool:
 
 
 def _private(node: ast.Attribute) -> bool:
-    """Whether it is an attribute of another's that its name calls private."""
+    """Return whether a node reads another object's attribute that its name calls private."""
     named = node.attr.startswith("_") and not node.attr.startswith("__")
     return named and _name(node.value) not in {"self", "cls", "os", "sys", "ctypes"}
 
 
 def _told(node: ast.AST) -> bool:
-    """Whether it is what a program or an error tells people."""
+    """Return whether a node is text that a program or an error shows people."""
     if isinstance(node, ast.Call):
         return _name(node.func) in {"str", "details"}
     return isinstance(node, ast.Attribute) and node.attr in TEXTS
 
 
 def _text(node: ast.AST) -> str:
-    """What of a string stands in the source."""
+    """Return the literal parts of a string."""
     return " ".join(
         part.value for part in ast.walk(node) if isinstance(part, ast.Constant) and isinstance(part.value, str)
     )
@@ -106,6 +115,25 @@ def _text(node: ast.AST) -> str:
 
 def _name(node: ast.AST) -> str:
     return node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
+
+
+def without_subject(sources: Iterable[str]) -> float:
+    """Return the percentage of docstrings that begin with a preposition or a pronoun."""
+    nodes = [node for source in sources for node in ast.walk(ast.parse(source)) if isinstance(node, _DOCUMENTED)]
+    texts = [*filter(None, map(ast.get_docstring, nodes))]
+    return _percent(sum(_NO_SUBJECT.match(text) is not None for text in texts), len(texts))
+
+
+def prose(pages: Iterable[str]) -> tuple[int, float]:
+    """Return the number of words of Markdown pages without their code, and the percentage of long sentences."""
+    texts = [re.sub(r"```.*?```", "", page, flags=re.DOTALL) for page in pages]
+    plain = [re.sub(r"^\s*[|#>].*$", "", text, flags=re.MULTILINE) for text in texts]
+    lengths = [len(each.split()) for text in plain for each in re.split(r"(?<=[.!?])\s+(?=[A-Z`*])", text)]
+    return sum(len(text.split()) for text in texts), _percent(sum(n > LONGEST_SENTENCE for n in lengths), len(lengths))
+
+
+def _percent(part: int, whole: int) -> float:
+    return math.ceil(1000 * part / whole) / 10
 
 
 def main() -> int:
@@ -118,12 +146,21 @@ def main() -> int:
         for line, what in broken(path)
     ]
     limits = tomllib.loads((HERE / "limits.toml").read_text("utf-8"))
-    sizes = {"lines": sum(len(path.read_bytes().splitlines()) for path in paths), "bytes": tracked_bytes(HERE.parent)}
+    root = HERE.parent
+    pages = [root / "README.md", root / "CONTRIBUTING.md", *root.glob("docs/**/*.md")]
+    words, long_percent = prose(path.read_text("utf-8") for path in pages)
+    sizes = {
+        "lines": sum(len(path.read_bytes().splitlines()) for path in paths),
+        "bytes": tracked_bytes(root),
+        "words": words,
+        "long_sentences_percent": long_percent,
+        "no_subject_percent": without_subject(path.read_text("utf-8") for path in python_files(tests=True)),
+    }
     for unit, size in sizes.items():
         if size > limits[unit]:
-            found.append(f"{size:,} {unit}, wanted {limits[unit]:,} or fewer (tests/limits.toml)")
+            found.append(f"{size:,.10g} {unit}, wanted {limits[unit]:,} or fewer (tests/limits.toml)")
     print(*found, sep="\n", end="\n" if found else "")
-    told = [f"{size:,} of {limits[unit]:,} {unit}" for unit, size in sizes.items()]
+    told = [f"{size:,.10g} of {limits[unit]:,} {unit}" for unit, size in sizes.items()]
     print(*told, f"{len(found)} rules broken", sep="; ")
     return bool(found)
 

@@ -1,4 +1,4 @@
-"""Where everything must be tested, a skipped test fails: `.ci/run` sets LIGHTPAGE_REQUIRE_ALL=1."""
+"""Failure of skipped tests where everything must be tested: `.ci/run` sets LIGHTPAGE_REQUIRE_ALL=1."""
 
 import os
 from collections.abc import Generator

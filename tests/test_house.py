@@ -1,10 +1,10 @@
-"""The house stays small: its rooms, floors, arrows, folders and lines have limits."""
+"""The house stays small: its rooms, floors, arrows, folders and lines have limits, and so have its words."""
 
 from pathlib import Path
 
 import pytest
 
-from tests import house
+from tests import house, rules
 
 
 @pytest.fixture(scope="module")
@@ -28,3 +28,13 @@ def test_a_class_is_as_large_as_its_lines_and_methods_and_may_say_why(tmp_path: 
     source = "class A:\n    x = 1\n\n    def f(self): ...\n\n    async def g(self):\n        def h(): ...\n\n\n"
     (path := tmp_path / "a.py").write_text(source + "# Large: a table\n@dataclass\nclass B:\n    y: int\n")
     assert house.classes(path) == [("A", 7, 2, ""), ("B", 2, 0, "a table")]
+
+
+@pytest.mark.parametrize(("docstring", "percent"), [("Of a page.", 50), ("Offset of a page.", 0)])
+def test_docstrings_that_begin_without_their_subject_are_counted(docstring: str, percent: float) -> None:
+    assert rules.without_subject([f'"""{docstring}"""', 'def f():\n    """Return it."""\n']) == percent
+
+
+def test_words_and_long_sentences_of_pages_are_counted_without_code() -> None:
+    page = f"# Title\n\nA short one. A{' word' * 25}. Three more words.\n```\nno word\n```\n| a | row |\n"
+    assert rules.prose([page]) == (2 + 3 + 26 + 3 + 5, 33.4)

@@ -14,7 +14,7 @@ class Told:
     """See `lightpage.progress.Reporter`.
 
     Attributes:
-        notes: what was told.
+        notes: notes that were told.
     """
 
     notes: list[str] = field(default_factory=list)

@@ -24,7 +24,7 @@ STRATEGIES = (AUTO, DDP)
 _MOST_ON_A_NODE = 1024
 _MEETING = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK")
 _PATIENCE_S, _LOOK_S = 1800.0, 0.2
-"""How long a process waits for the next piece of another's work, and how often it looks."""
+"""Longest wait of a process for the next piece of another's work, and time between two looks."""
 
 
 @dataclass(frozen=True)
@@ -32,9 +32,9 @@ class Processes:
     """The processes of one training, a GPU each where there are any.
 
     Attributes:
-        devices: of each node; "auto" for all GPUs, or one process without one.
+        devices: number of devices of each node; "auto" for all GPUs, or one process without one.
         nodes: machines.
-        strategy: of `STRATEGIES`.
+        strategy: name out of `STRATEGIES`.
     """
 
     devices: int | str = AUTO
@@ -42,7 +42,7 @@ class Processes:
     strategy: str = AUTO
 
     def checked(self) -> Processes:
-        """The same with what `torchrun` says, where that has started this process.
+        """Check the processes, and return them as `torchrun` says if that has started this process.
 
         Raises:
             InvalidInputError: more devices than there are, nodes that cannot meet, or others than `torchrun` started.
@@ -63,7 +63,7 @@ class Processes:
         return self
 
     def environment(self) -> ClusterEnvironment:
-        """How the processes find each other."""
+        """Return the environment by which the processes find each other."""
         from lightning.fabric.plugins.environments.lightning import LightningEnvironment
         from lightning.fabric.plugins.environments.torchelastic import TorchElasticEnvironment
 
@@ -95,14 +95,14 @@ ONE = Processes(1)
 
 
 def process_number() -> int:
-    """Of this process, 0 for the first one of the first node; each has another."""
+    """Return this process's number, which is unique; it is 0 for the first process of the first node."""
     if _by_torchrun():
         return int(os.environ["RANK"])
     return _MOST_ON_A_NODE * int(os.environ.get("NODE_RANK") or 0) + int(os.environ.get("LOCAL_RANK") or 0)
 
 
 def is_first_process() -> bool:
-    """Whether this is the process that writes, and shows how far it is."""
+    """Return whether this is the process that writes, and shows progress."""
     return process_number() == 0
 
 
@@ -111,9 +111,9 @@ def wait_for_first(done: Callable[[], int], count: int, what: str, clock: Clock 
 
     Args:
         done: how much is there.
-        count: that is waited for.
-        what: for the error.
-        clock: to wait by.
+        count: amount of work that is waited for.
+        what: name of the work, for the error.
+        clock: clock to wait by.
 
     Raises:
         LightpageError: no more has come for half an hour.

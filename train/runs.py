@@ -36,9 +36,9 @@ WEIGHTS = "decoder.pt"
 REFERENCES = "references.npz"
 GOLDEN = "golden.npz"
 FORMAT = 8
-"""Of what a run keeps while it is made: raised when features, network or checkpoints of an earlier version would not go
-together with those of this one, or when the simulator's light changes (as the simulator's `LIGHT` is then), or which
-pages the comparison trains on."""
+"""Version of what a run keeps while it is made: raised when features, network or checkpoints of an earlier version
+would not go together with those of this one, or when the simulator's light changes (as the simulator's `LIGHT` is
+then), or which pages the comparison trains on."""
 
 _RENAMED = {"levels": "depth"}
 """Choices that runs in analysis/weights keep under other names: the depth of the network was called its levels."""
@@ -46,13 +46,13 @@ _RENAMED = {"levels": "depth"}
 
 @dataclass(frozen=True)
 class Run:
-    """What a finished run is, as `run.json` keeps it.
+    """Record of a finished run, as `run.json` keeps it.
 
     Attributes:
         localizer: name.
         profile_toml, calibration_toml: the device.
         hyperparameters: the choices.
-        camera_bit_depth: of the recording.
+        camera_bit_depth: bit depth of the recording.
         trained_pages: hashes of the pages that were trained on or used to stop.
         validation_air: bits per data symbol.
         pages: recorded pages for training, for validation, and left for evaluation.
@@ -125,8 +125,8 @@ def begin(folder: Path, options: dict[str, Any]) -> None:
     """Note what a run is begun with, or check that it goes on with just that.
 
     Args:
-        folder: of the run, which is there.
-        options: by name, as JSON can keep them.
+        folder: folder of the run, which is there.
+        options: options by name, as JSON can keep them.
 
     Raises:
         InvalidInputError: the folder holds a run that was begun with other options.

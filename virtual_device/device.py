@@ -40,9 +40,9 @@ class VirtualDevice:
     Args:
         profile: nominal device.
         device: true state; its sensor's bit depth is that of `pixel_format`.
-        folder: that exists, for port, socket and configuration.
-        seed: of noise and drift.
-        pixel_format: of both cameras.
+        folder: existing folder for port, socket and configuration.
+        seed: seed of noise and drift.
+        pixel_format: pixel format of both cameras.
         black_level: counts that both cameras add.
 
     Raises:

@@ -45,14 +45,14 @@ _SENSOR_ROWS, _SENSOR_COLUMNS = 0x118, 0x11C
 _PIXEL_FORMAT, _PERIOD_US = 0x128, 0x138
 _TRIGGER_MODE, _LIBRARY_TRIGGER_SOURCE, _SHOOT = 0x300, 0x304, 0x30C
 _TRIGGER_SOURCE = 0x3F4
-"""Where the edited description keeps the trigger's source. The library shoots on a command only while its own register
-says ``Software``, and it would read that back whatever was chosen."""
+"""Address of the trigger's source in the edited description. The library shoots on a command only while its own
+register says ``Software``, and it would read that back whatever was chosen."""
 _SOFTWARE = 1
 _LINES = {"Line0": 0, "Line1": 2}
 _PAYLOAD = "WIDTH * HEIGHT * ((PIXELFORMAT>>16)&amp;0xFF) / 8"
 """Formula of its PayloadSize."""
 _POLLS_HZ = 250.0
-"""How often a waiting camera looks for a trigger."""
+"""Rate at which a waiting camera looks for a trigger."""
 
 
 class FakeCamera:
@@ -62,11 +62,11 @@ class FakeCamera:
     an acquisition may be up to 0.1 s late.
 
     Args:
-        address: to listen on, of an interface of this machine.
-        serial: its number.
+        address: address to listen on, of an interface of this machine.
+        serial: serial number of the camera.
         picture: the whole sensor [row, column], called by the camera's own thread; the region that is set is sent.
         sensor_shape: (rows, columns).
-        more_bytes: by how much its PayloadSize is larger than the pixels that it sends.
+        more_bytes: bytes by which its PayloadSize is larger than the pixels that it sends.
 
     Raises:
         SourceError: no library, or the address cannot be listened on.
@@ -142,7 +142,7 @@ class FakeCamera:
 
     @property
     def waits(self) -> bool:
-        """Whether a trigger makes a frame now: it acquires, and its trigger is on."""
+        """Return whether a trigger makes a frame now: the camera acquires, and its trigger is on."""
         if self._camera is None:
             return False
         return bool(self._library("arv_fake_camera_get_acquisition_status", self._inner)) and bool(
@@ -195,7 +195,7 @@ class FakeCamera:
 
 
 def _check_free(address: str) -> None:
-    """A second camera on an address would claim to run, and hear nothing."""
+    """Check that no other camera has the address: a second one would claim to run, and hear nothing."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.bind((address, PORT))

@@ -19,12 +19,12 @@ Counts = NDArray[np.unsignedinteger[Any]]
 
 
 class Light:
-    """What is on display, as light. Its methods may be called from many threads.
+    """Light of the page on display. Its methods may be called from many threads.
 
     Args:
         profile: nominal device.
         device: true state.
-        seed: of noise and drift.
+        seed: seed of noise and drift.
         black_level: counts that both cameras add.
     """
 
@@ -68,7 +68,7 @@ class Light:
                 self._reference, self._dark = references, dark
 
     def pair(self) -> FramePair:
-        """What both cameras see now, black level included."""
+        """Return what both cameras see now, black level included."""
         with self._lock:
             if not self._reference_beam:
                 pair = self._dark

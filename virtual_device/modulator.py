@@ -27,8 +27,8 @@ class ModulatorSocket:
     """Listens on a Unix socket, one driver at a time; see its other end, `SimulatedModulator`, for what is said.
 
     Args:
-        light: in which the pages are shown.
-        address: of the socket, which is made.
+        light: light in which the pages are shown.
+        address: address of the socket, which is made.
 
     Raises:
         LightpageError: the address cannot be listened on.

@@ -22,7 +22,7 @@ from lightpage.errors import SourceError
 INSIDE = "LIGHTPAGE_PRIVATE_NETWORK"
 """Environment variable that is 1 in a private network."""
 ADDRESSES = ("127.0.0.1", "127.0.0.2")
-"""Of the in-phase and the quadrature camera."""
+"""Addresses of the in-phase and the quadrature camera."""
 _SUBJECT = "private network"
 _EXPECTED = "Linux that lets this user make one (unshare --net, with --user --map-root-user for other users than root)"
 _SIOCSIFFLAGS, _SIOCSIFADDR, _SIOCSIFNETMASK = 0x8914, 0x8916, 0x891C
@@ -32,7 +32,7 @@ _TRY_S = 20.0
 
 @functools.cache
 def available() -> str | None:
-    """Why this machine lets the process make no private network, or None where it does; asked once."""
+    """Return why this machine lets the process make no private network, or None where it does; asked once."""
     if shutil.which("unshare") is None:
         return "no unshare (package util-linux)"
     try:

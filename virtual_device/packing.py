@@ -17,7 +17,7 @@ def pack(counts: NDArray[np.unsignedinteger[Any]], name: str) -> NDArray[np.uint
 
     Args:
         counts: [row, column], of the format's bit depth.
-        name: of the pixel format.
+        name: name of the pixel format.
 
     Raises:
         InvalidInputError: see `pixel_format`.

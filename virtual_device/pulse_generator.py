@@ -80,12 +80,12 @@ _INSTRUMENT = re.compile(r"PULSE?([0-8])?|(SPULSE?)", re.IGNORECASE)
 
 
 class PulseGeneratorEmulator:
-    """Its state and its grammar. Its methods may be called from many threads.
+    """Emulator of a pulse generator: its state and its grammar. Its methods may be called from many threads.
 
     Not emulated: delays and widths of its pulses in time, and the train of pulses of a running T0 in `NORMal` mode.
 
     Args:
-        cables: by channel, what is called at every shot while the channel is on.
+        cables: functions by channel, each called at every shot while its channel is on.
     """
 
     def __init__(self, cables: Mapping[int, Callable[[], None]] | None = None) -> None:
@@ -110,7 +110,7 @@ class PulseGeneratorEmulator:
             return self._values[channel, setting]
 
     def answer(self, message: str) -> str:
-        """What it answers to a message; both without line end."""
+        """Return the answer to a message; both without line end."""
         with self._lock:
             self.messages += 1
             if message.startswith("*"):
@@ -183,7 +183,7 @@ def _short(word: str) -> str:
 
 
 def _means(given: str, name: str) -> bool:
-    """Whether keywords are given in their long or short forms, in any case."""
+    """Return whether keywords are given in their long or short forms, in any case."""
     some, names = given.upper().split(":"), name.split(":")
     if len(some) != len(names):
         return False

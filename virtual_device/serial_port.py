@@ -23,7 +23,7 @@ _STOP_S = 5.0
 
 
 class Fault(StrEnum):
-    """What goes wrong with a message or with its answer."""
+    """Fault of a message or of its answer."""
 
     SILENCE = "SILENCE"
     """The answer does not come."""
@@ -43,15 +43,15 @@ class VirtualSerialPort(ABC):
     """Bytes in, bytes out, by a thread; `Pty` and `TcpPort` say where.
 
     Args:
-        answer: of the device to a line without its end.
-        seed: of faults.
+        answer: function from a line without its end to the device's answer.
+        seed: seed of faults.
 
     Attributes:
         fault: chosen for each message; None for a sound one.
         echo: whether the port sends back what it receives.
         late_s: least and longest delay of a late answer.
-        line_end: what ends the device's lines.
-        before_line: what comes before each of them.
+        line_end: bytes that end the device's lines.
+        before_line: bytes that come before each of them.
         faults: how many there were of each.
     """
 
@@ -67,7 +67,7 @@ class VirtualSerialPort(ABC):
         self._thread: threading.Thread | None = None
 
     def plug(self) -> None:
-        """Be there, under the usual address.
+        """Appear under the usual address.
 
         Raises:
             LightpageError: the address is taken, or cannot be made.
@@ -82,7 +82,7 @@ class VirtualSerialPort(ABC):
         self._thread.start()
 
     def unplug(self) -> None:
-        """Be gone; what was on its way is lost."""
+        """Disappear; what was on its way is lost."""
         thread, self._thread = self._thread, None
         if thread is None:
             return
@@ -100,7 +100,7 @@ class VirtualSerialPort(ABC):
     @property
     @abstractmethod
     def address(self) -> str:
-        """What a driver is given as its port."""
+        """Address that a driver is given as its port."""
 
     @abstractmethod
     def _appear(self) -> None: ...
@@ -110,7 +110,7 @@ class VirtualSerialPort(ABC):
 
     @abstractmethod
     def _read(self) -> bytes:
-        """What has come within a poll; empty where nothing has.
+        """Return the bytes that have come within a poll; empty where none have.
 
         Raises:
             OSError: no driver is there any more.

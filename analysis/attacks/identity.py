@@ -87,7 +87,7 @@ def documented() -> tuple[str, dict[str, str]]:
 
 
 def expected(caller: str, role: str) -> str:
-    """What the documentation says becomes of a call that needs a role."""
+    """Return the outcome that the documentation promises to a caller whose call needs a role."""
     if caller in _UNKNOWN:
         return NO_CONNECTION
     roles = CALLERS[caller]
@@ -95,7 +95,7 @@ def expected(caller: str, role: str) -> str:
 
 
 def outcome(code: str) -> str:
-    """What became of a call that ended so."""
+    """Return the outcome of a call by its status code."""
     return {"UNAVAILABLE": NO_CONNECTION, "PERMISSION_DENIED": REFUSED}.get(code, LET_IN)
 
 
@@ -107,7 +107,7 @@ def methods() -> Iterator[tuple[str, MethodDescriptor]]:
 
 
 def ended(channel: grpc.Channel, method: MethodDescriptor) -> str:
-    """How a call with an empty request ends."""
+    """Call with an empty request, and return the name of the status code."""
     request, path = GetMessageClass(method.input_type)(), f"/{method.containing_service.full_name}/{method.name}"
     ways = "stream" if method.client_streaming else "unary", "stream" if method.server_streaming else "unary"
     call: Any = getattr(channel, "_".join(ways))(path, type(request).SerializeToString, None)
@@ -136,7 +136,7 @@ def connected(target: str, caller: str, folder: Path) -> Iterator[grpc.Channel]:
 
 
 def measured() -> dict[str, Any]:
-    """How every call ends for every caller, and which of them should have ended otherwise."""
+    """Return the status code of every call for every caller, and the calls that should have ended otherwise."""
     commands, needed = documented()
     undocumented = sorted(name for name, _ in methods() if name not in needed)
     found: dict[str, dict[str, str]] = {}

@@ -54,10 +54,10 @@ class Attacker:
     """Makes tries.
 
     Args:
-        target: of the service.
-        header: of a good pair.
-        pair: it.
-        seed: of all choices.
+        target: address of the service.
+        header: header of a good pair.
+        pair: good pair.
+        seed: seed of all choices.
     """
 
     def __init__(self, target: str, header: pb.DecodeHeader, pair: FramePair, seed: int) -> None:
@@ -87,11 +87,11 @@ class Attacker:
         }
 
     def good(self) -> bool:
-        """Whether a good pair is answered."""
+        """Send a good pair, and return whether it is answered."""
         return self._ended(self._memory.handle, 0) == "OK"
 
     def close(self) -> None:
-        """Leave."""
+        """Close the connection and the region."""
         self._memory.close()
         self._channel.close()
 
@@ -100,7 +100,7 @@ class Attacker:
         return self._chance.choice([*far, self._chance.randrange(1, 1 << 64)])
 
     def _begun(self, region: bytes, offset: int, rows_px: int | None = None) -> Any:
-        """A call that is on its way."""
+        """Begin a call."""
         header = pb.DecodeHeader()
         header.CopyFrom(self._header)
         header.shared.region, header.shared.offset = region, offset
@@ -109,24 +109,28 @@ class Attacker:
         return self._stub.DecodeFrames.future(iter([pb.DecodeFramesRequest(header=header)]), timeout=CALL_S)
 
     def _ended(self, region: bytes, offset: int, rows_px: int | None = None) -> str:
-        """How a call ends."""
+        """Make a call, and return the name of its status code."""
         return str(self._begun(region, offset, rows_px).code().name)
 
     def _cancelled(self) -> str:
-        """The whole pair is there, so a page may come of it; its bytes of the receive budget must be given back."""
+        """Cancel a call whose whole pair is there: a page may come of it, and its bytes of the receive budget come
+        back.
+        """
         call = self._begun(self._memory.handle, 0)
         time.sleep(self._chance.uniform(0, _CANCEL_S))
         call.cancel()
         return str(call.code().name)
 
     def _bad(self, region: bytes, offset: int, larger: int = 0) -> str:
-        """A try of which no page may come."""
+        """Make a call of which no page may come, and count one that does."""
         ended = self._ended(region, offset, self._header.rows_px + 1 if larger else None)
         self.outside += ended == "OK"
         return ended
 
     def _dropped(self) -> str:
-        """The whole pair is there when the call begins, so a page may come of it; a crash may not."""
+        """Drop a region during a call. The whole pair is there when it begins, so a page may come of it; a crash may
+        not.
+        """
         memory = SharedMemory(self._target, self._size)
         memory.write(self._pair)
         closing = threading.Timer(self._chance.uniform(0, 2e-3), memory.close)
@@ -138,7 +142,7 @@ class Attacker:
             self._gone = [*self._gone[-20:], memory.handle]
 
     def _resized(self) -> str:
-        """A region is asked for by hand, its descriptor is cut, and a call reads where its end would have been."""
+        """Ask for a region by hand, cut its descriptor, and have a call read where its end would have been."""
         with socket.socket(socket.AF_UNIX) as connection:
             connection.settimeout(CALL_S)
             connection.connect(memory_path(self._target))
@@ -220,7 +224,7 @@ def attacked(tries: int, seed: int) -> dict[str, Any]:
 
 
 def faults(found: Mapping[str, Any]) -> list[str]:
-    """What is wrong with figures of `attacked`, a few words each."""
+    """Return the faults in the figures of `attacked`, a few words each."""
     before, after = found["regions_and_files_before"], found["regions_and_files_after"]
     wrong = {
         f"{found['crashes']} crashes": found["crashes"],

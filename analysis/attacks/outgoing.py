@@ -38,7 +38,7 @@ from lightpage.runtime.commands.service.healthcheck import is_serving
 
 CALLS = ("connect", "sendto", "sendmsg", "sendmmsg")
 UNSEEN = "io_uring_setup"
-"""Of system calls: what is sent through a ring is in no trace. Nobody may make one."""
+"""System call that is not seen: what is sent through a ring is in no trace. Nobody may make one."""
 TRACE = (
     *("strace", "--follow-forks", "--timestamps=unix,us", "--quiet=attach", "--signal=none"),
     *("--trace", ",".join((*CALLS, UNSEEN))),
@@ -69,7 +69,7 @@ class Called:
     """A call to an address.
 
     Args:
-        at: when, seconds since the epoch.
+        at: time of the call, seconds since the epoch.
         call: name of the system call.
         address: numeric, or the path of a socket in the file system.
         port: 0 of such a path.

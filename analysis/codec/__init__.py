@@ -1,1 +1,1 @@
-"""What the page codec is worth: net user bytes on recorded pages, drawn blocks, damaged pages, speed."""
+"""Benchmarks of the page codec: net user bytes on recorded pages, drawn blocks, damaged pages, speed."""

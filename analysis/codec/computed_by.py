@@ -11,7 +11,7 @@ from lightpage.codec.compiled.choice import VARIABLE
 
 @contextmanager
 def computed_by(name: str) -> Iterator[None]:
-    """Inside, the page code is computed by numpy or by the compiled arithmetic."""
+    """Compute the page code by numpy or by the compiled arithmetic in the `with` statement."""
     before = os.environ.get(VARIABLE)
     os.environ[VARIABLE] = name
     try:

@@ -43,7 +43,7 @@ from lightpage.train.models.presets import FAST
 
 WEIGHTS = Path("analysis/weights")
 LOSS = 1e-6
-"""Of a data page behind the outer code."""
+"""Probability that a data page is lost behind the outer code."""
 VOLUME = 7
 _SEED = 90_000
 
@@ -53,12 +53,12 @@ class DataSet:
     """A device with the decoder that reads it.
 
     Attributes:
-        name: for people and files.
+        name: name for people and files.
         bundle: makes the bundle's path, in a folder.
         profile: nominal device.
         device: true state.
         known: pages that the code is chosen on.
-        pages: that the file fills.
+        pages: number of pages that the file fills.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""What the blind refit of a page's smooth phase error gains: by level count, by what is fitted, and how often.
+"""Gain of the blind refit of a page's smooth phase error, by level count, fitted terms and number of refits.
 
     python -m analysis.codec.refit --recording R.h5
 

@@ -1,4 +1,4 @@
-"""Whether a wrong byte is ever given out: pages drawn at and below the code's limit, and pages damaged in every way.
+"""Check that no wrong byte is ever given out: pages drawn at and below the code's limit, and pages damaged every way.
 
 python -m analysis.codec.safety --json runs/bench-codec/safety.json
 """
@@ -32,13 +32,13 @@ Floats = NDArray[np.float64]
 Damage = Callable[[Floats, Floats, np.random.Generator], None]
 
 NOISES = (0.97, 0.99, 1.0, 1.01, 1.03, 1.1, 1.3, 2.0)
-"""Of the noise at which half of the pages are lost: from just below it to far beyond."""
+"""Factors on the noise at which half of the pages are lost: from just below it to far beyond."""
 _LIMIT_PAGES, _LIMIT_STEPS = 20, 10
 
 
 @dataclass(frozen=True)
 class Count:
-    """What became of pages.
+    """Count of pages by outcome.
 
     Attributes:
         right, lost, wrong: how many gave their bytes, gave none, or gave others.
@@ -53,8 +53,8 @@ class Pages:
     """Pages of random bytes on the bench device.
 
     Args:
-        code: of the pages.
-        seed: of bytes and noise.
+        code: code of the pages.
+        seed: seed of bytes and noise.
     """
 
     def __init__(self, code: Code, seed: int) -> None:
@@ -82,7 +82,7 @@ class Pages:
         return (low + high) / 2
 
     def outcome(self, sent: bytes, header: Header, phase: Floats, concentration: Floats) -> str:
-        """Whether a page is right, lost or wrong."""
+        """Decode a page, and return its outcome: right, lost or wrong."""
         try:
             found = self.codec.decode(phase, concentration)
         except LightpageError:
@@ -122,7 +122,7 @@ def _sure(phase: Floats, concentration: Floats, rng: np.random.Generator) -> Non
 
 
 def _few(phase: Floats, concentration: Floats, rng: np.random.Generator) -> None:
-    """Some symbols that say another level."""
+    """Turn the phases of a few symbols to other levels, without lowering their concentration."""
     wrong = rng.random(phase.shape) < 10 ** rng.uniform(-4, -1)
     phase[wrong] += rng.uniform(-np.pi, np.pi, int(wrong.sum()))
 

@@ -38,7 +38,7 @@ from lightpage.recording.pages import PagesWriter
 
 Floats = NDArray[np.float32]
 _MARGIN_BITS = 0.1
-"""Of the pages that are timed, bits a symbol."""
+"""Margin of the pages that are timed, bits a symbol."""
 _UNEVEN = Modulation(tuple((NOMINAL.as_dict() | {"stroke_relative": -0.05, "phase_sin_1_rad": 0.1}).values()))
 """A modulator whose levels are not even, as any real one's."""
 PAGES: dict[str, tuple[str, int, Code]] = {

@@ -1,4 +1,4 @@
-"""What each part of one coherent pass is worth: the decoder without it, beside the whole one, on the same pages.
+"""Ablation: each part of one coherent pass left out, compared with the whole decoder on the same pages.
 
     python -m analysis.comparison.ablation --angle -0.6 --out runs/ablation
 

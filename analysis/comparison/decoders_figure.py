@@ -24,7 +24,7 @@ def draw(data_sets: list[dict[str, Any]], out: Path) -> None:
     """Write `figure.png` into the folder of a comparison.
 
     Args:
-        data_sets: as `figures.json` holds them; each outcome's `run` is a folder below `out`, with its `MAP`.
+        data_sets: data sets of `figures.json`; each outcome's `run` is a folder below `out`, with its `MAP`.
         out: the comparison's folder.
     """
     figure = Figure(figsize=(_WIDTH_IN, _DATA_SET_IN * len(data_sets)), layout="constrained")
@@ -42,7 +42,7 @@ def draw(data_sets: list[dict[str, Any]], out: Path) -> None:
 
 
 def title(data_set: dict[str, Any]) -> str:
-    """What a data set of a comparison is."""
+    """Return the title of a comparison's data set."""
     size = data_set["symbol_size_px"]
     noise = f"full well {data_set['full_well_e']:g} e-, exposure {data_set['exposure']:g}"
     device = ", ideal device" if data_set["ideal"] else ""
@@ -63,7 +63,7 @@ def _bars(axis: Any, outcomes: list[dict[str, Any]], top: float) -> None:
 
 
 def _curves(axis: Any, outcomes: list[dict[str, Any]], top: float) -> None:
-    """How each method learnt: AIR by share of its steps, of training pages (thin) and of validation pages (thick)."""
+    """Draw learning curves: AIR by share of steps, thin for training pages and thick for validation pages."""
     for number, outcome in enumerate(outcomes):
         for name, width in (("training_curve", 0.7), ("validation_curve", 1.8)):
             steps, rates = np.reshape(outcome[name], (-1, 2)).T
@@ -75,7 +75,7 @@ def _curves(axis: Any, outcomes: list[dict[str, Any]], top: float) -> None:
 
 
 def _maps(part: Any, outcomes: list[dict[str, Any]], out: Path) -> None:
-    """Where on the page each method reads how much."""
+    """Draw maps of the AIR of each symbol of the page, one for each method."""
     maps = [np.load(out / outcome["run"] / MAP) for outcome in outcomes]
     top = max(0.1, *(float(np.nanpercentile(rates, _BRIGHT)) for rates in maps))
     rows = 1 if len(outcomes) < 3 else 2

@@ -3,11 +3,15 @@
     python -m analysis.comparison.imperfections --out runs/imperfections
     python -m analysis.comparison.imperfections --device axial --out runs/imperfections
     python -m analysis.comparison.imperfections --set slm.stroke_relative_error=-0.03 --out runs/stroke
+    python -m analysis.comparison.imperfections --drawn 1000 --drawn 1001 --out runs/drawn
 
 Every device is recorded and calibrated from nominal. Decoder and oracle are the methods wave and oracle of
 `analysis.comparison.decoders`, with the network of the preset `standard`, the same steps and pages. Interrupted, it
-goes on where it was; all lies in --out. The oracle's equations are linear: where cameras stand some 1.5 rad apart, they
-miss one of two numbers on a ring of the facet (`train/models/apart.py`), and it reads less than the decoder.
+goes on where it was; all lies in --out. `--drawn` takes a device of the whole capture range, the one that
+`analysis.calibration.devices` draws by this seed.
+
+The oracle's equations are linear: where cameras stand some 1.5 rad apart, they miss one of two numbers on a ring of the
+facet (`train/models/apart.py`), and it reads less than the decoder.
 """
 
 from __future__ import annotations
@@ -17,6 +21,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import click
+import numpy as np
 
 from analysis.comparison.data_set import CALIBRATED, recorded
 from analysis.comparison.methods.bench import ORACLE, Bench
@@ -25,7 +30,7 @@ from analysis.comparison.weight_store import TRAINED, WeightStore
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFolder
 from lightpage.device.profile import Profile, load_profile
-from lightpage.device.state import Device
+from lightpage.device.state import Device, draw_device
 from lightpage.files import write_json
 from lightpage.train.fitting.memory import keep_freed_memory
 from lightpage.train.models.decoder import WAVE
@@ -95,9 +100,11 @@ class Row:
 HEADER = f"{'device':<12} {'AIR':>7} {'oracle':>7} {'ratio':>7} {'angle off':>10} {'seconds':>8}"
 
 
-def measured(name: str, settings: list[str], profile: Profile, pages: int, steps: int, seed: int, out: Path) -> Row:
+def measured(
+    name: str, device: Device, settings: list[str], profile: Profile, pages: int, steps: int, seed: int, out: Path
+) -> Row:
     """Record and calibrate a device, or go on with it, and train the decoder and the oracle."""
-    device = Device().of_profile(profile).with_settings(settings)
+    device = device.of_profile(profile).with_settings(settings)
     folder = out / name
     with recorded(profile, device, pages - CALIBRATED, seed, folder) as recording:
         kept = WeightStore(folder, TRAINED / profile.name / name)
@@ -125,6 +132,7 @@ def measured(name: str, settings: list[str], profile: Profile, pages: int, steps
     "--device", "names", type=click.Choice(list(DEVICES)), multiple=True, help="All of them if neither is given."
 )
 @click.option("--set", "settings", multiple=True, metavar="TABLE.KEY=VALUE", help="A device of your own.")
+@click.option("--drawn", "seeds", type=click.IntRange(0), multiple=True, help="A device drawn by this seed.")
 @click.option("--pages", type=click.IntRange(6), default=28, show_default=True, help="A fifth of them held out.")
 @click.option("--steps", type=click.IntRange(10), default=600, show_default=True)
 @click.option("--seed", type=click.IntRange(min=0), default=7, show_default=True)
@@ -133,6 +141,7 @@ def main(
     profile_name: str,
     names: tuple[str, ...],
     settings: tuple[str, ...],
+    seeds: tuple[int, ...],
     pages: int,
     steps: int,
     seed: int,
@@ -143,9 +152,12 @@ def main(
     profile = load_profile(profile_name)
     click.get_current_context().with_resource(sole_writer(out))
     chosen = {name: DEVICES[name] for name in names} | ({OWN: list(settings)} if settings else {})
+    devices = {name: (Device(), changes) for name, changes in (chosen or ({} if seeds else DEVICES)).items()}
+    for number in seeds:
+        devices[f"drawn-{number}"] = draw_device(np.random.default_rng(number)), list[str]()
     rows: list[Row] = []
-    for name, changes in (chosen or DEVICES).items():
-        rows.append(measured(name, changes, profile, pages, steps, seed, out))
+    for name, (device, changes) in devices.items():
+        rows.append(measured(name, device, changes, profile, pages, steps, seed, out))
         click.echo(f"{HEADER}\n{rows[-1].line()}", err=True)
         write_json(out / "imperfections.json", {"rows": [asdict(row) for row in rows]})
     click.echo("\n".join([HEADER, *(row.line() for row in rows)]))

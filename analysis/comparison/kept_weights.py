@@ -29,7 +29,7 @@ from lightpage.train.fitting.modules import DecoderTraining
 from lightpage.von_mises import mean_resultant
 
 MOST_MOVED_BITS = 1e-4
-"""That rounding may change what a decoder says, as a mean over symbols: below the fourth digit of every AIR."""
+"""Largest change by rounding of what a decoder says, as a mean over symbols: below the fourth digit of every AIR."""
 LARGE = 1000
 """Numbers of a tensor from which it is rounded; the others are kept as they are."""
 _PROBE = 1 / 16

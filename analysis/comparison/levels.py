@@ -1,4 +1,4 @@
-"""How well calibrated confidences are on pages of few levels, where decisions are mostly right."""
+"""Calibration of confidences on pages of few levels, where most decisions are right."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ def level_figures(
     """Figures of decoded pages.
 
     Args:
-        p: of their data symbols, [2, symbols].
-        recording: with the truth.
-        pages: which of its pages, in order.
+        p: estimates of the data symbols, [2, symbols].
+        recording: recording with the truth.
+        pages: numbers of its pages, in order.
         mask: pilots, bool [ny, nx].
     """
     written = [recording.symbols(page) for page in pages]

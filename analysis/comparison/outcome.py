@@ -1,4 +1,4 @@
-"""What a method reached, as figures and as a line of the table."""
+"""Outcome of a method: its figures, and its line of the table."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lightpage.report.contents.data import exit_centroids
 from lightpage.train.fitting.curves import Curve
 
 WALLS = {"no wall": (0, 0), "x": (1, 0), "y": (0, 1), "both": (1, 1)}
-"""Whether a symbol's light meets walls of a pair, as the columns of the table say it."""
+"""Columns of the table: whether a symbol's light meets walls of pair x, and of pair y."""
 
 LAST_SHARE = 0.2
 SETTLED_BITS = 0.02
@@ -23,13 +23,13 @@ SETTLED_BITS = 0.02
 
 
 def symbols_by_walls(profile: Profile, fitted: Calibration) -> dict[str, NDArray[np.bool_]]:
-    """Which symbols' light meets the walls of `WALLS`, bool [ny, nx] each."""
+    """Return masks of the symbols whose light meets the walls of `WALLS`, bool [ny, nx] each."""
     met = np.rint(exit_centroids(profile, fitted)).astype(bool)
     return {name: (met[0] == x) & (met[1] == y) for name, (x, y) in WALLS.items()}
 
 
 def gained_at_the_end(curve: Curve, steps: int) -> float:
-    """What the best of the last fifth of a run's steps has over the best before, of a curve of (step, value)."""
+    """Return the best value of a run's last fifth of steps less the best before it; NaN where either has none."""
     late = [value for step, value in curve if step > (1 - LAST_SHARE) * steps]
     early = [value for step, value in curve if step <= (1 - LAST_SHARE) * steps]
     return max(late) - max(early) if late and early else float("nan")
@@ -37,14 +37,20 @@ def gained_at_the_end(curve: Curve, steps: int) -> float:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one method reached with a network of one size.
+    """Outcome of one method with a network of one size.
 
-    Rates in bits per data symbol, errors as a share, `size` as `--size` has it; `run` is its folder, `kappa_scale` the
-    factor on its concentrations that the validation pages ask for, `own_mi_unscaled` what it claims without, `passes`
-    how many it makes, `by_levels` what it is worth among fewer levels, `by_walls` the AIR of the symbols whose light
-    meets the walls of `WALLS`, `pages_per_second` how fast it trained. The curves are AIR by step. The size is that of
-    the first pass's network, steps, times and curves are those of the last pass, which goes on from the ones before.
-    `analysis.comparison.decoders.compared` tells `over_oracle` and `over_published`.
+    Rates are in bits per data symbol, errors are a share. `size` is that of `--size`, for the first pass's network.
+    Steps, times and curves are those of the last pass, which continues from those before. Curves are AIR by step.
+
+    Attributes:
+        run: the method's folder.
+        own_mi_unscaled: information that the decoder claims without `kappa_scale`.
+        by_walls: AIR of the symbols whose light meets the walls of `WALLS`.
+        pages_per_second: rate of training.
+        kappa_scale: factor on the concentrations, fitted to the validation pages.
+        passes: number of passes.
+        over_oracle, over_published: ratios that `analysis.comparison.decoders.compared` sets.
+        by_levels: figures among fewer levels.
     """
 
     run: str
@@ -73,7 +79,7 @@ class Outcome:
 
     @property
     def is_settled(self) -> bool:
-        """Whether more steps would hardly have helped; False if that was not seen."""
+        """Return whether more steps would hardly have helped; False if that is not known."""
         return self.gained_in_last_fifth < SETTLED_BITS
 
     def as_json(self) -> dict[str, Any]:

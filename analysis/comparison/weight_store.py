@@ -25,16 +25,16 @@ from lightpage.train.runs import BEGUN, FORMAT, renamed
 TRAINED = Path(__file__).parents[1] / "weights"
 CALIBRATION = "calibration.toml"
 KEPT_WEIGHTS = "fitted.xz"
-"""Of a kept run, in place of its `FITTED_WEIGHTS`."""
+"""File of a kept run, in place of its `FITTED_WEIGHTS`."""
 
 
 @dataclass(frozen=True)
 class WeightStore:
-    """What is kept of a data set.
+    """Store of what was trained on a data set: its calibration and the methods' weights.
 
     Attributes:
         data_set: folder of the data set, with its recording.
-        folder: where it is kept, which need not be there.
+        folder: folder of the store, which need not be there.
         adds: whether what is trained now is to be kept too.
     """
 
@@ -44,7 +44,7 @@ class WeightStore:
 
     @property
     def is_of_this_data_set(self) -> bool:
-        """Whether something is kept, and of just this data set: device, pages, seed and the code's format."""
+        """Return whether the store holds this very data set: the same device, pages, seed and format of the code."""
         return (self.folder / BEGUN).exists() and _read(self.folder / BEGUN) == _read(self.data_set / BEGUN)
 
     def bring_calibration(self) -> None:
@@ -65,8 +65,8 @@ class WeightStore:
         Nothing is taken where training has begun, or that was begun with other options or another calibration.
 
         Args:
-            run: its folder below the data set's.
-            options: with which it would be begun.
+            run: folder of the run below the data set's.
+            options: options with which it would be begun.
 
         Returns:
             Whether it was copied.

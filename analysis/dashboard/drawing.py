@@ -65,7 +65,7 @@ class Drawing:
     """The panels of a dashboard, as a Prometheus knows them.
 
     Args:
-        prometheus: that is asked.
+        prometheus: Prometheus that is asked.
         start, end: seconds since 1970.
     """
 
@@ -133,7 +133,7 @@ def _moment(seconds: float) -> datetime:
 
 
 def _colours(panel: dict[str, Any]) -> dict[str, str]:
-    """Of the series that have one of their own."""
+    """Return the colours of a panel's series that have one of their own, by name."""
     found = {}
     for override in panel["fieldConfig"]["overrides"]:
         for one in override["properties"]:
@@ -184,7 +184,7 @@ def _series(
 
 
 def _locator(unit: str, limits: tuple[float, float]) -> Locator:
-    """Some five marks; of bytes at powers of two."""
+    """Place about five marks on an axis, at powers of two for bytes."""
     if unit not in ("bytes", "Bps"):
         return MaxNLocator(5)
     return MultipleLocator(2.0 ** math.ceil(math.log2(max(1.0, (limits[1] - limits[0]) / 5))))

@@ -31,7 +31,7 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 
 _PAGES = tuple(page for page in range(6) if page != SPOILT_PAGE)
 _DRIFT = 0.1
-"""Of the change of temperature of `drifted`: margin is lost, and no page yet."""
+"""Share of the change of temperature of `drifted`: margin is lost, and no page yet."""
 _DEADLINE_S = 4.0
 _CALLERS = 12
 _USER_BYTES = pb.DecodeOptions(want_user_data=True, session="device")
@@ -62,7 +62,7 @@ class Load:
     """Callers that send pairs of the device, now and then two in one call.
 
     Args:
-        service: that they call.
+        service: service that they call.
         rate: calls a second, of all callers together.
     """
 

@@ -46,13 +46,13 @@ Counts = NDArray[np.unsignedinteger[Any]]
 FORMATS = ("Mono8", "Mono12", "Mono12p", "Mono12Packed")
 PACKETS_BYTES = (1400, 9000, 60_000)
 TOLERANCES_S = (0.02, 0.01)
-"""Of the pairing; shots are 2.5 of them apart at least."""
+"""Tolerances of the pairing; shots are at least 2.5 tolerances apart."""
 _SMALL = (256, 320)
 FULL = (2048, 2048)
 _CHAIN = 4
 """Times as many shots of the whole chain: a lost one costs as much as ten others."""
 _TRIES = 10
-"""Of the first shot, until the cameras' clocks are known."""
+"""Tries of the first shot, until the cameras' clocks are known."""
 _FRAME_S = 2.0
 _FREE_RUN_S = 0.004
 _LEFTOVERS = 5
@@ -227,7 +227,7 @@ class InstantCamera:
         return self._ready.pop(0) if self._ready else None
 
     def arm(self) -> None:
-        """Nothing is to be done."""
+        """Do nothing: the camera needs no arming."""
 
     disarm = close = arm
 
@@ -248,7 +248,7 @@ class Edges:
         return fired
 
     def arm(self) -> None:
-        """Nothing is to be done."""
+        """Do nothing: the cameras need no arming."""
 
     disarm = close = arm
 

@@ -96,8 +96,8 @@ class Truth:
     """Facts that the simulator knows of a page.
 
     Attributes:
-        symbols: that were written, uint8 [ny, nx].
-        pair: its frames.
+        symbols: symbols that were written, uint8 [ny, nx].
+        pair: frames of the page.
         device: true state.
         shift_px: walk of its image (x, y), on both cameras.
         optics: gives the reference frames of that moment.
@@ -114,9 +114,9 @@ class DriftingSource(FrameSource):
     """A simulated bench device that drifts with a time that its user sets.
 
     Args:
-        decoder: of its bundle, whose code the pages are written in.
+        decoder: decoder of its bundle, whose code the pages are written in.
         state: the true device at a time, in pages.
-        seed: of noise and walk.
+        seed: seed of noise and walk.
 
     Attributes:
         moment: the time, in pages.
@@ -196,10 +196,10 @@ class Untold:
 
 @dataclass(frozen=True)
 class TrueTable:
-    """The same network, fed the table of the device's true state: as good as any calibration could make it.
+    """Decoder with the bundle's network and the true device's table: the best that calibration could do.
 
     Attributes:
-        decoder: of the bundle.
+        decoder: decoder of the bundle.
     """
 
     decoder: Decoder
@@ -246,5 +246,5 @@ def light_of(parameters: NDArray[np.float64], modulation: Modulation) -> dict[st
 
 
 def true_light(profile: Profile, device: Device) -> dict[str, float]:
-    """The same of a true device."""
+    """Return `light_of` of a device's true parameters and modulation."""
     return light_of(true_parameters(profile, device), true_modulation(device.slm))

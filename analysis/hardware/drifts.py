@@ -129,7 +129,7 @@ def alarms(rows: Rows, settings: MonitorSettings | None = None) -> list[tuple[in
 
 
 def judged(seed: int, rows: Rows) -> dict[str, Any]:
-    """When the alarm came, and when the margin was gone."""
+    """Return the page of the first alarm, the page at which the margin was gone, and how far the alarm came ahead."""
     told = alarms(rows)
     gone = next((int(row["page"]) for row in rows if row["page"] > 0 and row["lost"]), None)
     alarm, reasons = told[0] if told else (None, ())

@@ -168,7 +168,7 @@ def source_of(stage: Stage, tolerance_s: float, repeats: int) -> CameraSource:
 
 
 class _Endless(PageStore):
-    """Any page number is there."""
+    """Page store that has every page number."""
 
     def __init__(self, like: PageStore) -> None:
         self.__dict__.update(like.__dict__)

@@ -54,7 +54,7 @@ class Photographed(FrameSource):
     """Pages that a source has shown before.
 
     Args:
-        source: that shows them once.
+        source: source that shows them once.
     """
 
     name = "photographed pages"
@@ -81,8 +81,8 @@ class Taken:
     """Costs of a recalibration; not a number where it failed.
 
     Attributes:
-        seconds: from the call to the new model in service.
-        worked_s: of it, in its own process.
+        seconds: time from the call to the new model in service.
+        worked_s: seconds of work in its own process.
         error: why it failed, if so.
     """
 

@@ -47,7 +47,7 @@ _SETTINGS = {"WIDT": "WIDTh", "DEL": "DELay"}
 
 @dataclass
 class Outcome:
-    """What became of the queries.
+    """Outcome of the queries.
 
     Attributes:
         queries: asked.
@@ -57,7 +57,7 @@ class Outcome:
         lost: not answered, by reason and by a fault that there was meanwhile.
         faults: injected, by kind.
         unplugged: how often the line was.
-        back_s: from plugging it in again to the first answer.
+        back_s: time from plugging it in again to the first answer.
         seconds: all of it.
     """
 
@@ -85,10 +85,10 @@ class Experiment:
     """A line with faults, and what its answers are worth.
 
     Args:
-        port: of the emulated device, plugged in.
+        port: port of the emulated device, plugged in.
         device: behind it.
-        rate: of faults, for each message.
-        seed: of everything random.
+        rate: rate of faults, for each message.
+        seed: seed of everything random.
     """
 
     def __init__(self, port: VirtualSerialPort, device: PulseGeneratorEmulator, rate: float, seed: int) -> None:
@@ -100,7 +100,7 @@ class Experiment:
         self._given: set[float] = set()
         """Every value that a setting was given."""
         self._away = False
-        """Whether no answer has come since the line was unplugged."""
+        """True until an answer has come after the line was unplugged."""
         for channel in range(1, CHANNELS + 1):
             for setting in _SETTINGS:
                 device.answer(self._command(channel, setting))

@@ -41,10 +41,10 @@ DAILY_UNITS = 0.7
 0.13 to spare."""
 
 WARM_UP_UNITS, WARM_UP_PAGES = 3.0, 144.0
-"""Of the warm-up, 0.9 bit in all, and the pages (twelve hours) in which it falls to 1/e."""
+"""Size of the warm-up, 0.9 bit in all, and the pages (twelve hours) in which it falls to 1/e."""
 
 KNOCK_SHARE = 0.5
-"""Of the week, when somebody knocks against the table."""
+"""Share of the week after which somebody knocks against the table."""
 KNOCK_PX, KNOCK_DEG = (2.0, -2.0), 0.02
 """Shift of the image on both cameras, and turn of the pipe."""
 
@@ -61,7 +61,7 @@ class LightDrift:
     """Changes that go on evenly through a week, beside the geometry.
 
     Attributes:
-        stroke_relative: of the modulator.
+        stroke_relative: change of the modulator's stroke.
         axial_rad: places of modulator and cameras along the axis, as phases at the middle of the facet's wall.
     """
 
@@ -106,13 +106,13 @@ class Week:
     """A service and its device through a week.
 
     Args:
-        out: where models, frames and rows are kept.
-        pages: of the week.
-        pages_during: that are read while a recalibration runs, at most.
-        threads: of an inference.
-        bundle: that the service begins with.
+        out: folder where models, frames and rows are kept.
+        pages: number of pages of the week.
+        pages_during: largest number of pages that are read while a recalibration runs.
+        threads: threads of an inference.
+        bundle: bundle that the service begins with.
         device: true state at the beginning.
-        light: what drifts beside the geometry.
+        light: changes beside the geometry.
         true_every: pages from one that is read with the true table, too, to the next.
         shown: whether fully known pages are shown to recalibrate by; else pages of user data serve.
     """

@@ -17,7 +17,7 @@ class WatchedRecalibrator(Recalibrator):
     """A recalibrator that says when it runs and how it ended.
 
     Args:
-        plane: of the service.
+        plane: data plane of the service.
     """
 
     def __init__(self, plane: DataPlane) -> None:
@@ -48,7 +48,7 @@ class WatchedRecalibrator(Recalibrator):
         return ends
 
     def settle(self, monitor: Monitor, pages: int) -> None:
-        """After a page: give a recalibration that is due time to begin, and wait for it after `pages` pages."""
+        """Give a recalibration that is due time to begin, and wait for its end once it has run for `pages` pages."""
         if monitor.due and not self.running:
             _wait(lambda: self.running or not monitor.due, 0.5)
         if self.running:

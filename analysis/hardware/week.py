@@ -41,10 +41,10 @@ from lightpage.files import write_json
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 
 WANTED_SHARE = 0.95
-"""Of the AIR with the true table that a page should have."""
+"""Share of the AIR with the true table that a page should have."""
 
 PARTS = 10
-"""Of the week, lines of its table."""
+"""Parts of the week, each a line of its table."""
 
 WORTH = 0.004
 """Share of the true table's AIR that an alarm must be about: half of what half of a page's margin is."""

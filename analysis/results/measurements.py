@@ -39,7 +39,7 @@ class Measurement:
     Attributes:
         figures: under the names that the benchmark gave them.
         source: "measured DATE on COMMIT", or the document that they were copied from.
-        note: what a reader must know of them, if anything.
+        note: remark that a reader must know, if any.
     """
 
     figures: Figures
@@ -48,7 +48,7 @@ class Measurement:
 
     @classmethod
     def read(cls, path: Path) -> Measurement:
-        """What `write` has written.
+        """Read a file that `write` has written.
 
         Raises:
             InvalidInputError: another file.
@@ -81,17 +81,17 @@ def read_object(path: Path) -> Figures:
 
 
 def kept_measurements(folder: Path = KEPT) -> dict[str, Measurement]:
-    """All that a folder keeps, by name."""
+    """Read all measurements of a folder, by name."""
     return {path.stem: Measurement.read(path) for path in sorted(folder.glob("*.json"))}
 
 
 def collected(name: str, path: Path, commit: str | None = None) -> Measurement:
-    """What a benchmark has written, slimmed.
+    """Collect the figures that a benchmark has written, reduced to those that the pages need.
 
     Args:
-        name: of the measurement.
-        path: of its JSON, whose date is taken for the measurement's.
-        commit: that was measured; the one that is checked out where the JSON lies if None.
+        name: name of the measurement.
+        path: path of its JSON, whose date is taken for the measurement's.
+        commit: commit that was measured; the one that is checked out where the JSON lies if None.
 
     Raises:
         InvalidInputError: no JSON of that benchmark, or a checkout that is younger than it or missing.
@@ -131,7 +131,7 @@ def slim(name: str, figures: Figures) -> Figures:
 
 
 def comparison(figures: Figures) -> Figures:
-    """Of `analysis.comparison.decoders`, without its curves."""
+    """Drop the curves from the figures of `analysis.comparison.decoders`."""
     curves = {"training_curve", "validation_curve"}
     data_sets = [
         data_set | {"outcomes": [{key: of[key] for key in of if key not in curves} for of in data_set["outcomes"]]}
@@ -149,19 +149,19 @@ def methods(measurement: Measurement) -> set[str]:
 
 
 def evaluation(figures: Figures) -> Figures:
-    """Of `lightpage evaluate`, its numbers alone."""
+    """Keep the numbers and texts of the figures of `lightpage evaluate`."""
     return {"air_bits_per_symbol": figures["air_bits_per_symbol"]} | {
         key: value for key, value in figures.items() if isinstance(value, int | float | str)
     }
 
 
 def demo(figures: Figures) -> Figures:
-    """Of `lightpage demo`."""
+    """Keep the figures of `lightpage demo` that the pages need."""
     return {key: figures[key] for key in ("seed", "pages", "phases", "healing")}
 
 
 def image_search(figures: Figures) -> Figures:
-    """Of `analysis.tracking.image_search`, counted over both operating points."""
+    """Count the outcomes of `analysis.tracking.image_search` over both operating points."""
     first = [row for part, of in figures.items() if part.endswith(": offsets") for row in of["rows"]]
     kinds = [kind for part, of in figures.items() if part.endswith(": wrong pages") for kind in of["kinds"].values()]
     return {
@@ -174,12 +174,12 @@ def image_search(figures: Figures) -> Figures:
 
 
 def ledger(figures: Figures) -> Figures:
-    """Of `analysis.codec.ledger`, without the list of every page's margin."""
+    """Drop the margin of every page from the figures of `analysis.codec.ledger`, and data sets without pages."""
     return {name: {key: of[key] for key in of if key != "margins"} for name, of in figures.items() if of["pages"]}
 
 
 def speed(figures: Figures) -> Figures:
-    """Of `analysis.speed.speed`."""
+    """Keep the figures of `analysis.speed.speed` that the pages need."""
     return {key: figures[key] for key in ("profile", "threads", "repeats", "decoders")}
 
 

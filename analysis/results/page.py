@@ -56,11 +56,11 @@ LEDGER_LABELS = {
 
 @dataclass(frozen=True)
 class Results:
-    """What the template asks for; what it does not get is remembered.
+    """Results that a template asks for by name; those that are missing are noted.
 
     Attributes:
-        measurements: by name.
-        missing: what was asked for and is not there.
+        measurements: measurements by name.
+        missing: names that were asked for and are not there.
     """
 
     measurements: Mapping[str, Measurement]
@@ -90,7 +90,7 @@ class Results:
         return whole if len(whole) == len(methods) else None
 
     def times(self, profile: str, decoder: str, other: str) -> float | None:
-        """How many times another decoder's time one takes, in the speed benchmark."""
+        """Return a decoder's time over another's in the speed benchmark; None where one of them was not timed."""
         name = f"{SPEED}{profile}"
         seconds = {timed["decoder"]: timed["seconds"] for timed in (self.figures(name) or {"decoders": []})["decoders"]}
         lacking = [f"{name}, {one}" for one in (decoder, other) if one not in seconds]
@@ -120,7 +120,7 @@ def render(results: Results) -> str:
 
 
 def digits(value: float, count: int) -> str:
-    """So many digits behind the point."""
+    """Format a value with so many digits behind the point."""
     return f"{value:.{count}f}"
 
 
@@ -135,7 +135,7 @@ def kilobytes(value: float) -> str:
 
 
 def symbols(profile: str, size_px: int) -> str:
-    """How many symbols a page of a profile has if they are of this size."""
+    """Return the number of symbols on a page of a profile whose symbols have this size, as text."""
     rows, columns = load_profile(profile).with_symbols_of(size_px).page_shape
     return f"{columns} x {rows} of {size_px}x{size_px}"
 

@@ -25,10 +25,10 @@ def archive(folder: Path, pages: int, fields: int, seed: int, kept: Path | None 
     """A recording of a device with known symbols; made once.
 
     Args:
-        folder: where it goes.
-        pages: that it has.
+        folder: folder that it goes into.
+        pages: number of its pages.
         fields: how many of them are simulated.
-        seed: of symbols and noise.
+        seed: seed of symbols and noise.
         kept: folder of the data set whose device it is; None for the shipped bundle's.
     """
     simulated, out = folder / "fields.h5", folder / "archive.h5"

@@ -62,10 +62,10 @@ class BulkRun:
     """`lightpage bulk decode` in a process of its own; it runs in a `with` statement.
 
     Args:
-        job: what it is asked.
-        folder: of the run.
+        job: job of the run.
+        folder: folder of the run.
         options: beside what is asked.
-        mark: in the environment of its workers.
+        mark: mark in the environment of its workers.
     """
 
     def __init__(self, job: Job, folder: Path, options: tuple[str, ...], mark: str) -> None:
@@ -102,11 +102,11 @@ class BulkRun:
         return sum(1 for _ in records_of(self.folder))
 
     def workers(self) -> list[int]:
-        """Its workers' processes."""
+        """Process numbers of the run's workers."""
         return children(self.process.pid) or with_mark(b"ray::_work", self._mark)
 
     def pages_per_s(self, pages: int) -> float:
-        """From the first range's beginning to the last one's end."""
+        """Return pages a second between the beginning of the first range and the end of the last."""
         found = [(path.stat().st_mtime, ShardRecord.read(path.with_suffix(""))) for path in records_of(self.folder)]
         begun = min(end - record.seconds for end, record in found)
         return pages / (max(end for end, _ in found) - begun)

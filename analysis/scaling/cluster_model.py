@@ -21,12 +21,13 @@ _SATURATED = 0.9
 
 @dataclass(frozen=True)
 class Work:
-    """What a worker does.
+    """Work of one worker.
 
     Attributes:
-        page_seconds: of a range's pages in the mean, one for each range that was measured; drawn from at random.
-        read_bytes: of a page, from the storage.
-        written_bytes: of its result, to the storage.
+        page_seconds: mean seconds of a range's pages, one number for each range that was measured; drawn from at
+            random.
+        read_bytes: bytes of a page that are read from the storage.
+        written_bytes: bytes of its result that are written to the storage.
         range_s: a worker's time for a range beside its pages: to be given it, and to write its record.
         range_pages: pages of a range.
     """
@@ -39,13 +40,13 @@ class Work:
 
     @property
     def mean_s(self) -> float:
-        """Of a page, with its part of what a range takes."""
+        """Seconds for a page, with its share of a range's overhead."""
         return float(np.mean(self.page_seconds)) + self.range_s / self.range_pages
 
 
 @dataclass(frozen=True)
 class Driver:
-    """What a range costs the driver: `base_s`, and more for each that is on its way.
+    """Cost of a range to the driver: `base_s`, and more for each range that is in flight.
 
     Attributes:
         base_s: seconds.
@@ -58,7 +59,7 @@ class Driver:
     ahead: int
 
     def range_s(self, workers: int) -> float:
-        """Of so many workers."""
+        """Return the driver's seconds for a range with so many workers."""
         return self.base_s + self.in_flight_s * self.ahead * workers
 
 
@@ -68,9 +69,9 @@ class Cluster:
 
     Attributes:
         nodes: how many.
-        workers: of a node.
-        storage_bytes_per_s: that all nodes share.
-        link_bytes_per_s: of a node.
+        workers: workers of a node.
+        storage_bytes_per_s: bandwidth that all nodes share.
+        link_bytes_per_s: bandwidth of a node.
         mtbf_s: mean time between two failures of a node; None for none.
         repair_s: until a node that failed works again.
     """
@@ -85,12 +86,12 @@ class Cluster:
 
 @dataclass(frozen=True)
 class Rate:
-    """How fast a cluster reads.
+    """Rate at which a cluster reads.
 
     Attributes:
-        nodes: that it has.
-        pages_per_s: of all.
-        efficiency: of what as many workers would read that wait for nothing.
+        nodes: number of nodes.
+        pages_per_s: rate of all nodes together.
+        efficiency: share of the rate of as many workers that wait for nothing.
         driver, storage: how much of the driver's time, and of the storage's bytes a second, is used.
         lost_ranges: ranges that were given out again.
     """
@@ -104,7 +105,7 @@ class Rate:
 
     @property
     def bound(self) -> str:
-        """What more of would make it faster."""
+        """Name of the bottleneck: the driver, the storage or the workers."""
         name, use = max((("driver", self.driver), ("storage", self.storage)), key=lambda part: part[1])
         return name if use >= _SATURATED else "workers"
 
@@ -116,7 +117,7 @@ class _Line:
         self._per_s, self._free = per_s, 0.0
 
     def done(self, now: float, amount: float) -> float:
-        """When it has done what is asked now."""
+        """Queue an amount of work, and return the time at which it is done."""
         self._free = max(now, self._free) + amount / self._per_s
         return self._free
 
@@ -187,7 +188,7 @@ class _Run:
         yield environment.timeout(there - environment.now)
 
     def _moved(self, link: _Line, amount: float) -> float:
-        """When so many bytes have gone between storage and node."""
+        """Move so many bytes between storage and node, and return the time at which they have arrived."""
         now = self.environment.now
         return max(self.storage.done(now, amount), link.done(now, amount))
 
@@ -230,7 +231,7 @@ def _rate(cluster: Cluster, work: Work, driver: Driver, pages_per_s: float, lost
 
 
 def nodes_that_saturate(cluster: Cluster, work: Work, driver: Driver) -> dict[str, float]:
-    """By arithmetic alone: how many nodes, that wait for nothing, take all of the driver, and all of the storage."""
+    """Return how many nodes saturate the driver, and how many the storage, if no node waits for anything."""
     node_pages_per_s = cluster.workers / work.mean_s
     storage = cluster.storage_bytes_per_s / ((work.read_bytes + work.written_bytes) * node_pages_per_s)
     ranges_per_s = node_pages_per_s / work.range_pages

@@ -43,7 +43,7 @@ NODES = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 ETHERNET_BYTES_PER_S = 1.25e9
 """10 Gbit/s."""
 FULL_SIZE_S, FULL_SIZE_BYTES, FULL_SIZE_SYMBOLS = 3.324, 2 * 5472 * 3648.0, 350 * 225
-"""Of a page of two passes on two cores (docs/experiments/full-size.md), of its frames, and on it."""
+"""Seconds of a page of two passes on two cores (docs/experiments/full-size.md), bytes of its frames, its symbols."""
 BENCH_SYMBOLS = 87 * 56
 _DRAWS = 20
 """Jobs whose mean is compared with one that was run."""
@@ -56,9 +56,9 @@ class Kind:
     """Pages of one size, and the nodes that read them.
 
     Attributes:
-        name: of it.
-        work: of a worker.
-        workers: of a node.
+        name: name of the kind.
+        work: work of a worker.
+        workers: workers of a node.
     """
 
     name: str
@@ -79,13 +79,13 @@ def kinds(figures: NodeFigures, full_size_s: float, full_size_bytes: float) -> l
 
 
 def round_trip_s(figures: NodeFigures) -> float:
-    """From a worker's end of a range to its beginning of the next: workers that do nothing, two ranges on their way."""
+    """Return the seconds between two ranges of a worker that does nothing, with two ranges in flight."""
     least = min(figures.ray, key=lambda driver: driver.in_flight)
     return least.wall_s * least.in_flight
 
 
 def fitted_driver(figures: Sequence[DriverFigures], ahead: int) -> Driver:
-    """What a range costs the driver against how many are on their way: a line through what was measured."""
+    """Fit the driver's cost of a range as a line over the number of ranges in flight."""
     in_flight, took = np.array([(each.in_flight, each.cpu_s) for each in figures]).T
     if len(figures) == 1:
         return Driver(float(took[0]), 0.0, ahead)
@@ -133,7 +133,7 @@ def curve(kind: Kind, cluster: Cluster, driver: Driver, nodes: Sequence[int], se
 
 
 def assumptions(figures: NodeFigures, cluster: Cluster, driver: Driver) -> list[str]:
-    """What the model takes for granted."""
+    """List the assumptions of the model."""
     failures = (
         "no node fails"
         if cluster.mtbf_s is None

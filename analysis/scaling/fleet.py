@@ -63,7 +63,7 @@ def fleet_file(path: Path, devices: Sequence[FleetDevice], bundle: Path, run: Pa
 
 
 def recalibrated(folder: Path, fleet: Path, options: Sequence[str], threads: int) -> list[dict[str, Any]]:
-    """What `lightpage bulk recalibrate` says of each device; it goes on where it was."""
+    """Run or resume `lightpage bulk recalibrate`, and return its report of each device."""
     told = folder.with_suffix(".json")
     command = [sys.executable, "-m", "lightpage.cli.main", "bulk", "recalibrate", str(folder), "--fleet", str(fleet)]
     environment = same_packages(threads)
@@ -119,7 +119,7 @@ def quick(devices: int, out: Path, workers: int, threads: int) -> dict[str, Any]
 
 
 def deep(devices: int, steps: int, out: Path, threads: int) -> dict[str, Any]:
-    """Both forms on devices whose network may be trained on."""
+    """Recalibrate devices in both forms, where their network may be trained on."""
     profile, before, _ = data_set_of(KEPT)
     run, bundle = out / "kept", out / "kept.zip"
     if not bundle.exists():

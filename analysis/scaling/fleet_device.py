@@ -40,11 +40,11 @@ class FleetDevice:
     """A device of the fleet.
 
     Attributes:
-        name: of it.
-        seed: of its drift, pages and noise.
+        name: name of the device.
+        seed: seed of its drift, pages and noise.
         profile: the nominal device.
-        before: its state as its bundle has it.
-        folder: of its recordings.
+        before: state of the device as its bundle has it.
+        folder: folder of its recordings.
         known: how many known pages it has.
     """
 
@@ -57,7 +57,7 @@ class FleetDevice:
 
     @property
     def state(self) -> Device:
-        """What it is now."""
+        """State of the device today, after its drift."""
         rng = np.random.default_rng([self.seed, 2])
         drifted = moved(self.before, direction(self.seed) * rng.uniform(*UNITS))
         shifts = zip("xy", rng.uniform(-IMAGE_PX, IMAGE_PX, 2), strict=True)
@@ -71,12 +71,12 @@ class FleetDevice:
 
     @property
     def recording(self) -> Path:
-        """Its known pages."""
+        """Recording of the device's known pages."""
         return self.folder / f"{self.name}.h5"
 
     @property
     def held_out(self) -> Path:
-        """Its other pages, with what only a simulator knows."""
+        """Recording of the device's other pages, with quantities that only a simulator knows."""
         return self.folder / f"{self.name}-held-out.h5"
 
     def make(self) -> None:

@@ -51,8 +51,8 @@ class RunFigures(Part):
 
     Attributes:
         workers: processes of one thread.
-        page_seconds: of a page in the mean, for each range.
-        pages_per_s: from the first range's beginning to the last one's end.
+        page_seconds: mean seconds of a page, for each range.
+        pages_per_s: rate from the first range's beginning to the last one's end.
     """
 
     workers: int
@@ -65,8 +65,8 @@ class DriverFigures(Part):
 
     Attributes:
         in_flight: ranges on their way at once.
-        cpu_s: of its process, all threads together.
-        main_thread_s: of its loop alone.
+        cpu_s: seconds of its process, all threads together.
+        main_thread_s: seconds of its loop alone.
         wall_s: between two outcomes; workers that do nothing share the machine with it.
     """
 
@@ -77,16 +77,16 @@ class DriverFigures(Part):
 
 
 class NodeFigures(Part):
-    """All of it.
+    """Figures of a node that the model of a cluster is made from.
 
     Attributes:
-        cores: of the machine.
-        range_pages, pages: of the runs.
+        cores: cores of the machine.
+        range_pages, pages: numbers of pages of a range, and of a run.
         measured: runs that the model is made from, by their workers.
         checked: runs of the same pages, made after these, that it is compared with.
-        read_bytes: of a page in the recording.
-        written_bytes: of a page's result: symbols, confidences, and its part of the record.
-        record_s: to write a record, until it is on the disk; median.
+        read_bytes: bytes of a page in the recording.
+        written_bytes: bytes of a page's result: symbols, confidences, and its part of the record.
+        record_s: median seconds to write a record, until it is on the disk.
         local, ray: the driver of either engine.
     """
 
@@ -118,9 +118,9 @@ def measure(recording: Path, folder: Path, range_pages: int, worker_counts: tupl
     """Run it all; a few minutes for a hundred pages.
 
     Args:
-        recording: that is read.
-        folder: where runs go.
-        range_pages: of a range.
+        recording: recording that is read.
+        folder: folder that runs go into.
+        range_pages: number of pages of a range.
         worker_counts: how many work in each run.
     """
     runs = [
@@ -197,7 +197,7 @@ def _driver(engine: Engine, in_flight: int) -> DriverFigures:
 
 
 def _tasks() -> Iterator[Task]:
-    """Without end, and as long as real ones."""
+    """Yield tasks without end, as long as real ones."""
     recording = Path("/archive/shelf-1/recording-000001.h5")
     task = Task(
         choices=Choices(operation=Operation.DECODE),

@@ -74,7 +74,7 @@ class Watch:
                         self.seen.setdefault((name, process), []).append((pages, taken))
 
     def growth(self, after_pages: int) -> dict[str, float | None]:
-        """By what processes are: the most that one has grown since so many pages were done, as a share of what it had.
+        """Return the largest growth of a process since so many pages were done, relative to its size then, by kind.
 
         None where none was seen twice after them.
         """

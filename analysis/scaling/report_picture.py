@@ -40,7 +40,7 @@ from lightpage.runtime.model.bundle.shipped import DEFAULT
 from lightpage.simulator.simulator import Simulator
 
 DRIFTS = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""Of each device, as shares of the demo's drift."""
+"""Drifts of each device, as shares of the demo's drift."""
 LEVELS, RANGE_PAGES = 256, 4
 WIDTH_PX, HEIGHT_PX = 1240, 900
 _SHOWN = "nav, #losses, #rounds, #workers { display: none }"

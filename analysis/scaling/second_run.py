@@ -1,4 +1,4 @@
-"""What a second run over finished work costs: `python -m analysis.scaling.second_run --out FOLDER`.
+"""Cost of a second run over finished work: `python -m analysis.scaling.second_run --out FOLDER`.
 
 One recording of simulated pages that hold a file is read for real, by each operation. The archive is that recording
 under many names, by hard links, and its run has a copy of the real shards for each of them. So the second run finds
@@ -56,11 +56,11 @@ def finished(folder: Path, recording: Path, operation: Operation, pages: int, ra
     """Make a finished run over links to a recording that is read once; its folder is `folder / "run"`.
 
     Args:
-        folder: where links and run go; it must not be there.
-        recording: what is read.
-        operation: by which.
-        pages: of the run, at least.
-        range_pages: of a range.
+        folder: folder that links and run go into; it must not be there.
+        recording: recording that is read.
+        operation: operation that reads it.
+        pages: least number of pages of the run.
+        range_pages: number of pages of a range.
 
     Returns:
         How many recordings the run has.
@@ -88,7 +88,7 @@ def finished(folder: Path, recording: Path, operation: Operation, pages: int, ra
 
 
 def second_run(folder: Path, operation: Operation, repeats: int) -> dict[str, Any]:
-    """How long runs over finished work take, and what they found."""
+    """Time runs over finished work, and return the seconds with the pages that they found."""
     out, took, cpu = folder / "second.json", list[float](), list[float]()
     figures: dict[str, Any] = {}
     for _ in range(repeats):
@@ -107,7 +107,7 @@ def second_run(folder: Path, operation: Operation, repeats: int) -> dict[str, An
 
 
 def _cpu_s() -> float:
-    """Of all processes that were started and have ended."""
+    """Return the CPU seconds of all child processes that have ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 

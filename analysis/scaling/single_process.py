@@ -1,4 +1,4 @@
-"""What a bulk run is compared with: the pages that a single process reads, and the speed of bare decode loops."""
+"""Baselines of a bulk run: the pages that a single process reads, and the speed of bare decode loops."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from lightpage.runtime.archives.workers.local import LocalEngine
 
 
 def single(job: Job, folder: Path) -> None:
-    """What one worker reads; what is there of it already stays."""
+    """Run a job with one worker; results that are there stay."""
     if Job.read(folder) != job:
         shutil.rmtree(folder, ignore_errors=True)
     with Ledger(folder) as ledger:
@@ -53,7 +53,7 @@ def _same(path: Path, folder: Path, other: Path) -> Path:
 
 
 def bare_pages_per_s(job: Job) -> float:
-    """Of two decode loops beside each other, each over its half of the pages."""
+    """Return pages a second of two decode loops side by side, each over half of the pages."""
     source, pages = job.sources[0], job.sources[0].pages
     parts = [(0, pages // 2), (pages // 2, pages)]
     command = [sys.executable, "-m", "analysis.scaling.bare_loop", str(source.path), str(job.bundles[0].path)]

@@ -17,7 +17,7 @@ MESSAGE_BYTES = 4 << 20
 
 
 async def take(parts: AsyncIterator[bytes], context: Any) -> bytes:
-    """How many bytes came, as text."""
+    """Count the bytes that come, and return their number as text."""
     count = 0
     async for part in parts:
         count += len(part)
@@ -25,7 +25,7 @@ async def take(parts: AsyncIterator[bytes], context: Any) -> bytes:
 
 
 async def serve() -> None:
-    """Until stdin is closed."""
+    """Serve until stdin is closed."""
     server = grpc.aio.server(options=(("grpc.max_receive_message_length", MESSAGE_BYTES),))
     method = grpc.stream_unary_rpc_method_handler(take)
     server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler("bare.Stream", {"Take": method}),))

@@ -49,9 +49,9 @@ APART = {
 have the same answer but for the times in it."""
 
 _KNOWN_PAGES = 2
-"""Of a recalibration, which holds back one more."""
+"""Known pages of a recalibration, which holds back one more."""
 _DRIFTED = "geometry.pipe_angle_deg=-0.61"
-"""Of the device that is recalibrated: a re-fit that brings nothing would be refused."""
+"""Setting of the device that is recalibrated: a re-fit that brings nothing would be refused."""
 _CALL_S = 1800.0
 _SHOWN = 4
 """Functions of a file that are printed."""
@@ -64,11 +64,11 @@ class EnteredFile:
     """A file that a call enters.
 
     Attributes:
-        number: in order of first entry.
+        number: number in order of first entry.
         file: path in the repository.
         entered_from: path of the file that entered it first; empty where none of the project did.
-        calls: of its functions.
-        functions: in order of first entry.
+        calls: calls of its functions.
+        functions: functions in order of first entry.
         apart: why it is listed apart; empty where it is on the way.
     """
 
@@ -108,10 +108,10 @@ def served(
     """The functions that a service, started with some options, enters while it answers a call for the second time.
 
     Args:
-        bundle: that it serves.
+        bundle: bundle that it serves.
         folder: empty.
-        options: of `lightpage serve`.
-        call: of the client's.
+        options: options of `lightpage serve`.
+        call: call of the client.
         undo: done after the first time.
     """
     traced = Traced(folder)

@@ -29,8 +29,8 @@ def constant_bundle(path: Path, profile: Profile, seed: int = 0) -> FramePair:
 
     Args:
         path: a new zip.
-        profile: of the device.
-        seed: of the page that it always answers, and of the frames.
+        profile: profile of the device.
+        seed: seed of the page that it always answers, and of the frames.
     """
     rng = np.random.default_rng(seed)
     theta = symbol_phases(random_symbols(profile, MAX_LEVELS, 1, rng)[0], MAX_LEVELS)

@@ -28,9 +28,10 @@ _FOLDER = "LIGHTPAGE_ENTERED"
 """Variable that names the folder of a program that is traced."""
 _SWITCH = "switch"
 _OTHER = (".", f"analysis{os.sep}", f"tests{os.sep}")
-"""How paths in the repository begin that serve nothing, those of an environment's packages among them."""
+"""Beginnings of paths in the repository that serve nothing, those of an environment's packages among them."""
 _START = bytes([opmap["RESUME"], 0])
-"""Where a function begins; a generator or a coroutine goes on at a RESUME of another number. Source: module `dis`."""
+"""Instruction at which a function begins; a generator or a coroutine goes on at a RESUME of another number. Source:
+module `dis`."""
 _PARTS = frozenset(["<listcomp>", "<setcomp>", "<dictcomp>", "<genexpr>"])
 
 
@@ -39,7 +40,7 @@ class Entry:
     """A function that was entered.
 
     Attributes:
-        moment: when first, `time.monotonic` seconds, which all processes of a machine share.
+        moment: time of the first entry, `time.monotonic` seconds, which all processes of a machine share.
         file: path in the repository.
         function: qualified name, without functions inside it.
         calls: how often it was entered, lambdas and functions inside it counted with it.
@@ -57,7 +58,7 @@ class Recorder:
     """Notes the functions of the project that are entered while the byte that it watches is set.
 
     Args:
-        switch: one byte, which another process may set.
+        switch: byte, which another process may set.
     """
 
     def __init__(self, switch: mmap.mmap | bytearray) -> None:

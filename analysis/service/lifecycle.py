@@ -35,7 +35,7 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 
 _SHIFTS_PX = (1, -2, 3, 0)
-"""Of another caller's pages, columns."""
+"""Shifts of another caller's pages, columns."""
 
 
 def starts(count: int, own: tuple[str, ...]) -> dict[str, float]:

@@ -38,7 +38,7 @@ class RunningService:
     """`lightpage serve` until it is ended; use it in a `with` statement.
 
     Args:
-        arguments: of the command, beside addresses.
+        arguments: arguments of the command, beside addresses.
         environment: variables that it has beside those of this process.
         before: words before the command, of a program that becomes it, as `env` does.
     """
@@ -87,7 +87,7 @@ class RunningService:
         raise RuntimeError(f"the service ended with {self.process.wait()}: {self.log()[-2000:]}")
 
     def log(self) -> str:
-        """What it wrote to stderr."""
+        """Return all that the service has written to stderr."""
         self._log.seek(0)
         return self._log.read()
 
@@ -97,7 +97,7 @@ class RunningService:
         return (int(fields[11]) + int(fields[12])) / 100
 
     def resident_bytes(self) -> int:
-        """Its memory."""
+        """Return the resident memory of the service, bytes."""
         return int(Path(f"/proc/{self.pid}/statm").read_text().split()[1]) * resource.getpagesize()
 
     @property

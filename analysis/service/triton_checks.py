@@ -1,4 +1,4 @@
-"""What an unmodified tritonclient, a health check and a reflection client meet; runs in an environment of their own.
+"""Checks by an unmodified tritonclient, a health check and a reflection client; they run in their own environment.
 
     PYTHON analysis/service/triton_checks.py TARGET HEALTH FOLDER
 
@@ -52,7 +52,7 @@ class Service:
     Args:
         target: HOST:PORT of the service.
         health: HOST:PORT of its health checks.
-        folder: with what is expected.
+        folder: folder of what is expected.
     """
 
     def __init__(self, target: str, health: str, folder: Path) -> None:
@@ -67,7 +67,7 @@ class Service:
         return triton.InferInput(name, list(array.shape), _TYPES[str(array.dtype)]).set_data_from_numpy(array)
 
     def pair(self) -> list[Any]:
-        """Both frames."""
+        """Return both frames as input tensors."""
         return [self.tensor("in_phase"), self.tensor("quadrature")]
 
     def infer(self, inputs: list[Any] | None = None, **options: Any) -> Any:
@@ -126,7 +126,7 @@ def live_and_ready(service: Service) -> None:
 
 
 def metadata(service: Service) -> None:
-    """Of the server and of the model."""
+    """Check the metadata of the server and of the model."""
     client, (rows, columns) = service.client, service.arrays["in_phase"].shape
     server = client.get_server_metadata()
     assert server.name == "lightpage"
@@ -186,14 +186,14 @@ def infer_compressed(service: Service) -> None:
 
 
 def infer_again(service: Service) -> None:
-    """The same objects twice."""
+    """Infer twice with the same objects."""
     inputs = service.pair()
     for _ in range(2):
         service.check_answer(service.infer(inputs))
 
 
 def infer_asynchronously(service: Service) -> None:
-    """By a callback, and several at once on one connection."""
+    """Infer by callback, several at once on one connection."""
     done: queue.SimpleQueue[tuple[Any, Any]] = queue.SimpleQueue()
     for _ in range(AT_ONCE):
         service.client.async_infer(
@@ -294,7 +294,7 @@ def extensions(service: Service) -> None:
 
 
 def health_protocol(service: Service) -> None:
-    """What grpc_health_probe and Kubernetes ask, on both ports."""
+    """Ask for health as grpc_health_probe and Kubernetes do, at both ports."""
     for target in (service.target, service.health):
         with grpc.insecure_channel(target) as channel:
             check = health_pb2_grpc.HealthStub(channel).Check
@@ -332,7 +332,7 @@ def reflection(service: Service) -> None:
 
 
 def example_of_the_docs(service: Service) -> None:
-    """What a reader would paste."""
+    """Run the example of the documentation as a reader would paste it."""
     text = (service.folder / "example.py").read_text("utf-8")
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):

@@ -1,4 +1,4 @@
-"""How long the runtime that serves takes for a page with an exported decoder."""
+"""Time of the serving runtime for a page with an exported decoder."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def frames_of(profile: Profile) -> dict[str, np.ndarray]:
 
 
 def seconds_of(graph: TableGraph, feeds: dict[str, np.ndarray]) -> float:
-    """How long one decode takes, the threads of the one before at rest."""
+    """Time one decode, seconds, after the threads of the previous one have come to rest."""
     time.sleep(SETTLE_S)
     start = time.perf_counter()
     graph.run(["p"], feeds)

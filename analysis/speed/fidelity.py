@@ -1,4 +1,4 @@
-"""What a second pass reads and takes, by how exactly it follows light: weights stay, waves and precision change.
+"""Accuracy and time of a second pass, by how exactly it models light: weights stay, waves and precision change.
 
     python -m analysis.speed.fidelity --kept analysis/weights/bench/-0.6deg-32e-4px --out runs/fidelity
 
@@ -61,10 +61,11 @@ class Form:
     """A form of the decoder.
 
     Attributes:
-        name: for people.
-        air: on the pages, bits a symbol.
+        name: name for people.
+        air: AIR on the pages, bits a symbol.
         seconds: median of a page; NaN where it would say nothing.
-        deviation: of p from that of the usual form in float32, over its length, 99th percentile of all symbols.
+        deviation: deviation of p from that of the usual form in float32, over its length, 99th percentile of all
+            symbols.
     """
 
     name: str
@@ -82,7 +83,7 @@ def graphs(folder: Path) -> tuple[dict[str, bytes], bytes]:
     """Every form of a run's decoder as ONNX by name, and the usual one rounded.
 
     Args:
-        folder: of a run of two passes.
+        folder: folder of a run of two passes.
     """
     run = load_run(folder)
     profile, calibration = run.profile, run.calibration
@@ -113,7 +114,7 @@ def measured(
     """Rates, times and deviations of all forms on the pages of a recording.
 
     Args:
-        decoder: of the run, for all but its graph; each form follows the image by itself, as a service does.
+        decoder: decoder of the run, for all but its graph; each form follows the image by itself, as a service does.
         models: every form's decoder.onnx by name.
         half: the one in half precision.
         recording: pages with symbols.

@@ -1,4 +1,4 @@
-"""What a bundle weighs, file by file, and what loading it and decoding with it take in time and memory.
+"""Footprint of a bundle: its size, file by file, and the time and memory that loading and decoding take.
 
     python -m analysis.speed.footprint --profile paper
 
@@ -32,17 +32,17 @@ from lightpage.runtime.model.execution.cpus import available_cpus
 
 _PROCESS = "analysis.speed.footprint_process"
 _PATIENCE_S = 900
-"""For one process: a full-size page of two passes takes a few seconds."""
+"""Limit for one process: a full-size page of two passes takes a few seconds."""
 
 
 @dataclass(frozen=True)
 class File:
-    """One file of a bundle.
+    """File of a bundle.
 
     Attributes:
-        name: of it.
-        unpacked_bytes: its own size.
-        stored_bytes: what it takes in the zip.
+        name: name of the file.
+        unpacked_bytes: size of the file.
+        stored_bytes: size in the zip.
     """
 
     name: str
@@ -52,14 +52,14 @@ class File:
 
 @dataclass(frozen=True)
 class Footprint:
-    """What a bundle weighs and takes.
+    """Footprint of a bundle: its size, and what loading and decoding take.
 
     Attributes:
         decoder: name.
-        zip_bytes: of the bundle as one file.
-        files: in it, the largest first.
-        loading: what a process that loads it took.
-        decoding: what one that also decodes pages took.
+        zip_bytes: size of the bundle as one file.
+        files: files in it, the largest first.
+        loading: cost of a process that loads it.
+        decoding: cost of a process that also decodes pages.
     """
 
     decoder: str
@@ -70,7 +70,7 @@ class Footprint:
 
     @property
     def unpacked_bytes(self) -> int:
-        """Of all files."""
+        """Bytes of all files, unpacked."""
         return sum(file.unpacked_bytes for file in self.files)
 
 
@@ -82,7 +82,7 @@ def files_of(bundle: Path) -> tuple[File, ...]:
 
 
 def measured(bundle: Path, pages: int, threads: int) -> Taken:
-    """What a process of its own took that loads a bundle and decodes so many pages.
+    """Load a bundle and decode so many pages in a new process, and return what that took.
 
     Raises:
         InvalidInputError: it failed, or took longer than it may.
@@ -103,11 +103,11 @@ def footprint(name: str, profile: Profile, seen: Seen, pages: int, threads: int)
     """Make, weigh and measure the bundle of one decoder.
 
     Args:
-        name: one of `analysis.speed.untrained_graphs.OWN`.
+        name: name out of `analysis.speed.untrained_graphs.OWN`.
         profile: the nominal device.
-        seen: what its cameras saw.
-        pages: to decode.
-        threads: of one decode.
+        seen: frames of its cameras.
+        pages: number of pages to decode.
+        threads: threads of one decode.
 
     Raises:
         BundleError, InvalidInputError: see `untrained_bundle` and `measured`.

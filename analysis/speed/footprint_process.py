@@ -20,7 +20,7 @@ _LEVELS = 16
 
 @dataclass(frozen=True)
 class Taken:
-    """What a process took.
+    """Time and memory that a process took.
 
     Attributes:
         load_s: seconds from the path to a decoder that has proven its golden page.
@@ -34,7 +34,7 @@ class Taken:
 
 
 def peak_bytes() -> int:
-    """Most memory that this process has held.
+    """Return the peak memory of this process, bytes.
 
     Linux hands `ru_maxrss` on to a process that another one starts, with the other's peak; its own is told beside it.
     """
@@ -50,9 +50,9 @@ def taken(bundle: Path, pages: int, threads: int) -> Taken:
     """Load and decode in this process.
 
     Args:
-        bundle: its path.
+        bundle: path of the bundle.
         pages: how often the golden page is decoded, may be 0.
-        threads: of one decode.
+        threads: threads of one decode.
 
     Raises:
         BundleError: no bundle that decodes.

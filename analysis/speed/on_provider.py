@@ -1,4 +1,4 @@
-"""What an execution provider makes of one bundle: how fast, how exact, and whether every node runs there."""
+"""Behaviour of one bundle on an execution provider: speed, accuracy, and whether every node runs there."""
 
 from __future__ import annotations
 
@@ -51,26 +51,27 @@ class Kernel:
 
 @dataclass(frozen=True)
 class Made:
-    """What a provider makes of one bundle in one precision.
+    """Measurements of one bundle in one precision on a provider.
 
     Attributes:
-        bundle: its name.
-        precision: of network and waves.
-        provider: as options name it.
+        bundle: name of the bundle.
+        precision: precision of network and waves.
+        provider: provider as options name it.
         load_s: until the golden page was proven.
-        nodes: that run for a page, by ONNX Runtime's name of what they run on.
-        air: of the provider's answers, bits a symbol, mean of the pages.
-        deviation: of p from the CPU's in float32, over its length, 99th percentile of the symbols, worst page.
+        nodes: number of nodes that run for a page, by ONNX Runtime's name of what they run on.
+        air: AIR of the provider's answers, bits a symbol, mean of the pages.
+        deviation: deviation of p from the CPU's in float32, over its length, 99th percentile of the symbols, worst
+            page.
         symbols_changed: share that is another symbol than the CPU's.
-        infer_s: of a single caller, median.
-        decode_s: of a single caller, post-processing included, median.
-        inferences_per_s: by how many callers run the graph at once.
-        pages_per_s: by how many callers decode at once.
-        frame_bytes: of a pair.
-        user_bytes: that a page holds by the bundle's code; None without one.
-        device_bytes: of the GPU's memory that are taken after all of that, by all programs; None without a GPU.
-        busy_s: that the GPU computes for a page, copies included; None without a GPU.
-        kernels: that take longest, and how many there are in all; empty without a GPU.
+        infer_s: median seconds of an inference for a single caller.
+        decode_s: median seconds of a decode for a single caller, post-processing included.
+        inferences_per_s: rates of inferences, by how many callers run the graph at once.
+        pages_per_s: rates of decodes, by how many callers decode at once.
+        frame_bytes: bytes of a pair.
+        user_bytes: bytes that a page holds by the bundle's code; None without one.
+        device_bytes: bytes of the GPU's memory that are taken after all of that, by all programs; None without a GPU.
+        busy_s: seconds that the GPU computes for a page, copies included; None without a GPU.
+        kernels: kernels that take longest, and how many there are in all; empty without a GPU.
         kernel_count: runs of kernels and copies for a page.
     """
 
@@ -103,7 +104,7 @@ def in_precision(bundle: Bundle, precision: Precision) -> Bundle:
 
 
 def placed(bundle: Bundle, provider: Provider) -> dict[str, int]:
-    """How many nodes run for a page on each provider, by ONNX Runtime's profile."""
+    """Count the nodes that run for a page on each provider, by ONNX Runtime's profile."""
     file = GraphFile(bundle.files[DECODER], bundle.subject)
     pair = bundle.golden.pair
     with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""Where a page's time goes: the parts of a decoder, each against its floor, from the runtime's own profile.
+"""Breakdown of a page's time: the parts of a decoder, each against its floor, from the runtime's own profile.
 
 A part's floor is the larger of its arithmetic at the runtime's measured peak and of its bytes at the measured memory
 bandwidth: what it takes from other parts, its weights, and what it gives to others. All else that it moves could stay
@@ -23,7 +23,7 @@ from lightpage.errors import InvalidInputError
 from lightpage.runtime.model.execution.session import open_session
 
 _SIDE = 2048
-"""Of the square matrices whose product measures the peak."""
+"""Side of the square matrices whose product measures the peak."""
 _LARGE = 1 << 25
 """Numbers that the measurement of the bandwidth reads twice and writes once: far more than a cache holds."""
 _REPEATS = 5
@@ -50,15 +50,15 @@ _ORDER = (
     *(part for _, part in _PARTS if part.startswith("second")),
     OTHER,
 )
-"""In which a page passes them."""
+"""Order in which a page passes the parts."""
 
 
 @dataclass(frozen=True)
 class Machine:
-    """What the runtime reaches on this machine.
+    """Peak rates that the runtime reaches on this machine.
 
     Attributes:
-        flops_per_s: in a product of large matrices of float32.
+        flops_per_s: rate in a product of large matrices of float32.
         bytes_per_s: read and written together, in a sum of arrays that no cache holds.
     """
 
@@ -68,13 +68,13 @@ class Machine:
 
 @dataclass(frozen=True)
 class Part:
-    """One part of a decoder, a page.
+    """Part of a decoder, with its cost for a page.
 
     Attributes:
-        name: of the part.
-        seconds: that its nodes take.
-        flops: of products and convolutions, two for a multiplication with an addition.
-        bytes: from other parts, weights, and to other parts.
+        name: name of the part.
+        seconds: seconds that its nodes take.
+        flops: operations of products and convolutions, two for a multiplication with an addition.
+        bytes: bytes from other parts, of weights, and to other parts.
         floor_s: see the module.
     """
 
@@ -118,8 +118,8 @@ def parts_of(model: bytes, profile: Path, runs: int, machine: Machine) -> list[P
     Args:
         model: the exported decoder, whose nodes are named after the modules that they come from.
         profile: the runtime's profile of it.
-        runs: that the profile is of; the first is left out where there are more.
-        machine: that it ran on.
+        runs: number of runs in the profile; the first is left out where there are more.
+        machine: machine that it ran on.
 
     Raises:
         InvalidInputError: a profile without nodes.
@@ -214,7 +214,7 @@ def _crossing(model: bytes) -> Mapping[str, float]:
 
 
 def _flops(arguments: Mapping[str, Any]) -> float:
-    """Of a product or convolution, by the shapes that the runtime notes; 0 for all else."""
+    """Return the flops of a product or convolution, by the shapes that the runtime notes; 0 for all other operators."""
     shapes = [next(iter(entry.values())) for entry in arguments.get("input_type_shape", [])]
     out = [next(iter(entry.values())) for entry in arguments.get("output_type_shape", [])]
     operator = arguments.get("op_name", "")

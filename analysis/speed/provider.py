@@ -1,4 +1,4 @@
-"""What an execution provider makes of bundles: how fast, how exact, and whether every node runs there.
+"""Benchmark of bundles on an execution provider: speed, accuracy, and whether every node runs there.
 
     python -m analysis.speed.provider --provider cuda --bundle fast.zip --bundle accurate.zip --recording pages.h5
 
@@ -52,7 +52,7 @@ def pages_of(path: Path, count: int, mask: np.ndarray) -> tuple[list[Shown], int
 
 
 def lines(made: Made) -> list[str]:
-    """What people read of it."""
+    """Format the measurements as lines of text."""
     told = [
         f"{made.bundle}, {made.precision}, {made.provider}: loaded in {made.load_s:.1f} s, nodes "
         + ", ".join(f"{count} on {name}" for name, count in made.nodes.items()),

@@ -1,4 +1,4 @@
-"""What a GPU would make of a page, by its data sheet: an estimate, where no GPU can be measured.
+"""Estimate of a page's time on a GPU, by its data sheet, where no GPU can be measured.
 
     python -m analysis.speed.roofline --profile paper --decoder fast --decoder coherent --decoder refined
 
@@ -47,7 +47,7 @@ _KINDS = {
     "GridSample": SAMPLING,
     **dict.fromkeys(("Concat", "Gather", "GatherND", "Pad", "Slice", "Split", "Transpose"), LAYOUT),
 }
-"""Of operators; all others work number by number, or sum."""
+"""Kinds of operators; all others work number by number, or sum."""
 _DECODERS = "As `analysis.speed.speed` names it: wave is the preset standard, refined is accurate."
 _FREE = frozenset(["Constant", "Flatten", "Identity", "Reshape", "Squeeze", "Unsqueeze"])
 """Operators that move nothing."""
@@ -58,12 +58,12 @@ class Gpu:
     """A data sheet: peaks of products in each precision, and of the memory.
 
     Attributes:
-        name: of the GPU.
+        name: name of the GPU.
         flops_per_s: dense, by precision; float32 without the rounding of tensor cores.
-        half_flops_per_s: of float16 on tensor cores.
-        bytes_per_s: of its memory.
-        bus_bytes_per_s: from the host.
-        launch_s: from one kernel to the next.
+        half_flops_per_s: peak of float16 on tensor cores.
+        bytes_per_s: bandwidth of its memory.
+        bus_bytes_per_s: bandwidth from the host.
+        launch_s: time from one kernel to the next.
     """
 
     name: str
@@ -75,18 +75,18 @@ class Gpu:
 
 
 H100 = Gpu("H100 SXM", 67e12, 989e12, 3.35e12, 55e9, 4e-6)
-"""By NVIDIA's data sheet; bus and launches as commonly measured."""
+"""Figures of NVIDIA's data sheet; bus and launches as commonly measured."""
 
 
 @dataclass(frozen=True)
 class Load:
-    """What one kind of node asks for, a page.
+    """Load of all nodes of a kind, for a page.
 
     Attributes:
         nodes: how many.
-        flops: of products and convolutions, in float32 and float16 together.
+        flops: operations of products and convolutions, in float32 and float16 together.
         bytes: read and written.
-        seconds: on the GPU.
+        seconds: seconds on the GPU.
     """
 
     nodes: int
@@ -96,12 +96,12 @@ class Load:
 
 
 def loads(decoder: bytes, gpu: Gpu, share: float) -> dict[str, Load]:
-    """What a page asks for, by kind.
+    """Return the load of a page, by kind of node.
 
     Args:
         decoder: decoder.onnx.
-        gpu: what it would run on.
-        share: of the peaks that are reached.
+        gpu: GPU that it would run on.
+        share: share of the peaks that is reached.
     """
     model = shape_inference.infer_shapes(onnx.load_from_string(page_part(decoder)), data_prop=True)
     graph = model.graph
@@ -134,7 +134,7 @@ def estimate(by_kind: dict[str, Load], frame_bytes: int, gpu: Gpu) -> dict[str, 
 
     Args:
         by_kind: see `loads`.
-        frame_bytes: of both frames.
+        frame_bytes: bytes of both frames.
         gpu: the same.
     """
     work = math.fsum(load.seconds for load in by_kind.values())

@@ -43,7 +43,7 @@ class Timed:
 
 
 def profiled(model: bytes, feeds: dict[str, np.ndarray], threads: int, machine: Machine) -> list[Part]:
-    """Where an exported decoder's time goes."""
+    """Profile an exported decoder, and return its parts with their times."""
     with tempfile.TemporaryDirectory(prefix="lightpage-") as folder:
         graph = opened(model, threads, Path(folder) / "profile")
         for _ in range(_PROFILED):

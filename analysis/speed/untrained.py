@@ -34,10 +34,10 @@ _HEAD = 0.01
 
 @dataclass(frozen=True)
 class Seen:
-    """What both cameras of a device saw.
+    """Frames of both cameras of a device.
 
     Attributes:
-        device: its true state.
+        device: true state of the device.
         pair: a page, counts [H, W].
         references: the reference alone, counts [H, W].
     """
@@ -48,11 +48,11 @@ class Seen:
 
 
 def simulated(profile: Profile, device: Device, seed: int = 0) -> Seen:
-    """One page of random symbols and the references; minutes at full size.
+    """Simulate a page of random symbols and the references; this takes minutes at full size.
 
     Args:
         profile, device: nominal device and its true state.
-        seed: of symbols and noise.
+        seed: seed of symbols and noise.
     """
     simulator = Simulator(profile, device, seed=seed)
     symbols = random_symbols(profile, MAX_LEVELS, 1, np.random.default_rng(seed))[0]
@@ -79,8 +79,8 @@ def untrained_bundle(
         out: new bundle, a zip where it ends in .zip.
         profile: the nominal device.
         seen: frames of a page, and the device that they are of.
-        localizer, choices: of `lightpage.train.models.decoder.SymbolDecoder`.
-        seed: of the weights.
+        localizer, choices: arguments of `lightpage.train.models.decoder.SymbolDecoder`.
+        seed: seed of the weights.
 
     Returns:
         The bundle as opened again.

@@ -1,1 +1,1 @@
-"""How the image is found, followed and confirmed."""
+"""Benchmarks of image tracking: how the image is found, followed and confirmed."""

@@ -1,4 +1,4 @@
-"""What the search costs: beside a page that needs none, and at full size."""
+"""Cost of the image search: compared with a page that needs none, and at full size."""
 
 from __future__ import annotations
 

@@ -19,8 +19,8 @@ def draw(figures: dict[str, Any], path: Path) -> None:
     """Offsets, walks, and what pilots confirm of right and of wrong pages.
 
     Args:
-        figures: as `analysis.tracking.image_search` keeps them.
-        path: of the PNG.
+        figures: figures as `analysis.tracking.image_search` keeps them.
+        path: path of the PNG.
     """
     figure = Figure(figsize=(13, 4), layout="constrained")
     first, second, third = figure.subplots(1, 3)

@@ -49,7 +49,7 @@ def knocked(
 
 
 def apart(point: Point, seeds: int) -> Figures:
-    """The same where the quadrature camera alone has moved."""
+    """Measure first pages of devices whose quadrature camera alone has moved."""
     rows, pose = [], point.device.quadrature_camera
     for seed in track(range(seeds), f"{point.name}: cameras apart", unit="seed"):
         rng = np.random.default_rng([OFFSETS_STREAM, 1, seed])

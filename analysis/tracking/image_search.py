@@ -42,7 +42,7 @@ from lightpage.files import write_json
 WANTED_SHARE = 0.98
 WALKED = 200
 WRONG_PAGES = 100
-"""Of each kind."""
+"""Number of wrong pages of each kind."""
 FULL_SIZE_PAGES = 3
 REPEATS = 15
 

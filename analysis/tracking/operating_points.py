@@ -50,7 +50,7 @@ class Point:
 
     @cached_property
     def tracker(self) -> Tracker:
-        """One that has seen no page."""
+        """Tracker that has seen no page."""
         return tracker_for(self.decoder)
 
     @cached_property
@@ -64,7 +64,7 @@ class Point:
         return self.decoder.pilots(LEVELS)
 
     def simulator(self, seed: int, device: Device | None = None, *, reference_stays: bool = False) -> Simulator:
-        """Of the device, or of one that has changed; the image stays where it is put."""
+        """Return a simulator of the device, or of a changed one; the image stays where it is put."""
         still = (device or self.device).with_settings(STILL)
         profile = self.decoder.bundle.profile
         return Simulator(profile, still, LEVELS, seed, reference_stays=reference_stays)
@@ -96,7 +96,7 @@ class Point:
 
 
 def share_of(air: float, reference: float) -> float:
-    """Of a reference page's AIR; 0 where that was not read."""
+    """Return AIR as a share of a reference page's, 0 where that page was not read."""
     return air / reference if reference > 0 else 0.0
 
 

@@ -1,4 +1,4 @@
-"""What `analysis.tracking.image_search` prints."""
+"""Tables that `analysis.tracking.image_search` prints."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def tell_full_size(rows: Rows) -> str:
 
 
 def tell_gaps(name: str, figures: dict[str, Any]) -> str:
-    """Another device's pages, in order and each after a gap."""
+    """Format the results of another device's pages, read in order and each after a gap."""
     order, alone = figures["in_order"], [row["air"] for row in figures["after_a_gap"]]
     return (
         f"{name}: in order {min(order):.3f} to {max(order):.3f} bits, each page by a decoder just started "

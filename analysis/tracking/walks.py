@@ -58,7 +58,7 @@ def sound_pages(point: Point, pages: int) -> Figures:
 
 
 def gaps(bundle: Path, recording: Path) -> Figures:
-    """Another device's recording, every page read by a decoder that was just started, and all in their order."""
+    """Decode another device's recording, all pages in order and each by a decoder that was just started."""
     decoder = Decoder.load(bundle)
     tracker, rows = tracker_for(decoder), []
     with Recording.open(recording) as pages:

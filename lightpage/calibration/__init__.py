@@ -1,1 +1,1 @@
-"""From a few known pages to a device's geometry."""
+"""Calibration: a device's geometry fitted to a few known pages."""

@@ -78,7 +78,7 @@ ORIENTATIONS: Mapping[str, tuple[tuple[int, int], tuple[int, int]]] = {
     "mirrored along the falling diagonal": ((0, 1), (1, 0)),
     "mirrored along the rising diagonal": ((0, -1), (-1, 0)),
 }
-"""How a camera may show an image, by name, and the matrix from (x, y) to (column, row) that does so."""
+"""Orientations in which a camera may show an image, by name: matrices from (x, y) to (column, row)."""
 _SHOWS = 0.5
 """Share of the patches in the middle that a camera finds which shows the image as it is looked for; another way of
 showing it is looked for where fewer are found."""
@@ -108,7 +108,7 @@ class Registered:
         coherence_before, coherence_after: mean over the pages, at the start's geometry and at the fitted one.
         cost: mean squared normalised residual of the last fit of patches.
         significant: share of the measured patches that were found, in the last stage.
-        modulation: what the modulator makes of its levels.
+        modulation: light that the modulator makes of its levels.
         modulation_deviations: standard deviations of its coefficients.
         goodness: how well all that explains the first page's light; None where that was not measured.
     """
@@ -154,11 +154,11 @@ _PHASES = (_Stage("phases", 2, 1, _ALL_GROUPS, COHERENT_BRANCHES, use_phase=True
 """Each round halves what is left of the error, since patches are measured about the current geometry; two bring it
 within reach of the waves."""
 _DRIFTED = (_Stage("follow the drift", 6, 2, _ALL_GROUPS, COHERENT_BRANCHES, half_rate=True),)
-"""From an earlier calibration: the complex field is right from the start, so nothing is searched camera by camera."""
+"""Stages from an earlier calibration: the complex field is right from the start, so no camera is searched alone."""
 _DRIFT_SHARES = {"angle": 1.0, "lengths": 0.2, "in_phase": 0.3, "quadrature": 0.3, "axial": 0.2}
 _DRIFT_SCALE: Real = np.array([_DRIFT_SHARES.get(parameter.group, 0.05) for parameter in PARAMETERS])
-"""How far a device drifts, as a share of what it may lie from nominal. What a fit cannot tell well stays as it was: a
-decoder has learned the earlier calibration's errors, and loses 0.1 bit a symbol where a re-fit draws others."""
+"""Drift of a device, as a share of the prior about nominal. What a fit cannot tell well stays as it was: a decoder
+has learned the earlier calibration's errors, and loses 0.1 bit a symbol where a re-fit draws others."""
 
 
 def calibrate(
@@ -178,7 +178,7 @@ def calibrate(
         solve_field: recovers the complex field from registered frames.
         profile: the nominal device.
         references: reference-only frames.
-        pages: one to a few known pages; the first is fitted, all are judged by.
+        pages: one known page, or a few; the first is fitted, and all judge the fit.
         progress: told of every stage, and within it of every patch or derivative, so that it may stop the work soon.
         any_orientation: whether cameras that show the image mirrored or turned are taken.
 
@@ -218,7 +218,7 @@ def refine(
         start: [P] earlier parameters.
         quadrature_phase: earlier angle between the homodyne arms.
         modulation: earlier one, which is fitted again, see `DRIFTS`.
-        twin, solve_field, profile, references, pages, progress: as for `calibrate`.
+        twin, solve_field, profile, references, pages, progress: see `calibrate`.
 
     Raises:
         CalibrationError: the pages do not fit near the earlier calibration.
@@ -243,7 +243,7 @@ def check_found(coherence: float, significant: float, symbols: int, reflected: M
     """Check that a registration ended at the device and not at a guess.
 
     Args:
-        coherence: of the known pages with the fitted geometry.
+        coherence: coherence of the known pages with the fitted geometry.
         significant: share of the patches that were found in the last stage.
         symbols: number of symbols on a page.
         reflected: the same share for each reflected branch.
@@ -313,12 +313,12 @@ class _Registration:
         self._found: list[Measurement] = []
 
     def _begin(self, what: str) -> None:
-        """Tell of the next stage."""
+        """Begin the next stage, and report it."""
         self._stage, self._done = what, self._done + 1
         self._tell(0.0)
 
     def _tell(self, share: float) -> None:
-        """Tell what share of the present stage is behind."""
+        """Report progress: the share of the present stage that is done."""
         self.progress(self._stage, (self._done - 1 + share) / self.total)
 
     def single_camera(self, stage: _Stage) -> None:
@@ -330,10 +330,10 @@ class _Registration:
         self._fit(stage, found[0] + found[1])
 
     def _orient(self, stage: _Stage, found: list[list[Measurement]]) -> list[list[Measurement]]:
-        """Look for the image of a camera that has not found it as it may show it otherwise.
+        """Search the other orientations of a camera that has not found the image in its own.
 
         Args:
-            stage: of the search.
+            stage: stage of the search.
             found: measurements of either camera.
 
         Returns:
@@ -369,7 +369,7 @@ class _Registration:
         return found
 
     def _set_orientation(self, camera: int, how: str) -> None:
-        """Begin anew with a camera that shows the image so."""
+        """Start the parameters of a camera, and the centres of their priors, from an orientation."""
         (xx, xy), (yx, yy) = ORIENTATIONS[how]
         name = ("in_phase", "quadrature")[camera]
         values = {"scale_x_relative": xx - 1, "turn_xy_slope": xy, "turn_yx_slope": yx, "scale_y_relative": yy - 1}
@@ -509,7 +509,7 @@ class _Registration:
         """The first page's patches as each of `samplers` sees them.
 
         Args:
-            stage: what to look for.
+            stage: patches, branches and ranges to measure.
             samplers: the field, or one camera's light, by the cameras that it is seen through.
         """
         window = search_window(stage.reach_px * self._pixel, stage.step_px * self._pixel)

@@ -1,4 +1,4 @@
-"""One device as calibration found it."""
+"""Calibrated device: the parameters, phases and references that decoders need of it."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from lightpage.recording.frame_pair import FramePair
 
 @dataclass(frozen=True)
 class CalibratedDevice:
-    """All that a field and its rays are computed with, beside the frames themselves.
+    """Calibrated device: all that a field and its rays are computed with, beside the frames themselves.
 
     Attributes:
         profile: the nominal device.
         parameters: [P] fitted, see `lightpage.calibration.parameters`.
         quadrature_phase_rad: phase between the two cameras, about 90 degrees, negative where Q is inverted.
         references: reference-only frames.
-        modulation: what the modulator makes of its levels.
+        modulation: light that the modulator makes of its levels.
     """
 
     profile: Profile
@@ -33,5 +33,5 @@ class CalibratedDevice:
 
     @property
     def stands_apart(self) -> bool:
-        """Whether the cameras stand so far apart that each must be seen through a defocus of its own."""
+        """Return whether the cameras' axial places differ so much that each needs a defocus of its own."""
         return stand_apart(self.parameters)

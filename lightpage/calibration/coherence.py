@@ -1,4 +1,4 @@
-"""How well a geometry explains a known page: one number between 0 and 1."""
+"""Coherence of a geometry with a known page: a number between 0 and 1, 1 where the geometry explains the page."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def branch_shares(positions: Real, branches: Sequence[str] = COHERENT_BRANCHES) 
 
     Args:
         positions: exit centroid over the pipe's width, (x, y') last, [N, 2].
-        branches: of them; the two mixed ones are given half of their light each.
+        branches: names out of `BRANCHES`; the two mixed ones are given half of their light each.
 
     Returns:
         [branches, N]; those of all of `BRANCHES` add up to one.

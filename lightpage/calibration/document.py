@@ -32,14 +32,14 @@ _ADDED = {
     "parameters": {"lens_path_relative": -1.0, **dict.fromkeys(_LATER, 0.0)},
     "deviations": dict.fromkeys(("lens_path_relative", *_LATER), 0.0),
 }
-"""What documents lack that were written before it: they took lenses for ideal, and planes for those of the profile."""
+"""Fields that older documents lack: they took lenses for ideal, and planes for those of the profile."""
 
 
 _OPTIONAL = ("coherence_at_first", "goodness")
 
 
 def _names_problem(values: dict[str, Any], names: tuple[str, ...] = NAMES) -> str:
-    """Which names are missing or unknown, in words; empty when they are just those wanted."""
+    """Name the parameters that are missing or unknown, in words; empty when they are just those wanted."""
     missing = [name for name in names if name not in values]
     unknown = sorted(set(values) - set(names))
     parts = [("no " + ", ".join(missing)) if missing else "", ("unknown " + ", ".join(unknown)) if unknown else ""]
@@ -64,7 +64,7 @@ class Calibration(TomlTable):
         schema_version: 1.
         profile_name: name of the nominal profile that the numbers deviate from.
         turn_rad: angle between the homodyne arms, radians: 90 degrees plus error, negative when Q is inverted.
-        coherence_before, coherence_after: of the known pages at nominal and at fitted geometry, 0 to 1.
+        coherence_before, coherence_after: coherence of the known pages at nominal and at fitted geometry, 0 to 1.
         coherence_at_first: `coherence_after` of the calibration from nominal, where this is a re-fit that followed it.
         cost: mean squared normalised residual of the fit, about 1 when the twin explains the measurements.
         significant: share of the measured patches that were found, 0 to 1.
@@ -72,8 +72,8 @@ class Calibration(TomlTable):
         calibrated_pages: their SHA-256 (`hash_frames`), so that no figure counts them as held out.
         parameters: fitted value of every parameter of `lightpage.calibration.parameters`, in the unit of its name.
         deviations: their standard deviations, same names and units.
-        modulation: what the modulator makes of its levels, by the names of `lightpage.page.modulation`; nominal in
-            documents that do not tell it.
+        modulation: light that the modulator makes of its levels, by the names of `lightpage.page.modulation`; nominal
+            in documents that do not tell it.
         modulation_deviations: standard deviations of that, same names.
         goodness: how well the fit explains the light; None where that was not measured, as in documents of before.
     """
@@ -103,7 +103,7 @@ class Calibration(TomlTable):
         """The document of a registration.
 
         Args:
-            registered: what registration found.
+            registered: outcome of the registration.
             profile: the nominal device.
             hashes: SHA-256 of the known pages, one each.
         """
@@ -153,7 +153,7 @@ class Calibration(TomlTable):
 
     @property
     def modulator(self) -> Modulation:
-        """What the modulator makes of its levels."""
+        """Modulation that was fitted: the complex light of each level."""
         return Modulation(tuple(self.modulation.values()))
 
     def device(self, profile: Profile, references: FramePair) -> CalibratedDevice:
@@ -166,15 +166,15 @@ class Calibration(TomlTable):
 
     @property
     def is_wrong(self) -> bool:
-        """Whether the fit leaves so much light unexplained that it is wrong."""
+        """Return whether the fit leaves so much light unexplained that it is wrong."""
         return self.goodness is not None and self.goodness.verdict == "wrong"
 
     def check_good(self, subject: str, remedy: str = "; mend the cause and calibrate anew") -> None:
         """Check that the fit is not wrong; a warning where it is only usable.
 
         Args:
-            subject: what has the calibration.
-            remedy: what to do, after the limit.
+            subject: name of the thing that has the calibration.
+            remedy: advice that follows the limit in the message.
 
         Raises:
             CalibrationError: it is wrong.

@@ -20,7 +20,7 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
 REACH_PX = 12.0
-"""How far from where it is looked for the image is found, camera pixels, along either axis."""
+"""Reach of the search from where the image is expected, camera pixels, along either axis."""
 
 COARSE_PX = 2.0
 """Step of the coarse search, camera pixels. The light's correlation falls to half within 3: at most a fifth is lost."""
@@ -32,7 +32,7 @@ _FINE_PX = (1.0, 0.4, 0.15)
 """Steps of the lattices of 3x3 shifts, each about the vertex of the one before, whose last vertex is the answer."""
 
 FALSE_ALARMS = 1e-5
-"""How often light that is not this page's may pass for it in one search."""
+"""Probability that one search takes another page's light for this page's."""
 
 FEWEST_SEARCHED = 4
 """Fewer agree by chance wherever they are looked at."""
@@ -58,7 +58,7 @@ class FoundImage(NamedTuple):
 
     @property
     def found(self) -> bool:
-        """Whether the pilots bear out that the image lies there."""
+        """Return whether the pilots confirm that the image lies at this place."""
         return self.significance >= self.needed
 
 
@@ -67,8 +67,8 @@ class _Template:
     """The light of the pilots that is looked for.
 
     Attributes:
-        places: where to sample the field, grid samples (column, row), [B, N, S, 2].
-        conjugate: what takes off the path's and the symbol's phase, over the branch's share, [B, N, S].
+        places: places at which the field is sampled, grid samples (column, row), [B, N, S, 2].
+        conjugate: factors that remove the path's and the symbol's phase, over the branch's share, [B, N, S].
     """
 
     places: Real
@@ -172,7 +172,7 @@ def _lattice(around: Real, reach: float, step: float) -> Real:
 
 
 def _vertex(scores: Real) -> Real:
-    """Where the quadratic fitted to 3x3 scores [y, x] peaks, in steps (x, y) from the middle, within the lattice."""
+    """Return the vertex (x, y) of a quadratic fitted to 3x3 scores [y, x], in steps from the middle, within +-1."""
     y, x = (axis.ravel() for axis in np.mgrid[-1:2, -1:2])
     terms = np.stack([np.ones(9), x, y, x * x, x * y, y * y], axis=1)
     _, slope_x, slope_y, xx, xy, yy = np.linalg.lstsq(terms, scores.ravel(), rcond=None)[0]

@@ -1,4 +1,4 @@
-"""What registration asks of a ray twin, whoever computes it (torch when training, ONNX in the runtime)."""
+"""Interfaces that registration needs of a ray twin, computed by torch in training and by ONNX in the runtime."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ in x, odd in y', odd in both. In a sheared pipe the last splits by which wall is
 
 
 class Rays(NamedTuple):
-    """What the twin says of points on the page.
+    """Rays of points on the page, as the twin traces them.
 
     Attributes:
-        places: where each branch lands on the camera plane, [B, N, 2] as (x, y), metres from the optical axis.
+        places: points where each branch lands on the camera plane, [B, N, 2] as (x, y), metres from the optical axis.
         phases: phase that the branch's path adds to the symbol's, against the reference, [B, N] radians, unwrapped.
         positions: exit centroid of the beam over the pipe's width, (x, y'), [N, 2], dimensionless.
     """
@@ -62,7 +62,7 @@ class RememberingTwin:
     """A twin that remembers its last trace: either camera is looked at for the same one.
 
     Args:
-        twin: what traces.
+        twin: ray tracer.
     """
 
     def __init__(self, twin: Twin) -> None:

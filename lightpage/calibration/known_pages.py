@@ -52,7 +52,7 @@ def known_pages(recording: Recording, profile: Profile, indices: Iterable[int]) 
     Args:
         recording: open, with symbols.
         profile: the nominal device.
-        indices: which pages.
+        indices: numbers of the pages.
 
     Raises:
         FrameError: a frame or reference that is black or saturated; it names recording, page and frame.

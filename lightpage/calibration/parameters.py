@@ -12,10 +12,10 @@ Real = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number that calibration may fit; its nominal value is zero.
+    """Parameter that calibration may fit; its nominal value is zero.
 
     Attributes:
-        name: with the unit as its suffix; `relative` and `slope` are dimensionless.
+        name: name with the unit as its suffix; `relative` and `slope` are dimensionless.
         prior: standard deviation about nominal, in the parameter's unit.
         group: the part of the device that it describes; stages of a fit free whole groups.
     """

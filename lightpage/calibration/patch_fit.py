@@ -63,7 +63,7 @@ def fit_parameters(
     Args:
         twin: the ray tracer.
         profile: the nominal device.
-        measurements: of one page, from any branches and cameras.
+        measurements: measurements of one page, from any branches and cameras.
         start: [P] start vector.
         free: indices of the parameters to fit.
         use_phase: whether the patches' phases count, beside places and slopes; needs a start whose phases are right

@@ -49,8 +49,8 @@ class Measurement:
     Attributes:
         branch: name.
         centre_m: the patch's centre (x, y) on the page, [2].
-        pixels: where the centre was found, (column, row) on each camera, [2, 2].
-        cameras: which of the two were looked at.
+        pixels: position of the centre, (column, row) on each camera, [2, 2].
+        cameras: numbers of the cameras that were used.
         read_at: (column, row) on each camera where the twin had put the centre, [2, 2].
         phase: phase of the light against the symbols', radians, read there.
         carrier: how that phase changes with the pixels where it is read, radians a pixel along (column, row) on each
@@ -74,7 +74,7 @@ class Measurement:
 
 
 def patch_edge(profile: Profile) -> int:
-    """About how many symbols a patch is wide and high."""
+    """Return the approximate width and height of a patch, symbols."""
     return max(_EDGE_SYMBOLS, round(_EDGE_PX / profile.page.symbol_size_px))
 
 
@@ -134,13 +134,13 @@ def measure(
         twin: the ray tracer.
         parameters: [P] current parameters.
         profile: the nominal device.
-        patch: which symbols.
+        patch: symbols to measure.
         symbols: light that the modulator makes of the whole page's, complex [ny, nx].
-        branches: which branches to look for.
+        branches: branches to look for.
         window: trial shifts [K, 2], metres on the camera plane, a square lattice (see `search_window`).
         samples: samples per symbol along each axis; the field's own rate (`symbol_samples`), or half of it in a wide
             search.
-        cameras: which cameras the sampler looks through, a label of the result.
+        cameras: cameras that the sampler looks through, a label of the result.
     """
     known = symbols[patch.rows, patch.columns]
     rows, columns = known.shape

@@ -49,14 +49,14 @@ def camera_phase(value: Mapping[str, Any], x: Any, y: Any, edge_x: float, edge_y
 def tilt_of_shift(
     value: Mapping[str, float], shift_m: NDArray[np.float64], half_width_m: float, half_height_m: float
 ) -> NDArray[np.float64]:
-    """What `camera_phase` gains as tilt, at the page's edges, where the image moves over a reference that stays.
+    """Return the tilt of `camera_phase` at the page's edges that a shift of the image over a fixed reference adds.
 
     The gradient of its quadratic terms times the shift; the constant that is left over is piston.
 
     Args:
         value: parameters by name.
         shift_m: (x, y) by which the image moves in the camera plane, metres.
-        half_width_m, half_height_m: of the page.
+        half_width_m, half_height_m: half sizes of the page.
 
     Returns:
         (camera_tilt_x_rad, camera_tilt_y_rad), [2].

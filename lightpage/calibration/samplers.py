@@ -29,12 +29,12 @@ def linear_light(frame: NDArray[np.integer], reference: NDArray[np.integer]) -> 
 
 
 class FrameSampler:
-    """One camera's frame as a linear estimate of the field's projection on its reference, |E|^2 left in.
+    """Sampler of one camera's frame: a linear estimate of the field's projection on its reference, |E|^2 not removed.
 
     Args:
         frame, reference: counts [H, W].
         camera: 0 in-phase, 1 quadrature.
-        twin, parameters: where the camera plane lies on the camera.
+        twin, parameters: registration of the camera plane on the camera.
     """
 
     def __init__(

@@ -60,7 +60,7 @@ def registration_coefficients(twin: Twin, parameters: Real, profile: Profile) ->
 
 
 def stand_apart(parameters: Real) -> bool:
-    """Whether the cameras of a device stand so far apart that the field of each is to be seen through its defocus."""
+    """Return whether the cameras' axial places differ so much that each field must be refocused by its own defocus."""
     return bool(abs(axial_of_cameras(as_dict(parameters))[1]) >= _LEAST_APART_RAD)
 
 
@@ -73,10 +73,10 @@ def cameras_apart(parameters: Real, profile: Profile) -> NDArray[np.float32]:
 
 
 def orientations(linear: NDArray[np.floating]) -> NDArray[np.floating]:
-    """How cameras show the image, from (x, y) to (column, row), but for small turns and scales.
+    """Return how cameras flip and swap the axes from (x, y) to (column, row), without small turns and scales.
 
     Args:
-        linear: what they truly do, in any unit, [..., 2, 2].
+        linear: linear part of the cameras' maps, in any unit, [..., 2, 2].
 
     Returns:
         Zeros, and in each row and column one of 1 and -1, [..., 2, 2].

@@ -41,7 +41,7 @@ _CODED_BITS = 2
 protects more where wrong upper numbers are more than Reed-Solomon mends."""
 _CORRECTIONS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 _PAGE_LOSS = 1e-3
-"""Of a page whose upper bits Reed-Solomon does not mend: small beside the loss that the rate allows."""
+"""Share of pages whose upper bits Reed-Solomon does not mend: small beside the loss that the rate allows."""
 _UNSEEN = 3.0
 """Errors that may have been there where so many pages show none, with 95% confidence."""
 _SPREAD = 2
@@ -49,7 +49,7 @@ _SPREAD = 2
 _BISECTIONS = 7
 _LOWEST_RATE, _HIGHEST_RATE = 340, 960
 _LOWEST_RATE_OF_TWO_LEVELS = 460
-"""Where a symbol has one bit, the header's code is no better than the body's would be below."""
+"""Lowest rate, per mille, where a symbol has one bit: the header's code is no better than the body's would be below."""
 _FIRST_GAP, _MOST_TRIED = 0.04, 30
 """Information beyond the rate that a code is first thought to need; rates that are tried."""
 _DRAWS = 3
@@ -63,8 +63,8 @@ class DrawnPage:
     Attributes:
         phase: decoded, radians, of the data symbols, [symbols].
         concentration: kappa, [symbols].
-        symbols: what was drawn.
-        levels: that they were drawn from.
+        symbols: symbols that were drawn.
+        levels: levels that they were drawn from.
     """
 
     phase: NDArray[np.float64]
@@ -78,7 +78,7 @@ Draw = Callable[[int, np.random.Generator], Sequence[DrawnPage]]
 
 
 class Drift(NamedTuple):
-    """The same few pages as they are read, and as they are read of a device that has drifted."""
+    """Pages as they are read before and after a drift of the device."""
 
     before: Draw
     after: Draw
@@ -89,14 +89,14 @@ class Choice:
     """A code with what was found of it.
 
     Attributes:
-        code: its parameters.
-        user_bytes: of a page.
+        code: parameters of the code.
+        user_bytes: user bytes of a page.
         information: mean information of a coded bit.
-        deviation: its standard deviation from page to page.
+        deviation: standard deviation of the information from page to page.
         upper_errors: mean wrong upper numbers of a page.
         kept: information of a coded bit that was to be kept for drift.
-        spare: what the weakest page of a thousand carries of it beyond the need: `kept`, and what steps of the rate
-            leave.
+        spare: information that the weakest page of a thousand carries beyond the need: `kept`, and what steps of the
+            rate leave.
     """
 
     code: Code
@@ -133,11 +133,11 @@ def choose(
 
     Args:
         draw: draws the known pages.
-        air_bits: what a symbol carries, bits: level counts near it are tried, and fewer levels where none carries.
+        air_bits: information of a symbol, bits: level counts near it are tried, and fewer levels where none carries.
         pilots: bool [ny, nx].
         headroom: share of what a symbol carries that is kept for drift.
-        seed: of what is drawn.
-        drift: that pages are to survive, where it costs more than that share.
+        seed: seed of the draws.
+        drift: drift that pages are to survive, where it costs more than that share.
 
     Raises:
         InvalidInputError: too few pages, or no code carries a page.
@@ -213,9 +213,9 @@ def _best_of(
 
 
 def survives(choice: Choice, drift: Drift, pilots: NDArray[np.bool_]) -> tuple[bool, float]:
-    """Whether the weakest page of a thousand is still read after a drift, as far as a few pages can say; what it costs.
+    """Estimate whether the weakest page of a thousand is still read after a drift, and what the drift costs.
 
-    The cost is information of a coded bit: `Choice.spare` of it may go.
+    Few pages are drawn for it. The cost is information of a coded bit, of which `Choice.spare` may be lost.
     """
     code = choice.code
     cost, wrong = _drift_costs(drift, code.levels, code.coded_bits)
@@ -297,10 +297,10 @@ def needed_information(code: LdpcCode, pages: Sequence[DrawnPage], coded: int, r
     """Information per bit from which nearly all blocks decode: the pages' light is made noisier until 2% of them fail.
 
     Args:
-        code: of the blocks.
-        pages: with their light.
+        code: code of the blocks.
+        pages: pages with their light.
         coded: b.
-        rng: of noise.
+        rng: generator of noise.
     """
     low, high = 0.0, 3.0
     needed = 1.0
@@ -315,7 +315,7 @@ def needed_information(code: LdpcCode, pages: Sequence[DrawnPage], coded: int, r
 
 
 def _all_decode(draw: Draw, code: Code, pilots: NDArray[np.bool_], rng: np.random.Generator) -> bool:
-    """Whether every page decodes, drawn some times."""
+    """Return whether every page decodes, in each of several draws."""
     ldpc = PageCodec(code, pilots).ldpc
     return all(
         decode(ldpc, _blocks(draw(code.levels, rng), ldpc, code.coded_bits, 0.0, rng)[0]).converged.all()

@@ -15,7 +15,7 @@ from lightpage.files import read_text, replace_text
 
 
 class Code(BaseModel):
-    """How user bytes are protected on a page.
+    """Code of a page: how its user bytes are protected.
 
     Attributes:
         levels: M, a power of two.
@@ -89,7 +89,7 @@ def parse_code(text: str, subject: str) -> Code:
 
 
 def problems_of(error: ValidationError) -> str:
-    """What is wrong with the parameters of a code, in a line."""
+    """Describe in one line which parameters of a code were refused, and why."""
     return "; ".join(
         f"{'.'.join(map(str, e['loc'])) or 'code'}: {e['msg'].removeprefix('Value error, ')}" for e in error.errors()
     )

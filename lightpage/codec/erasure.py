@@ -63,7 +63,7 @@ def restore(pages: Mapping[int, bytes], data_pages: int, parity_pages: int) -> l
     """All data pages of a group from those that are left; None where they are too few.
 
     Args:
-        pages: what is left, by place in the group: data 0 to k - 1, parity k to k + m - 1; all of one length.
+        pages: remaining pages, by place in the group: data 0 to k - 1, parity k to k + m - 1; all of one length.
         data_pages: k.
         parity_pages: m.
     """

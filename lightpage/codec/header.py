@@ -23,7 +23,7 @@ from lightpage.page.levels import Levels
 
 MOST_PAGES = 1 << 24
 MOST_BYTES = (1 << 40) - 1
-"""Of a volume."""
+"""Largest volume."""
 FIELD_BYTES = 15
 HEADER_BYTES = FIELD_BYTES + 2
 _SENT_BITS, _SENT_BITS_OF_FEW_LEVELS = 204, 408
@@ -84,7 +84,7 @@ def encode_headers(headers: list[Header], levels: int) -> NDArray[np.uint8]:
     """The symbols of headers, uint8 [headers, header symbols].
 
     Args:
-        headers: of pages.
+        headers: headers of the pages.
         levels: M of the page.
     """
     text = np.array([np.frombuffer(header.to_bytes(), np.uint8) for header in headers])

@@ -63,7 +63,7 @@ def bit_llrs(
         concentration: kappa, the same shape.
         levels: M, a power of two, or uneven levels of that number.
         label_bits: b, 1 to log2 M; all bits, in Gray code, if left out.
-        threads: that share the work where it is compiled.
+        threads: number of threads that share the work where it is compiled.
 
     Returns:
         float32, the shape of `phase` and b; -40 to 40.

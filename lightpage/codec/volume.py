@@ -23,7 +23,7 @@ from lightpage.codec.page_codec import PageCodec
 from lightpage.errors import InvalidInputError
 
 DATA_PAGES, PARITY_PAGES = 60, 4
-"""Of a group, unless told otherwise: enough parity for a page in a hundred to be lost."""
+"""Pages of a group, unless told otherwise: enough parity for a page in a hundred to be lost."""
 
 _PAGES_AT_ONCE = 32
 _READ_BYTES = 1 << 20
@@ -31,7 +31,7 @@ _READ_BYTES = 1 << 20
 
 @dataclass(frozen=True)
 class Volume:
-    """How a file lies on pages.
+    """Volume: the layout of a file on pages.
 
     Attributes:
         id: a number that tells files on one medium apart.
@@ -88,7 +88,7 @@ class Volume:
         return self.file_pages + self.groups * self.parity_pages
 
     def holds(self, page: int) -> bool:
-        """Whether a page of this number is written."""
+        """Return whether a page of this number is written."""
         group, place = divmod(page, self.group_pages)
         return group < self.groups and (place >= self.data_pages or place < self.data_in(group))
 
@@ -99,7 +99,7 @@ class Volume:
         return later[0] if later else (group + 1) * self.group_pages if group + 1 < self.groups else None
 
     def to_json(self) -> dict[str, int]:
-        """What a file of pages says of its volume."""
+        """Return the fields that a file of pages states about its volume, as JSON."""
         return {
             "volume": self.id,
             "file_bytes": self.file_bytes,
@@ -111,7 +111,7 @@ class Volume:
 
     @property
     def facts(self) -> FileFacts:
-        """What every page says of the file."""
+        """Facts about the file that every page states."""
         return FileFacts(self.data_pages, self.parity_pages, self.checksum)
 
     @classmethod
@@ -119,7 +119,7 @@ class Volume:
         """The volume that a page says it belongs to; None of a lost page, or where no volume is such.
 
         Args:
-            page: as it was read.
+            page: page that was read.
         """
         header, data, file = page.header, page.data, page.file
         if header is None or data is None or file is None:
@@ -149,18 +149,18 @@ class Volume:
 
 @dataclass(frozen=True)
 class Successor:
-    """Which page should come next, after pages that were read.
+    """Successor of the pages that were read: the page that should come next.
 
     Attributes:
-        volume: that the last page belongs to; None where nothing is known.
-        header: of the page that should come; None where nothing is known, or after the last one.
+        volume: volume that the last page belongs to; None where nothing is known.
+        header: header of the page that should come; None where nothing is known, or after the last one.
     """
 
     volume: Volume | None = None
     header: Header | None = None
 
     def after(self) -> Successor:
-        """What should come after that."""
+        """Return the successor of the page that should come next."""
         if self.volume is None or self.header is None:
             return Successor()
         following = self.volume.following(self.header.page)
@@ -173,7 +173,7 @@ def encode_volume(
     """Pages of a file, some at a time, in the order of their numbers.
 
     Args:
-        codec: of the pages.
+        codec: codec of the pages.
         volume: how the file lies on them.
         file: read once, from where it stands.
         pilots: levels of the pilots.
@@ -218,9 +218,9 @@ def restore_group(volume: Volume, group: int, pages: dict[int, bytes]) -> list[b
     """The data pages of a group that are written, restored where they are lost; None where too many are.
 
     Args:
-        volume: of the file.
-        group: which.
-        pages: what was read, by page number.
+        volume: volume of the file.
+        group: number of the group.
+        pages: pages that were read, by page number.
     """
     first = group * volume.group_pages
     places = {number - first: page for number, page in pages.items()}

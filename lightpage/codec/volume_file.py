@@ -28,7 +28,7 @@ PARTIAL = ".partial"
 
 @dataclass(frozen=True)
 class Restored:
-    """What became of a file's pages.
+    """Numbers of a file's data pages that were missing: those restored, and those lost.
 
     Attributes:
         restored: numbers of data pages that parity pages gave back.
@@ -43,7 +43,7 @@ class VolumeFile:
     """The pages of one volume, kept in a partial file beside `path` until the file is made.
 
     Args:
-        path: of the file.
+        path: path of the file.
         volume: how it lies on its pages.
         number: tells the partial files of several volumes apart.
 
@@ -85,8 +85,8 @@ class VolumeFile:
         """Take a page of this volume.
 
         Args:
-            number: of the page.
-            data: its user bytes.
+            number: number of the page.
+            data: user bytes of the page.
 
         Raises:
             InvalidInputError: other bytes came under this number before, or there is no room for it on the disk.
@@ -157,7 +157,7 @@ class VolumeFile:
         return check.value
 
     def _place(self, number: int) -> int:
-        """Where a page lies in the partial file: data in order, parity behind all data."""
+        """Return the offset of a page in the partial file, bytes: data pages in order, parity pages behind all data."""
         group, place = divmod(number, self.volume.group_pages)
         if place < self.volume.data_pages:
             return (group * self.volume.data_pages + place) * self.volume.page_bytes
@@ -184,7 +184,7 @@ class VolumeFiles:
     """The pages of several volumes, of which one becomes a file; use it in a `with` statement.
 
     Args:
-        path: of the file.
+        path: path of the file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -227,8 +227,8 @@ class VolumeFiles:
         """The one volume that was asked for; None where no page came at all.
 
         Args:
-            volume_id: its number; any if left out.
-            checksum: of its file; any if left out.
+            volume_id: number of the volume; any if left out.
+            checksum: checksum of its file; any if left out.
 
         Raises:
             InvalidInputError: none of them, or several.

@@ -1,1 +1,1 @@
-"""How much a decoded page carries, and how well calibrated its confidences are."""
+"""Metrics of a decoded page: the information that it carries, and the calibration of its confidences."""

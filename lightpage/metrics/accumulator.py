@@ -18,11 +18,11 @@ _AT_ONCE = 1 << 16
 
 
 class Accumulator:
-    """What `lightpage.metrics.information` says of all pages together, in twelve bytes a symbol.
+    """Accumulator of the figures of `lightpage.metrics.information` over all pages, in twelve bytes a symbol.
 
     Args:
         levels: M, or uneven levels.
-        data: where the data symbols are, bool [ny, nx].
+        data: mask of the data symbols, bool [ny, nx].
         pages: the most that are added.
     """
 
@@ -59,7 +59,7 @@ class Accumulator:
         self._rank(mu, kappa, symbols)
 
     def figures(self) -> PageMeasures:
-        """Over the symbols of all pages.
+        """Return the figures over the symbols of all pages.
 
         Raises:
             PageError: no pages.
@@ -83,7 +83,7 @@ class Accumulator:
         return SymbolMaps(*(self._maps / (len(self._measures) or np.nan)))
 
     def confidence_bins(self) -> list[ConfidenceBin]:
-        """What `reliability` says of the symbols of all pages."""
+        """Return what `reliability` returns for the symbols of all pages together."""
         counts, claimed, right = self._reliability
         return [
             ConfidenceBin(

@@ -1,4 +1,4 @@
-"""How much a decoded page carries and how well calibrated its confidence is: decisions and rates.
+"""Information that a decoded page carries, and calibration of its confidences: decisions and rates.
 
 A decoder's estimate of a symbol is a von Mises density of its phase, with mean phase `mu` (radians) and concentration
 `kappa`. All figures are computed in float64. `levels` is M, where symbol s stands for the phase 2 pi s / M, or says
@@ -35,7 +35,7 @@ _LEFT_OUT = 1e-12
 _CHUNK = 8192
 
 _LEAST_WEIGHT = 1e-200
-"""Of all levels with the right bit together, beside the most probable one: a smaller sum of floats has lost digits."""
+"""Least weight of all levels with the right bit, over the most probable level's: a smaller sum has lost digits."""
 
 
 def own_information(mu: NDArray[np.floating], kappa: NDArray[np.floating], levels: int | Levels) -> Floats:
@@ -55,7 +55,7 @@ def own_information(mu: NDArray[np.floating], kappa: NDArray[np.floating], level
 
 
 def page_kilobytes(bits_per_symbol: float, data_symbols: int) -> float:
-    """What a page of so many data symbols carries, kilobytes of 8000 bits."""
+    """Return the capacity of a page with so many data symbols, kilobytes of 8000 bits."""
     return bits_per_symbol * data_symbols / 8000
 
 
@@ -180,7 +180,7 @@ Neighbours = NDArray[np.int64]
 
 
 def _parts(phase: Floats, kappa: Floats, levels: Levels) -> Iterator[tuple[NDArray[np.bool_], Neighbours | None]]:
-    """Which symbols need which levels beside their nearest; None for those that need none."""
+    """Yield masks of symbols with the levels that they need beside their nearest; None for symbols that need none."""
     everything, left = np.arange(levels.count), np.ones(kappa.shape, bool)
     if levels.count > 2 * _WINDOW + 1:
         if levels.is_nominal:
@@ -217,9 +217,9 @@ def _closest(phase: Floats, levels: Levels) -> Floats:
 def _windows(
     phase: Floats, kappa: Floats, levels: Levels, neighbours: Neighbours
 ) -> Iterator[Iterator[tuple[Floats, Floats]]]:
-    """Of some symbols at a time: the levels about mu, one after the other.
+    """Yield, for some symbols at a time, an iterator over the levels near mu, one level after the other.
 
-    Of each level: its probability over the nearest level's, and by how much its 1 - cos(theta_k - mu) is more.
+    A level is a pair: its probability over the nearest level's, and its 1 - cos(theta_k - mu) less the nearest level's.
     """
     angles = neighbours * (2 * np.pi / levels.count) if levels.is_nominal else levels.gaps(neighbours)
     sines, versines = np.sin(angles), 2 * np.sin(0.5 * angles) ** 2

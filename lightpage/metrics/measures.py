@@ -73,7 +73,7 @@ class SymbolMaps:
     Attributes:
         air: bits.
         own_mi: bits, as the decoder claims.
-        error_rad: of the phase error's magnitude, radians.
+        error_rad: magnitude of the phase error, radians.
     """
 
     air: Floats
@@ -88,12 +88,12 @@ def symbol_maps(
     levels: int | Levels,
     data: NDArray[np.bool_],
 ) -> SymbolMaps:
-    """What `measure` averages over the page, place by place.
+    """Return maps over the page of what `measure` averages over it.
 
     Args:
-        mu, kappa, symbols: of the data symbols, [pages, number of Trues in data] in row order.
+        mu, kappa, symbols: estimates and truth of the data symbols, [pages, number of Trues in data] in row order.
         levels: M, or uneven levels.
-        data: where the data symbols are, bool [ny, nx].
+        data: mask of the data symbols, bool [ny, nx].
 
     Raises:
         PageError: as `log_posterior`, or the number of symbols is not that of `data`.

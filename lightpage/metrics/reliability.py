@@ -1,4 +1,4 @@
-"""Whether confidences and concentrations keep their promise."""
+"""Reliability: how often decisions are right, and phases as close, as confidences and concentrations claim."""
 
 from __future__ import annotations
 

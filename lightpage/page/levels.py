@@ -17,7 +17,7 @@ MAX_LEVELS = 256
 Real = NDArray[np.float64]
 
 _STEPS = 4096
-"""Of a turn, to find the nearest of uneven levels by: a sixteenth of the distance of 256 levels."""
+"""Steps in a turn, to find the nearest of uneven levels by: a sixteenth of the distance of 256 levels."""
 
 
 def check_levels(levels: int, subject: str = "levels") -> None:
@@ -60,12 +60,12 @@ class Levels:
 
     @property
     def is_nominal(self) -> bool:
-        """Whether level s is the phase 2 pi s / M."""
+        """Return whether the levels are even: level s has the phase 2 pi s / M."""
         return self.uneven is None
 
     @property
     def carry_bits(self) -> bool:
-        """Whether M is a power of two."""
+        """Return whether levels carry whole bits: M is a power of two."""
         return self.count & (self.count - 1) == 0
 
     @cached_property
@@ -147,7 +147,7 @@ class Levels:
         return first, borders, starts, int(np.diff(starts, append=self.count - 1).max())
 
     def gaps(self, neighbours: NDArray[np.integer]) -> Real:
-        """From the level at each place on the circle to some of its neighbours there, radians, [neighbours, M].
+        """Return angles from the level at each place on the circle to some of its neighbours, radians, [neighbours, M].
 
         Args:
             neighbours: how many places further on each is, [neighbours].

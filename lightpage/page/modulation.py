@@ -1,4 +1,4 @@
-"""What a modulator makes of a level: a complex number, smooth over the levels, told by a few coefficients.
+"""Modulation: the complex light that a modulator makes of each level, smooth over the levels, by a few coefficients.
 
 Nominally level s of M is light of unit amplitude and the phase 2 pi s / M. A real modulator has a phase stroke of less
 or more than 2 pi, a lookup table that is not straight, light that it does not modulate, and an amplitude that goes with
@@ -19,14 +19,15 @@ from lightpage.page.symbols import symbol_phases
 Real = NDArray[np.float64]
 
 HARMONICS = 3
-"""Of the Fourier series: a fifth of unmodulated light leaves an error of 4e-4."""
+"""Order of the Fourier series: a fifth of unmodulated light leaves an error of 4e-4."""
 _SERIES = tuple(f"{function}_{number}" for number in range(1, HARMONICS + 1) for function in ("cos", "sin"))
 NAMES = ("stroke_relative", *(f"phase_{name}_rad" for name in _SERIES), *(f"amplitude_{name}_log" for name in _SERIES))
-"""Of the coefficients, each zero nominally."""
+"""Names of the coefficients, each zero nominally."""
 PRIORS: Real = np.array([0.02, *[0.2 / number for number in range(1, HARMONICS + 1) for _ in "cs"] * 2])
 """Standard deviations of the coefficients about nominal, before data are seen."""
 DRIFTS: Real = PRIORS * [1.0, *[0.1] * (len(NAMES) - 1)]
-"""The same about those of an earlier day: a stroke changes with temperature, a lookup table hardly."""
+"""Standard deviations of the coefficients about those of an earlier day: a stroke changes with temperature, a lookup
+table hardly."""
 
 
 def basis(phases: Real) -> Real:
@@ -40,14 +41,14 @@ class Modulation:
     """The light that a modulator makes of its levels.
 
     Attributes:
-        coefficients: by `NAMES`.
+        coefficients: coefficients in the order of `NAMES`.
     """
 
     coefficients: tuple[float, ...] = (0.0,) * len(NAMES)
 
     @cached_property
     def is_nominal(self) -> bool:
-        """Whether every coefficient is zero."""
+        """Return whether every coefficient is zero."""
         return not any(self.coefficients)
 
     def light(self, phases: Real) -> NDArray[np.complex128]:
@@ -71,7 +72,7 @@ class Modulation:
         return self.phase(symbol_phases(np.arange(count), count))
 
     def page_levels(self, count: int) -> Levels:
-        """So many levels of a page, as the phases of their light tell them apart.
+        """Return so many levels of a page, as the phases of their light tell them apart.
 
         Raises:
             PageError: a level count outside 2..256.
@@ -85,7 +86,7 @@ class Modulation:
 
 @lru_cache(16)
 def _page_levels(modulation: Modulation, count: int) -> Levels:
-    """Those of every page of one device: what is known of their neighbours is computed once."""
+    """Return the levels of a modulation, cached: all pages of a device share them and what they have computed."""
     return Levels(count, None if modulation.is_nominal else tuple(modulation.phases(count).tolist()))
 
 

@@ -1,4 +1,4 @@
-"""What pilots show: the piston, which frames alone do not, and how far a decoder's claims may be trusted."""
+"""Evidence of pilots: the piston, which frames alone do not show, and how far a decoder's claims may be trusted."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _CREDIT = 20.0
 _OUTLIERS = 0.01
 """Share of pilots that are expected to say nothing: a dead place of the modulator, a value that was not written."""
 _MOST_OUTLIERS = 0.05
-"""Where more of them contradict the rest, it is the device that has changed, and all of them count."""
+"""Largest share of outliers; where more pilots contradict the rest, the device has changed, and all of them count."""
 _ROUNDS = 10
 _MEDIAN_CHI2 = 0.4549
-"""Of the chi-squared distribution with one degree of freedom."""
+"""Median of the chi-squared distribution with one degree of freedom."""
 
 LEAST_CONFIRMED_SHARE = 0.25
 """Share of the claimed information that the pilots of a page must confirm. A page whose image lies a pixel off confirms
@@ -47,8 +47,8 @@ class Pilots:
     """Known symbols of a page.
 
     Attributes:
-        mask: where they are, bool [ny, nx].
-        phases: what they are, radians, one a True in `mask` in row order.
+        mask: mask of the pilots, bool [ny, nx].
+        phases: phases of the pilots, radians, one a True in `mask` in row order.
     """
 
     mask: NDArray[np.bool_]
@@ -89,7 +89,7 @@ class Piston:
     """The common phase of a page.
 
     Attributes:
-        angle_rad: to be taken off every decoded phase, -pi..pi.
+        angle_rad: angle to be taken off every decoded phase, -pi..pi.
         coherence: 1 where all pilots agree on it, near 1/sqrt(number of pilots) where they say nothing.
     """
 
@@ -99,7 +99,7 @@ class Piston:
 
 @dataclass(frozen=True)
 class PilotCheck:
-    """What a decoder claims to know of the pilots, and how much of it they confirm.
+    """Check of a decoder by its pilots: the information that it claims of them, and how much of that they confirm.
 
     Attributes:
         pilots: how many were looked at.
@@ -107,7 +107,7 @@ class PilotCheck:
         confirmed_bits: information per pilot that the known phases show, the claims scaled by the trust that they
             deserve: log2 of the density at the true phase over that of no knowledge.
         noise_bits: standard deviation of `confirmed_bits` where the claims are true.
-        gained_nats: what fitting the piston, and drift where it was read, to the same pilots gains by chance.
+        gained_nats: gain by chance from fitting the piston, and drift where it was read, to the same pilots.
     """
 
     pilots: int
@@ -123,28 +123,28 @@ class PilotCheck:
 
     @property
     def agrees(self) -> bool:
-        """Whether the pilots bear out enough of what is claimed."""
+        """Return whether the pilots confirm a large enough share of the claimed information."""
         return self.share >= LEAST_CONFIRMED_SHARE
 
     @property
     def tells(self) -> bool:
-        """Whether the pilots together tell more than chance would."""
+        """Return whether the pilots confirm more information than chance would."""
         nats = self.confirmed_bits * np.log(2) * self.pilots
         return bool(nats >= LEAST_CONFIRMED_NATS + self.gained_nats)
 
     @property
     def confirmed(self) -> bool:
-        """Whether the page may be given out."""
+        """Return whether the pilots confirm the page, so that it may be given out."""
         return self.agrees and self.tells
 
     @property
     def sound(self) -> bool:
-        """Whether the device is as the decoder knows it, as far as this page's pilots can tell."""
+        """Return whether this page's pilots are consistent with the device as the decoder knows it."""
         return self.confirmed_bits >= SOUND_SHARE * self.claimed_bits - _NOISE_DEVIATIONS * self.noise_bits
 
     @property
     def recalibration_due(self) -> bool:
-        """Whether the device has changed so far that a recalibration pays."""
+        """Return whether the device has changed so far that a recalibration pays."""
         return not self.sound
 
 
@@ -257,12 +257,12 @@ def without_outliers(p: NDArray[np.floating], pilots: Pilots) -> Pilots:
 
 @dataclass(frozen=True)
 class PilotReading:
-    """All that a page's pilots say of it.
+    """Reading of a page's pilots.
 
     Attributes:
         piston: common phase of the page.
         trust: factor on the claimed concentrations, 0..1.
-        check: what the decoder claims, and what of it the pilots confirm.
+        check: claims of the decoder, and the part that the pilots confirm.
         sound: the pilots that were read.
     """
 
@@ -316,5 +316,5 @@ def _errors(p: NDArray[np.floating], pilots: Pilots) -> NDArray[np.complex128]:
 
 
 def _missed(errors: NDArray[np.complex128], angle_rad: float) -> NDArray[np.float64]:
-    """Twice kappa (1 - cos error) of each pilot, less the piston: chi-squared of one degree where claims are true."""
+    """Return 2 kappa (1 - cos error) of each pilot, piston removed: chi-squared of one degree where claims are true."""
     return np.asarray(2 * (np.abs(errors) - (errors * np.exp(-1j * angle_rad)).real), np.float64)

@@ -23,7 +23,7 @@ def check_symbols(symbols: ArrayLike, page_shape: tuple[int, int], levels: int, 
         symbols: whole numbers from 0 to levels - 1.
         page_shape: (ny, nx).
         levels: M, 2 to 256.
-        subject: what the symbols are, for the error message.
+        subject: name of the symbols, for the error message.
 
     Raises:
         PageError: wrong type, shape or range.

@@ -1,4 +1,4 @@
-"""From a field and a reference beam to camera counts: interference, pose of each camera, exposure."""
+"""Camera frames of a field and a reference beam: interference, pose of each camera, exposure, counts."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def quadrature_intensity(field: Complex, reference: Complex, error: float = 0.0,
 
 @dataclass(frozen=True)
 class CameraView:
-    """Where the pixels of one camera look on the common camera plane.
+    """View of one camera: the points of the common camera plane that its pixels see.
 
     Args:
         camera: sensor size and pitch.
@@ -73,7 +73,7 @@ class CameraView:
 
 @dataclass(frozen=True)
 class Blemishes:
-    """What is wrong with single pixels of one camera.
+    """Blemishes of single pixels of one camera.
 
     Attributes:
         transmission: share of the light that dust lets through, float32 [rows, columns], or 1.
@@ -105,7 +105,7 @@ def _behind_dust(shape: tuple[int, int], drawn: Real) -> Real:
 
     Args:
         shape: (rows, columns).
-        drawn: of each speck four numbers from 0 to 1: row, column, radius and depth of its shadow, [n, 4].
+        drawn: four numbers from 0 to 1 for each speck: row, column, radius and depth of its shadow, [n, 4].
     """
     passed = np.ones(shape, np.float32)
     for row, column, size, depth in drawn:

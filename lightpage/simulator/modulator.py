@@ -1,4 +1,4 @@
-"""What a modulator makes of the phases that are written on it."""
+"""Effects of a modulator on the phases that are written on it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def with_crosstalk(phase: Real, share: float) -> Real:
 
 
 def dead_pixels(slm: SlmDefects, shape: tuple[int, int]) -> tuple[NDArray[np.bool_], Complex]:
-    """Which of the pixels [ny, nx] are dead, and the light [n] of those: of a phase that stays, or none."""
+    """Return the mask [ny, nx] of dead pixels, and their light [n]: of a constant phase, or zero."""
     rng = np.random.default_rng(slm.dead_pixel_seed)
     dead, turns, dark = rng.random(shape) < slm.dead_pixel_share, rng.random(shape), rng.random(shape) < 0.5
     return dead, np.where(dark, 0, np.exp(2j * np.pi * turns))[dead]

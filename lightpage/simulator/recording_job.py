@@ -24,13 +24,13 @@ _SYMBOLS = 3
 
 
 class RecordingJob:
-    """One recording to make. Beside the partial file lie the settings that it is made with, until it is complete.
+    """Job that makes one recording. Its settings lie beside the partial file until the recording is complete.
 
     Args:
         profile: the nominal device.
-        device: its true state.
+        device: true state of the device.
         levels: M.
-        seed: of symbols, noise and drift.
+        seed: seed of symbols, noise and drift.
         truth: whether to keep what only a simulator knows beside the pages.
         out: the recording.
         written: pages that the modulator shows; random ones if left out.

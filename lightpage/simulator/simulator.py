@@ -33,7 +33,7 @@ _WALK, _NOISE, _FLICKER = 0, 2, 4
 
 @dataclass(frozen=True)
 class SimulatedPage:
-    """One page as recorded, with what only the simulator knows.
+    """Recorded page, with quantities that only the simulator knows.
 
     Attributes:
         pair: the frames.
@@ -55,7 +55,7 @@ class Simulator:
         profile: nominal device.
         device: true state.
         levels: levels M of the symbols it will be given.
-        seed: of noise and drift from page to page; the same seed and calls give the same frames. The ripple of the
+        seed: seed of noise and drift from page to page; the same seed and calls give the same frames. The ripple of the
             reference belongs to the device (`reference.ripple_seed`).
         steps: splitting steps of a sheared pipe; `splitting_steps` if left out.
         reference_stays: whether the image moves over the reference, as when page or pipe move, and not with it, as when

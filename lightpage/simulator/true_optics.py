@@ -40,9 +40,12 @@ _CAMERA_TILTS = "cameras_axial_x_rad", "cameras_axial_y_rad"
 _RIPPLE = 1
 """The random stream of the reference's ripple; a simulator draws others from a seed of its own."""
 
+_STEP = 1e-4
+"""Step of a derivative, radians; exact to 1e-8 in double precision."""
+
 
 class Place(NamedTuple):
-    """How a camera stands against its focal plane, by the numbers of its pose."""
+    """Place of a camera against its focal plane, by the numbers of its pose."""
 
     axial_rad: float
     tilt_x_rad: float
@@ -55,7 +58,7 @@ class Place(NamedTuple):
 
     @property
     def tilt_rad(self) -> tuple[float, float]:
-        """Both tilts."""
+        """Tilts about both axes, radians."""
         return self.tilt_x_rad, self.tilt_y_rad
 
 
@@ -142,7 +145,7 @@ class TrueOptics:
         """Nominal phase written on the SLM [ny, nx], radians, to the field on the exit facet.
 
         Args:
-            page_phase: of the levels, as their numbers say.
+            page_phase: nominal phases of the levels, as their numbers say.
             noise_rad: phase that is added to what the SLM makes of them.
             flicker_rad: phase that is added to one of 2 pi, and to others in proportion.
         """
@@ -150,11 +153,20 @@ class TrueOptics:
         if flicker_rad:
             stroke = slm.stroke_relative_error + flicker_rad / (2 * np.pi)
             slm = slm.model_copy(update={"stroke_relative_error": stroke})
+        return self.signal_scale * self._through(self._shown(slm, page_phase, noise_rad))
+
+    def exit_field_change(self, page_phase: Real, direction: Real) -> Complex:
+        """Derivative of `exit_field` at phases [ny, nx] along a direction of them [ny, nx], per radian."""
+        ahead, behind = (self._shown(self.device.slm, page_phase + step * direction) for step in (_STEP, -_STEP))
+        return self.signal_scale * self._through((ahead - behind) / (2 * _STEP))
+
+    def _shown(self, slm: SlmDefects, page_phase: Real, noise_rad: Real | float = 0.0) -> Complex:
+        """Light that the SLM makes of nominal phases, [ny, nx]."""
         shown = modulated(slm, with_crosstalk(page_phase, slm.crosstalk_relative)) * np.exp(1j * np.asarray(noise_rad))
         if self._dead_pixels is not None:
             dead, light = self._dead_pixels
             shown[dead] = light
-        return self.signal_scale * self._through(shown)
+        return shown
 
     @cached_property
     def _dead_pixels(self) -> tuple[NDArray[np.bool_], Complex] | None:
@@ -269,7 +281,7 @@ def true_geometry(profile: Profile, device: Device, camera_tilt_rad: tuple[float
 
 
 def _like_taper(profile: Profile, device: Device) -> tuple[float, float, float]:
-    """What a taper does, told by parameters that a twin has, to first order.
+    """Express a taper by parameters that a twin has, to first order.
 
     Returns:
         Relative change of the focal length, and what is added to the axial places of modulator and cameras, radians.

@@ -109,7 +109,7 @@ class WaveChannel:
         """Field on the SLM [ny, nx] to the field on the exit facet's grid.
 
         Args:
-            field: on the SLM.
+            field: field on the SLM.
             passed: share of the light's amplitude that the entrance facet lets pass, over its grid or everywhere.
         """
         return self.pipe.forward(self.launch_lens.to_facet(field) * (self.entrance_window * passed))

@@ -20,7 +20,7 @@ def defocus_taps(geometry: WaveGeometry, defocus: float, pitch_m: float) -> NDAr
     Args:
         geometry: the device.
         defocus: factor of R^2 on the facet, rad/m^2.
-        pitch_m: of the samples.
+        pitch_m: pitch of the samples.
     """
     frequency = (np.arange(_NODES) + 0.5) / _NODES * np.pi / pitch_m
     per_metre = geometry.focal_length_m / geometry.wave_number

@@ -41,9 +41,9 @@ class WaveGeometry:
     pipe_taper: float = 0.0
     """Both distances at the exit over those at the entrance, less one; `taper_defocus` belongs to the lenses' paths."""
     lens_path: SeidelTerms = IDEAL
-    """Of the first lens, the modulator's axial place included."""
+    """Path of the first lens, the modulator's axial place included."""
     camera_path: SeidelTerms = IDEAL
-    """Of the second lens, the cameras' axial place included, as a lens from camera plane to facet (`mirrored`)."""
+    """Path of the second lens, the cameras' axial place included, as a lens from camera plane to facet (`mirrored`)."""
 
     @property
     def wave_number(self) -> float:
@@ -57,14 +57,14 @@ class WaveGeometry:
 
 
 def taper_defocus(wave_number: float, length_m: float, taper: float) -> tuple[float, float]:
-    """What a taper of the pipe bends: factors of R^2 on entrance and exit, rad/m^2.
+    """Return the curvature that a taper of the pipe adds: factors of R^2 at entrance and exit, rad/m^2.
 
     Modes of widening walls are those of even ones under exp(i k w'/(2 w) R^2), w' being the growth of the width per
     length. This is exact for paraxial light and walls that run straight.
 
     Args:
         wave_number: k in the glass, rad/m.
-        length_m: of the pipe.
+        length_m: length of the pipe.
         taper: see `WaveGeometry`.
     """
     bend = wave_number * taper / (2 * length_m)
@@ -164,8 +164,8 @@ def highest_frequencies(geometry: WaveGeometry, path: SeidelTerms, x_m: Real, y_
 
     Args:
         geometry: the device.
-        path: of that lens.
-        x_m, y_m: what is looked at of the plane.
+        path: path of that lens.
+        x_m, y_m: points of the plane that are used.
     """
     (height, width), factors = geometry.facet_sides_m(second=True), np.abs(couplings(geometry))
     furthest = on_facet(Couplings(*factors), width / 2, height / 2)

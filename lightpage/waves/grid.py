@@ -27,7 +27,7 @@ _BAND_TAPS = 31
 _BAND_HEADROOM = 1.06
 """Pass band over the pipe's nominal band, for misalignment of the pipe against the lens axes."""
 _BAND_STOP = 1.36
-"""Where its stop band begins, over the same."""
+"""Beginning of its stop band, over the same."""
 _NYQUIST = 0.5
 """Cycles per sample."""
 
@@ -46,7 +46,7 @@ class FieldGrid:
     Attributes:
         x_m, y_m: uniform axes, metres from the optical axis, [nx] and [ny].
         step_px: pitch in camera pixels.
-        edge: of the pipe's band, cycles per camera pixel.
+        edge: edge of the pipe's band, cycles per camera pixel.
     """
 
     x_m: Real
@@ -151,7 +151,7 @@ def splitting_steps(profile: Profile, share: float = 1.0) -> int:
 
     Args:
         profile: the device.
-        share: of them, where less accuracy will do.
+        share: share of the steps that are taken, where less accuracy will do.
     """
     pipe, lens = profile.pipe, profile.lens
     steepness = profile.corner_m / lens.focal_length_m

@@ -24,7 +24,7 @@ _TOLERANCE = 1e-7
 """Singular values of an ideal lens's expansion are dropped below this share of the largest: less than rounding."""
 
 TOLERANCE_WITH_PATH = 1e-3
-"""The same for a real lens, a field error of about 0.002; 1e-5 would take twice the terms."""
+"""Tolerance for a real lens, a field error of about 0.002; 1e-5 would take twice the terms."""
 
 
 def lens_kernel(geometry: WaveGeometry, rows: Real, columns: Real) -> Complex:
@@ -41,7 +41,7 @@ def entrance_window(
         geometry: the device.
         facet_x_m, facet_y_m: sample positions along the facet's axes, [fx] and [fy].
         envelope_m, blur_m: see `WaveChannel`.
-        xp: as for `couplings`.
+        xp: see `couplings`.
     """
     per_metre = 1 / (geometry.wavelength_m * geometry.focal_length_m)
     along = on_facet(couplings(geometry, xp), facet_x_m, facet_y_m[:, None])
@@ -52,10 +52,10 @@ def entrance_window(
 
 @dataclass(frozen=True)
 class LensPath:
-    """A lens's phase between (x, y) on its plane and (X, Y') on the facet, by parts. Radians, in numpy or torch.
+    """Phase of a lens between (x, y) on its plane and (X, Y') on the facet, by parts. Radians, in numpy or torch.
 
-    What depends on the facet alone, on x and X, on y and X or on y and Y' has a place in the factors that the couplings
-    have. Only the `rest` needs terms of its own: half as many as all of it would. Places are told from (a, b).
+    Terms in the facet's point alone, in (x, X), (y, X) or (y, Y') are merged into the factors of the couplings. The
+    `rest` needs an expansion of its own, with half as many terms as the whole phase. Places are relative to (a, b).
 
     Args:
         geometry: the device.
@@ -68,24 +68,24 @@ class LensPath:
     factors: Couplings
 
     def on_facet(self, across: Any, up: Any) -> Any:
-        """What the facet alone decides."""
+        """Return the part of the path's phase that depends on the facet's point alone, radians."""
         return self.path.of_both(0.0, 0.0, *on_facet(self.factors, across, up))
 
     def beyond(self, x: Any, y: Any, across: Any, up: Any, a: Any = 0.0, b: Any = 0.0) -> Any:
-        """By how much the path at (x, y) differs from that at (a, b)."""
+        """Return the path's phase at (x, y) less that at (a, b), radians."""
         if not self.path.couples:
             return 0.0 * (a + b + x + y + across + up)
         there = on_facet(self.factors, across, up)
         return self.path.of_both(a + x, b + y, *there) - self.path.of_both(a, b, *there)
 
     def phase(self, x: Any, y: Any, across: Any, up: Any, a: Any = 0.0, b: Any = 0.0) -> Any:
-        """The same of the whole lens, the ideal one included."""
+        """Return `beyond` of the whole lens, with the ideal lens's phase, radians."""
         along, upward = on_facet(self.factors, across, up)
         per_metre = self.geometry.wave_number / self.geometry.focal_length_m
         return self.beyond(x, y, across, up, a, b) - per_metre * (x * along + y * upward)
 
     def rest(self, x: Any, y: Any, across: Any, up: Any, a: Any = 0.0, b: Any = 0.0) -> Any:
-        """What of that has no such place, the coupling of x with Y' included, which a roll makes."""
+        """Return the phase, radians, that no factor of the couplings takes in, the roll's term in (x, Y') included."""
         rolled = -self.geometry.wave_number / self.geometry.focal_length_m * self.factors.x_to_y * x * up
         to_x, to_both = self.beyond(x, 0.0, across, 0.0, a, b), self.beyond(0.0, y, across, 0.0, a, b)
         to_y = self.beyond(0.0, y, 0.0, up, a, b)
@@ -107,7 +107,7 @@ class FourierLens:
 
     Attributes:
         x_to_x, y_and_x, y_to_y: the three couplings that factor, [nx, fx], [ny, fx] and [fy, ny].
-        terms: of the rest, between plane and facet.
+        terms: terms of the rest, between plane and facet.
         on_plane, on_facet: phasors of the lens's path that depend on one of them alone, [ny, nx] and [fy, fx], or one.
     """
 
@@ -170,7 +170,7 @@ def _phasor(phase: Real) -> Complex:
 
 
 def modes_of_plane(geometry: WaveGeometry, plane_m: Real, cells: int) -> Complex:
-    """One axis of a field on a lens's outer plane to the square pipe's sine modes, by a matrix [cells - 1, samples].
+    """Return the matrix from a lens's outer plane to the square pipe's sine modes on one axis, [cells - 1, samples].
 
     Mode m = row + 1. The pipe neither sheared nor rolled; the matrix's adjoint takes modes back to the plane.
 

@@ -20,7 +20,7 @@ Phase = Callable[[Real, Real, Real, Real], Real]
 _SPARE_DEGREES = 12
 """Degrees beyond the steepest phase along an axis, in radians over half of the axis, that its polynomials need."""
 _SPARE_IN_TILES = 4
-"""The same where a tolerance of a percent serves."""
+"""Spare nodes where a tolerance of a percent serves."""
 _PROBES = 9
 """Places along an axis that are asked how steep the phase is."""
 _FLAT = 1e-9
@@ -90,12 +90,12 @@ class Interpolation:
 
     @classmethod
     def of(cls, phases: Sequence[Sequence[Phase]], tile: Plane, second: Plane, tolerance: float) -> Interpolation:
-        """As few nodes as serve, the same number in each tile.
+        """Choose as few nodes as reach the tolerance, the same number in each tile.
 
         Args:
-            phases: of each tile some phases, for these and what lies between them, places told within the tile.
+            phases: some phases of each tile, for these and what lies between them, places told within the tile.
             tile: sample places of one tile.
-            second: of the other plane.
+            second: sample places of the other plane.
             tolerance: root mean square error over all tiles, as an integral over them.
         """
         by_axis = zip(*(_axes(phase, tile, second, _SPARE_IN_TILES) for some in phases for phase in some), strict=True)
@@ -135,7 +135,7 @@ class _Axis:
     """Gauss's nodes on one axis, and Legendre's polynomials at its samples.
 
     Attributes:
-        nodes, weights: of Gauss's quadrature from -1 to 1, [D].
+        nodes, weights: nodes and weights of Gauss's quadrature from -1 to 1, [D].
         places: the nodes on the axis, [D].
         at_samples: polynomials there, [samples, D].
     """

@@ -32,7 +32,7 @@ class PipePropagator:
     Attributes:
         bases: sine modes along (y', x), by parity.
         half: phasors of half a step, [2, 2, Ky, Kx] by parity.
-        cos, sin: of the turn of each pair of modes in a step, [Ky, Kx].
+        cos, sin: cosine and sine of the turn of each pair of modes in a step, [Ky, Kx].
         steps: splitting steps.
         sheared: whether modes couple at all.
     """
@@ -83,7 +83,7 @@ class ParityBasis:
     Args:
         cells: sample intervals.
         lag: phase in radians by which a mode falls behind in a step, over the square of its number.
-        chosen: which modes of each parity, all if left out.
+        chosen: modes of each parity to take, all if left out.
 
     Attributes:
         sine_by_parity: samples of the modes, [2, K, cells - 1], zero where a parity has one mode less.
@@ -110,14 +110,14 @@ def modes_by_parity(cells: int) -> Real:
 
 
 def _stay_together(apart: Real) -> Real:
-    """How far modes are coupled that fall apart by so many radians in a step: beyond about half a turn, not at all."""
+    """Return how far modes stay coupled whose phases part by so many radians in a step: 1 near 0, 0 beyond about pi."""
     uncoupled, fully = UNCOUPLED
     return np.clip((uncoupled - np.abs(apart)) / (uncoupled - fully), 0, 1)
 
 
 @lru_cache(maxsize=8)
 def _parity_basis(cells: int, lag: float) -> ParityBasis:
-    """It depends on nothing else, and takes as long as the rest of a small propagator."""
+    """Return the parity basis, cached, since it takes as long as the rest of a small propagator."""
     return ParityBasis(cells, lag)
 
 

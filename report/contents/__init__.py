@@ -1,1 +1,1 @@
-"""What a report shows, read from a run, an evaluation, a recovery or a bulk run."""
+"""Contents of a report, read from a run, an evaluation, a recovery or a bulk run."""

@@ -1,4 +1,4 @@
-"""What a report shows, whichever source it was read from."""
+"""Data that a report shows, whichever source they were read from."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ class Golden:
 
 @dataclass(frozen=True)
 class Rays:
-    """What rays are drawn through.
+    """Parameters of the optics that rays are drawn through.
 
     Attributes:
-        angle_deg: of the pipe.
+        angle_deg: angle of the pipe.
         origin: whose angle that is.
         lens: prescription of both lenses; None for ideal ones.
         own: whether the decoder trained the angle itself.
@@ -52,16 +52,16 @@ class ReportData:
     """Everything that a report shows. For what is missing stands a sentence that says why.
 
     Attributes:
-        title: of the page.
-        pages: which pages were measured, in sentences.
+        title: title of the page.
+        pages: sentences that say which pages were measured.
         facts: decoder and provenance, (name, value).
         profile, calibration: nominal and fitted device.
-        rays: what rays are drawn through.
+        rays: parameters of the optics that rays are drawn through.
         measures: over the data symbols of all pages together.
         maps: means over the pages at every place.
-        confidence_bins, concentration_bins: what was claimed against what happened.
-        curves: of the training, by TensorBoard's tag, for each validation at the light.
-        golden: one page.
+        confidence_bins, concentration_bins: claims against results.
+        curves: curves of the training, by TensorBoard's tag, for each validation at the light.
+        golden: golden page with its decoded phase.
     """
 
     title: str
@@ -79,22 +79,22 @@ class ReportData:
 
     @property
     def data(self) -> NDArray[np.bool_]:
-        """Where the data symbols are, bool [ny, nx]."""
+        """Mask of the data symbols, bool [ny, nx]."""
         return np.isfinite(self.maps.air)
 
     @property
     def page_kb(self) -> float:
-        """What a page carries, by its AIR."""
+        """Kilobytes that a page carries, by its AIR."""
         return page_kilobytes(self.measures.air_bits_per_symbol, int(np.count_nonzero(self.data)))
 
     @property
     def summary(self) -> str:
-        """What matters most, in a few words."""
+        """Headline figure, in a few words."""
         return f"AIR {self.measures.air_bits_per_symbol:.3f} bit/symbol"
 
 
 def exit_centroids(profile: Profile, calibration: Calibration) -> Real:
-    """Where each symbol's beam would leave a pipe without walls, over its width, (x, y') [2, ny, nx].
+    """Return the exit centroid of each symbol in a pipe without walls, over its width, (x, y') [2, ny, nx].
 
     Rounded, these are the symbol's zone: how often it meets the walls x and y', with the sign of the side.
     """

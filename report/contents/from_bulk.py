@@ -22,9 +22,9 @@ from lightpage.words import counted
 
 MARGIN = "margin_bits"
 MEASURES = {AIR: "AIR", MARGIN: "margin", CONFIRMED: "confirmed by pilots"}
-"""What is told of a device, bits a symbol, where it is known."""
+"""Figures of a device, bits a symbol, where it is known."""
 PAUSE_S = 15.0
-"""With nobody at work for longer, a run had stopped."""
+"""Longest pause in which a run counts as going on."""
 LISTED = 200
 """Devices, workers or files that are listed; the worst, or the first, of more."""
 _NAMED = 20
@@ -38,9 +38,9 @@ class Device:
     """A device, or a recording where there is no fleet.
 
     Attributes:
-        name: of it.
-        group: what was found of it.
-        told: its first problem, for people.
+        name: name of the device.
+        group: findings about the device.
+        told: first problem of the device, for people.
     """
 
     name: str
@@ -55,21 +55,21 @@ class Device:
 
     @property
     def losses(self) -> str:
-        """How many pages by cause, for people."""
+        """Pages lost by cause, for people."""
         return ", ".join(f"{count:,} {cause}" for cause, count in self.group.lost.most_common())
 
 
 @dataclass(frozen=True)
 class Recalibration:
-    """What became of a device that was to be recalibrated.
+    """Outcome of a device's recalibration.
 
     Attributes:
-        name: of the device, or its recording where there is no fleet.
-        recordings: that it has.
-        state: in a word.
-        air_before: by the bundle before, bit/symbol; None where it is not known.
-        air_after: by the new bundle.
-        version: of that; empty without one.
+        name: name of the device, or its recording where there is no fleet.
+        recordings: number of the device's recordings.
+        state: state of the recalibration, in a word.
+        air_before: AIR by the bundle before, bit/symbol; None where it is not known.
+        air_after: AIR by the new bundle.
+        version: version of the new bundle; empty without one.
         reason: why there is none, for people.
     """
 
@@ -84,12 +84,12 @@ class Recalibration:
 
 @dataclass(frozen=True)
 class Worker:
-    """What a worker has done.
+    """Work done by one worker.
 
     Attributes:
         name: host and process.
         ranges, pages: how many.
-        seconds: that they took it.
+        seconds: time that it took for them.
     """
 
     name: str
@@ -103,9 +103,9 @@ class File:
     """A file of a run that recovers user bytes.
 
     Attributes:
-        volume: its number.
-        size: in bytes.
-        result: what became of it, for people.
+        volume: number of the volume.
+        size: size in bytes.
+        result: outcome of the file, for people.
         whole: whether all of it is there.
     """
 
@@ -120,18 +120,18 @@ class BulkData:
     """Everything that the report of a bulk run shows.
 
     Attributes:
-        title: of the page.
+        title: title of the page.
         told: how the run stands, in a sentence or two.
         cards: the figures that matter most, (name, value, unit).
         facts: the others, (name, value).
-        unit: what a piece of the work is, in the plural: pages or devices.
-        found: what the run has found.
-        causes: of losses: cause, how many, their share of all, and the first one.
+        unit: name of the pieces of the work, in the plural: pages or devices.
+        found: findings of the run.
+        causes: causes of losses: cause, how many, their share of all, and the first one.
         devices: the worst first; none where devices are recalibrated.
         fleet: whether these are devices of a fleet.
-        recalibrations: of devices, the worst first; None of another operation.
+        recalibrations: recalibrations of devices, the worst first; None of another operation.
         workers: the busiest first.
-        files: of a recovery; None where no run has ended yet, or of another operation.
+        files: files of a recovery; None where no run has ended yet, or of another operation.
     """
 
     title: str
@@ -149,17 +149,17 @@ class BulkData:
 
     @property
     def measures(self) -> list[str]:
-        """Which of `MEASURES` are known."""
+        """Names of the known ones of `MEASURES`."""
         return [name for name in MEASURES if self.found.figures[name].value is not None]
 
     @property
     def lost(self) -> str:
-        """What becomes of pages, or of devices, that are not read."""
+        """Word for pages, or devices, that are not read."""
         return _LOST[self.unit]
 
     @property
     def summary(self) -> str:
-        """What matters most, in a few words."""
+        """Headline figures, in a few words."""
         found = self.found
         done = f"{found.pages - found.missing:,} of {found.pages:,} {self.unit} done"
         return f"{done}, {found.lost.total():,} {self.lost}"
@@ -199,7 +199,7 @@ def report_of_bulk(folder: Path) -> BulkData:
 
 
 def begun_s(readings: Sequence[Reading]) -> float:
-    """When the first range was begun, seconds since 1970."""
+    """Return the time at which the first range was begun, seconds since 1970."""
     return min(reading.finished_s - reading.seconds for reading in readings)
 
 
@@ -342,7 +342,7 @@ def _file(told: dict[str, Any]) -> File:
 
 
 def sessions(readings: Sequence[Reading], pause_s: float = PAUSE_S) -> list[tuple[float, float]]:
-    """When somebody was at work: begin and end, seconds since 1970; a pause that is shorter does not count as one."""
+    """Return the times of work, (begin, end), seconds since 1970; shorter pauses do not count."""
     spans = sorted((reading.finished_s - reading.seconds, reading.finished_s) for reading in readings)
     found: list[tuple[float, float]] = []
     for begin, end in spans:

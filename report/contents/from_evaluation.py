@@ -117,7 +117,7 @@ def _checked(file: JsonFile) -> _Evaluation:
 
 
 def _page(path: Path, rows: Rows, shape: tuple[int, int]) -> NDArray[np.float64]:
-    """One map, NaN at pilots."""
+    """Return a map of the page as an array, NaN at pilots."""
     if {(len(rows), len(row)) for row in rows} != {shape}:
         got = f"{len(rows)} rows of {sorted({len(row) for row in rows})} symbols"
         raise InvalidInputError(f"{path}: maps", got, f"{shape[0]} rows of {shape[1]}, as the bundle's page has")

@@ -31,7 +31,7 @@ _UNKNOWN, _NO_SYMBOLS = "unknown: no page of it could be read", "unknown: the re
 
 
 class PageResult(Part):
-    """One recorded page; see `lightpage.runtime.archives.recordings.recovery.RecoveredPage`."""
+    """Result of a recorded page; see `lightpage.runtime.archives.recordings.recovery.RecoveredPage`."""
 
     page: Count
     number: Count | None
@@ -107,13 +107,13 @@ class RecoveryData:
     """Everything that the report of a recovery shows.
 
     Attributes:
-        title: of the page.
-        told: what became of the file, in a sentence.
+        title: title of the page.
+        told: outcome of the file, in a sentence.
         cards: the figures that matter most, (name, value, unit).
         facts: the others, (name, value).
         pages: every recorded page.
         blocks_per_page: LDPC blocks that each of them holds.
-        causes: of pages that gave no bytes: cause, what it means, how many, their share of all.
+        causes: causes of pages without bytes: cause, what it means, how many, their share of all.
         unread: pages that gave no bytes, the first ones only.
         more_unread: how many there are besides.
     """
@@ -130,7 +130,7 @@ class RecoveryData:
 
     @property
     def summary(self) -> str:
-        """What matters most, in a few words."""
+        """Headline figure, in a few words."""
         return f"{len(self.unread) + self.more_unread} of {len(self.pages)} pages unread"
 
 

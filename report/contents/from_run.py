@@ -28,15 +28,15 @@ from lightpage.train.published.training import PublishedChoices
 from lightpage.train.runs import GOLDEN, REFERENCES, Run, load_arrays, load_run
 
 _PHASE_TOLERANCE = 1e-2
-"""Of a level: phases are kept in float32, which knows 2 pi to 1e-5 of 256 levels."""
+"""Tolerance of a level's phase: phases are kept in float32, which knows 2 pi to 1e-5 of 256 levels."""
 
 
 def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportData:
     """Decode the validation pages of a run and measure them.
 
     Args:
-        folder: of the run.
-        recording_path: that it was trained on; needed for a published decoder, which reads its frames.
+        folder: folder of the run.
+        recording_path: recording that it was trained on; needed for a published decoder, which reads its frames.
 
     Raises:
         InvalidInputError: no finished run, or one that lacks a part; a recording that is missing or not the run's.
@@ -73,7 +73,7 @@ def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportDat
 
 
 def _curves(folder: Path, run: Run) -> list[dict[str, Curve]]:
-    """Those of each pass; none unless they were kept for all."""
+    """Return the curves of each pass; none unless they were kept for all."""
     found = [curves_of(at) or fitted_curves(at) for at in passes_of(folder, run)]
     return found if all(found) else []
 
@@ -82,8 +82,8 @@ def levels_of(phases: NDArray[np.floating], modulation: Modulation = NOMINAL) ->
     """The fewest levels that hold all of these phases, radians: M where thousands of symbols were drawn from M.
 
     Args:
-        phases: of light.
-        modulation: of the modulator that showed them.
+        phases: phases of light.
+        modulation: modulation of the modulator that showed them.
 
     Raises:
         InvalidInputError: no level count up to 256 does.

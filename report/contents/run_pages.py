@@ -28,7 +28,7 @@ from lightpage.train.runs import Run, load_decoder, load_weights
 
 
 class Decodable(NamedTuple):
-    """What decodes the validation pages as it takes them, and how many parameters the whole decoder has."""
+    """Decoder in training form, with validation pages as it takes them, and its number of parameters."""
 
     module: DecoderTraining[Any]
     pages: Dataset[Page]
@@ -83,7 +83,7 @@ def passes_of(folder: Path, run: Run) -> list[Path]:
 
 
 def validation_pages(run: Run, recording: Recording) -> list[int]:
-    """Where the validation pages of a run lie in its recording.
+    """Find the validation pages of a run in its recording, and return their numbers there.
 
     Raises:
         RecordingError: it is not that recording.

@@ -1,4 +1,4 @@
-"""Whether rays find the pipe's angle in training, from zero on; and what a decoder without rays sees.
+"""Study of the pipe's angle: whether rays find it in training, from zero on, and what a decoder without rays reaches.
 
 Rays say where light lands, not its phase, which runs hundreds of radians over the page and is left to the network.
 Against a reference beam of the same curvature most of it does not show: what it costs to learn, the third case says.

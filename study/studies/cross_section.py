@@ -1,4 +1,4 @@
-"""Where the light of one point lands behind a square and behind a round pipe: few spots, or a smear."""
+"""Study of cross-sections: where a point's light lands behind a square and a round pipe, in few spots or a smear."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a day's drift shows in crosshairs, and how much of each drift costs a decoder so much that it is recalibrated."""
+"""Study of drift: a day's drift seen in crosshairs, and the amount of each drift that makes a recalibration due."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ from lightpage.study.study import Case, Result, Row, Settings, Study
 Real = NDArray[np.float64]
 
 MINUTES = 2.5
-"""From one frame to the next."""
+"""Time from one frame to the next."""
 HOURS = 24
 _QUICK_FRAMES = 6
 _FIRST_SEED = 10_000
-"""Of the pages that are written: far from those of a recording that the shipped decoder was trained on."""
+"""First seed of the pages that are written: far from those of a recording that the shipped decoder was trained on."""
 _CROSSHAIRS = 6
 """Along each axis."""
 _SPAN = 0.75
-"""Of the zone that meets no wall, in which they lie."""
+"""Share of the zone that meets no wall, in which the crosshairs lie."""
 _ARM_PX, _LINE_PX = 6, 2
 """Half length and width of a crosshair's lines, modulator pixels."""
 _BACKGROUND_PX = 15 / 6
 """Standard deviation of a Gaussian kernel of 15 x 15 modulator pixels."""
 _BRIGHTEST = 0.6
-"""Of the full well: with the reference blocked, exposure is longer."""
+"""Share of the full well: with the reference blocked, exposure is longer."""
 
 _WARM_UP_PX, _WARM_UP_HOURS = (0.9, -0.6), 1.0
 _WALK_PX = 0.01
@@ -59,7 +59,7 @@ _DRIFTS: dict[str, tuple[tuple[str, ...], str, tuple[float, ...]]] = {
     "camera scale, relative": (_BOTH_CAMERAS, "scale_relative_error", (5e-5, 1e-4, 2e-4, 5e-4)),
     "camera shift, pixels": (_BOTH_CAMERAS, "shift_x_px", (0.5, 1.0, 2.0)),
 }
-"""What drifts: its place in the device's state, and by how much."""
+"""Drifts: the quantity's place in the device's state, and by how much."""
 _BUNDLED = "bench"
 """Profile of the bundle that is shipped, whose AIR is measured."""
 

@@ -1,4 +1,4 @@
-"""What the pipe does to a picture: its pieces come out mirrored, and nothing that looks on from outside can tell."""
+"""Study of folding: the pipe mirrors the pieces of a picture, and no view from outside can tell which."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which symbols a pipe can carry: its width against their first diffraction order, its aperture against the page."""
+"""Study of the imaging condition: pipe width against a symbol's first diffraction order, aperture against the page."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ def fitted_path(profile: Profile, lens: LensPrescription, seed: int = 0) -> Fitt
 
 
 def _traced(profile: Profile, lens: LensPrescription, field: Real, aperture: Real) -> tuple[Real, Real]:
-    """Where rays from the page, aimed at the facet, reach it, [N, 2], and their path beyond the ideal, [N]."""
+    """Trace rays from the page towards the facet: return their places there, [N, 2], and path beyond the ideal, [N]."""
     wave_number = 2 * np.pi / profile.light.wavelength_m
     arrived, length = (
         tensor.numpy()

@@ -1,4 +1,4 @@
-"""How much a page carries through longer and longer square pipes, by modes and by rays."""
+"""Study of the pipe's length: information of a page through longer and longer square pipes, by modes and by rays."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lightpage.study.study import Case, Result, Row, Settings, Study
 from lightpage.study.trained import DataSet, trained
 
 LENGTHS_MM = tuple(10 + 32.5 * step for step in range(13))
-"""Of the full-size pipe, 10 to 400; those of a smaller device are as much shorter as its focal length."""
+"""Lengths of the full-size pipe, 10 to 400; those of a smaller device are as much shorter as its focal length."""
 LOCALIZERS = ("mode", "ray")
 _SHOWN = 6
 

@@ -1,4 +1,4 @@
-"""Where rays go: through lenses and pipe, and from the page's zones to the cameras."""
+"""Study of rays: their ways through lenses and pipe, and from the page's zones to the cameras."""
 
 from __future__ import annotations
 
@@ -64,10 +64,10 @@ def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> 
 
 
 def shared_with_others(places: NDArray[np.float64], zones: NDArray[np.int64], cell_m: float) -> NDArray[np.bool_]:
-    """Whether a ray lands in a cell of the camera plane where one of another zone lands too, [N].
+    """Return whether each ray shares its cell of the camera plane with a ray of another zone, [N].
 
     Args:
-        places: on the camera plane, metres, [N, 2].
+        places: places on the camera plane, metres, [N, 2].
         zones: reflections of each ray, [N, 2].
         cell_m: edge of a cell.
     """

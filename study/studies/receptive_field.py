@@ -1,4 +1,4 @@
-"""How far each layer of the published U-Net sees, measured by gradients."""
+"""Study of receptive fields: the reach of each layer of the published U-Net, measured by gradients."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def field_of_network(samples: int) -> int:
 
 
 def _network(samples: int) -> PublishedUNet:
-    """With weights that are the same whenever they are drawn."""
+    """Return a network with the same weights at every call."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
         return PublishedUNet(samples, _CHANNELS)

@@ -28,7 +28,7 @@ from lightpage.train.published.unet import samples_for
 _ENLARGED = (1, 2, 4, 8)
 """Linear sizes over the profile's: with bench, 5,000 to 312,000 symbols."""
 _MOST_SYMBOLS = 400_000
-"""Of the largest page."""
+"""Number of symbols of the largest page."""
 _MOST_BYTES = 4 << 30
 """A transmission matrix beyond that is not made: its time is extrapolated from one of that size."""
 _ENTRY_BYTES = 8

@@ -1,4 +1,4 @@
-"""How much a page carries with symbols of 16, 8, 4 and 2 modulator pixels, by modes and by rays."""
+"""Study of symbol sizes: information of a page with symbols of 16, 8, 4 and 2 modulator pixels, by modes and rays."""
 
 from __future__ import annotations
 

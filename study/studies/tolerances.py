@@ -1,4 +1,4 @@
-"""How far each knob of a device may be off: what a decoder that was kept reads then, re-fitted by two known pages.
+"""Study of tolerances: AIR of a kept decoder, re-fitted by two known pages, as each knob of a device moves.
 
 The device of the simulator is turned at one knob after the other. Three decoders read the same pages of it. All have
 one pass by waves.
@@ -51,7 +51,7 @@ _JUDGED = 2
 """Pages that are read: ten thousand symbols of the bench device, whose AIR is known to 0.01 bit."""
 _QUICK_KNOBS = ("stroke", "modulator-axial", "keystone", "phase-noise")
 _QUICK_VALUES = (2, -1)
-"""Of a knob's values, by place."""
+"""Places of a knob's values."""
 _ANEW_VALUES = 3
 _COLUMNS, _TITLE, _MOST_BITS, _TICKS = 5, 32, 8, 5
 _CURVES = {
@@ -59,7 +59,7 @@ _CURVES = {
     "told": ("told", ".--", "tab:orange"),
     "anew": ("trained anew", "^", "tab:green"),
 }
-"""Of a picture, by the names of results: label, style, colour."""
+"""Curves of a picture, by the names of results: label, style, colour."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Range:
     """Values of a knob at which no more than so much is lost.
 
     Attributes:
-        low, high: its ends.
+        low, high: ends of the range.
         below, above: whether it ends there because more is lost beyond, and not because no more was measured.
     """
 
@@ -81,7 +81,7 @@ class Range:
         """Find the range about a value from AIRs, ascending values; between two values the AIR is a straight line.
 
         Args:
-            values: of the knob, [N], ascending.
+            values: values of the knob, [N], ascending.
             airs: bits a symbol, [N].
             at: value from which the range is looked for outwards.
             least: AIR that it must have.
@@ -95,7 +95,7 @@ class Range:
         """Tell both ends; `<` and `>` say that no more was lost as far as was measured.
 
         Args:
-            factor: on the numbers, for another unit.
+            factor: factor on the numbers, for another unit.
             least: value below which there is none.
         """
         low = "" if self.below or self.low == least else "<"
@@ -154,12 +154,12 @@ def _part(progress: Progress, first: float, last: float) -> Progress:
 
 
 def _read(settings: Settings, kept: Path, device: Device, work: Path, progress: Progress, least: float) -> Result:
-    """What decoders read of a device.
+    """Measure what decoders read of a device.
 
     Args:
-        settings: of the study.
+        settings: settings of the study.
         kept: run of the decoder that is kept.
-        device: that is read.
+        device: device that is read.
         work: folder of the case.
         progress: told of every step.
         least: AIR below which it is trained anew.
@@ -189,13 +189,13 @@ def _read(settings: Settings, kept: Path, device: Device, work: Path, progress: 
 
 @dataclass(frozen=True)
 class _Curve:
-    """What was read of a device over one of its knobs.
+    """Results for a device over one of its knobs.
 
     Attributes:
-        knob: which.
-        at: its value on the device that was trained on.
-        values: of the knob, [N], ascending; that one is among them.
-        results: of each.
+        knob: knob that is turned.
+        at: value of the knob on the device that was trained on.
+        values: values of the knob, [N], ascending; that one is among them.
+        results: results at each value.
     """
 
     knob: Knob
@@ -208,12 +208,12 @@ class _Curve:
         return np.maximum([result[name] for result in self.results], 0.0)
 
     def measured(self, name: str) -> bool:
-        """Whether there is a number at another value than that of the device that was trained on."""
+        """Return whether there is a number at a value other than that of the device that was trained on."""
         return bool(np.count_nonzero(np.isfinite(self.airs(name))) > 1)
 
     @property
     def trained_airs(self) -> Real:
-        """The same of decoders that are trained where a re-fit is not enough, [N]."""
+        """AIR of decoders that are trained where a re-fit is not enough, bits a symbol, [N]."""
         anew, air = self.airs("anew"), self.airs("air")
         enough = air >= air[np.argmin(np.abs(self.values - self.at))] - LOSS
         return np.where(np.isnan(anew) & enough, air, anew)
@@ -283,7 +283,7 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
 
 
 def _draw(axis: Axes, curve: _Curve) -> None:
-    """One knob: AIR over its values, the range shaded within which `LOSS` is lost."""
+    """Draw AIR over a knob's values, the range shaded within which `LOSS` is lost."""
     within = curve.within("air")
     if within is not None:
         axis.axvspan(within.low, within.high, color="tab:blue", alpha=0.12, label=f"{LOSS:g} bit lost within")

@@ -20,7 +20,7 @@ from tests.lightpage.small import small_profile
 
 ROOT = Path(__file__).resolve().parents[2]
 ELSEWHERE = ("on_ray", "on_kserve", "on_mlserver", "__main__", "triton_checks")
-"""What runs in environments of other servers."""
+"""Modules that run in environments of other servers."""
 SMALL: dict[str, tuple[str, ...]] = {
     "codec.safety": ("--pages", "3", "--damaged", "3"),
     "codec.speed": ("--blocks", "16", "--rounds", "1"),

@@ -21,12 +21,12 @@ _files = {kind: name for name, schema in _schemas.items() for kind in schema["ki
 
 
 def kind_of(manifest: dict[str, Any]) -> str:
-    """Its `apiVersion kind`, as the schemas name it."""
+    """Return `apiVersion kind` of a manifest, as the schemas name it."""
     return f"{manifest['apiVersion']} {manifest['kind']}"
 
 
 def problems(manifest: dict[str, Any]) -> list[str]:
-    """What the schema of its kind has against a manifest."""
+    """List a manifest's violations of the schema of its kind."""
     kind = kind_of(manifest)
     place = kind.replace("~", "~0").replace("/", "~1").replace(" ", "%20")
     validator = Draft202012Validator({"$ref": f"{_files[kind]}#/kinds/{place}"}, registry=_registry)
@@ -39,7 +39,7 @@ def read(path: Path) -> list[dict[str, Any]]:
 
 
 def kustomizations() -> list[Path]:
-    """All of them."""
+    """Return the paths of all kustomizations."""
     return sorted(FOLDER.rglob(KUSTOMIZATION))
 
 

@@ -179,7 +179,7 @@ def test_kubelet_waits_until_calls_in_flight_have_ended() -> None:
 
 
 def parsed(words: Sequence[str]) -> dict[str, Any]:
-    """What a command line sets; the command is found as `lightpage` finds it, and not run."""
+    """Return the parameters that a command line sets; the command is found as `lightpage` finds it, and not run."""
     program, name, *arguments = words
     assert program == "lightpage"
     module, _, attribute = COMMANDS[name].partition(":")

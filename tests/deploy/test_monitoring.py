@@ -44,7 +44,7 @@ def metrics_in(expression: str) -> set[str]:
 
 
 def dashboard_expressions() -> Iterator[str]:
-    """What the dashboard asks for, in folded rows too, its variables filled in as Grafana would."""
+    """Yield the dashboard's expressions, those of folded rows too, with variables filled in as Grafana would."""
     whole = json.loads(DASHBOARD.read_text())
     panels = [*whole["panels"], *(panel for row in whole["panels"] for panel in row.get("panels", ()))]
     asked = [target["expr"] for panel in panels for target in panel.get("targets", ())]

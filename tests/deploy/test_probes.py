@@ -52,7 +52,7 @@ class Pod:
         self.settings.write_text(settings.replace('"0.0.0.0"', '"127.0.0.1"'))
 
     def _provide(self, bundle: Path) -> None:
-        """What the cluster's administrator provides: certificates, and a signed bundle."""
+        """Provide what the cluster's administrator provides: certificates, and a signed bundle."""
         folder, authority = self.folder, Authority(self.folder / "authority")
         for name in ("tls", "bundles", "bundle-key"):
             (folder / name).mkdir()
@@ -66,7 +66,7 @@ class Pod:
 
     @contextmanager
     def running(self) -> Iterator[subprocess.Popen[str]]:
-        """Its process, which ends with the block."""
+        """Run the pod's process until the block ends."""
         arguments = [word.replace("/settings", str(self.settings.parent)) for word in self.container["args"]]
         environment = {"LIGHTPAGE_STORE": str(self.folder / "state" / "models"), "PYTHONUNBUFFERED": "1"}
         environment |= {each["name"]: "1" for each in self.container["env"]}
@@ -85,7 +85,7 @@ class Pod:
             process.wait()
 
     def answers(self, name: str) -> bool:
-        """Whether a probe succeeds: kubelet asks once, without TLS, within the probe's time."""
+        """Return whether a probe succeeds: kubelet asks once, without TLS, within the probe's time."""
         probe: dict[str, Any] = self.container[name]
         assert probe.keys() - {"periodSeconds", "timeoutSeconds", "failureThreshold"} == {"grpc"}
         target = f"127.0.0.1:{self.ports[probe['grpc']['port']]}"

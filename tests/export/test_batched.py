@@ -169,7 +169,7 @@ def test_a_stream_is_read_in_batches_as_page_by_page(
 
 
 def graph_for_batches(preset: str) -> BatchFile:
-    """That of an untrained decoder of a preset."""
+    """Return the batch graph of an untrained decoder of a preset."""
     torch.manual_seed(0)
     device, chosen = Device(), PRESETS[preset]
     parameters = true_parameters(PROFILE, device)

@@ -50,7 +50,7 @@ def exported(decoder: Decoder) -> Bundle:
 
 @pytest.fixture
 def frame_types(exported: Bundle, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Has an export take the graphs of an earlier one, which take most of its time; frame types that it asks for."""
+    """Let exports take the graphs of an earlier one, to save time; return the frame types that they ask for."""
     files, asked = exported.files, []
 
     def ready(name: str) -> Callable[..., bytes]:

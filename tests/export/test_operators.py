@@ -31,7 +31,7 @@ SMALL = "agraph (float[1, 2, 6, 8] x, float[1, 4, 4, 2] grid) => (float[1, 2, 4,
 
 @pytest.fixture(scope="module")
 def fast() -> bytes:
-    """What runs for every page of a small device's fast decoder."""
+    """Return the part of a small device's fast decoder that runs for every page."""
     profile, device = small_profile(), Device()
     parameters = true_parameters(profile, device)
     choices = replace(PRESETS[FAST].choices, channels=8, blocks=1)
@@ -49,7 +49,7 @@ def small(body: str, header: str = SMALL, opset: int = OPSET) -> bytes:
 
 @pytest.mark.parametrize("decoder", ["fast", "of two passes"])
 def test_no_node_of_a_decoder_leaves_the_provider(decoder: str, fast: bytes, small_bundle: Path) -> None:
-    """That of two passes holds the operators of one pass, by beams or by waves, too."""
+    """The decoder of two passes also holds the operators of one pass, by beams or by waves."""
     part = fast if decoder == "fast" else page_part(Bundle.open(small_bundle).files[DECODER])
     assert [fallbacks(part, provider) for provider in PROVIDERS] == [[]] * len(PROVIDERS)
     assert (shape_computations(part), repeated_products(part)) == ([], [])

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def full_disk(size: int) -> Generator[None]:
-    """Inside, writing beyond `size` bytes of any file fails as it does on a full disk."""
+    """Let writes beyond `size` bytes of any file fail as on a full disk, in the `with` statement."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:

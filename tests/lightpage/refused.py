@@ -1,4 +1,4 @@
-"""What an error names, without the sentence that it makes of it."""
+"""Assertion on what an error names, without the sentence that it makes of it."""
 
 from collections.abc import Generator
 from contextlib import contextmanager

@@ -14,7 +14,7 @@ THICK = LensPath(
     coma_rad=-1.4,
     spherical_rad=-0.1,
 )
-"""About what a real lens does at the full size."""
+"""Path that is about that of a real lens at the full size."""
 EXPLAINED = Goodness(
     verdict="good",
     bits_lost=0.01,

@@ -5,7 +5,7 @@ from lightpage.page.modulation import NAMES, NOMINAL, Modulation
 
 
 def modulation(**changes: float) -> Modulation:
-    """One with these coefficients, all others zero."""
+    """Return a modulation with these coefficients, all others zero."""
     assert set(changes) <= set(NAMES)
     return Modulation(tuple((NOMINAL.as_dict() | changes).values()))
 

@@ -1,6 +1,6 @@
-"""What the command line says in the failures that people meet most: all of it in one snapshot, to be read as a whole.
+"""Messages of the command line in the failures that people meet most, in one snapshot to be read as a whole.
 
-`make messages` writes the snapshot anew; nothing else in the tests holds a sentence fixed.
+`make messages` writes the snapshot anew; no other test fixes a sentence.
 """
 
 import shlex

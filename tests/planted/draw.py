@@ -63,7 +63,7 @@ def _operator(left: ast.expr, right: ast.expr, names: dict[str, str], source: li
 
 
 def edits(kind: str, node: ast.AST, source: list[bytes]) -> Iterator[Edit]:
-    """What a kind of fault makes of a node."""
+    """Yield the edits by which a kind of fault changes a node."""
     match kind, node:
         case "comparison", ast.Compare(ops=[_]):
             yield from _operator(node.left, node.comparators[0], TURNED, source)
@@ -102,7 +102,7 @@ def edits(kind: str, node: ast.AST, source: list[bytes]) -> Iterator[Edit]:
 
 
 def reached(node: ast.AST) -> Iterator[ast.AST]:
-    """All of a tree that computes: no annotations, texts, logs, nor what a constructor stores."""
+    """Yield all nodes that compute: no annotations, texts, logs, nor what a constructor stores."""
     yield node
     for name, value in ast.iter_fields(node):
         for child in value if isinstance(value, list) else [value]:
@@ -130,7 +130,7 @@ def candidates(area: str, kind: str) -> Iterator[Fault]:
 
 
 def draw(seed: int, struck: set[Fault]) -> Iterator[Fault]:
-    """One fault for as many pairs of an area and a kind: the first one in an order that the seed makes."""
+    """Yield one fault for each of the first pairs of an area and a kind, in an order that the seed makes."""
     areas, kinds = random.Random(seed).sample(list(AREAS), len(AREAS)), random.Random(seed).sample(KINDS, len(KINDS))
     taken = 0
     for turn in range(len(areas) * len(kinds)):  # numbers without a common divisor: every pair comes once

@@ -13,7 +13,7 @@ LIST = Path(__file__).with_name("faults.toml")
 
 @dataclass(frozen=True)
 class Fault:
-    """One line of a file, in a function or class (the whole file if that is ""), that another takes the place of."""
+    """Fault: another line in place of one of a function or class (of the whole file if `within` is empty)."""
 
     area: str = field(compare=False)
     kind: str = field(compare=False)
@@ -64,6 +64,6 @@ def blocks_of(tree: ast.AST, outer: str = "") -> list[tuple[str, tuple[int, int]
 
 
 def load(kind: str) -> list[Fault]:
-    """What the list has of one kind of entry: `fault`, or `struck`."""
+    """Load the list's entries of one kind: `fault`, or `struck`."""
     rows = tomllib.loads(LIST.read_text()).get(kind, [])
     return [Fault(**{**row, "tests": tuple(row.get("tests", ()))}) for row in rows]

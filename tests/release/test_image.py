@@ -1,4 +1,4 @@
-"""What may be built is said before anything is, and an image that is not the work tree's is not taken for it."""
+"""Build targets are checked before anything is built, and an image that is not the work tree's is refused."""
 
 import os
 import re

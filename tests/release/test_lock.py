@@ -16,14 +16,14 @@ inventory, licences, lock = script("inventory"), script("licences"), script("loc
 LOCKS: Path = lock.LOCKS
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 OF_CUDA = ("nvidia-", "cuda-", "triton")
-"""How names of packages begin that PyTorch's build for GPUs brings. A developer may have it; no lock does."""
+"""Beginnings of names of packages that PyTorch's build for GPUs brings. A developer may have it; no lock does."""
 BEYOND_CONSTRAINTS = ("nvidia-",)
-"""What the image `gpu` alone installs. constraints.txt leaves them open: torch for GPUs needs other versions."""
+"""Packages of the image `gpu` alone. constraints.txt leaves them open: torch for GPUs needs other versions."""
 OF_THE_DASHBOARD = {
     *("aiohttp-cors", "colorful", "google-api-core", "google-auth", "opencensus", "opencensus-context", "proto-plus"),
     *("opentelemetry-exporter-prometheus", "py-spy", "pyasn1", "pyasn1-modules", "smart-open", "wrapt"),
 }
-"""What the image `ray` alone installs, and nobody here: of Ray's dashboard, by which KubeRay hands over jobs."""
+"""Packages of the image `ray` alone: those of Ray's dashboard, by which KubeRay hands over jobs."""
 
 
 def constrained() -> dict[str, str]:
@@ -32,7 +32,7 @@ def constrained() -> dict[str, str]:
 
 
 def asked(target: str) -> list[Requirement]:
-    """What pyproject.toml asks for, for a target."""
+    """Return the requirements that pyproject.toml states for a target."""
     extras: Mapping[str, list[str]] = PROJECT["optional-dependencies"]
     lists = [PROJECT["dependencies"], *(extras[extra] for extra in lock.TARGETS[target].extras)]
     return [Requirement(line) for requirements in lists for line in requirements]
@@ -62,7 +62,7 @@ def closure(requirements: Iterable[Requirement], machine: str) -> set[str]:
 def disagreements(
     locked: Mapping[str, Any], pins: Mapping[str, str], needed: set[str], beyond: tuple[str, ...] = ()
 ) -> list[str]:
-    """What is wrong with a lock: packages that are missing or too many, and versions that constraints.txt has not."""
+    """List a lock's faults: packages that are missing or too many, and versions that constraints.txt does not have."""
     lines = [f"{name} is not locked" for name in needed - locked.keys()]
     for name, package in locked.items():
         if beyond and name.startswith(beyond):

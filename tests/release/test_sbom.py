@@ -140,7 +140,7 @@ def test_the_image_that_it_was_made_of_agrees_with_it_and_with_the_lock(
 
 
 def subjects(lines: Iterable[str]) -> list[str]:
-    """Of what each line is told."""
+    """Return the subject of each line."""
     return [line.rpartition(": ")[0] for line in lines]
 
 

@@ -11,7 +11,7 @@ from lightpage.report.command import report
 
 
 class Seen(HTMLParser):
-    """What a page is made of: its sections, pictures, and everything that a browser would fetch."""
+    """Parser of a page: its sections, its pictures, and everything that a browser would fetch."""
 
     def __init__(self, text: str) -> None:
         super().__init__()

@@ -23,7 +23,7 @@ SECTIONS = ["figures", "speed", "losses", "devices", "workers"]
 
 
 def told(text: str) -> str:
-    """What a reader sees, in one line."""
+    """Return the text that a reader sees, in one line."""
     return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", text)).split())
 
 

@@ -19,7 +19,7 @@ from tests.lightpage.small import small_profile
 JUMPS = {0: (-6.0, 8.0), 2: (9.0, -5.0)}
 """Camera pixels: while nobody read, and between two pages."""
 KEPT_SHARE = 0.88
-"""Of the AIR of other pages, read in order: 98% at full size, 93% at half, but for what leaves the cameras."""
+"""Share of the AIR of other pages, read in order: 98% at full size, 93% at half, but for what leaves the cameras."""
 SEED = "LIGHTPAGE_FOREIGN_SEED"
 """Environment variable with the seed of the device; without it, the long test draws another one each time."""
 

@@ -1,4 +1,4 @@
-"""One name: all that is installed lies under `lightpage.`, and a caller's own modules of any name break nothing."""
+"""All that is installed lies under `lightpage.`, and a caller's own modules of any name break nothing."""
 
 import ast
 import os
@@ -35,7 +35,7 @@ def test_every_package_is_linked_and_found_by_all_who_look() -> None:
 
 
 def test_nothing_is_imported_by_its_folders_name() -> None:
-    """Else a module would be loaded twice, and an error of the one would not be caught as that of the other."""
+    """A module would otherwise be loaded twice, and errors of the one not be caught as those of the other."""
     found = []
     for path in sources():
         if path.suffix == ".py":

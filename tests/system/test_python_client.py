@@ -1,4 +1,4 @@
-"""What the packages offer by name; the Python client by itself, which needs little of what a service needs."""
+"""Names that the packages offer, and the Python client by itself, which needs little of what a service needs."""
 
 import importlib
 import json

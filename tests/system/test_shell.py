@@ -182,7 +182,7 @@ print(json.dumps({{
     "typed": files("lightpage").joinpath("py.typed").is_file(),
 }}))
 """
-"""What must go well with what the runtime image has, all in one process: importing everything takes seconds."""
+"""Script that must run with the runtime image's packages, in one process, since importing everything takes seconds."""
 
 
 def does_its_work(said: str) -> None:

@@ -1,4 +1,4 @@
-"""One process of a training on several nodes, which are shown the same pages between them in each step, unturned."""
+"""Process of a training on several nodes, which are shown the same pages between them in each step, unturned."""
 
 import sys
 from pathlib import Path

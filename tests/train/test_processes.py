@@ -19,11 +19,11 @@ from tests.train.node import STEPS, train
 
 SECONDS = 240
 ROUNDING = 1e-5
-"""Of float32: sums of four pages and of twice two come in another order. Weights were found to differ by 2e-7."""
+"""Rounding of float32: sums of four pages and of twice two differ in order. Weights were found to differ by 2e-7."""
 
 
 def on_two_nodes(out: Path) -> list[str]:
-    """What training prints on either of two nodes that meet on this machine."""
+    """Train on two nodes that meet on this machine, and return what either prints."""
     with socket.socket() as found:
         found.bind(("127.0.0.1", 0))
         meeting = {**os.environ, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(found.getsockname()[1])}

@@ -26,7 +26,7 @@ from lightpage.train.models.twin import RayTwin, TorchTwin
 
 DEFAULT_PAGES = 2
 _DOTS = 150
-"""Of a picture, an inch."""
+"""Dots of a picture in an inch."""
 MAX_PAGES = 4
 """More cost time and add nothing that a decoder would notice."""
 

@@ -1,4 +1,4 @@
-"""What `lightpage train` lets one choose of a decoder and its training: one table, read by the command."""
+"""Options of `lightpage train` for a decoder and its training: one table, read by the command."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ class Choice:
     """An option that says how to train.
 
     Attributes:
-        flag: on the command line.
+        flag: name on the command line.
         type: click's.
-        what: it does.
-        default: what holds without it at symbol pitch; the value of `Hyperparameters` if left out.
-        published: what holds without it for the published decoders, where they have it.
-        localizers: that have it.
+        what: effect of the option.
+        default: value without the option at symbol pitch; that of `Hyperparameters` if left out.
+        published: value without the option for the published decoders, where they have it.
+        localizers: localizers that have the option.
         of_preset: whether it is set by `--preset`; `--help` does not list it then, but it may be given too.
     """
 
@@ -54,12 +54,12 @@ class Choice:
 
     @property
     def name(self) -> str:
-        """Of the parameter."""
+        """Name of the command's parameter."""
         return self.flag.removeprefix("--").replace("-", "_")
 
     @property
     def help(self) -> str:
-        """With what holds without it."""
+        """Help text of the option, followed by its default."""
         if self.localizers == PUBLISHED:
             return f"{self.what} [default: {self.published}; only with {', '.join(PUBLISHED)}]"
         value = getattr(Hyperparameters, self.name) if self.default is None else self.default
@@ -240,7 +240,7 @@ def chosen_trainer(
     Args:
         localizer: name.
         profile: the nominal device.
-        pages: to train on.
+        pages: number of pages to train on.
         given: see `given_choices`.
 
     Raises:

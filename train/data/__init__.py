@@ -1,1 +1,1 @@
-"""What a network is trained on."""
+"""Data that networks are trained on."""

@@ -40,8 +40,8 @@ class FeatureStore(Dataset[Page]):
     [2, ny, nx] if there was one, and true phases [ny, nx].
 
     Args:
-        folder: with arrays that `fill` has completed.
-        pages: which of them, all if left out.
+        folder: folder of arrays that `fill` has completed.
+        pages: numbers of the pages to show, all if left out.
     """
 
     def __init__(self, folder: Path, pages: range | None = None) -> None:
@@ -55,11 +55,11 @@ class FeatureStore(Dataset[Page]):
         return len(self._pages)
 
     def __getitem__(self, index: int) -> Page:
-        """One page."""
+        """Return a whole page."""
         return self.part(index, slice(None), slice(None))
 
     def part(self, index: int, rows: slice, columns: slice) -> Page:
-        """Some rows and columns of a page; no more is read."""
+        """Read some rows and columns of a page, and nothing more."""
         number = self._pages[index]
         light, *others = (torch.from_numpy(np.array(array[number][..., rows, columns])) for array in self._arrays)
         return light.flatten(0, -3), *others
@@ -83,7 +83,7 @@ def fill(folder: Path, key: str, count: int, make: Maker, what: str) -> float:
         key: everything that the features depend on.
         count: pages.
         make: makes them, from a page on.
-        what: for the progress bar.
+        what: name of the work, for the progress bar.
 
     Raises:
         LightpageError: the folder cannot be written or has no room, or the first process has made no page for half an

@@ -37,7 +37,7 @@ _LARGEST_STEP_PX = 0.5
 
 @dataclass(frozen=True)
 class PageState:
-    """What differs from page to page and no symbol explains.
+    """State of one page that no symbol explains: image shift and piston.
 
     Attributes:
         shift_px: how far the image has moved (x, y) since calibration, camera pixels.
@@ -50,7 +50,7 @@ class PageState:
 
 @dataclass(frozen=True)
 class PageFeatures:
-    """One page as a network sees it.
+    """Features of one page as a network takes them.
 
     Attributes:
         light: demodulated samples [2, B, S, ny, nx], float16, piston taken off.
@@ -71,9 +71,9 @@ class FeatureExtractor:
     """Turns frame pairs of one calibrated device into features.
 
     Args:
-        device: as calibrated.
+        device: device as it was calibrated.
         localizer: `coherent` or `wave`.
-        choices: of the decoder that the features are for.
+        choices: hyperparameters of the decoder that the features are for.
         with_signal_power: see `FieldRecovery`.
     """
 
@@ -110,7 +110,7 @@ class FeatureExtractor:
         return self._solve(pair, self.device.references, *at)[0]
 
     def measure(self, pair: FramePair, shift_px: tuple[float, float]) -> tuple[Measured, Tensor]:
-        """What was measured on the calibrated grid of a page whose image has moved by (x, y), and its field there."""
+        """Return the equations and the field of a page whose image has moved by (x, y), on the calibrated grid."""
         registration = shifted(self.table["registration"], np.array(shift_px))
         seen = (pair.in_phase, pair.quadrature, self.device.references.in_phase, self.device.references.quadrature)
         tensors = [*(frame.astype(np.float32) for frame in seen), registration, self.table["homodyne"]]
@@ -122,7 +122,7 @@ class FeatureExtractor:
         """Check that a known page shows its symbols where this calibration says.
 
         Args:
-            page: of the recording.
+            page: number of the page in the recording.
             calibrated: coherence of the pages that were calibrated on.
 
         Raises:

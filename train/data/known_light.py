@@ -1,4 +1,4 @@
-"""What known pages show, against what the fitted waves say of them."""
+"""Light of known pages, compared with the fitted waves' prediction."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lightpage.waves.grid import symbol_samples
 ACCURACY = 3 / 8
 """Share of a simulation's splitting steps."""
 _EQUATIONS = 100_000
-"""About how many samples of the common grid say by which factors the illumination varies: six unknowns."""
+"""Approximate number of samples of the common grid that say by which factors the illumination varies: six unknowns."""
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
@@ -31,9 +31,9 @@ class Explained:
 
     Attributes:
         measured: both equations of the field.
-        field: that solves them, complex [Gy, Gx].
+        field: field that solves them, complex [Gy, Gx].
         illumination: factors of `illumination_terms` over the first, complex [6], with which the waves explain most.
-        expected: what they say then, complex [Gy, Gx], of the field's strength and piston.
+        expected: field that the waves predict then, complex [Gy, Gx], with the measured field's strength and piston.
     """
 
     measured: Measured
@@ -43,7 +43,7 @@ class Explained:
 
     @property
     def seen(self) -> NDArray[np.bool_]:
-        """Where both cameras look at the common grid, bool [Gy, Gx]."""
+        """Mask of the common grid's samples that both cameras see, bool [Gy, Gx]."""
         return self.measured.lit.numpy().astype(bool)
 
 
@@ -53,8 +53,8 @@ def explained(extractor: FeatureExtractor, pages: Sequence[KnownPage]) -> list[E
     The waves are as exact as those of a decoder that makes another pass.
 
     Args:
-        extractor: of the device.
-        pages: of the device.
+        extractor: extractor of the device.
+        pages: known pages of the device.
     """
     profile, parameters = extractor.device.profile, extractor.device.parameters
     modulation, samples = extractor.device.modulation, symbol_samples(profile)

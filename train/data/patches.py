@@ -18,7 +18,7 @@ from lightpage.train.models.network import reach, with_page_coordinates
 
 
 def training_pages(stores: Sequence[FeatureStore], mask: NDArray[np.bool_], choices: Hyperparameters) -> Dataset[Page]:
-    """What a network at symbol pitch trains on: whole pages, or patches where they are larger than those.
+    """Return the data set of a network at symbol pitch: whole pages, or patches where pages are larger than those.
 
     Args:
         stores: pages of one shape.
@@ -38,7 +38,7 @@ class Patches(Dataset[Page]):
     `with_page_coordinates`), and phases that are not to be learnt from are NaN: pilots, and a rim.
 
     Args:
-        stores, mask: as for `training_pages`.
+        stores, mask: see `training_pages`.
         side: symbols along an edge.
         rim: symbols along a patch's edge that are shown and not asked for: the network misses their neighbours.
         step: places lie on multiples of it, as the network's coarser grids do.
@@ -62,7 +62,7 @@ class Patches(Dataset[Page]):
         self._each = int(np.prod([np.ceil(count / side) for count in mask.shape]))
 
     def __len__(self) -> int:
-        """As many as cover all pages."""
+        """Number of patches that cover all pages."""
         return len(self._places) * self._each
 
     def __getitem__(self, index: int) -> Page:

@@ -62,12 +62,12 @@ anything."""
 
 @dataclass(frozen=True)
 class ModelMatch:
-    """What recorded pages show over the fitted geometry.
+    """Discrepancy between recorded pages and the fitted geometry.
 
     Attributes:
         illumination: complex factor on the modulator as a quadratic in the page's coordinates (-1 to 1), [6].
         noise: power of what is left unexplained over the field's power.
-        seen: where both cameras look at the common grid, bool [Gy, Gx].
+        seen: mask of the common grid's samples that both cameras see, bool [Gy, Gx].
     """
 
     illumination: Complex
@@ -76,7 +76,7 @@ class ModelMatch:
 
 
 def model_match(known: Sequence[Explained]) -> ModelMatch:
-    """What known pages show over the fitted wave model, as means over them."""
+    """Return the discrepancy between known pages and the fitted wave model, as means over the pages."""
     left = [
         np.mean(np.abs(light.field - light.expected)[light.seen] ** 2) / np.mean(np.abs(light.field[light.seen]) ** 2)
         for light in known
@@ -89,10 +89,10 @@ class SyntheticPages:
     """Features of pages that the fitted device would show after drifts of its own.
 
     Args:
-        device: as calibrated.
-        like: what recorded pages show over that geometry.
+        device: device as it was calibrated.
+        like: discrepancy between recorded pages and that geometry.
         localizer: the coherent one; None for that by waves.
-        seed: of drifts, symbols and noise.
+        seed: seed of drifts, symbols and noise.
         grid: the common grid, where it is not the usual one.
     """
 

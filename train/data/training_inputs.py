@@ -1,4 +1,4 @@
-"""What every way of training a decoder starts from, and what it comes to."""
+"""Inputs and results that all trainers share."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ class TrainingInputs:
 
     Attributes:
         out: folder of the run.
-        recording: with symbols, open.
+        recording: open recording with symbols.
         profile: the nominal device.
         calibration: the fitted device.
-        extractor: of the calibrated device, for the run's localizer.
+        extractor: extractor of the calibrated device, for the run's localizer.
         training, validation: page numbers.
         pilot_mask: bool [ny, nx].
         key: digest of profile, recording and calibration.
-        processes: of the training.
+        processes: processes of the training.
     """
 
     out: Path
@@ -46,7 +46,7 @@ class TrainingInputs:
 
     @property
     def levels(self) -> Levels:
-        """Of the recording's pages, as the device shows them."""
+        """Levels of the recording's pages, as the device shows them."""
         return self.calibration.modulator.page_levels(self.recording.levels)
 
 
@@ -55,7 +55,7 @@ class Trained:
     """A trained decoder.
 
     Attributes:
-        weights: by name.
+        weights: weights by name.
         validation_air: bits per data symbol.
         kappa_scale: factor on p that calibrates the claimed concentration on the validation pages.
         seconds: preparing the pages and training, all stretches together.

@@ -1,1 +1,1 @@
-"""How a network is trained."""
+"""Fitting of a network: loss, validation, precision and the finished weights."""

@@ -25,7 +25,7 @@ _AT_A_BOUND = 1e-3
 
 
 def decode_pages(module: DecoderTraining[Any], pages: Dataset[Page]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """What a trained module says of pages, p [pages, 2, ny, nx], and their true phases [pages, ny, nx]."""
+    """Decode pages with a trained module: return p [pages, 2, ny, nx] and the true phases [pages, ny, nx]."""
     outputs, truths = [], []
     with torch.no_grad():
         for *page, phases in DataLoader(pages, batch_size=None):

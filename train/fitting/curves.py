@@ -12,7 +12,7 @@ TENSORBOARD = "tensorboard"
 """Folder of a run's TensorBoard files."""
 
 CURVES = ("train_nll", "train_air", "val_air", "angle_deg")
-"""What training logs; the angle is that of a decoder by rays."""
+"""Quantities that training logs; the angle is that of a decoder by rays."""
 
 Curve = Sequence[tuple[int, float]]
 """Values by step."""
@@ -37,6 +37,6 @@ def curves_of(run: Path) -> dict[str, Curve]:
 
 
 def thinned(curve: Curve, points: int) -> Curve:
-    """At most so many points of a curve: means over equal parts of it, at the last step of each."""
+    """Reduce a curve to so many points at most: means over equal parts, each at its part's last step."""
     parts = np.array_split(np.array(curve), min(len(curve), points)) if curve else []
     return [(round(float(part[-1, 0])), float(part[:, 1].mean())) for part in parts]

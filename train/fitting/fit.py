@@ -35,13 +35,13 @@ from lightpage.train.processes import AS_IT_IS, Processes, is_first_process, pro
 _LAST = "last.ckpt"
 
 VALIDATIONS = 60
-"""How often a run is judged by its validation pages."""
+"""Number of validations of a run."""
 
 _SEEDS_APART = 1_000_003
-"""Of two processes of one run: further than any run has steps."""
+"""Distance of the seeds of two processes of one run: further than any run has steps."""
 
 _SEEDS = 2**32
-"""That Lightning takes."""
+"""Number of seeds that Lightning takes."""
 
 
 def fit_network(
@@ -59,12 +59,12 @@ def fit_network(
     """Train, or go on with, the network of a run: see `fit`.
 
     Args:
-        run, validation, processes: as for `fit`.
+        run, validation, processes: see `fit`.
         training: pages whose phases are NaN where nothing is asked (`lightpage.train.data.patches.training_pages`).
         hyperparameters: the run's choices.
         pilot_mask: bool [ny, nx].
-        levels: of the pages.
-        kind: of the network.
+        levels: levels of the pages.
+        kind: kind of the network.
         start: network of the same kind and size whose weights a new run begins with; random ones if left out.
     """
     seed_stretch(run, hyperparameters.seed)
@@ -117,13 +117,13 @@ def fit(
     Args:
         run: folder of the run; checkpoints and TensorBoard logs go there, and the last checkpoint is resumed from: the
             caller sees to it that it belongs to these pages and choices (`lightpage.train.runs.begin`).
-        module: with its first weights.
+        module: module with its first weights.
         training: batches of pages whose phases are NaN where nothing is asked.
         validation: pages.
         steps: optimiser steps.
-        precision: of `PRECISIONS`.
+        precision: name out of `PRECISIONS`.
         callbacks: further Lightning callbacks.
-        processes: that work together; by default all GPUs, or one process.
+        processes: processes that work together; by default all GPUs, or one process.
     """
     if (before := finished(run, module)) is not None:
         return before

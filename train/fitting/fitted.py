@@ -1,4 +1,4 @@
-"""What a finished training leaves in its run."""
+"""Files of a finished training in its run."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ CHECKPOINTS = "checkpoints"
 """Folder of a run's checkpoints."""
 
 FITTED, FITTED_WEIGHTS = "fitted.json", "fitted.pt"
-"""Of a run whose training is finished: what it reached, and the weights. They stand in for its checkpoints."""
+"""Files of a run whose training is finished: what it reached, and the weights. They stand in for its checkpoints."""
 
 _WANTED = f"{FITTED} and {FITTED_WEIGHTS} of one training, or neither, to train from the last checkpoint on"
 
 KEPT_POINTS = 60
-"""Of each curve in what a finished training keeps."""
+"""Points of each curve that a finished training keeps."""
 
 M = TypeVar("M", bound=DecoderTraining[Any])
 
@@ -37,9 +37,9 @@ class Fitted(Generic[M]):
 
     Attributes:
         module: the best one, in float32.
-        validation_air: its AIR on the validation pages, bits per data symbol.
-        seconds: of training, all stretches of an interrupted run together.
-        curves: of `lightpage.train.fitting.curves.CURVES`, thinned.
+        validation_air: AIR on the validation pages, bits per data symbol.
+        seconds: seconds of training, all stretches of an interrupted run together.
+        curves: curves of `lightpage.train.fitting.curves.CURVES`, thinned.
     """
 
     module: M
@@ -56,12 +56,12 @@ class Fitted(Generic[M]):
 
 
 def is_finished(run: Path) -> bool:
-    """Whether the training of a run has ended, and what it made is there."""
+    """Return whether the training of a run has ended, and its result is there."""
     return (run / FITTED).exists()
 
 
 def finished(run: Path, module: M) -> Fitted[M] | None:
-    """What an earlier call of `fit` made of the module of a run, None if it is not there.
+    """Return what an earlier call of `fit` made of the run's module, None if it is not there.
 
     Raises:
         InvalidInputError: it is damaged, or of another module.
@@ -86,7 +86,7 @@ def fitted_curves(run: Path) -> dict[str, Curve]:
 
 
 def _kept(run: Path) -> dict[str, Any]:
-    """What a finished training says of itself, as `Fitted` has it."""
+    """Read the figures of a finished training, by the names of `Fitted`."""
     try:
         kept = json.loads((run / FITTED).read_text())
         curves = {str(name): [(int(step), float(value)) for step, value in c] for name, c in kept["curves"].items()}

@@ -36,7 +36,7 @@ class DecoderTraining(L.LightningModule, Generic[N]):
     Args:
         network: pages without their phases to p [N, 2, ny, nx].
         pilot_mask: bool [ny, nx]; pilots are no data: no figure counts them.
-        levels: of the pages, whose number bounds their AIR.
+        levels: levels of the pages, whose number bounds their AIR.
     """
 
     def __init__(self, network: N, pilot_mask: NDArray[np.bool_], levels: int | Levels) -> None:
@@ -82,7 +82,7 @@ class SymbolTraining(DecoderTraining[SymbolNetwork]):
     [N, 2, ny, nx], and true phases [N, ny, nx].
 
     Args:
-        network, pilot_mask, levels: as for `DecoderTraining`.
+        network, pilot_mask, levels: see `DecoderTraining`.
         hyperparameters: the run's choices.
     """
 

@@ -1,4 +1,4 @@
-"""Which arithmetic a network is trained in, where it is left to the machine."""
+"""Precision of training: the arithmetic that is chosen by the machine where nobody chooses it."""
 
 from __future__ import annotations
 

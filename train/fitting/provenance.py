@@ -1,4 +1,4 @@
-"""Where a trained artefact comes from."""
+"""Provenance of a trained artefact."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def provenance() -> dict[str, Any]:
 
 
 def provenance_of(folder: Path) -> dict[str, Any]:
-    """The same of work that goes on in a folder: also the commit that it was begun with, where that was another.
+    """Return the provenance of work that goes on in a folder, with the commit that it was begun with if another.
 
     Asked for before the work, it notes there who begins it.
     """
@@ -36,7 +36,7 @@ def provenance_of(folder: Path) -> dict[str, Any]:
 
 
 def _program() -> str:
-    """How the running program was started."""
+    """Return the command that started the running program."""
     spec = getattr(sys.modules["__main__"], "__spec__", None)
     return f"python -m {spec.name}" if spec is not None else Path(sys.argv[0]).name
 
@@ -55,7 +55,7 @@ def commit() -> str:
 
 
 def _git(tree: Path, *arguments: str) -> str:
-    """What git answers, empty where there is none or it refuses."""
+    """Run git, and return its output; empty where git is missing or refuses."""
     try:
         done = subprocess.run(["git", "-C", str(tree), *arguments], capture_output=True, text=True, check=False)
     except OSError:

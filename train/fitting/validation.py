@@ -1,4 +1,4 @@
-"""What held-out pages say of a network in training."""
+"""Validation of a network on held-out pages while it is trained."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def held_out_air(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDAr
         p: [pages, 2, ny, nx].
         phases: true phases [pages, ny, nx].
         mask: pilots, bool [ny, nx].
-        levels: of the pages.
+        levels: levels of the pages.
     """
     rates = []
     for page, truth in zip(p, phases, strict=True):

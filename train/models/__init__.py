@@ -1,1 +1,1 @@
-"""What is trained."""
+"""Models: networks and the optics that they are trained with."""

@@ -1,4 +1,4 @@
-"""What each of two cameras sees of one field, apart on the axis or not, and the field that both have seen.
+"""Fields of two cameras that see one field from two places on the axis or from one, and the field that fits both.
 
 Against the mean of both places the in-phase camera sees D e and the quadrature camera D* e, with D = exp(i phi) over
 the facet and phi growing as the square of the frequency (`lightpage.waves.defocus`). Without |e|^2, and for a turn of
@@ -24,10 +24,10 @@ from lightpage.train.models.filters import BLOCK, block_weights
 
 ROUNDS = 14
 WEIGHT = 0.75
-"""Of the likelihood against staying: a larger one takes fewer rounds and, in dim light, lets more noise in."""
+"""Weight of the likelihood against staying: a larger one takes fewer rounds and, in dim light, lets more noise in."""
 STIFF = 1 + 2 * WEIGHT
 RELAXATION = 1.4
-"""Of a round's step; below 2."""
+"""Factor on a round's step; below 2."""
 _DARK = 1e-9
 _LINEAR_ROUNDS = 30
 _LINEAR_STEP = 0.7
@@ -61,7 +61,7 @@ class CamerasApart(NamedTuple):
         return cls(torch.cat(forth + adjoint), torch.cat(adjoint + forth), torch.cat(added))
 
     def seen(self, field: Tensor) -> Tensor:
-        """What the cameras see of a field [2, ny, nx]: in-phase, then quadrature, [4, ny, nx]."""
+        """Return the fields that the cameras see of a field [2, ny, nx]: in-phase, then quadrature, [4, ny, nx]."""
         ny, nx = field.shape[1:]
         return _along_columns(_along_rows(_in_blocks(field), self.there), self.there)[:, :ny, :nx]
 
@@ -77,7 +77,7 @@ class CamerasApart(NamedTuple):
 
         Args:
             left: sides of the equations, [2, ny, nx].
-            arms, amplitude, inverse_amplitude, band: as for `reflected`.
+            arms, amplitude, inverse_amplitude, band: see `reflected`.
 
         Returns:
             e, [2, ny, nx]; on the ring of the determinant's zero, what one of two real numbers says of it.
@@ -116,12 +116,12 @@ def reflected(
     """The field that both cameras have seen.
 
     Args:
-        cameras: what each sees of a field.
-        rounds: of averaged reflections.
+        cameras: map of a field to what each camera sees.
+        rounds: number of averaged reflections.
         start: estimate of e, [2, ny, nx].
         brightness: measured |1 + D e|^2 and |arm + D* e|^2, [2, ny, nx].
-        arms: of both cameras, [4, 1, 1].
-        amplitude, inverse_amplitude: by which e becomes E, which defocus and band are about, and back, [ny, nx].
+        arms: phasors of both cameras, [4, 1, 1].
+        amplitude, inverse_amplitude: factors from e to E, which defocus and band are about, and back, [ny, nx].
         band: filter of E to the pipe's band.
 
     Returns:
@@ -179,7 +179,7 @@ def _along_rows(images: Tensor, weights: Tensor) -> Tensor:
 
 
 def _along_columns(images: Tensor, weights: Tensor) -> Tensor:
-    """The same of columns."""
+    """Filter blocks of columns, as `_along_rows` filters rows."""
     reach, groups = (weights.shape[2] - BLOCK) // 2, len(images) // weights.shape[1]
     split = functional.conv2d(images, weights[:, :, :, None], stride=(BLOCK, 1), padding=(reach, 0), groups=groups)
     ny, nx = images.shape[1:]

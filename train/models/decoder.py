@@ -22,12 +22,12 @@ _BY_WAVES = ("parameters",)
 
 
 class SymbolDecoder(nn.Module):
-    """What the cameras measured of one calibrated device to p.
+    """Decoder from the cameras' measurements of one calibrated device to p.
 
     Args:
         profile: the nominal device.
         parameters: [P] fitted.
-        localizer: of `LOCALIZERS`.
+        localizer: name out of `LOCALIZERS`.
         choices: sizes, and how many refinements.
     """
 
@@ -55,8 +55,8 @@ class SymbolDecoder(nn.Module):
         """Decode one page.
 
         Args:
-            recovery: of the same device.
-            measured: of the page.
+            recovery: field recovery of the same device.
+            measured: measurements of the page.
             table: tensors of the sampling table by name, at least `table_inputs`.
 
         Returns:

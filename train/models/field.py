@@ -30,7 +30,7 @@ from lightpage.waves.defocus import resampled_taps
 from lightpage.waves.grid import GRID_STEP_PX, FieldGrid, field_grid
 
 ROUNDS = 6
-"""Of descent; beyond these the band filter's ripple adds up."""
+"""Steps of descent; beyond these the band filter's ripple adds up."""
 STEP = 0.9
 """Along the weighted gradient: the weights bound the curvature by 2, and step times curvature must stay below 2."""
 MOMENTUM = 0.5
@@ -44,13 +44,13 @@ _FLOOR = 0.1
 
 
 class Measured(NamedTuple):
-    """What the cameras measured on the common grid, [ny, nx] each but the turn's cosine and sine.
+    """Measurements of the cameras on the common grid, [ny, nx] each but the cosine and sine of the turn.
 
     Attributes:
         a, b: left sides of the two equations, zero where a camera has no reference.
-        cos, sin: of the turn between the arms.
+        cos, sin: cosine and sine of the turn between the arms.
         amplitude: the reference's over its mean, by which e becomes E.
-        lit: one where both cameras have a reference, else zero.
+        lit: mask: 1 where both cameras have a reference, else 0.
         apart: the defocus of the cameras; None where both see the same plane.
     """
 
@@ -63,12 +63,12 @@ class Measured(NamedTuple):
     apart: CamerasApart | None = None
 
     def left(self, e: Tensor) -> Tensor:
-        """What is left of the two equations at e, [2, ny, nx] real and imaginary part."""
+        """Return the residual of both equations at e, [2, ny, nx], a camera each."""
         in_phase, turned = self._brightness(*self._seen(e), 0.0)
         return torch.stack([self.a + (1 - in_phase) / 2, self.b + (1 - turned) / 2])
 
     def pull(self, e: Tensor, floor: Tensor | float, share: float = 1.0) -> Tensor:
-        """How the measurements pull at e: the gradient of their likelihood, or a share of it, [2, ny, nx].
+        """Return the gradient of the measurements' log-likelihood at e, times `share`, [2, ny, nx].
 
         An equation's variance is that of its camera's photons, |1 + e|^2 or |exp(i turn) + e|^2, and of its
         electronics, the `floor`. The first is also the squared length of its gradient, so a step along the sum needs
@@ -109,7 +109,7 @@ class Measured(NamedTuple):
         return in_phase, (real + self.cos) ** 2 + (imaginary + self.sin) ** 2 + floor
 
     def in_blocks(self, side: int) -> Measured:
-        """The same on whole blocks of so many samples a side, zeros at the right and below where there are none."""
+        """Return the measurements on whole blocks of so many samples a side, zeros added at the right and below."""
         ny, nx = self.a.shape
         missing = (0, -nx % side, 0, -ny % side)
         a, b, amplitude, lit = (functional.pad(plane, missing) for plane in (self.a, self.b, self.amplitude, self.lit))
@@ -117,7 +117,7 @@ class Measured(NamedTuple):
 
 
 class References(NamedTuple):
-    """What the references and the registration say of the common grid.
+    """References and registration, evaluated on the common grid.
 
     Attributes:
         where: places in both frames for grid_sample, [2, ny, nx, 2].
@@ -138,7 +138,7 @@ class FieldRecovery(nn.Module):
         profile: the nominal device.
         with_signal_power: whether the frames hold |E|^2; an oracle takes it off beforehand, and the equations are then
             linear.
-        rounds: of descent.
+        rounds: number of steps of descent.
         reflections: rounds of averaged reflections in place of descent; none for descent. Where cameras stand apart,
             reflections serve in any case.
         binning: camera pixels along each axis whose mean is sampled; one filters the frames first instead, which takes
@@ -196,7 +196,7 @@ class FieldRecovery(nn.Module):
         homodyne: Tensor,
         apart: Tensor | None = None,
     ) -> Measured:
-        """Both cameras' measurements on the common grid.
+        """Measure the field on the common grid by both cameras.
 
         Args:
             in_phase, quadrature: raw frames [H, W], any number type.
@@ -219,11 +219,11 @@ class FieldRecovery(nn.Module):
         return _block_means(_stacked(in_phase, quadrature), self.binning)
 
     def filtered(self, blocks: Tensor) -> Tensor:
-        """Both frames as they are sampled, [2, rows, columns]."""
+        """Return the frames as they are sampled, [2, rows, columns]."""
         return torch.as_tensor(self.prefilter(blocks)) if self.binning == 1 else blocks
 
     def references(self, blocks: Tensor, registration: Tensor) -> References:
-        """What the references alone say, of both in blocks."""
+        """Evaluate the references on the common grid, both given in blocks."""
         where = self._where(registration, self.binning)
         reference = self._reference(blocks, registration)
         floor = _FLOOR * blocks.mean(dim=(1, 2))[:, None, None]
@@ -250,10 +250,10 @@ class FieldRecovery(nn.Module):
         return (e * blocks.amplitude)[:, :ny, :nx], residual[:, :ny, :nx]
 
     def innovation(self, measured: Measured, field: Tensor, floor: Tensor | float) -> Tensor:
-        """What was measured beyond what a predicted field would show, as a change of the field.
+        """Return the change of a predicted field that the measurements ask for.
 
         Args:
-            measured: of the frames.
+            measured: measurements of the frames.
             field: predicted E [2, ny, nx], as `solve` returns it.
             floor: see `Measured.pull`.
 
@@ -298,7 +298,7 @@ class FieldRecovery(nn.Module):
         return torch.as_tensor(estimate)
 
     def _where(self, registration: Tensor, side: int, step: int = 1) -> Tensor:
-        """Where every `step`-th grid sample lies in frames of blocks of pixels, [2, ny, nx, 2] for grid_sample.
+        """Return the places of every `step`-th grid sample in frames of blocks, [2, ny, nx, 2] for grid_sample.
 
         From -1 to 1 between the outer edges of the blocks.
         """

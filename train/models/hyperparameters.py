@@ -1,4 +1,4 @@
-"""What a training run chooses."""
+"""Hyperparameters of a training run."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _REFINEMENT_STEPS = 0.25
 """Steps of a refinement's network over those of the first."""
 
 _FEWEST_STEPS = 2
-"""That a learning rate can rise and fall in."""
+"""Fewest steps in which a learning rate can rise and fall."""
 
 
 @dataclass(frozen=True)
@@ -24,15 +24,16 @@ class Hyperparameters:
     Attributes:
         channels, blocks, depth: size of the network, see `SymbolUNet`.
         refinements: further passes of the decoder, see `lightpage.train.trainers.refinement`.
-        field_rounds, reflections, binning: of the field's recovery, see `lightpage.train.models.field.FieldRecovery`.
+        field_rounds, reflections, binning: settings of the field's recovery, see
+            `lightpage.train.models.field.FieldRecovery`.
         field_step: pitch of the common grid, camera pixels.
         samples, interpolation: see `CoherentLocalizer`.
         steps: optimiser steps.
         batch: pages a step, or patches of large ones.
         patch: symbols along a patch's edge; smaller pages are trained on whole.
         learning_rate: peak of the one-cycle schedule.
-        weight_decay: of AdamW.
-        seed: of initial weights, batches and rotations.
+        weight_decay: weight decay of AdamW.
+        seed: seed of initial weights, batches and rotations.
         precision: see `lightpage.train.fitting.precision`.
     """
 
@@ -56,7 +57,7 @@ class Hyperparameters:
 
     @property
     def first_pass(self) -> str:
-        """What the features of the first pass depend on."""
+        """Key of all settings that the features of the first pass depend on."""
         reflections = f"{self.reflections} reflections " if self.reflections else ""
         rest = f"{self.binning} {self.field_step} {self.samples} {self.interpolation}"
         return f"{reflections}{self.field_rounds} {rest}"

@@ -14,11 +14,11 @@ _CONDITIONS = 6 + 4 * len(_HARMONICS)
 _CONDITION_WIDTH = 64
 _TYPICAL_LOG_KAPPA = 5.0
 _KAPPA_UNIT = 100.0
-"""What an output of one adds to p: with concentrations in the hundreds, the net need not learn large numbers."""
+"""Change of p by an output of one: with concentrations in the hundreds, the net need not learn large numbers."""
 _LOG_KAPPA_UNIT = 10.0
-"""What an output of one adds to the logarithm of p's length: few steps are to make large factors."""
+"""Change of the logarithm of p's length by an output of one: few steps are to make large factors."""
 _MOST_LOG_FACTOR = 15.0
-"""Of that factor: light unlike any that was trained on shall not make p infinite."""
+"""Largest logarithm of that factor: light unlike any that was trained on shall not make p infinite."""
 
 
 def with_page_coordinates(positions: Tensor, shape: tuple[int, ...], part: tuple[slice, slice]) -> Tensor:
@@ -26,8 +26,8 @@ def with_page_coordinates(positions: Tensor, shape: tuple[int, ...], part: tuple
 
     Args:
         positions: exit centroids.
-        shape: of the page, rows and columns of symbols.
-        part: which rows and columns of it.
+        shape: shape of the page, rows and columns of symbols.
+        part: slices of the page's rows and columns.
     """
     rows, columns = (
         torch.linspace(-1, 1, count, device=positions.device)[some] for count, some in zip(shape, part, strict=True)
@@ -43,7 +43,7 @@ class PositionModulation(nn.Module):
     makes a filter for each place; without it, a single one has to serve all.
 
     Args:
-        channels: of the features.
+        channels: number of channels of the features.
     """
 
     def __init__(self, channels: int) -> None:
@@ -88,7 +88,7 @@ class Residual(nn.Module):
         nn.init.zeros_(self.second.weight)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Same shape [N, C, ny, nx]."""
+        """Map features to features of the same shape [N, C, ny, nx]."""
         inner = self.second(functional.gelu(self.first(functional.gelu(x))))
         return torch.as_tensor(x + inner)
 
@@ -106,7 +106,7 @@ def estimate(outputs: Tensor, before: Tensor | float = 0.0) -> Tensor:
     From a page's dark edge to its middle concentration grows a hundredfold: a factor says so more easily than a sum.
 
     Args:
-        outputs: of the network; zeros leave p as it was before.
+        outputs: outputs of the network; zeros leave p as it was before.
         before: p of an earlier pass, [N, 2, ny, nx].
     """
     log_factor = torch.clamp(_LOG_KAPPA_UNIT * outputs[:, 2:], max=_MOST_LOG_FACTOR)
@@ -159,11 +159,11 @@ class SymbolUNet(nn.Module):
         return estimate(self.outputs(light, positions))
 
     def outputs(self, light: Tensor, positions: Tensor) -> Tensor:
-        """What `estimate` makes p of, [N, 3, ny, nx]; light and exit centroids as for p itself."""
+        """Return the outputs that `estimate` turns into p, [N, 3, ny, nx]; light and exit centroids are those for p."""
         return self.behind_places(self.where(self.stem(light), positions))
 
     def behind_places(self, x: Tensor) -> Tensor:
-        """The same of features that are scaled and shifted by where they lie, [N, C, ny, nx]."""
+        """Return the outputs for features that are scaled and shifted by where they lie, [N, C, ny, nx]."""
         kept = []
         for inward, down in zip(self.inward, self.down, strict=True):
             x = inward(x)
@@ -184,7 +184,7 @@ class Refiner(nn.Module):
     does. Who to trust is learnt.
 
     Args:
-        light_channels, channels, blocks, depth: as for `SymbolUNet`.
+        light_channels, channels, blocks, depth: see `SymbolUNet`.
     """
 
     def __init__(self, light_channels: int, channels: int = 96, blocks: int = 2, depth: int = 0) -> None:
@@ -199,7 +199,7 @@ class Refiner(nn.Module):
 
     @staticmethod
     def known(earlier: Tensor) -> tuple[Tensor, Tensor]:
-        """What the network is told of an earlier p [N, 2, ny, nx]: its direction, and the logarithm of its length."""
+        """Return the network's input of an earlier p [N, 2, ny, nx]: its direction, and the logarithm of its length."""
         x, y = earlier.chunk(2, 1)
         kappa = torch.sqrt(x * x + y * y + 1e-12)
         return earlier / kappa, torch.log(kappa) - _TYPICAL_LOG_KAPPA

@@ -27,7 +27,7 @@ class Matrix(NamedTuple):
     """A complex matrix [..., m, n] for products that take three real ones and not four.
 
     Attributes:
-        real: its real part.
+        real: real part of the matrix.
         difference, sum: imaginary part less the real one, and both together.
     """
 
@@ -42,7 +42,7 @@ class Matrix(NamedTuple):
 
     @property
     def adjoint(self) -> Matrix:
-        """Its conjugate transpose."""
+        """Conjugate transpose."""
         real, difference, both = (part.transpose(-1, -2) for part in self)
         return Matrix(real, -both, -difference)
 

@@ -1,4 +1,4 @@
-"""What a decoded page leaves unexplained of both frames, as a further pass of the decoder sees it."""
+"""Prediction of both frames by a decoded page, and their residual as the next pass takes it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lightpage.waves.grid import FieldGrid, symbol_samples
 
 
 class Prediction(nn.Module):
-    """What decoded symbols leave unexplained of both frames, on the modulator.
+    """Residual of both frames after decoded symbols are explained, taken back to the modulator.
 
     Args:
         profile: the nominal device.
@@ -68,8 +68,8 @@ class Prediction(nn.Module):
         """Light that an estimated page leaves unexplained.
 
         Args:
-            recovery: of the same device.
-            measured, field: of the page; the field says how strong its light is.
+            recovery: field recovery of the same device.
+            measured, field: measurements and field of the page; the field says how strong its light is.
             p: [2, ny, nx].
             parameters: [P] of a device that has drifted since.
 

@@ -19,7 +19,7 @@ class Preset:
     """A decoder to choose.
 
     Attributes:
-        localizer: of its first pass, where none is chosen.
+        localizer: localizer of the first pass, where none is chosen.
         choices: all else.
     """
 
@@ -35,7 +35,7 @@ PRESETS = {
     STANDARD: Preset(WAVE, Hyperparameters(reflections=REFLECTIONS)),
     ACCURATE: Preset(COHERENT, Hyperparameters(reflections=REFLECTIONS, refinements=1)),
 }
-"""One quick pass, one pass, two passes.
+"""Presets of one quick pass, one pass and two passes.
 
 A pass by waves reads more than one by branches, and takes longer. Before a second pass that gain is lost again, and
 branches are the quicker first pass. A second pass adds more than anything else does."""

@@ -64,7 +64,7 @@ class RayTwin(nn.Module):
     def forward(
         self, parameters: Tensor, points: Tensor, anchors: Tensor, places: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Both questions at once: rays of page points, and pixels of camera-plane places.
+        """Trace rays of page points, and return the pixels of camera-plane places.
 
         Args:
             parameters: [P] float64.
@@ -104,7 +104,7 @@ class RayTwin(nn.Module):
             return torch.stack([k @ normals["x"] * reach, k @ normals["y"] * reach], dim=-1)
 
         def bent_by(path: SeidelTerms, field: Tensor, facet: Tensor, spread: Tensor) -> tuple[Tensor, Tensor]:
-            """What a lens's path adds to k, and to the phase, of light that fills a part of the facet: [N, 2] and [N].
+            """Return the change of k, [N, 2], and of the phase, [N], by a lens's path of light on a part of the facet.
 
             The part has its middle at `facet`, as (X, Y'), and the variance `spread` along either axis, [N, 2].
             """
@@ -149,7 +149,7 @@ class RayTwin(nn.Module):
         return torch.stack(landings), torch.stack(phases), positions
 
     def _filled(self, met: Tensor, positions: Tensor, width: Tensor, focal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Where light that leaves through the cells `met` enters and leaves, for exit centroids `positions`, [N, 2].
+        """Return the places where light through the cells `met` enters and leaves the pipe, by exit centroids.
 
         Returns:
             Mean places at entrance and exit, and variance along either axis, [N, 2]; weighted by a symbol's light.

@@ -26,7 +26,7 @@ from lightpage.waves.sinc_interpolation import interpolation, sparse_axis
 Real = NDArray[np.floating]
 
 OVERSAMPLING = 1.1
-"""Of light on sparse samples: an error of 0.003."""
+"""Oversampling of light on sparse samples: an error of 0.003."""
 WAVES_A_TILE = 170
 """Waves that a tile of the lens is wide, about: more need more samples of the facet, fewer need more tiles."""
 ROLL_MARGIN = np.deg2rad(0.05)
@@ -62,8 +62,8 @@ class TiledLens(nn.Module):
 
     Args:
         geometry: the device.
-        path: of this lens, beyond an ideal one's.
-        plane: its sample positions (x, y), uniform, metres.
+        path: path of this lens, beyond an ideal one's.
+        plane: sample positions (x, y) on the lens's plane, uniform, metres.
         cells: sample intervals of the pipe along (y', x).
         roll_margin: radians of roll to either side that are to be served.
         tolerance: error of the expansion.
@@ -127,7 +127,7 @@ class TiledLens(nn.Module):
 
     @property
     def terms(self) -> int:
-        """Of each tile."""
+        """Number of terms of each tile."""
         return self.nodes.shape[2]
 
     def matrices(
@@ -256,7 +256,7 @@ def _terms(
     roll_margin: float,
     tolerance: float,
 ) -> Interpolation:
-    """Of the rest, over all tiles."""
+    """Expand the phases that no factor takes in, over all tiles."""
     half = geometry.pipe_width_m / 2
     rolled = [replace(geometry, pipe_roll=geometry.pipe_roll + share * roll_margin) for share in (-1, 0, 1)]
     phases = [LensPath(one, path, couplings(one)) for one in rolled]
@@ -270,7 +270,7 @@ def _terms(
 
 
 def _strip(lens: LensMatrices, number: int) -> LensMatrices:
-    """What belongs to one strip of tiles."""
+    """Return the matrices of one strip of tiles."""
 
     def chosen(value: Any) -> Any:
         return (

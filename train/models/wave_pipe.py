@@ -45,7 +45,7 @@ class TiledPipe(nn.Module):
     Args:
         geometry: the device.
         cells: sample intervals along (y', x).
-        error: of the splitting, wanted.
+        error: wanted error of the splitting.
     """
 
     def __init__(self, geometry: WaveGeometry, cells: tuple[int, int], error: float) -> None:
@@ -75,11 +75,11 @@ class TiledPipe(nn.Module):
         return [block for block in self.blocks if isinstance(block, _Block)]
 
     def matrices(self, geometry: WaveGeometry) -> list[BlockMatrices]:
-        """Of each block, for a geometry of tensors."""
+        """Return each block's matrices, for a geometry of tensors."""
         return [block.matrices(geometry) for block in self._blocks]
 
     def forward(self, field: Parts, at: list[BlockMatrices], *, backwards: bool) -> Parts:
-        """From facet to facet, [cells_y - 1, cells_x - 1] both.
+        """Propagate a field from facet to facet, [cells_y - 1, cells_x - 1] both.
 
         Both parts and all parities go through each product as one stack [2, 2, 2, Ky, Kx]: an exported graph is made
         and run node by node. To modes and back, the parities of an axis are one matrix: no product repeats both of its
@@ -99,7 +99,7 @@ class TiledPipe(nn.Module):
 
 
 class _Block(nn.Module):
-    """Some modes of both parities along either axis, and their neighbours."""
+    """Block of modes of both parities along either axis, and their neighbours."""
 
     def __init__(
         self,
@@ -139,7 +139,7 @@ class _Block(nn.Module):
             self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(value)).float(), persistent=False)
 
     def matrices(self, geometry: WaveGeometry) -> BlockMatrices:
-        """For a geometry of tensors."""
+        """Return the block's matrices, for a geometry of tensors."""
         width, nk = geometry.pipe_width_m, geometry.refractive_index * geometry.wave_number
         step = geometry.pipe_length_m / self._steps
         squares = self.y_numbers[:, None, :, None] ** 2 + self.x_numbers[None, :, None, :] ** 2

@@ -33,7 +33,7 @@ Real = NDArray[np.float64]
 
 
 class Fidelity(NamedTuple):
-    """How exactly light is followed; what is less exact takes less time.
+    """Fidelity of the simulated light: error bounds; larger ones take less time.
 
     Attributes:
         pipe: error of the splitting of a sheared pipe.
@@ -45,9 +45,9 @@ class Fidelity(NamedTuple):
 
 
 EXACT = Fidelity(0.01, 0.015)
-"""For light that is taken off what was seen: twice the error of the pipe costs a full-size page 0.02 bit."""
+"""Fidelity for light that is taken off what was seen: twice the error of the pipe costs a full-size page 0.02 bit."""
 ROUGH = Fidelity(0.06, 0.05)
-"""For light that is but a small rest: half the errors bring 0.006 bit."""
+"""Fidelity for light that is but a small rest: half the errors bring 0.006 bit."""
 
 
 class WaveMatrices(NamedTuple):
@@ -67,7 +67,7 @@ class Waves(nn.Module):
         profile: the nominal device.
         parameters: [P] of the ray twin, fitted (or, for an oracle, true): they say how finely the pipe is sampled
             and which of its modes couple.
-        samples: on the modulator, per symbol and axis.
+        samples: number of samples on the modulator, per symbol and axis.
         fidelity: how exactly light is followed.
         filled, grid: see `FittedWaves`. One filled sample per symbol stands for all of it.
     """
@@ -133,7 +133,7 @@ class Waves(nn.Module):
         self.register_buffer("default", torch.from_numpy(parameters).to(torch.float32), persistent=False)
 
     def matrices(self, parameters: Tensor | None = None) -> WaveMatrices:
-        """What the two ways need, of parameters [P]; of those that the model was made with if left out."""
+        """Return the matrices of both ways for parameters [P]; for those that the model was made with if left out."""
         value = dict(zip(NAMES, (self.default if parameters is None else parameters).unbind(), strict=True))
         geometry = fitted_geometry(self.profile, value)
         x = self.x_m + value["page_centre_x_m"], self.y_m + value["page_centre_y_m"]

@@ -27,11 +27,11 @@ def make_localizer(
     """A published localizer by name.
 
     Args:
-        name: of `NAMES`.
+        name: name out of `NAMES`.
         profile: the nominal device.
         samples: samples per symbol and axis.
-        lenses: of `LENS_CHOICES`, for rays.
-        quadrature_sign: for modes, see `ModeLocalizer`.
+        lenses: name out of `LENS_CHOICES`, for rays.
+        quadrature_sign: sign of the quadrature, for modes, see `ModeLocalizer`.
 
     Raises:
         InvalidInputError: no such localizer or lens.
@@ -54,7 +54,7 @@ class PublishedDecoder(nn.Module):
         profile: the nominal device.
         references: reference-only frames.
         localizer: see `make_localizer`.
-        channels: of the U-Net.
+        channels: channels of the U-Net.
         classes: levels that it tells apart as classes; 0 for p itself.
     """
 
@@ -81,7 +81,7 @@ class PublishedDecoder(nn.Module):
         return self._p(self.scores(frames, shift_px))
 
     def scores(self, frames: Tensor, shift_px: Tensor) -> Tensor:
-        """The same to what the U-Net says: p itself, or the logit of each class [N, classes, ny, nx]."""
+        """Return the U-Net's outputs: p itself, or the logit of each class [N, classes, ny, nx]."""
         with torch.autocast(frames.device.type, enabled=False):
             seen, level = sample_pair(frames.float(), self.references, self.localizer.grid(), shift_px)
         return self._scores(seen, level)
@@ -117,7 +117,7 @@ def p_of_classes(logits: Tensor) -> Tensor:
 
 
 def sample_pair(frames: Tensor, references: Tensor, grid: Tensor, shift_px: Tensor) -> tuple[Tensor, Tensor]:
-    """Both frames of each pair, and the references at the same pixels, bilinearly; zero outside.
+    """Sample both frames of each pair, and the references at the same pixels, bilinearly; zero outside.
 
     Args:
         frames: [N, 2, H, W].
@@ -143,7 +143,7 @@ def sample_frames(frames: Tensor, grid: Tensor) -> Tensor:
 
 
 def over_reference(seen: Tensor, level: Tensor) -> Tensor:
-    """What a page adds to the reference, over the reference's amplitude, of unit root mean square a page.
+    """Return a page's frames less the reference, over its amplitude, with a root mean square of 1 a page.
 
     Args:
         seen, level: counts of the frames and of the references, [N, 2, h, w].

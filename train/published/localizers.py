@@ -17,7 +17,7 @@ AFFINE_START = (0.98, 0.95)
 """Page over camera along x and y, roughly: where each camera's affine starts."""
 NAMES = ("none", "mode", "ray")
 _FAR = 10.0
-"""In page half extents: off every camera, where samples are zero."""
+"""Place in page half extents: off every camera, where samples are zero."""
 
 
 class Registration(nn.Module):
@@ -40,7 +40,7 @@ def page_places(shape: tuple[int, int]) -> Tensor:
 
 
 class Localizer(nn.Module):
-    """What the three share: where samples lie on the page, and how each camera lies to it.
+    """Base of the three localizers: the samples' places on the page, and the registration of each camera.
 
     Args:
         profile: the nominal device.
@@ -55,7 +55,7 @@ class Localizer(nn.Module):
         self.registration = Registration()
 
     def grid(self) -> Tensor:
-        """Where both frames are sampled, [2, h, w, 2], (x, y) from -1 to 1 at their edges."""
+        """Return the places of the samples in both frames, [2, h, w, 2], (x, y) from -1 to 1 at their edges."""
         return torch.as_tensor(self.registration(self.places.float()))
 
     def forward(self, seen: Tensor) -> Tensor:
@@ -130,7 +130,7 @@ class RayLocalizer(Localizer):
         self._half = (profile.page_width_m / 2, profile.page_height_m / 2)
 
     def grid(self) -> Tensor:
-        """Where both frames are sampled; a ray that the pipe loses lies outside them."""
+        """Return the places of the samples in both frames; a ray that the pipe loses lies outside them."""
         half = torch.tensor(self._half, dtype=torch.float64, device=self.places.device)
         traced = self.tracer((self.places * half).reshape(-1, 2), self.angle.double())
         landed = torch.where(traced.valid[:, None], traced.places / half, _FAR)

@@ -34,11 +34,11 @@ _WIDEST_ANGLE = math.pi / 6
 
 
 class Traced(NamedTuple):
-    """Where rays land.
+    """Landing places of rays.
 
     Attributes:
-        places: on the camera plane, metres from the axis, the flip of the two lenses taken out, [N, 2] float64. That of
-            a lost ray is finite and means nothing.
+        places: places on the camera plane, metres from the axis, the flip of the two lenses taken out, [N, 2] float64.
+            That of a lost ray is finite and means nothing.
         valid: whether the ray gets there, [N] bool.
         reflections: how often it was reflected at the walls x = +-w/2 and at the walls y' = +-w/2, [N, 2] int64.
     """
@@ -102,7 +102,7 @@ class RayTracer(nn.Module):
         """Trace one ray for each point. The places can be differentiated, once, by both arguments.
 
         Args:
-            points: on the page (x, y), metres from its centre, [N, 2] float64.
+            points: points on the page (x, y), metres from its centre, [N, 2] float64.
             angle: the pipe's angle in place of the profile's, radians, scalar float64.
 
         Raises:
@@ -112,7 +112,7 @@ class RayTracer(nn.Module):
         return Traced(-stops[-1].position[:, :2], stops[-1].valid, reflections)
 
     def path(self, points: Tensor, angle: Tensor) -> Tensor:
-        """Where each ray has been, for drawing: arguments and errors of `forward`.
+        """Return the path of each ray, for drawing: arguments and errors of `forward`.
 
         Returns:
             Positions (x, y, z), metres, z from the modulator, [K, N, 3]: modulator, each surface of the launch lens,
@@ -135,7 +135,7 @@ class RayTracer(nn.Module):
         return stops + self._delaunch(stops[-1]), reflections
 
     def _launch(self, rays: _Rays) -> list[_Rays]:
-        """From the modulator to the plane of the entrance, still in air."""
+        """Trace from the modulator to the plane of the entrance, still in air."""
         if self.lens is not None:
             return _through(self.lens, rays)
         squared = (rays.position[:, :2] ** 2).sum(-1)
@@ -147,7 +147,7 @@ class RayTracer(nn.Module):
         return [bent._replace(position=facet - self.focal_length * bent.direction), bent._replace(position=facet)]
 
     def _delaunch(self, rays: _Rays) -> list[_Rays]:
-        """From the plane of the exit, in air, to the cameras."""
+        """Trace from the plane of the exit, in air, to the cameras."""
         if self.lens is not None:
             return _through(self.lens.reversed(), rays)
         at_lens = rays.position + self.focal_length * rays.direction
@@ -156,7 +156,7 @@ class RayTracer(nn.Module):
         return [rays._replace(position=at_lens), rays._replace(position=camera)]
 
     def _pipe(self, rays: _Rays, angle: Tensor) -> tuple[list[_Rays], Tensor]:
-        """From the plane of the entrance, in air, to that of the exit, in air, and the reflections on the way."""
+        """Trace from the plane of the entrance, in air, to that of the exit, in air, and count the reflections."""
         none, half = torch.zeros_like(angle), self.pipe_width / 2
         normals = torch.stack(
             [torch.stack([none + 1, none, none]), torch.stack([torch.sin(angle), torch.cos(angle), none])]
@@ -212,7 +212,7 @@ def _check(points: Tensor, angle: Tensor) -> None:
 
 
 def launched_path(lens: LensPrescription, points: Tensor, sines: Tensor) -> tuple[Tensor, Tensor]:
-    """Where rays from a lens's front focal plane reach its back focal plane, and over what optical path.
+    """Trace rays from a lens's front focal plane to its back focal plane.
 
     Args:
         lens: the lens.
@@ -236,7 +236,7 @@ def launched_path(lens: LensPrescription, points: Tensor, sines: Tensor) -> tupl
 
 
 def _through(lens: LensPrescription, rays: _Rays) -> list[_Rays]:
-    """From the lens's front focal plane, where the rays are, to its back focal plane."""
+    """Trace rays through a lens, from its front focal plane, where they are, to its back focal plane."""
     vertex, before, stops = rays.position[:, 2] + lens.front_focal_m, 1.0, []
     for surface in lens.surfaces:
         rays, normal = _met(rays, surface, vertex, lens.diameter_m)
@@ -273,7 +273,7 @@ def _newton(rays: _Rays, surface: Surface, vertex: Tensor, distance: Tensor) -> 
 
 
 def _height(surface: Surface, at: Tensor, vertex: Tensor) -> tuple[Tensor, Tensor]:
-    """How far points lie behind a surface along z, [N] metres, and the gradient of that, [N, 3].
+    """Return the distance of points behind a surface along z, [N] metres, and its gradient, [N, 3].
 
     The surface is z = c r^2 / (1 + sqrt(1 - (1 + conic) c^2 r^2)), carried on beyond its rim with the root there.
     """
@@ -289,7 +289,7 @@ def _under_root(surface: Surface, at: Tensor) -> Tensor:
 
 
 def _refracted(rays: _Rays, normal: Tensor, ratio: float) -> _Rays:
-    """Behind a surface with unit normals [N, 3] along the light; `ratio` is the index before it over that behind it."""
+    """Refract rays at a surface with unit normals [N, 3] along the light; `ratio` is index before over index after."""
     along = (rays.direction * normal).sum(-1)
     squared = 1 - ratio**2 * (1 - along**2)
     onward = torch.sqrt(torch.clamp(squared, min=_SMALLEST_SQUARE))

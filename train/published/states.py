@@ -27,9 +27,9 @@ def page_states(
     Args:
         path: file that keeps them; interrupted, the next call goes on with what is in it under the same key.
         key: everything that they depend on.
-        recording: with symbols.
-        extractor: of the calibrated device; shift is followed from page to page.
-        pages: which.
+        recording: recording with symbols.
+        extractor: extractor of the calibrated device; shift is followed from page to page.
+        pages: numbers of the pages.
     """
     states, seconds = _kept(path, key)
     if len(states) >= len(pages):

@@ -50,7 +50,7 @@ class PublishedTrainer:
     """Trains a published decoder.
 
     Attributes:
-        localizer: of `lightpage.train.published.localizers.NAMES`.
+        localizer: name out of `lightpage.train.published.localizers.NAMES`.
         choices: the run's.
     """
 
@@ -107,10 +107,10 @@ def train_published(
 
     Args:
         run: folder.
-        localizer, choices, profile, quadrature_phase: as for `published_decoder`.
+        localizer, choices, profile, quadrature_phase: see `published_decoder`.
         mask: pilots, bool [ny, nx], which are not learnt from.
         training, validation: pages of one recording.
-        callbacks, processes: as for `lightpage.train.fitting.fit.fit`.
+        callbacks, processes: see `lightpage.train.fitting.fit.fit`.
     """
     seed_stretch(run, choices.seed)
     recording = training.recording
@@ -134,8 +134,8 @@ def published_decoder(
     """A published decoder with its first weights.
 
     Args:
-        localizer: of `lightpage.train.published.localizers.NAMES`.
-        choices: its size and lenses.
+        localizer: name out of `lightpage.train.published.localizers.NAMES`.
+        choices: size and lenses of the decoder.
         profile: the nominal device.
         references: reference-only frames.
         quadrature_phase: angle between the homodyne arms, whose sign the mode localizer must know.

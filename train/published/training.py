@@ -39,13 +39,13 @@ class PublishedChoices:
     """Hyperparameters of a published decoder; the defaults are its authors' for 4x4 symbols.
 
     Attributes:
-        channels: of the U-Net, at sample pitch and below.
+        channels: channels of the U-Net, at sample pitch and below.
         steps: optimiser steps: 50 epochs of 450 pages, two at a time.
         batch: pages a step.
         decoder_rate, affine_rate, angle_rate: learning rates of U-Net, registration and pipe angle (radians).
         decay: factor on the decoder's learning rate at each of `DECAYS`.
-        lenses: of `lightpage.train.published.decoder.LENS_CHOICES`.
-        seed: of initial weights and batches.
+        lenses: name out of `lightpage.train.published.decoder.LENS_CHOICES`.
+        seed: seed of initial weights and batches.
         precision: see `lightpage.train.fitting.precision`.
         classes: levels that the decoder tells apart by cross-entropy; 0 for the von Mises likelihood.
     """
@@ -69,10 +69,10 @@ class FramePages(Dataset[Page]):
     A state is the image's shift (x, y) in pixels and the piston in radians.
 
     Args:
-        recording: with symbols; stays open.
-        pages: which of its pages.
-        states: of those pages.
-        modulation: what the modulator makes of its levels.
+        recording: recording with symbols; stays open.
+        pages: numbers of the pages to show.
+        states: states of those pages.
+        modulation: light that the modulator makes of its levels.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class FramePages(Dataset[Page]):
         return len(self._pages)
 
     def __getitem__(self, index: int) -> Page:
-        """One page."""
+        """Return a page: frames, state and true phases."""
         page, state = self._pages[index], self.states[index]
         pair, symbols = self.recording.frames(page), self.recording.symbols(page)
         assert symbols is not None
@@ -118,7 +118,7 @@ class DataPages(Dataset[Page]):
         return len(self._pages)  # type: ignore[arg-type]  # it has a length
 
     def __getitem__(self, index: int) -> Page:
-        """One page."""
+        """Return a page, with NaN for the phases of its pilots."""
         *shown, phases = self._pages[index]
         return *shown, torch.where(self._pilots, torch.nan, phases)
 
@@ -130,7 +130,7 @@ class PublishedTraining(DecoderTraining[PublishedDecoder]):
     and its shift to where it is looked at. Its authors' device stood still.
 
     Args:
-        network, pilot_mask, levels: as for `DecoderTraining`.
+        network, pilot_mask, levels: see `DecoderTraining`.
         choices: the run's.
     """
 

@@ -13,7 +13,7 @@ from lightpage.errors import InvalidInputError
 
 KERNEL = 5
 DEPTH = 3
-"""How often the U halves its resolution."""
+"""Number of times that the U halves its resolution."""
 HEAD_STRIDES = {4: (1, 1, 2, 1, 2), 8: (1, 1, 2, 2, 2), 16: (1, 2, 2, 2, 2)}
 """Strides of the convolutions behind the U, by samples per symbol and axis."""
 INPUTS = 4
@@ -30,7 +30,7 @@ class PublishedUNet(nn.Module):
 
     Args:
         samples: samples per symbol and axis: 4, 8 or 16.
-        channels: at sample pitch and below it.
+        channels: channels at sample pitch and below it.
         outputs: numbers for each symbol.
 
     Raises:

@@ -1,1 +1,1 @@
-"""How a decoder comes to be, from recording to run."""
+"""Trainers: from a recording to a run."""

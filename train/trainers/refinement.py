@@ -39,7 +39,7 @@ def fit_prediction(extractor: FeatureExtractor, known: Sequence[Explained]) -> P
     """The prediction of a device, illumination and floor as known pages show them.
 
     Args:
-        extractor: of the device.
+        extractor: extractor of the device.
         known: pages, as `explained` gives them for that extractor.
     """
     prediction = Prediction(extractor.device.profile, extractor.device.parameters, extractor.grid)
@@ -64,8 +64,8 @@ class Refined:
 
     Attributes:
         trained: their trainings, in order.
-        validation: its features of the validation pages.
-        seconds: of all of it, features and training, all stretches together.
+        validation: features of the validation pages for this refinement.
+        seconds: seconds of features and training, all stretches together.
     """
 
     trained: list[Fitted[SymbolTraining]]
@@ -83,7 +83,7 @@ class RefinementPages:
     """Recorded pages that refinements are trained on.
 
     Attributes:
-        recording: with their frames.
+        recording: recording with their frames.
         pages: page numbers: those trained on, those validated on, then others.
         training, validation: how many of them.
         features: their features for the first pass, in the same order.
@@ -110,10 +110,10 @@ def fit_refinements(
     """Train, or go on with, the refinements of a run, one behind the other.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         choices: the run's; `choices.refinements` of them, at least one.
         inputs: pages.
-        extractor, prediction: of the device.
+        extractor, prediction: extractor and prediction of the device.
         first: the first pass's training.
         key: everything that the first pass's features depend on.
         starts: networks whose weights the first of them begin with.
@@ -154,10 +154,10 @@ def refined_pages(
     """Features for a refinement.
 
     Args:
-        extractor, prediction: of the device.
+        extractor, prediction: extractor and prediction of the device.
         inputs: pages.
         earlier: their features for the pass before.
-        module: which was trained on such features.
+        module: module that was trained on such features.
         start: first page.
         shift_px: not asked for: the pass before has found each page's.
     """

@@ -29,7 +29,7 @@ from lightpage.train.trainers.refinement import Refined, RefinementPages, fit_pr
 from lightpage.waves.grid import symbol_samples
 
 _SYNTHETIC_SYMBOLS = 470_000
-"""Of all synthetic pages together, unless told otherwise: 96 pages of the bench device."""
+"""Symbols of all synthetic pages together, unless told otherwise: 96 pages of the bench device."""
 _SYNTHETIC_PAGES = 12, 96
 """Fewest and most: few large ones would show few drifted states, and more small ones teach no more."""
 MATCHED_PAGES = 2
@@ -46,7 +46,7 @@ class SymbolTrainer:
     """Trains the network at symbol pitch.
 
     Attributes:
-        localizer: of `LOCALIZERS`.
+        localizer: name out of `LOCALIZERS`.
         choices: the run's.
         synthetic_pages: pages of the drifted device to train on beside the recorded ones.
         start: finished run whose weights are begun with.

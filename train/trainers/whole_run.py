@@ -40,7 +40,7 @@ from lightpage.train.runs import (
 from lightpage.train.trainers.symbols import MATCHED_PAGES, SymbolTrainer
 
 FEWEST_PAGES = 6
-"""To train, validate and evaluate with."""
+"""Fewest pages to train, validate and evaluate with."""
 
 _RECORDED = "--recording (SHA-256 of its frames and symbols)"
 
@@ -51,7 +51,7 @@ class Split:
 
     Attributes:
         training, validation, left: page numbers.
-        validation_share, test_share: of all.
+        validation_share, test_share: shares of all pages.
     """
 
     training: list[int]
@@ -105,12 +105,12 @@ def make_run(
     """Train, or go on with, a run whose folder belongs to this command; a finished one is told again.
 
     Args:
-        out: its folder.
-        recording: with symbols, open.
+        out: folder of the run.
+        recording: open recording with symbols.
         profile: the nominal device.
         trainer: the way of training.
         usable: see `usable_pages`.
-        split: of these pages.
+        split: split of these pages.
         calibrate: gives the device's calibration; it is called once the options are known to be those of before.
         processes: see `lightpage.train.fitting.fit.fit`.
 
@@ -185,7 +185,7 @@ def make_run(
 
 
 def _symbols_digest(recording: Recording, pages: list[int]) -> str:
-    """Of what was written on these pages, of its levels, and of the recording's own pilots if it has any."""
+    """Return a digest of the symbols written on these pages, their levels, and the recording's own pilots if any."""
     digest = hashlib.sha256(str(recording.levels).encode())
     for values in (*(recording.symbols(page) for page in pages), recording.pilots()):
         digest.update(b"" if values is None else np.ascontiguousarray(values).tobytes())

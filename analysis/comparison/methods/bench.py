@@ -43,8 +43,8 @@ class Bench:
         out: folder of everything.
         training, validation, unseen: page numbers.
         levels: numbers of levels of further recordings, on which confidences are judged.
-        seed: of the recording; theirs follow.
-        kept: of this data set.
+        seed: seed of the recording; the methods' seeds follow from it.
+        kept: store of this data set.
         reflections: rounds to the field, of methods that are not `fast`; see `Hyperparameters`.
     """
 
@@ -96,7 +96,7 @@ class Bench:
 
     @property
     def pages(self) -> list[int]:
-        """All that is not calibrated on, in order."""
+        """Pages that are not calibrated on, in order."""
         return [*self.training, *self.validation, *self.unseen]
 
     def calibrated_device(self, method: str = "") -> CalibratedDevice:

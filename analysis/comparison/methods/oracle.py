@@ -39,9 +39,9 @@ class Oracle:
     """Features of an oracle, which may know what the recording's `truth` says.
 
     Args:
-        recording: of a simulated device, with its truth.
+        recording: recording of a simulated device, with its truth.
         profile: the nominal device.
-        device: its true state.
+        device: true state of the device.
     """
 
     def __init__(self, recording: Recording, profile: Profile, device: Device) -> None:

@@ -34,7 +34,7 @@ FIRST_PASSES = {REFINED: "coherent", WAVE_REFINED: "wave", ORACLE_REFINED: ORACL
 
 SYMBOL_METHODS = (*LOCALIZERS, FAST, REFINED, WAVE_REFINED, ORACLE, ORACLE_REFINED)
 LEVEL_PAGES = 4
-"""Of each number of levels, and as many as are calibrated on: thirty thousand symbols on the bench device."""
+"""Pages of each number of levels, as many as are calibrated on: thirty thousand symbols on the bench device."""
 
 
 def symbol_method(bench: Bench, name: str, size: str, choices: Hyperparameters) -> Outcome:

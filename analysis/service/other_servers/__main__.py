@@ -1,4 +1,4 @@
-"""What a call costs beside the run of the graph: the service, and MLServer, KServe and Ray Serve with the same graph.
+"""Overhead of a call beyond the run of the graph, for the service, MLServer, KServe and Ray Serve with the same graph.
 
     python -m analysis.service.other_servers --out runs/bench-service/other-servers --json FILE
 
@@ -70,7 +70,7 @@ _COMPARED = (
 
 
 def idle_cores(ways: Iterable[Way]) -> dict[str, float]:
-    """How many cores each server keeps busy while nobody calls it; the service at its port and at its socket as one."""
+    """Return how many cores each idle server keeps busy; the service's port and socket count as one server."""
     servers = {way.marked: way.server for way in ways}
     before = {marked: marked.cpu_s() for marked in servers}
     time.sleep(_IDLE_S)
@@ -81,7 +81,7 @@ def idle_cores(ways: Iterable[Way]) -> dict[str, float]:
 
 
 def versions() -> dict[str, Any]:
-    """Of what runs here and in each environment."""
+    """Return the versions of what runs here and in each environment."""
     found: dict[str, Any] = {"python": platform.python_version()}
     found["lightpage"] = {name: version(name) for name in ("lightpage", *_TOLD)}
     for name in NAMES:

@@ -29,12 +29,12 @@ _RUN_S = 60.0
 
 
 class BareRuns:
-    """Such a process; use it in a `with` statement.
+    """Process that runs graphs and serves nobody; use it in a `with` statement.
 
     Args:
-        folder: of the models.
-        graphs: in it.
-        threads: of one run.
+        folder: folder of the models.
+        graphs: graphs in it.
+        threads: threads of one run.
 
     Raises:
         WorkerError: it has ended, or does not answer.

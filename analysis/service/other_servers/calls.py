@@ -45,9 +45,9 @@ def infer_request(
     """A pair in raw contents.
 
     Args:
-        model: its name.
+        model: name of the model.
         pair: uint8 or uint16.
-        outputs: that are wanted.
+        outputs: names of the outputs that are wanted.
         as_bytes: whether a frame goes as one element of type BYTES.
     """
     request = oip.ModelInferRequest(model_name=model)
@@ -145,7 +145,7 @@ def chunk_caller(target: str, graph: Graph) -> Iterator[Call]:
 
 @contextmanager
 def memory_caller(target: str, graph: Graph) -> Iterator[Call]:
-    """The same over a Unix socket, with memory that is shared: frames are copied into it."""
+    """Call the service over a Unix socket, with shared memory that frames are copied into."""
     with LightpageClient(target, CALL_S) as client, client.frames.share_memory() as memory:
 
         def call() -> Answer:

@@ -23,7 +23,7 @@ def requirements(name: str) -> str:
 
 
 def environment(folder: Path, name: str) -> Path:
-    """Its Python, in FOLDER/NAME: made at the first call, and again after a change of its requirements.
+    """Install a server's environment in FOLDER/NAME unless one with the same requirements is there; return its Python.
 
     Raises:
         LightpageError: it cannot be installed.

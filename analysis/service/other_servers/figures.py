@@ -1,4 +1,4 @@
-"""What measured seconds say: medians, spreads, and whether one server is below another by more than the spread."""
+"""Figures of measured seconds: medians, spreads, and whether servers differ by more than the spread."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ class Figure:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Figure:
-        """Of values, one or more."""
+        """Summarise values, of which there is at least one."""
         p10, p50, p90 = (float(each) for each in np.quantile(values, [0.1, 0.5, 0.9]))
         return cls(p10, p50, p90)
 
     @property
     def spread(self) -> float:
-        """From p10 to p90."""
+        """Difference of p90 and p10."""
         return self.p90 - self.p10
 
 
@@ -37,7 +37,7 @@ class Comparison:
     """The service beside another server.
 
     Attributes:
-        difference: by how much the service is better, of the medians; negative where it is worse.
+        difference: difference of the medians, positive where the service is better.
         spread: the larger one of both.
     """
 
@@ -46,11 +46,11 @@ class Comparison:
 
     @classmethod
     def of(cls, own: Figure, other: Figure, more_is_better: bool = False) -> Comparison:
-        """Of seconds, or of rates."""
+        """Compare two servers by seconds, or by rates if more is better."""
         difference = own.p50 - other.p50 if more_is_better else other.p50 - own.p50
         return cls(difference, max(own.spread, other.spread))
 
     @property
     def missed_by(self) -> float:
-        """What is missing of a difference beyond the spread; zero or less where there is one."""
+        """Amount by which the difference falls short of the spread; zero or less where it does not."""
         return self.spread - self.difference

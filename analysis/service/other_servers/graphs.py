@@ -1,4 +1,4 @@
-"""What all servers carry: graphs, frames that they take, and the bundles that they come from."""
+"""Graphs that all servers run, frames that they take, and the bundles that both come from."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ class Graph:
     """A graph that every server carries.
 
     Attributes:
-        name: of the model.
+        name: name of the model.
         pair: frames that it takes.
-        bundle: that holds it, a zip.
-        page_shape: of what it answers.
+        bundle: bundle that holds it, a zip.
+        page_shape: shape of the answer.
     """
 
     name: str
@@ -42,12 +42,12 @@ class Graph:
 
     @property
     def frames(self) -> NDArray[Any]:
-        """Both, [2, rows, columns]."""
+        """Frames of the pair, [2, rows, columns]."""
         return np.stack([self.pair.in_phase, self.pair.quadrature])
 
     @property
     def pair_bytes(self) -> int:
-        """Of both frames."""
+        """Bytes of both frames."""
         return int(self.pair.in_phase.nbytes + self.pair.quadrature.nbytes)
 
 
@@ -56,7 +56,7 @@ def write_graphs(folder: Path, threads: int) -> list[Graph]:
 
     Args:
         folder: an empty one.
-        threads: of one run.
+        threads: threads of one run.
     """
     graphs = []
     for name, profile_name in CONSTANT.items():

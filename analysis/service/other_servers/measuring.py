@@ -1,4 +1,4 @@
-"""One graph in all servers: their ways to be called, what calls take, and how they compare."""
+"""Measurements of one graph in all servers: the ways to call them, what calls take, and how they compare."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ CALLS_EACH = {"constant-small": 12, "constant-large": 3, DECODER_NAME: 4}
 
 @dataclass(frozen=True)
 class Way:
-    """One way to call one server.
+    """Way to call a server.
 
     Attributes:
-        server: its name.
-        marked: its processes.
+        server: name of the server.
+        marked: processes of the server.
         connect: a caller.
     """
 

@@ -23,7 +23,7 @@ class GraphModel(Model):  # type: ignore[misc]  # of another environment
     """Runs a graph.
 
     Args:
-        name: of the model.
+        name: name of the model.
         run: the graph.
         like: frames that it takes.
     """

@@ -22,15 +22,15 @@ _STUBS = "lightpage.runtime.client.pb.inference.open_inference_pb2_grpc.add_GRPC
 _ONGOING = 64
 """Requests that the replica has taken at once: more than there are callers."""
 _STORE_BYTES = 1 << 30
-"""Of Ray's memory for objects: room for a dozen pairs of 42 MB."""
+"""Size of Ray's memory for objects: room for a dozen pairs of 42 MB."""
 
 
 class Graphs:
     """The deployment: its methods are those of the protocol, and run in threads.
 
     Args:
-        folder: of the models.
-        threads: of one run.
+        folder: folder of the models.
+        threads: threads of one run.
     """
 
     def __init__(self, folder: Path, threads: int) -> None:

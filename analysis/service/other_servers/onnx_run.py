@@ -1,6 +1,6 @@
-"""One ONNX graph in ONNX Runtime: what each of the other servers carries, in its own environment.
+"""Run of an ONNX graph in ONNX Runtime, the same for each of the other servers in its own environment.
 
-It needs numpy and onnxruntime, and nothing of Lightpage.
+The module needs numpy and onnxruntime, and nothing of Lightpage.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ os.environ["ORT_DISABLE_TELEMETRY"] = "1"  # read once, on import
 import onnxruntime  # type: ignore[import-untyped]
 
 GRAPH = "graph.onnx"
-"""In the folder of a model, which is named as the model is."""
+"""Name of the graph in the folder of a model, which is named as the model is."""
 FRAMES = "frames.npy"
 """Beside it: a pair that the model takes, [2, rows, columns]."""
 OUTPUT = "p"
@@ -32,8 +32,8 @@ class OnnxRun:
     """A graph that is open; calls may come from many threads at once.
 
     Args:
-        path: of the graph.
-        threads: of one run.
+        path: path of the graph.
+        threads: threads of one run.
     """
 
     def __init__(self, path: Path, threads: int) -> None:

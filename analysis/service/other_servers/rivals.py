@@ -1,4 +1,4 @@
-"""How each server is started and called: the configuration that counts, and others that were tried."""
+"""Starts and callers of the other servers: the configuration that counts, and others that were tried."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ MLSERVER_PORT, MLSERVER_HTTP_PORT = 18081, 18080
 """Ports are in a network that nothing else is in. These are in mlserver-settings.json too."""
 KSERVE_PORT, KSERVE_HTTP_PORT = 18181, 18180
 RAY_PORT, RAY_HTTP_PORT = 18281, 18280
-"""Of its proxy."""
+"""Ports of Ray's proxy."""
 RAY_DIRECT_PORT, RAY_DIRECT_HTTP_PORT = 18301, 18311
-"""Of the replica."""
+"""Ports of the replica."""
 _MESSAGE_BYTES = 128 << 20
 
 Caller = Callable[[Graph], AbstractContextManager[Call]]
@@ -85,10 +85,10 @@ def ray_serve(python: Path, models: Path, folder: Path, threads: int, direct: bo
     """Ray Serve.
 
     Args:
-        python: of its environment.
+        python: Python of its environment.
         models: folder of the graphs.
-        folder: where it works.
-        threads: of one run.
+        folder: folder that it works in.
+        threads: threads of one run.
         direct: whether the replica itself listens for callers, in place of a proxy before it.
     """
     temporary = tempfile.mkdtemp(prefix="lightpage-ray-")  # its sockets' paths must be short

@@ -50,7 +50,7 @@ class Marked:
         self.mark = uuid.uuid4().hex
 
     def ids(self) -> list[int]:
-        """Of those that run now."""
+        """Return the numbers of the marked processes that run now."""
         wanted, found = f"{MARK}={self.mark}".encode(), []
         for folder in Path("/proc").iterdir():
             if folder.name.isdigit():
@@ -91,9 +91,9 @@ class OtherServer:
     """A server in an environment of its own; use it in a `with` statement.
 
     Args:
-        name: of it.
-        command: that starts it.
-        folder: where it works, and writes NAME.log.
+        name: name of the server.
+        command: command that starts it.
+        folder: folder that it works in, and writes NAME.log to.
         caller: connects a caller to it.
         environment: variables beside those of this process.
     """
@@ -128,7 +128,7 @@ class OtherServer:
         return self
 
     def wait(self, graph: Graph) -> None:
-        """Until it answers a call.
+        """Wait until the server answers a call.
 
         Raises:
             LightpageError: it has ended, or never answers.

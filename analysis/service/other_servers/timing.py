@@ -25,13 +25,13 @@ CALLERS = 4
 def in_turns(
     calls: Mapping[str, Callable[[], T]], rounds: int, what: str, rng: np.random.Generator, warm: int = WARM
 ) -> dict[str, list[T]]:
-    """What calls tell of themselves, round by round. Each round has an order of its own: none always follows another.
+    """Call in turns, and return the calls' results by name, one a round; each round has an order of its own, by chance.
 
     Args:
-        calls: by name.
-        rounds: that count.
+        calls: calls by name.
+        rounds: rounds that count.
         what: is timed, for the progress.
-        rng: of the orders.
+        rng: generator of the orders.
         warm: rounds before these.
     """
     told: dict[str, list[T]] = {name: [] for name in calls}
@@ -48,8 +48,8 @@ class Timed:
     """A call that was timed.
 
     Attributes:
-        seconds: that it took.
-        work_s: of these, the service's checks and decision; zero of other servers.
+        seconds: seconds of the call.
+        work_s: seconds of these for the service's checks and decision; zero of other servers.
     """
 
     seconds: float

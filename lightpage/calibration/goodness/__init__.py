@@ -1,1 +1,1 @@
-"""How well a calibration explains the light: a verdict, maps, and the likeliest cause."""
+"""Goodness of fit of a calibration: a verdict, maps of unexplained light, and its likeliest cause."""

@@ -11,7 +11,7 @@ _HIGH_PASS = (1.0, -4.0, 6.0, -4.0, 1.0)
 _SMOOTHED_PX = 3
 """Side of the squares of pixels whose mean stands for a pixel's expected count."""
 _CLASSES = 20
-"""Of pixels of like counts, each with a variance of its own."""
+"""Number of classes of pixels of like counts, each with a variance of its own."""
 _ROUNDING = 1 / 12
 """Variance that counts have as whole numbers."""
 _NORMAL = 0.6745

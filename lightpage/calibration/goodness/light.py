@@ -44,8 +44,8 @@ class SeenLight:
     Attributes:
         waves: the fitted ones.
         page: light on the modulator, [ny samples, nx samples].
-        fields: what either camera should see.
-        counts: what it saw beyond its reference, over twice that, [2, Gy, Gx].
+        fields: light that the model predicts for each camera.
+        counts: frames less references, over twice the references, [2, Gy, Gx].
         references: counts of the references, [2, Gy, Gx].
     """
 
@@ -79,7 +79,7 @@ class SeenLight:
 
     @property
     def left(self) -> Complex:
-        """What the model leaves, as light of both cameras that would mend it."""
+        """Residual of the model: light of both cameras that would explain what it leaves, complex [2, Gy, Gx]."""
         return self._mending(self._lacking)
 
     def seen_of(self, change: Complex) -> Complex:
@@ -97,7 +97,7 @@ class SeenLight:
         return self._mending((seen - self.counts) / _MORE_NOISE)
 
     def noise_of_modulator(self) -> Complex:
-        """What a radian of phase noise, another in each sample, adds to what the cameras see, to first order."""
+        """Return the light that the modulator's phase noise of 1 rad a sample adds for both cameras, to first order."""
         noise = np.random.default_rng(1).standard_normal(self.page.shape)
         return self.seen_of(self.waves.to_cameras(1j * noise * self.page))
 
@@ -138,11 +138,11 @@ class SeenLight:
         return np.asarray(weighted[:, self._seen[_EVERY]].ravel())
 
     def equations_of(self, change: Complex) -> Real:
-        """What a small change of the light does to the equations; light of both cameras on the coarse grid."""
+        """Return the change of the equations, flat, by a small change of both cameras' light on the coarse grid."""
         return self.equations((change / self._amplitude[_EVERY] * self._along[:, *_EVERY].conj()).real)
 
     def equations_of_fit(self) -> Iterator[Real]:
-        """What each parameter that the twin knows does to the equations."""
+        """Yield the change of the equations by a small change of each parameter that the twin knows; each flat."""
         here = self.coarse.to_cameras(self.page)
         places = np.stack(np.meshgrid(self._grid.x_m, self._grid.y_m), axis=-1)[_EVERY]
         for index in range(min(self._twin.known, len(PARAMETERS))):
@@ -164,12 +164,12 @@ class SeenLight:
 
     @property
     def brightness(self) -> Real:
-        """What the cameras should have counted, over the reference's counts, [2, Gy, Gx]."""
+        """Counts that the model expects, over the reference's counts, [2, Gy, Gx]."""
         return np.abs(self._along) ** 2
 
     @property
     def left_of_equations(self) -> Real:
-        """What the model leaves of the equations, on the coarse grid, over their noise; flat."""
+        """Residual of the equations on the coarse grid, over their noise; flat."""
         return self.equations(self._lacking)
 
     @cached_property
@@ -200,7 +200,7 @@ class SeenLight:
         return np.asarray(self._seen * self._amplitude * along * left / (self.brightness + READ_NOISE))
 
     def _filtered(self, pair: FramePair, references: FramePair) -> list[NDArray[np.float32]]:
-        """What either frame shows beyond its reference, filtered as a decoder filters it."""
+        """Return each frame less its reference, filtered as a decoder filters it, float32 [H, W]."""
         images = []
         for frame, reference in ((pair.in_phase, references.in_phase), (pair.quadrature, references.quadrature)):
             beyond = frame.astype(np.float32) - reference

@@ -39,7 +39,7 @@ _NOTHING = 1e-30
 _BLOCKS = (6, 8)
 """Rows and columns of the maps, at most."""
 _MOST_RATIO = 1e6
-"""In the maps."""
+"""Largest ratio in the maps."""
 
 
 def measure_goodness(
@@ -54,10 +54,10 @@ def measure_goodness(
 
     Args:
         twin: ray tracer of the nominal device.
-        device: as it was fitted.
+        device: device as it was fitted.
         illumination: coefficients [T] of the page's, as `WaveFitted` has them.
         pair: frames of the page.
-        symbols: its unit phasors [ny, nx].
+        symbols: unit phasors of the page's symbols [ny, nx].
         progress: told of the share that is behind.
     """
     light = SeenLight(twin, device, illumination, pair, symbols)

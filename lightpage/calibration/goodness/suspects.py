@@ -1,4 +1,4 @@
-"""What is likeliest to be wrong with a fit that leaves light unexplained."""
+"""Search for the likeliest cause of light that a fit leaves unexplained."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ NEIGHBOURS = "phases that go with those of the symbols beside: is there crosstal
 
 
 def unlike_profile(parameters: Real) -> str:
-    """Which length of a fitted device [P] lies so far off that its profile is of another one, in words; or none.
+    """Name the length of a fitted device [P] that shows that its profile is another device's, in words; empty if none.
 
     Light that such a fit explains may be read all the same.
     """
@@ -46,11 +46,11 @@ def unlike_profile(parameters: Real) -> str:
 
 
 def likeliest(light: SeenLight, errors: Complex) -> str:
-    """What of the light is likeliest to be wrong, in words.
+    """Name the likeliest error of the model or of the page, in words.
 
     Args:
-        light: of a known page.
-        errors: of its symbols, less what is smooth in them.
+        light: light of a known page.
+        errors: errors of its symbols, less their smooth part.
     """
     fitted = scipy.linalg.orth(_of_unit_length(list(light.equations_of_fit())), rcond=_RANK)
     left = _beside(fitted, light.left_of_equations[:, None])[:, 0]
@@ -78,12 +78,12 @@ def _of_unit_length(columns: list[Real]) -> Real:
 
 
 def _beside(fitted: Real, columns: Real) -> Real:
-    """What of the columns no parameter of the fit does, given as orthonormal columns."""
+    """Return the part of the columns that is orthogonal to `fitted`, which has orthonormal columns."""
     return np.asarray(columns - fitted @ (fitted.T @ columns))
 
 
 def _suspects(light: SeenLight) -> Iterator[tuple[str, list[Real]]]:
-    """What may be wrong, in words, and how it would change the equations."""
+    """Yield each possible cause in words, with the columns by which it would change the equations."""
     coarse, page = light.coarse, light.page
     leaving, (across, up), squares = coarse.to_exit(page), places_on_facet(coarse), radius2(coarse)
     one = np.array([1, 0])[:, None, None]

@@ -17,7 +17,7 @@ GOOD, USABLE = 0.1, 0.3
 
 
 class Goodness(TomlTable):
-    """How well a fit explains the light of a known page.
+    """Goodness of fit: how well a calibration explains the light of a known page.
 
     Attributes:
         verdict: good, usable or wrong, by `bits_lost`; a device whose lengths are not its profile's is not good.
@@ -27,7 +27,7 @@ class Goodness(TomlTable):
         modulator_noise_rad: noise of phase of the modulator, a sample of `symbol_samples`.
         by_page: light that is left over what noise leaves, in blocks over the page, rows from the top; 1 is noise.
         by_facet: the same over the pipe's exit facet.
-        cause: what is likeliest to be wrong, in words; empty where nothing is.
+        cause: likeliest error, in words; empty where nothing is wrong.
     """
 
     verdict: Verdict

@@ -48,7 +48,7 @@ itself, and on the bench device three of them cost a twentieth of a bit."""
 _LARGEST_MOVE_PX = 1.5
 """A round's largest step: the model is linear in the displacement over about a speckle."""
 _EQUATIONS = 100_000
-"""Of each camera, at most about: more say nothing new of a few dozen unknowns."""
+"""Approximate limit of equations for each camera: more say nothing new of a few dozen unknowns."""
 _LEAST_STRIDE = 2
 """Grid samples from one equation to the next: the grid has twice the rate that the light needs."""
 _INSIDE = 0.98
@@ -73,7 +73,8 @@ class WaveFitted:
         quadrature_phase: angle between the homodyne arms, radians.
         residual: root mean square of what is left of the equations, in standard deviations of the reference's noise
             times an unknown factor: it says which of two fits is better.
-        modulation: what the modulator makes of its levels; the prior's centre where a page does not tell it from that.
+        modulation: light that the modulator makes of its levels; the prior's centre where a page does not tell it from
+            that.
         modulation_deviations: standard deviations of its coefficients, zero where held.
         illumination: coefficients [T] of the terms of the page's illumination.
     """
@@ -88,7 +89,7 @@ class WaveFitted:
 
 
 class LevelPrior(NamedTuple):
-    """What is known of a modulation before a page is seen.
+    """Prior of a modulation: its distribution before a page is seen.
 
     Attributes:
         centre: most likely one.
@@ -100,7 +101,7 @@ class LevelPrior(NamedTuple):
 
 
 class _State(NamedTuple):
-    """What is fitted.
+    """State of the fit: every quantity that is fitted.
 
     Attributes:
         parameters: [P].
@@ -119,10 +120,12 @@ class _Slopes(NamedTuple):
     """Derivatives at the places of the equations [...], of the light that each of both cameras sees.
 
     Attributes:
-        by_term: of the light by the illumination's terms, [T, 2, ...].
-        by_level: of the light by what the logarithm of the modulation is made of, [K, 2, ...]; none where it is held.
-        of_light: of the light by parameters that change it, [2, ...] each.
-        of_cameras: of the places (x, y), grid samples, by parameters that move the cameras, [2, ..., 2] each.
+        by_term: derivatives of the light by the illumination's terms, [T, 2, ...].
+        by_level: derivatives of the light by the terms of the modulation's logarithm, [K, 2, ...]; none where it is
+            held.
+        of_light: derivatives of the light by parameters that change it, [2, ...] each.
+        of_cameras: derivatives of the places (x, y), grid samples, by parameters that move the cameras, [2, ..., 2]
+            each.
     """
 
     by_term: Complex
@@ -141,7 +144,7 @@ class WaveFit:
         twin: ray tracer of the nominal device, for the cameras' poses.
         profile: the nominal device.
         pair, references: frames of a known page, and reference-only frames.
-        symbols: its unit phasors, complex [ny, nx].
+        symbols: unit phasors of the page's symbols, complex [ny, nx].
     """
 
     def __init__(
@@ -181,14 +184,14 @@ class WaveFit:
         Args:
             start: [P], right to within about a speckle and a radian.
             quadrature_phase: angle between the arms to start from, good to some tens of degrees.
-            groups: of `lightpage.calibration.parameters`. Without ``launch``, the illumination may bend the page's
-                phases instead.
+            groups: groups of `lightpage.calibration.parameters`. Without ``launch``, the illumination may bend the
+                page's phases instead.
             centre: [P] centre of the priors, nominal (zero) if None.
             prior_scale: factor on the priors' standard deviations, one for all or [P].
             progress: told of every round and of every derivative, with the share of the most rounds that is behind,
                 0 to 1. It may raise to stop the work.
-            modulation: what the modulator makes of its levels, to start from.
-            levels: what is known of it beforehand where it is fitted too, None where it is held.
+            modulation: light that the modulator makes of its levels, to start from.
+            levels: prior of the modulation where it is fitted too, None where it is held.
         """
         without_effect = _OF_REAL_LENSES if self._profile.ideal_lenses else ()
         of_light = [index for index in indices(*groups) if index not in (*SEEN_BY_CAMERAS, *without_effect)]
@@ -244,7 +247,7 @@ class WaveFit:
         return FittedWaves(self._profile, parameters, self._samples, filled=True)
 
     def _page(self, levels: Real) -> Complex:
-        """What the modulator makes of the page, evenly lit, [ny samples, nx samples]."""
+        """Return the light on the modulator under even illumination, complex [ny samples, nx samples]."""
         return on_modulator(Modulation(tuple(levels.tolist())).light(self._phases), self._samples)
 
     def _light(self, state: _State) -> Complex:
@@ -253,7 +256,7 @@ class WaveFit:
         return self._waves(state.parameters).to_cameras(lit)
 
     def _start(self, parameters: Real, quadrature_phase: float, modulation: Modulation) -> _State:
-        """With the even illumination that fits best."""
+        """Return the state to start from: the given values, and the even illumination that fits best."""
         chosen, counts, amplitude = self._look(parameters)
         even = np.eye(1, len(self._terms), dtype=np.complex128)[0]
         state = _State(parameters, quadrature_phase, even, np.array(modulation.coefficients))
@@ -308,7 +311,7 @@ class WaveFit:
         return np.asarray(np.linalg.inv(np.stack([right - middle, below - middle], axis=1)))
 
     def _pixels(self, parameters: Real) -> Real:
-        """Where both cameras see the places [...], [2, ..., 2]."""
+        """Return the pixels at which the cameras see the grid's places [...], [2, ..., 2] as (column, row)."""
         return self._twin.pixels(parameters, self._places.reshape(-1, 2)).reshape(2, *self._places.shape)
 
     def _look(self, parameters: Real) -> tuple[NDArray[np.bool_], Real, Real]:
@@ -409,12 +412,12 @@ def _told_apart(found: WaveFitted, usual: Modulation) -> WaveFitted:
 
 
 def _weight(here: Complex, phasor: complex) -> Real:
-    """One over the noise of equations of the light `here`."""
+    """Return 1 over the standard deviation of the equations' noise, where the light is `here`."""
     return np.asarray(1 / np.sqrt(np.abs(1 / phasor + here) ** 2 + READ_NOISE))
 
 
 def _inverse(information: Real) -> Real:
-    """Of a symmetric matrix whose rows have units of very different size."""
+    """Invert a symmetric matrix whose rows have units of very different size."""
     unit = 1 / np.sqrt(np.diag(information))
     inverse = np.linalg.pinv(information * unit * unit[:, None], hermitian=True)
     return np.asarray(inverse * unit * unit[:, None])

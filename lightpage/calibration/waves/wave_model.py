@@ -83,7 +83,7 @@ def fitted_camera_phase(profile: Profile, value: Mapping[str, Any], geometry: Wa
 
 
 def _ramp(value: Mapping[str, Any], geometry: WaveGeometry, x_m: Any, y_m: Any) -> Any:
-    """What a pipe off the lenses' axis does."""
+    """Return the phase over the page, radians, that an offset of the pipe from the lenses' axis causes."""
     per_metre = geometry.wave_number / geometry.focal_length_m
     return per_metre * (value["pipe_centre_x_m"] * x_m + value["pipe_centre_y_m"] * y_m)
 
@@ -169,7 +169,7 @@ class FittedWaves:
         return np.asarray(self.channel.camera_field(self.to_exit(field)) * self._camera)
 
     def to_cameras(self, field: Complex) -> Complex:
-        """The same as either camera sees it from where it stands, in-phase and quadrature, [2, Gy, Gx]."""
+        """Return the field as each camera sees it from where it stands, in-phase and quadrature, [2, Gy, Gx]."""
         return self.from_exit(self.to_exit(field))
 
     def from_exit(self, leaving: Complex) -> Complex:

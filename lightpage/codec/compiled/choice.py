@@ -1,4 +1,4 @@
-"""Which arithmetic the page code uses, the compiled one or numpy's, and how its work is spread over threads."""
+"""Choice between the page code's compiled arithmetic and numpy's, and the spread of its work over threads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One LDPC code of 5G New Radio: which bits its parity checks join, and its encoder.
+"""LDPC code of 5G New Radio: which bits its parity checks join, and its encoder.
 
 3GPP TS 38.212, section 5.3.2, base graph 1: 46 rows of checks, 68 columns of bits, each a group of Z. An entry (row,
 column, shift s) says that bit (z + s) mod Z of the column's group takes part in check z of the row's group. `K`
@@ -94,12 +94,12 @@ class LdpcCode:
 
     @cached_property
     def fillers(self) -> slice:
-        """Where the word holds zeros that both sides know."""
+        """Range of the word's fillers: zeros that both sides know."""
         return slice(self.information_bits, _INFORMATION_GROUPS * self.lifting)
 
     @cached_property
     def checks(self) -> tuple[NDArray[np.intp], ...]:
-        """For each row, the bits of its Z checks: indices into the whole word, [bits of a check, Z]."""
+        """Bits of each row's Z checks: indices into the whole word, a row's array being [bits of a check, Z]."""
         z = np.arange(self.lifting)
         return tuple(
             np.stack([c * self.lifting + (z + s) % self.lifting for (r, c), s in self._shift.items() if r == row])
@@ -108,7 +108,7 @@ class LdpcCode:
 
     @cached_property
     def rows(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """How many bits the checks of each row have, [rows], and the group and shift of each of them, [bits, 2]."""
+        """Number of bits in the checks of each row, [rows]; column group and shift of each of these bits, [bits, 2]."""
         entries = [(c, s) for row in range(self._rows) for (r, c), s in self._shift.items() if r == row]
         degrees = np.bincount([r for r, _ in self._shift], minlength=self._rows)
         return degrees.astype(np.int32), np.array(entries, np.int32)

@@ -22,7 +22,7 @@ OFFSET = np.float32(0.5)
 MOST_LLR = 40.0
 """Log-likelihood ratios are clipped here: a bit that is certain and wrong must not outvote all checks."""
 _KNOWN = np.float32(1e4)
-"""Of a filler, which both sides know to be 0."""
+"""LLR of a filler, which both sides know to be 0."""
 _SIGN = np.uint32(0x80000000)
 _BLOCKS_AT_ONCE = 16
 """More leave the cache and are slower a block."""
@@ -31,13 +31,13 @@ MOST_ITERATIONS = 25
 
 @dataclass(frozen=True)
 class DecodedBlocks:
-    """What became of some blocks.
+    """Decoded LDPC blocks.
 
     Attributes:
         information: uint8 [blocks, K].
         sent: the code word's sent bits, uint8 [blocks, n]; of a block that failed, the decoder's last guess.
         converged: whether all checks hold, bool [blocks].
-        iterations: that it took, int [blocks].
+        iterations: number of iterations, int [blocks].
     """
 
     information: Bits
@@ -52,10 +52,10 @@ def decode(
     """Decode blocks; each stops as soon as all of its checks hold.
 
     Args:
-        code: that they were encoded with.
+        code: code that the blocks were encoded with.
         llrs: log-likelihood ratios ln P(0) / P(1) of the sent bits, [blocks, n].
-        iterations: at most.
-        threads: that share the blocks where the decoder is compiled.
+        iterations: largest number of iterations.
+        threads: number of threads that share the blocks where the decoder is compiled.
 
     Raises:
         InvalidInputError: another shape, or a value that is no number.
@@ -130,7 +130,7 @@ def _update_layer(belief: NDArray[np.float32], check: NDArray[np.intp], messages
     Args:
         belief: log-likelihood ratio of every bit, [word, blocks].
         check: bits of each check, [degree, Z].
-        messages: what each check told each of its bits before, [degree, Z, blocks].
+        messages: messages of each check to each of its bits in the iteration before, [degree, Z, blocks].
     """
     others = np.take(belief, check, axis=0, mode="clip")
     others -= messages

@@ -1,1 +1,1 @@
-"""What symbols say of their bits: log-likelihood ratios and the information in them."""
+"""Likelihoods of bits: log-likelihood ratios of the symbols' bits, and the information in them."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 Float32 = NDArray[np.float32]
 
 LEAST_EXPONENT = -80.0
-"""Of `exponential`: less is far below what LLRs can tell, and would end in denormal numbers."""
+"""Least argument of `exponential`: less is far below what LLRs can tell, and would end in denormal numbers."""
 _HIGH, _LOW = np.float32(0.693359375), np.float32(-2.12194440e-4)
 """ln 2 in two parts: a whole number of at most 7 bits times the first is exact."""
 _EXPONENTIAL = [

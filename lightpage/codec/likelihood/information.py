@@ -9,7 +9,7 @@ from lightpage.codec.compiled.choice import compiled
 from lightpage.codec.likelihood.arithmetic import LEAST_EXPONENT, Float32, exponential, logarithm
 
 _UNITS = np.float32(2**24)
-"""Of a nat: whole numbers of them have the same sum in any order."""
+"""Units in a nat: whole numbers of them have the same sum in any order."""
 _CHUNK = 1 << 14
 
 

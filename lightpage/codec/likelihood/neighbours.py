@@ -37,20 +37,20 @@ class Neighbours:
 
     @property
     def width(self) -> int:
-        """How many they are."""
+        """Number of neighbours of a place."""
         return int(self.cosine.shape[1])
 
     @property
     def packed(self) -> tuple[int, Real, Real, NDArray[np.uint8]]:
-        """As the compiled arithmetic takes them."""
+        """Fields in the order that the compiled code takes."""
         return self.width, self.cosine, self.sine, self.coset
 
 
 class LevelTable:
-    """What the LLRs of a page's label bits follow from.
+    """Table of levels, neighbours and cosets that the LLRs of a page's label bits are computed from.
 
     Args:
-        levels: of the page, a power of two.
+        levels: levels of the page, a power of two.
         bits: b.
     """
 
@@ -68,7 +68,7 @@ class LevelTable:
         return first if np.array_equal(self.levels.order, (first + np.arange(count)) % count) else None
 
     def _ways(self, numbers: NDArray[np.int64]) -> Real:
-        """From each place to its neighbours, radians, [rows, neighbours]."""
+        """Return the angles from each place to its neighbours, radians, [rows, neighbours]; one row for even levels."""
         if self.levels.is_nominal:
             return np.asarray(numbers * (2 * np.pi / self.levels.count))[None]
         return np.ascontiguousarray(self.levels.gaps(numbers).T)
@@ -110,7 +110,7 @@ class LevelTable:
 
     @cached_property
     def packed(self) -> tuple[object, ...]:
-        """As the compiled arithmetic takes it."""
+        """Table in the form that the compiled code takes."""
         search: tuple[object, ...] = np.zeros(0), 0.0, np.zeros(0), np.zeros(0, np.int64), 0
         if not self.levels.is_nominal:
             first, borders, starts, most = self.levels.borders
@@ -121,10 +121,10 @@ class LevelTable:
 
 @lru_cache(32)
 def searches_of(levels: Levels, bits: int) -> tuple[object, ...]:
-    """What finds the nearest of uneven levels of each coset, as the compiled arithmetic takes it.
+    """Return the search tables for the nearest uneven level of each coset, in the form that the compiled code takes.
 
     Args:
-        levels: of the page, more than there are cosets.
+        levels: levels of the page, more than there are cosets.
         bits: b, of 2^b cosets.
     """
     cosets = [levels.every(1 << bits, coset) for coset in range(1 << bits)]

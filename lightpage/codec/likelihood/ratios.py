@@ -22,9 +22,9 @@ def ratios(phase: Real, concentration: Real, table: LevelTable, most: float, thr
     Args:
         phase: radians, at most `MOST_PHASE`, [symbols].
         concentration: kappa, [symbols].
-        table: of the levels.
+        table: table of the levels.
         most: LLRs are clipped here.
-        threads: that share the work where it is compiled.
+        threads: number of threads that share the work where it is compiled.
     """
     out = np.empty((len(phase), table.bits), np.float32)
     native = compiled()

@@ -1,4 +1,4 @@
-"""How far a cluster goes: the queues against arithmetic, and the command from what was measured before."""
+"""Size that a cluster can reach: the queues against arithmetic, and the command from earlier measurements."""
 
 import json
 from pathlib import Path

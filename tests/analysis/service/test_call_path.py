@@ -1,4 +1,4 @@
-"""What a call enters, traced in a service that runs, is split into its way and what only records it."""
+"""Functions that a call enters in a running service are split into its path and those that only record it."""
 
 import json
 from fnmatch import filter as matching

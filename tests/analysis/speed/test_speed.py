@@ -12,7 +12,7 @@ from tests.runtime import toy
 
 
 def figures(command: click.Command, folder: Path, *words: object) -> dict[str, Any]:
-    """What a benchmark writes."""
+    """Run a benchmark, and return the figures that it writes."""
     asked = [*map(str, words), "--json", str(folder / "F.json")]
     CliRunner().invoke(command, asked, catch_exceptions=False, standalone_mode=False)
     found: dict[str, Any] = json.loads((folder / "F.json").read_text())

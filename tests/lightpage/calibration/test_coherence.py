@@ -36,7 +36,7 @@ def light() -> FieldSampler:
 
 
 def test_light_that_a_twin_explains_has_the_coherence_of_its_share() -> None:
-    """This twin's branches all look at the same light, and only the first of the three has any weight."""
+    """All branches of this twin see the same light, and only the first of the three has any weight."""
     seen = page_coherence(Picture(PROFILE, SYMBOLS), FlatTwin(PROFILE), nominal(), PROFILE, SYMBOLS)
     assert seen == pytest.approx(1 / np.sqrt(3), rel=0.05)
 

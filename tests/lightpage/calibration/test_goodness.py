@@ -25,9 +25,9 @@ STILL = ("drift.shift_px=0",)
 
 
 def goodness_of(*settings: str, wrong_symbols: float = 0.0, stated: float = 1.0) -> Goodness:
-    """Of a device as a calibration would find it that knows all but what it has no parameter for.
+    """Return the goodness of a calibration that knows all of a device but what it has no parameter for.
 
-    Its profile states `stated` times the pipe's length.
+    The profile states `stated` times the pipe's length.
     """
     device = Device().with_settings([*STILL, *settings])
     simulator = Simulator(PROFILE, device, seed=3)

@@ -27,7 +27,7 @@ NEAR_PX = 0.3
 
 
 def known(symbols: NDArray[np.uint8] = SYMBOLS, count: int = 54) -> Pilots:
-    """As many pilots as a bench page has: the small page's own dozen are few."""
+    """Return as many pilots as a bench page has, since the dozen of the small page are too few."""
     mask = np.zeros(PROFILE.page_shape, bool)
     mask.flat[np.random.default_rng(2).choice(mask.size, count, replace=False)] = True
     return Pilots.of_symbols(mask, symbols, 256)
@@ -88,7 +88,7 @@ def test_other_pages_and_noise_are_not_found(
 def test_what_is_needed_is_what_unrelated_light_reaches_as_seldom_as_stated(
     pilots: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At a rate that can be seen: once in a hundred searches of an area that is one independent trial."""
+    """False alarms are counted at a higher rate: one in a hundred searches of an area that is one independent trial."""
     rng = np.random.default_rng(pilots)
     light = rng.standard_normal((5000, pilots)) + 1j * rng.standard_normal((5000, pilots))
     seen = np.abs(light.sum(axis=1)) ** 2 / np.sum(np.abs(light) ** 2, axis=1)

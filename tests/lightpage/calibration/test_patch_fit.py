@@ -20,7 +20,7 @@ EVERY = list(range(len(NAMES)))
 def measured(
     truth: np.ndarray, branches: tuple[str, ...] = ("direct", "x", "y"), piston: float = 0.0
 ) -> list[Measurement]:
-    """What patches would say, without error, of a device with parameters `truth`, looked at with the nominal twin."""
+    """Return error-free measurements of patches of a device with parameters `truth`, read with the nominal twin."""
     found, step = [], 0.5 * PROFILE.symbol_pitch_m
     for patch in patches(PROFILE):
         centre = np.array(patch.centre_m)

@@ -1,4 +1,4 @@
-"""What the light of pilots tells of a geometry."""
+"""Evidence of the pilots' light for a geometry."""
 
 import numpy as np
 

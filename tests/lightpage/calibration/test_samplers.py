@@ -74,7 +74,7 @@ CORNER = float(np.hypot(HALF_WIDTH, HALF_HEIGHT))
 
 
 def phase_of(value: dict[str, float], x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """At points in metres."""
+    """Return the camera phase at points in metres, radians."""
     return np.asarray(camera_phase(value, x / CORNER, y / CORNER, HALF_WIDTH / CORNER, HALF_HEIGHT / CORNER))
 
 

@@ -22,7 +22,7 @@ TURN = -1.5
 
 
 def some_device() -> np.ndarray:
-    """Off nominal everywhere, with the shear and distortion of a device at the edge of its range."""
+    """Draw parameters off nominal, with the shear and distortion of a device at the edge of its range."""
     vector = 0.5 * PRIORS * np.random.default_rng(0).standard_normal(len(PRIORS))
     vector[NAMES.index("pipe_angle_rad")] = -0.015
     vector[NAMES.index("distortion_relative")] = 0.003

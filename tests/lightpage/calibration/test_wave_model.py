@@ -20,7 +20,7 @@ ABUNDANT = 1.5
 
 @cache
 def missing_at_the_edge(angle_deg: float) -> float:
-    """How far the light of the page's outermost symbols is from that with abundant modes, within the page's image."""
+    """Return the relative error of the outermost symbols' light against abundant modes, within the page's image."""
     values = as_dict(nominal()) | {
         "pipe_angle_rad": np.deg2rad(angle_deg),
         "pipe_roll_rad": 0.004,

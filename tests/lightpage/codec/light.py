@@ -13,7 +13,7 @@ GROUP = FileFacts(5, 3, 0xFEDCBA98)
 
 
 def pilot_mask(shape: tuple[int, int] = SHAPE) -> np.ndarray:
-    """One pilot in twenty, bool [ny, nx]."""
+    """Draw pilots at one place in twenty, bool [ny, nx]."""
     return np.random.default_rng(5).random(shape) < 0.05
 
 

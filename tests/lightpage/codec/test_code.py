@@ -67,7 +67,7 @@ def test_the_id_is_the_documented_one() -> None:
 
 
 PUBLISHED = [6457827717110365317, 3203168211198807973, 9817491932198370423, 4593380528125082431, 16408922859458223821]
-"""Of seed 1234567, as Rosetta Code and others list them."""
+"""Outputs of seed 1234567, as Rosetta Code and others list them."""
 
 
 def test_words_are_the_published_ones() -> None:

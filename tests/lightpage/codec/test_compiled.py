@@ -176,7 +176,7 @@ def test_the_variable_chooses(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class TestRefusals:
-    """What is not as it must be is refused before it is read."""
+    """Wrong arguments are refused before they are read."""
 
     CODE = LdpcCode(136, 204)
 

@@ -10,7 +10,7 @@ from tests.lightpage.refused import refused
 
 
 def product(a: int, b: int) -> int:
-    """In GF(2^8) with polynomial 0x11D."""
+    """Multiply in GF(2^8) with polynomial 0x11D."""
     out = 0
     while b:
         out ^= a if b & 1 else 0
@@ -45,7 +45,7 @@ def test_parity_is_the_documented_sum(data_pages: int, parity_pages: int, size: 
     ("data_pages", "parity_pages", "patterns"), [(5, 3, 60), (20, 6, 60), (61, 3, 60), (247, 8, 10)]
 )
 def test_any_losses_as_many_as_parity_pages_come_back(data_pages: int, parity_pages: int, patterns: int) -> None:
-    """With one more they do not, unless all that is lost is parity."""
+    """Losses of one page more do not come back, unless all lost pages are parity."""
     data, pages = group_of(data_pages, parity_pages, 37)
     rng = np.random.default_rng(0)
     for _ in range(30):

@@ -35,13 +35,13 @@ CODES = [
 
 
 def header_places(codec: PageCodec) -> np.ndarray:
-    """Where the header lies in the flat page, by the specification."""
+    """Return the header's places in the flat page, by the specification."""
     data, count = np.flatnonzero(~codec.pilots), header_symbols(codec.code.levels)
     return data[[(2 * j + 1) * len(data) // (2 * count) for j in range(count)]]
 
 
 def body_places(codec: PageCodec) -> np.ndarray:
-    """Where the body lies in the flat page, in its order."""
+    """Return the body's places in the flat page, in its order."""
     return np.setdiff1d(np.flatnonzero(~codec.pilots), header_places(codec))
 
 
@@ -93,7 +93,7 @@ class TestRoundTrip:
 
 
 def changed_bits(codec: PageCodec, symbols: np.ndarray, which: np.ndarray) -> set[int]:
-    """Those of the T bits that change where body symbols of these numbers are decided one upper number too high."""
+    """Return which of the T bits change where these body symbols are decided one upper number too high."""
     code, start = codec.code, codec.blocks * codec.ldpc.information_bits
     bits = code.level_bits - code.coded_bits
     upper = symbols.ravel()[body_places(codec)[which]].astype(int) >> code.coded_bits
@@ -265,7 +265,7 @@ class TestMargin:
     SHAPE = (56, 44)
 
     def needed(self, codec: PageCodec, rng: np.random.Generator) -> float:
-        """What the code needs, measured as it is when it is chosen."""
+        """Measure the information that the code needs, as on choosing it."""
         pages = []
         for _ in range(20):
             _, symbols = written(codec, header_of(codec), rng)

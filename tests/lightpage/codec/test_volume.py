@@ -204,7 +204,7 @@ class TestFile:
         assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
 
     def test_the_files_checksum_tells_pages_of_two_files_apart(self, written: Written, tmp_path: Path) -> None:
-        """As if two files had the same number, size, groups and, by accident, checksum."""
+        """Two files have the same number, size, groups and, by accident, checksum."""
         other = write(written.file[::-1], whole(written.volume.id, written.file[::-1]))
         with VolumeFiles(tmp_path / "file") as files:
             for number, page in written.pages.items():

@@ -134,7 +134,7 @@ class TestTrust:
 
 
 class TestCheck:
-    """What a decoder claims of its pilots, held against what they are."""
+    """A decoder's claims about its pilots are compared with their true phases."""
 
     def test_the_bits_are_those_of_the_metrics_at_levels_too_fine_to_matter(self) -> None:
         p, pilots = noisy(30, 30, 0)

@@ -369,7 +369,7 @@ def test_against_a_matched_reference_light_that_met_no_wall_is_flat() -> None:
     profile = small_profile()
 
     def model_match(curvature: float) -> float:
-        """Of an even page's light and the reference in the middle of the page."""
+        """Return how well an even page's light matches the reference in the middle of the page, 0 to 1."""
         optics = TrueOptics(profile, ideal_device().with_settings([f"reference.curvature_rad={curvature}"]))
         light = optics.camera_field(optics.exit_field(np.zeros((28 * 4, 44 * 4)))) / optics.reference()
         x, y = optics.camera_axes_m

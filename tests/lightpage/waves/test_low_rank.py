@@ -79,7 +79,7 @@ HIGHEST = 42e3
 PITCH = 1 / (6 * HIGHEST)
 PLACES = 3e-4 + PITCH * np.arange(300)
 WORST = 1e-4
-"""That the module promises for the edge of the band."""
+"""Error that the module promises for the edge of the band."""
 
 
 def waves(places: np.ndarray) -> np.ndarray:

@@ -120,7 +120,7 @@ def test_symbols_at_the_edge_are_asked_for_as_often_as_those_in_the_middle() -> 
 
 
 def _found(phases: torch.Tensor, page: torch.Tensor) -> tuple[int, int]:
-    """Where a patch was cut."""
+    """Return the row and column at which a patch was cut."""
     height, width = phases.shape
     for row in range(SHAPE[0] - height + 1):
         for column in range(SHAPE[1] - width + 1):

@@ -34,7 +34,7 @@ class Recorded(NamedTuple):
 
 @pytest.fixture(scope="module")
 def recorded() -> Recorded:
-    """One recorded page."""
+    """Simulate a recorded page, with its features."""
     simulator = Simulator(PROFILE, DEVICE, seed=SEED)
     phases = symbol_phases(random_symbols(PROFILE, 256, 1, np.random.default_rng(SEED))[0], 256)
     pair = simulator.page(np.rint(phases / (2 * np.pi) * 256).astype(np.uint8))

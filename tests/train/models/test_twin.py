@@ -33,7 +33,7 @@ def page_points(profile: Profile, count: int, seed: int = 0) -> np.ndarray:
 
 @dataclass
 class Ray:
-    """One ray that has left the pipe: what it met, in order, where it goes and with what phase, and if it was lost."""
+    """Ray that has left the pipe: what it met, in order, its direction and phase, and whether it was lost."""
 
     met: str
     direction: np.ndarray

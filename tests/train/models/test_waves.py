@@ -18,7 +18,7 @@ PROFILE = small_profile()
 SAMPLES = 4
 FINE = Fidelity(1e-3, 1e-3)
 ERROR = 0.01
-"""Of that fidelity, and of light on sparse samples."""
+"""Error of that fidelity, and of light on sparse samples."""
 
 
 def device(angle_rad: float, *, thick: bool = False, roll_rad: float | None = None) -> tuple[Profile, np.ndarray]:

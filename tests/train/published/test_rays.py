@@ -27,7 +27,7 @@ FOCUSED_MM: list[list[float]] = [
     [-0.015109778538, -0.009679701876],
     [-0.088919473627, 0.066689605220],
 ]
-"""Where optiland 0.6.3 has them behind the achromat, on its back focal plane (traced once, written down here)."""
+"""Places that optiland 0.6.3 finds behind the achromat, on its back focal plane (traced once, written down here)."""
 OBLIQUE_MM: list[list[float]] = [[0, 0], [1.1, -0.7], [-1.6, 1.3], [0.4, 1.7]]
 OBLIQUE_SINES: list[list[float]] = [[0.06, 0.03], [-0.08, 0.05], [0.07, 0.06], [0.02, -0.05]]
 LANDED_REVERSED_MM: list[list[float]] = [
@@ -36,7 +36,7 @@ LANDED_REVERSED_MM: list[list[float]] = [
     [5.606800950923, 4.781807321474],
     [1.600919024354, -4.006142112707],
 ]
-"""Where optiland has rays that leave the front focal plane of the reversed achromat with those sines."""
+"""Places at which optiland finds rays that leave the front focal plane of the reversed achromat with those sines."""
 
 
 def with_pipe(profile: Profile, **values: float) -> Profile:
@@ -57,7 +57,7 @@ def path(tracer: RayTracer, points: np.ndarray, angle: float = 0.0) -> np.ndarra
 
 
 def follow(profile: Profile, angle: float, point: np.ndarray) -> Ray:
-    """One ray through the middle of the pipe's entrance."""
+    """Trace a ray through the middle of the pipe's entrance."""
     values = dict.fromkeys(NAMES, 0.0) | {"pipe_angle_rad": angle - np.deg2rad(profile.pipe.angle_deg)}
     return one_ray(profile, values, point, np.zeros(2))
 

@@ -19,8 +19,8 @@ class CoherentLocalizer(nn.Module):
     Args:
         profile: the nominal device.
         samples: per symbol and axis; 0 takes as many as the field has, see `symbol_samples`.
-        interpolation: of the field between the grid's samples, `bicubic` or `bilinear`: an error of -32 or -23 dB on
-            the usual grid.
+        interpolation: interpolation of the field between the grid's samples, `bicubic` or `bilinear`: an error of -32
+            or -23 dB on the usual grid.
         grid: the common grid, where it is not the usual one.
     """
 
@@ -35,7 +35,7 @@ class CoherentLocalizer(nn.Module):
         self._last = tuple(count - 1 for count in usual.shape)
         """Row and column of the usual grid's last sample, in whose units a table's places are."""
         self._span = tuple((count - 1) * own.pitch_m / usual.pitch_m for count in own.shape)
-        """From the first to the last sample of its own grid, in the same units; both have the same middle."""
+        """Distance from the first to the last sample of its own grid, in the same units; both have the same middle."""
         self.page_shape = profile.page_shape
         self.samples = samples or symbol_samples(profile)
         steps = (torch.arange(self.samples, dtype=torch.float32) + 0.5) / self.samples - 0.5
@@ -54,7 +54,7 @@ class CoherentLocalizer(nn.Module):
 
         Args:
             field: [2, Gy, Gx] on the common grid.
-            places, gradients, phases: as `lightpage.calibration.sampling_table.sampling_table` makes them.
+            places, gradients, phases: arrays that `lightpage.calibration.sampling_table.sampling_table` makes.
 
         Returns:
             [2, B, S, ny, nx]: real and imaginary part, S samples of each symbol row by row, over the field's root
@@ -76,7 +76,7 @@ class CoherentLocalizer(nn.Module):
         return torch.stack([real, imaginary])
 
     def looks(self, places: Tensor, gradients: Tensor, phases: Tensor) -> tuple[Tensor, Tensor]:
-        """Where samples lie, [1, B S ny, nx, 2] for grid_sample, and their phases, [B, S, ny, nx] radians."""
+        """Return the samples' places, [1, B S ny, nx, 2] for grid_sample, and their phases, [B, S, ny, nx] radians."""
         x, y = self.offset_x, self.offset_y
         column = places[:, 0:1] + gradients[:, 0:1] * x + gradients[:, 1:2] * y
         row = places[:, 1:2] + gradients[:, 2:3] * x + gradients[:, 3:4] * y

@@ -14,7 +14,7 @@ class WaveLocalizer(nn.Module):
     """Runs a field back through camera lens, pipe and launch lens to the SLM.
 
     Args:
-        profile, parameters, grid: as for `Waves`.
+        profile, parameters, grid: see `Waves`.
     """
 
     def __init__(self, profile: Profile, parameters: Real, grid: FieldGrid | None = None) -> None:

@@ -1,0 +1,102 @@
+"""The bound of the light: what a decoder could read at most of a device, whatever it is.
+
+    python -m analysis.comparison.bound --json F
+    python -m analysis.comparison.bound --set sensor.full_well_e=32 --pages 8 --symbols 100 --json F
+
+Symbols of random pages are drawn; of each, all others and the device are taken as known (see
+`lightpage.simulator.light_bound`). The least error of its phase is that of a von Mises posterior, whose information on
+one of M levels is the bound, bits. The standard error is that of the mean over all symbols. Interrupted, it goes on
+from the JSON file.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.cli.main import run
+from lightpage.cli.paths import OutputFile
+from lightpage.device.profile import load_profile
+from lightpage.device.state import Device, load_device
+from lightpage.errors import InvalidInputError
+from lightpage.files import write_json
+from lightpage.metrics.information import own_information
+from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
+from lightpage.page.symbols import random_symbols
+from lightpage.progress import track
+from lightpage.simulator.light_bound import LightBound
+
+
+def bits(concentrations: list[float], levels: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Information of posteriors of these concentrations on one of M levels, each at an error that it draws."""
+    kappa = np.array(concentrations)
+    return own_information(rng.vonmises(0.0, np.minimum(kappa, 1e12)), kappa, levels)
+
+
+def earlier(path: Path, asked: dict[str, object]) -> list[list[float]]:
+    """Concentrations by page that a run which was told the same has kept.
+
+    Raises:
+        InvalidInputError: the file is of another run.
+    """
+    if not path.exists():
+        return []
+    try:
+        kept = json.loads(path.read_text("utf-8"))
+        told, pages = kept["asked"], kept["concentrations"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InvalidInputError(f"--json {path}", error, "a file of this command, or a new name") from None
+    if told != asked:
+        raise InvalidInputError(f"--json {path}", f"figures of {told}", f"those of {asked}, or a new name")
+    return [list(map(float, page)) for page in pages]
+
+
+@click.command()
+@click.option("--profile", "profile_name", default="bench", show_default=True, help="Shipped profile or TOML file.")
+@click.option("--device", "state", type=click.Path(path_type=Path), help="True state (TOML).")
+@click.option("--set", "settings", multiple=True, metavar="TABLE.KEY=VALUE", help="Of the true state.")
+@click.option("--levels", type=click.IntRange(MIN_LEVELS, MAX_LEVELS), default=MAX_LEVELS, show_default=True)
+@click.option("--pages", default=4, show_default=True, type=click.IntRange(1))
+@click.option("--symbols", default=100, show_default=True, type=click.IntRange(2), help="Of each page.")
+@click.option("--seed", default=0, show_default=True, type=click.IntRange(0))
+@click.option("--json", "json_path", type=OutputFile(), required=True)
+def main(
+    profile_name: str,
+    state: Path | None,
+    settings: tuple[str, ...],
+    levels: int,
+    pages: int,
+    symbols: int,
+    seed: int,
+    json_path: Path,
+) -> None:
+    """Print the bound with its standard error, bits a symbol."""
+    profile = load_profile(profile_name)
+    device = (Device() if state is None else load_device(state)).of_profile(profile).with_settings([*settings])
+    asked: dict[str, object] = {
+        "profile": profile.to_toml(),
+        "device": device.model_dump(mode="json"),
+        "levels": levels,
+        "symbols": symbols,
+        "seed": seed,
+    }
+    found = earlier(json_path, asked)[:pages]
+    for page in track(range(len(found), pages), "bound", unit="page"):
+        rng = np.random.default_rng([seed, page])
+        bound = LightBound(profile, device, random_symbols(profile, levels, 1, rng)[0], levels)
+        places = rng.integers(profile.page_shape, size=(symbols, 2))
+        found.append([bound.concentration(row, column) for row, column in places.tolist()])
+        write_json(json_path, {"asked": asked, "concentrations": found})
+    each = bits([one for page in found for one in page], levels, np.random.default_rng(seed))
+    figures = {"bits": float(each.mean()), "standard_error": float(each.std(ddof=1) / np.sqrt(each.size))}
+    write_json(json_path, {"asked": asked, **figures, "concentrations": found})
+    click.echo(f"bound {figures['bits']:.3f} +- {figures['standard_error']:.3f} bits a symbol, {each.size} symbols")
+
+
+if __name__ == "__main__":
+    sys.exit(run(main, name="python -m analysis.comparison.bound"))

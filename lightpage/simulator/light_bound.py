@@ -1,0 +1,96 @@
+"""Bound that no decoder exceeds: information of a page's light on one symbol, all else of page and device being known.
+
+It is Fisher's, against shot noise, read noise, quantisation and the noise of the modulator's pixels. Hot pixels, dust
+and what a camera bends are left out: each takes information away.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.device.profile import Profile
+from lightpage.device.state import CameraPose, Device
+from lightpage.page.symbols import symbol_phases
+from lightpage.simulator.true_optics import TrueOptics
+
+Real = NDArray[np.floating]
+Complex = NDArray[np.complexfloating]
+
+
+@dataclass(frozen=True)
+class _View:
+    """Light of a page on one camera, on the plane and at the pitch of the computed optics.
+
+    Attributes:
+        pose: pose of the camera.
+        amplitude: signal and reference, complex [y, x].
+        electrons_per_unit: electrons for a unit of intensity.
+        weight: 1 over the variance of a pixel's electrons, [y, x]; 0 beside the frame and where the pixel is full.
+    """
+
+    pose: CameraPose
+    amplitude: Complex
+    electrons_per_unit: float
+    weight: Real
+
+    def information(self, change: Complex) -> float:
+        """Fisher information of a number that changes the field at this rate, [y, x]."""
+        rate = 2 * self.electrons_per_unit * np.real(np.conj(self.amplitude) * change)
+        return float(np.sum(rate**2 * self.weight))
+
+
+class LightBound:
+    """The least error of the symbols of one page.
+
+    Args:
+        profile, device: nominal and true.
+        symbols: symbols of the page, [ny, nx].
+        levels: M.
+    """
+
+    def __init__(self, profile: Profile, device: Device, symbols: NDArray[np.integer], levels: int) -> None:
+        self._optics, self._size, self._shape = TrueOptics(profile, device), profile.page.symbol_size_px, symbols.shape
+        self._phase = self._enlarged(symbol_phases(symbols, levels))
+
+    def concentration(self, row: int, column: int) -> float:
+        """1 over the least variance of a symbol's phase, 1/rad^2: the Cramer-Rao bound and the modulator's noise."""
+        here = np.zeros(self._shape)
+        here[row, column] = 1.0
+        change, optics = self._optics.exit_field_change(self._phase, self._enlarged(here)), self._optics
+        told = sum(view.information(optics.camera_field(change, view.pose)) for view in self._views)
+        noise = optics.device.slm.phase_noise_rad / self._size
+        return 1.0 / (1.0 / told + noise**2)
+
+    def _enlarged(self, values: Real) -> Real:
+        """Values of symbols on the modulator's pixels."""
+        return np.kron(values, np.ones((self._size, self._size)))
+
+    @cached_property
+    def _views(self) -> tuple[_View, _View]:
+        """The in-phase and the quadrature camera's."""
+        device, reference = self._optics.device, self._optics.reference_in_place
+        leaving = self._optics.exit_field(self._phase)
+
+        def view(pose: CameraPose, turned: Complex, gain: float) -> _View:
+            amplitude, scale = self._optics.camera_field(leaving, pose) + turned, gain * self._optics.electrons_per_unit
+            return _View(pose, amplitude, scale, self._weight(scale * np.abs(amplitude) ** 2))
+
+        homodyne = device.homodyne
+        turned = reference * np.exp(1j * homodyne.turn_rad)
+        return view(device.in_phase_camera, reference, 1.0), view(
+            device.quadrature_camera, turned, homodyne.quadrature_gain
+        )
+
+    def _weight(self, electrons: Real) -> Real:
+        """See `_View`."""
+        sensor, camera = self._optics.device.sensor, self._optics.profile.camera
+        step = sensor.full_well_e / (2**sensor.bit_depth - 1)
+        weight = np.where(electrons < sensor.full_well_e, 1 / (electrons + sensor.read_noise_e**2 + step**2 / 12), 0)
+        x, y = self._optics.camera_axes_m
+        weight[np.abs(y) > camera.rows_px * camera.pitch_m / 2] = 0
+        weight[:, np.abs(x) > camera.columns_px * camera.pitch_m / 2] = 0
+        return weight
