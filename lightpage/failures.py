@@ -178,6 +178,6 @@ def short_resource(subject: str, error: BaseException) -> SurroundingsError | No
 
 
 def lacks_memory(error: BaseException) -> bool:
-    """Whether a failure says that memory is short, this machine's or a device's."""
+    """Return whether a failure says that memory is short, this machine's or a device's."""
     short = short_resource("", error)
     return short is not None and short.expected == "more memory"

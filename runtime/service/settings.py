@@ -100,7 +100,7 @@ class ServiceTable(SettingsTable):
 
 
 class BatchesTable(SettingsTable):
-    """How pages are computed together, by bundles that have a graph for it."""
+    """Batches of pages that are computed together, by bundles that have a graph for it."""
 
     largest: int = Field(1, ge=1, le=64, description="Pages computed together at most, on a GPU; 1: each by itself.")
     longest_wait_ms: Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)] = 5.0

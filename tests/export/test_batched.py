@@ -135,7 +135,7 @@ def test_a_graph_that_says_something_else_to_the_golden_page_is_left_out(decoder
 def test_a_stream_is_read_in_batches_as_page_by_page(
     decoder: Decoder, batches: BatchGraph, small_device: list[str]
 ) -> None:
-    """Its image walks, jumps before the fifth page, and the third one is not of this device."""
+    """The image walks, jumps before the fifth page, and the third one is not of this device."""
     mask, lost, jump = decoder.bundle.pilot_mask, 2, 4
     with Recording.open(small_device[3]) as recording:
         pages = [(recording.frames(page), np.asarray(recording.symbols(page))) for page in range(7)]

@@ -29,7 +29,7 @@ and changes the light by so little."""
 
 @dataclass(frozen=True)
 class Constants:
-    """What follows from a table alone, where the graph computes.
+    """Tensors that follow from a table alone, where the graph computes.
 
     Attributes:
         registration: in the table, [2, 2, 10].
@@ -42,7 +42,7 @@ class Constants:
     reach_px: float
 
     def shift_of(self, registration: NDArray[np.float32]) -> NDArray[np.float32] | None:
-        """By how much an image lies elsewhere, [2, 2] pixels; None where that is no shift, or one beyond reach."""
+        """The shift of an image against it, [2, 2] pixels; None where there is none like it, or it is beyond reach."""
         apart = registration - self.registration
         shift = apart[..., 0].astype(np.float32)
         reached = not apart[..., 1:].any() and np.abs(shift).max() <= self.reach_px
@@ -111,7 +111,7 @@ class BatchGraph:
         return FrameBuffer(self.pages, self._bundle.profile.frame_shape, self._bundle.manifest.frame_dtype)
 
     def constants(self, graph: TableGraph, registration: NDArray[np.float32] | None = None) -> Constants:
-        """What follows from a table, computed on the CPU.
+        """Constants of a table, computed on the CPU.
 
         Args:
             graph: with that table.
@@ -127,7 +127,7 @@ class BatchGraph:
         return Constants(table[REGISTRATION], bound, REACH * self._bundle.profile.frame_shape[1])
 
     def run(self, constants: Constants, buffer: FrameBuffer, pages: slice) -> list[Inference]:
-        """What the graph says of some pages in a buffer, of whose residuals no one has judged.
+        """The answers of the graph to some pages in a buffer; of their residuals no one has judged.
 
         Raises:
             BundleError: other answers than one a page.
@@ -144,7 +144,7 @@ class BatchGraph:
         return [Inference(p, phase, length, float(left)) for p, phase, length, left in answers[:count]]
 
     def _golden(self, buffer: FrameBuffer, place: int, pages: int, pair: FramePair) -> NDArray[np.float32]:
-        """What is said of a page at a place among others that are no pages."""
+        """The answer to a page at a place among others that are no pages, p."""
         for number in range(pages):
             frames = pair if number == place else FramePair(pair.quadrature, pair.in_phase)
             buffer.put(number, frames, np.zeros((2, 2), np.float32))
@@ -169,5 +169,5 @@ def with_proven_batches(bundle: Bundle, graph: TableGraph) -> Bundle:
 
 
 def holds_batches(bundle: Bundle) -> bool:
-    """Whether a bundle has a graph for batches."""
+    """Return whether a bundle has a graph for batches."""
     return bundle.files.keys() >= _FILES

@@ -41,7 +41,7 @@ _BUFFERS = 2
 
 @dataclass(frozen=True)
 class Batching:
-    """How pages are gathered.
+    """Choices of how pages are gathered.
 
     Attributes:
         largest: pages of a run, at most; 1 for none together.
@@ -155,7 +155,7 @@ class OneByOne:
     def infer(
         self, table: TableGraph, pair: FramePair, registration: NDArray[np.float32] | None = None
     ) -> Inference | None:
-        """What the graph says of a page that is computed with others; None where it must be computed alone.
+        """The graph's answer to a page that is computed with others; None where it must be computed alone.
 
         Args:
             table: that it is decoded with.
@@ -299,7 +299,7 @@ class Batches(OneByOne):
             self._changed.wait_for(over)
 
     def _may_begin(self, run: _Run) -> bool:
-        """Whether it is a run's turn, and nothing is to be waited for."""
+        """Return whether it is a run's turn, and nothing is to be waited for."""
         if self._is_running or [run] != self._gathering[:1] or run.written < len(run.threads):
             return False
         if len(run.threads) >= self.largest:
@@ -309,7 +309,7 @@ class Batches(OneByOne):
         return not run.is_patient or not self._pages.count(Phase.COMING)
 
     def _computed(self, run: _Run) -> list[Inference]:
-        """What the graph says of a run's pages; in smaller runs from now on where there was no memory for so many."""
+        """The graph's answers to a run's pages; in smaller runs from now on where there was no memory for so many."""
         pages = len(run.threads)
         try:
             return self._graph.run(run.constants, run.buffer, slice(0, pages))

@@ -280,7 +280,7 @@ class ImageTracker:
                 return replace(self.state, table=state.table, looked_px=state.looked_px), inference
 
     def _has_left(self, state: ImageState, before: int = 0) -> bool:
-        """Whether a page with so many before it, that was decoded with a state, is now to be decoded anew."""
+        """Return whether a page with so many before it, that was decoded with a state, is now to be decoded anew."""
         if before >= self._ahead:
             return False
         now, moved = self.state, np.abs(self.state.looked_px - state.looked_px).max()

@@ -10,7 +10,7 @@ from enum import StrEnum
 
 
 class Phase(StrEnum):
-    """Where a page is."""
+    """A stretch of a page's way."""
 
     COMING = "coming"
     """Its frames are being checked."""
@@ -23,7 +23,7 @@ class Phase(StrEnum):
 
 
 class Device(StrEnum):
-    """What the device does, by the pages that are under way; one of these at every moment."""
+    """State of the device, by the pages that are under way; it is in one of these at every moment."""
 
     RUNNING = "running"
     """It computes a batch."""
@@ -63,12 +63,12 @@ class UnderWay:
                     self._phases[thread] = phase
 
     def count(self, phase: Phase) -> int:
-        """How many pages are in a phase."""
+        """The number of pages in a phase."""
         with self._lock:
             return list(self._phases.values()).count(phase)
 
     def knows(self, thread: int) -> bool:
-        """Whether a thread sees to a page."""
+        """Return whether a thread sees to a page."""
         with self._lock:
             return thread in self._phases
 
@@ -79,7 +79,7 @@ class UnderWay:
             self.runs[len(threads)] += 1
 
     def seconds(self) -> dict[Device, float]:
-        """How long the device did what until now."""
+        """Seconds that the device spent in each state until now."""
         with self._lock:
             self._count()
             return dict(self._spent)

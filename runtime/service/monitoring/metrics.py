@@ -227,7 +227,7 @@ def _load(decodes: Slots, received: ReceiveBudget) -> Iterator[Metric]:
 
 
 def _batches(pages: UnderWay) -> Iterator[Metric]:
-    """How full batches are, and what the device does that computes them."""
+    """Yield how full batches are, and what the device does that computes them."""
     runs = pages.runs.copy()
     bounds = {**{str(bound): bound for bound in _BATCH_PAGES}, "+Inf": math.inf}
     buckets = [(told, sum(runs[size] for size in runs if size <= bound)) for told, bound in bounds.items()]

@@ -24,7 +24,7 @@ PATIENT = 30.0
 
 
 class Table:
-    """What is asked of a decoder's graph: its registration."""
+    """A decoder's graph that is asked for its registration alone."""
 
     def __init__(self, shift: float = 0.0) -> None:
         self.registration = np.full((2, 2, 10), shift, np.float32)

@@ -328,7 +328,7 @@ def test_what_was_learnt_goes_over_as_text_and_decodes_the_next_page_the_same(de
 
 
 def test_pages_decoded_at_the_same_time_are_taken_in_their_order(device: FakeDevice) -> None:
-    """What was decoded beforehand is decoded again where the page before shows that the image has moved."""
+    """A page that was decoded beforehand is decoded again where the page before shows that the image has moved."""
     tracker = settled(device)
     device.drift[SHIFT] = (0.5, 0.0)
     first, second = tracker.turn(), tracker.turn()
