@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from copy import copy
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,8 @@ KEPT = 4
 """Tables whose constants are held: 640 MB each, of a full-size page by waves."""
 _STALE = 64
 """Constants that were not asked for by so many pages make room for those of another table."""
+_ALONE = 2
+"""Pages that are computed alone at a time, where batches were wanted: many more are on their way then."""
 _BUFFERS = 2
 """One is filled while the graph runs from the other."""
 
@@ -144,9 +147,17 @@ class HeldConstants:
 
 
 class OneByOne:
-    """Gathers nothing: each page is computed alone."""
+    """Gathers nothing: each page is computed alone.
+
+    Args:
+        at_once: pages that are computed at a time, at most; None for as many as come.
+    """
 
     largest = 1
+
+    def __init__(self, at_once: int | None = None) -> None:
+        self.alone: AbstractContextManager[Any] = nullcontext() if at_once is None else threading.Semaphore(at_once)
+        """Held while a page is computed alone."""
 
     def under_way(self) -> AbstractContextManager[None]:
         """A page is decoded within the `with` statement; until it is inferred, a batch may wait for it."""
@@ -182,6 +193,7 @@ class Batches(OneByOne):
     """
 
     def __init__(self, graph: BatchGraph, table: TableGraph, batching: Batching, clock: Clock = SYSTEM) -> None:
+        super().__init__(_ALONE)
         self._clock = clock
         self._graph, self._batching, self._constants = graph, batching, HeldConstants(graph, table)
         self.largest = min(batching.largest, graph.pages)
@@ -207,7 +219,7 @@ class Batches(OneByOne):
             _log.warning(
                 "%s: no %s, so pages are computed one by one (lightpage export --batches)", bundle.subject, BATCH
             )
-            return OneByOne()
+            return OneByOne(_ALONE)
         return cls(BatchGraph(bundle, table, batching.largest, threads), table, batching)
 
     @contextmanager

@@ -222,7 +222,8 @@ class Decoder:
         page = None if alone else self.batches.infer(self.graph, pair, table.get(REGISTRATION))
         if page is None:
             feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **table}
-            p, phase, concentration, *rest = self.graph.run(self._outputs, feeds)
+            with self.batches.alone:
+                p, phase, concentration, *rest = self.graph.run(self._outputs, feeds)
             page = Inference(p, phase, concentration, float(np.max(rest[0])) if rest else 0.0)
         check_residual(page.residual, self.bundle.manifest.residual_limit, doubtful=doubtful)
         return page

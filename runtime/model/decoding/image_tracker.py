@@ -247,28 +247,28 @@ class ImageTracker:
         device's moves nothing. Pages that are decoded at the same time are taken in their order, whatever they wait
         for: each begins with what the one before it has taught.
         """
-        with self._turns.taken(turn) as turn, self._decoder.batches.under_way():
-            _ = (
-                self._model.slopes
-            )  # of a new tracker still being measured; two inferences at once may not fit the memory
-            clock, shown = _Clock(), self._decoder.bundle.levels(levels)
-            self._decoder.check(pair)
-            pilots = pilots or self._decoder.pilots(levels)
-            clock.add("check_s")
-            begun, inference = self._in_turn(turn, pair, clock)
-            best, found = self._followed(pair, begun, inference, shown, pilots, clock)
-            turn.close()
-            page = self._decoder.post_process(best.inference, levels, pilots)
-            clock.add("decision_s")
-            page = replace(page, check=best.check, image=_position(best.after, found), timings=clock.timings)
-            return confirmed(page, found)
+        clock, shown = _Clock(), self._decoder.bundle.levels(levels)
+        with self._turns.taken(turn) as turn:
+            _ = self._model.slopes  # may still be measured; two inferences at once may not fit the memory
+            turn.wait(lambda before: before < self._ahead)
+            clock.add("waiting_s")
+            with self._decoder.batches.under_way():
+                self._decoder.check(pair)
+                pilots = pilots or self._decoder.pilots(levels)
+                clock.add("check_s")
+                begun, inference = self._in_turn(turn, pair, clock)
+                best, found = self._followed(pair, begun, inference, shown, pilots, clock)
+                turn.close()
+                page = self._decoder.post_process(best.inference, levels, pilots)
+                clock.add("decision_s")
+        page = replace(page, check=best.check, image=_position(best.after, found), timings=clock.timings)
+        return confirmed(page, found)
 
     def _in_turn(self, turn: Turn, pair: FramePair, clock: _Clock) -> tuple[ImageState, Inference | None]:
         """The state that the page before has left, and what the graph says of a page by it; nothing before any page.
 
         The graph runs beforehand, and again where a page before it shows that the image is to be looked at elsewhere.
         """
-        turn.wait(lambda before: before < self._ahead)
         while True:
             state, inference = self.state, None
             if state.settled:
