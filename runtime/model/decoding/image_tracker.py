@@ -392,7 +392,8 @@ class ImageTracker:
         if np.any((away > RETRACE_RAD) & (away > SIGNIFICANT_DEVIATIONS * error)):
             decoder, traced = self._tables.traced(drift[TILT]), drift[TILT].copy()
         state = replace(like, drift=drift, covariance=covariance, decoder=decoder, traced_tilt=traced)
-        stays = self._in_batches and np.abs(drift[SHIFT] - like.looked_px).max() <= STALE_PX
+        at_most = max(STALE_PX, float(np.sqrt(np.diag(covariance)[SHIFT]).max()))  # less is not known
+        stays = self._in_batches and np.abs(drift[SHIFT] - like.looked_px).max() <= at_most
         return state if stays else self._looking_there(state)
 
     def _looking_there(self, state: ImageState) -> ImageState:
