@@ -168,15 +168,15 @@ class DataPlane:
         self._source = source
         if source is not None:
             _check_source(source, models.current.decoder)
-        self.received = ReceiveBudget(self.limits.receive_bytes)
         self.shared: SharedMemory | None = None
         """Memory that clients share with the service."""
         self.heal: Callable[[Caller, str, int], bool] | None = None
         """Makes the model fit the device again and waits for that, see `SelfCalibration.heal`; None where none does."""
         self.heart = Heart(self.limits.decode_s, clock.now)
         self.together = models.current.decoder.batches.largest
-        """Pages that may be computed together, 1 for none: a batch runs while the next one is gathered."""
-        slots = max(self.limits.concurrent_decodes, 2 * self.together if self.together > 1 else 1)
+        """Pages that may be computed together, 1 for none."""
+        both = 2 * self.together if self.together > 1 else 1  # a batch runs while the next one is gathered
+        self.received, slots = ReceiveBudget(self.limits.receive_bytes, both), max(self.limits.concurrent_decodes, both)
         self.decodes = Slots(slots, "decodes", self.limits.deadline_s, clock)
         self.ranges = Slots(self.limits.concurrent_ranges, "ranges of pages", self.limits.deadline_s, clock)
         self.watches = Slots(self.limits.concurrent_watches, "watches of the display", self.limits.deadline_s, clock)

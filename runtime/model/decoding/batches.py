@@ -72,7 +72,7 @@ class _Run:
     written: int = 0
     is_patient: bool = True
     inferences: list[Inference] | None = None
-    error: Exception | None = None
+    error: BaseException | None = None
 
     @property
     def is_done(self) -> bool:
@@ -290,7 +290,7 @@ class Batches(OneByOne):
         self._pages.move(Phase.RUNNING, *run.threads)
         try:
             run.inferences = self._computed(run)
-        except Exception as error:
+        except BaseException as error:  # an interrupt too: others wait
             run.error = error
         finally:
             self._pages.ran(*run.threads)
