@@ -247,8 +247,8 @@ class ImageTracker:
         device's moves nothing. Pages that are decoded at the same time are taken in their order, whatever they wait
         for: each begins with what the one before it has taught.
         """
-        clock, shown = _Clock(), self._decoder.bundle.levels(levels)
         with self._turns.taken(turn) as turn:
+            clock, shown = _Clock(), self._decoder.bundle.levels(levels)
             _ = self._model.slopes  # may still be measured; two inferences at once may not fit the memory
             turn.wait(lambda before: before < self._ahead)
             clock.add("waiting_s")
