@@ -13,10 +13,11 @@ from lightpage.cli.progress_bar import percent_bar
 from lightpage.device.profile import load_profile
 from lightpage.errors import InvalidInputError
 from lightpage.files import replace_file, replace_text, write_json
+from lightpage.run_files import BEGUN
 from lightpage.study import STUDIES
 from lightpage.study.study import RESULTS, Settings, aligned, measured
 from lightpage.train.fitting.memory import keep_freed_memory
-from lightpage.train.runs import BEGUN, begin, sole_writer
+from lightpage.train.runs import begin, sole_writer
 
 _FULL = "paper"
 _RESULTS = "results"

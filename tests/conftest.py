@@ -93,7 +93,7 @@ def ray_run(small_device: list[str], tmp_path_factory: pytest.TempPathFactory) -
     def make(out: Path) -> None:
         from lightpage.train.commands.train import train
 
-        _command(train, *small_device, "--localizer", "ray", "--channels", 4, "--steps", 12, "--out", out)
+        _command(train, *small_device[2:], "--localizer", "ray", "--channels", 4, "--steps", 12, "--out", out)
 
     return _made_once(tmp_path_factory, "ray-run", make)
 

@@ -23,6 +23,7 @@ from lightpage.calibration.document import Calibration, parse_calibration
 from lightpage.device.profile import Profile, parse_profile
 from lightpage.errors import InvalidInputError
 from lightpage.files import lock, replace_file, replace_text
+from lightpage.run_files import BEGUN, DESCRIPTION
 from lightpage.train.fitting.fitted import CHECKPOINTS, FITTED
 from lightpage.train.models.decoder import SymbolDecoder
 from lightpage.train.models.hyperparameters import Hyperparameters
@@ -30,8 +31,6 @@ from lightpage.train.processes import is_first_process
 from lightpage.train.published.localizers import NAMES as PUBLISHED
 from lightpage.train.published.training import PublishedChoices
 
-BEGUN = "begun.json"
-DESCRIPTION = "run.json"
 WEIGHTS = "decoder.pt"
 REFERENCES = "references.npz"
 GOLDEN = "golden.npz"

@@ -16,10 +16,11 @@ from lightpage.device.state import Device, Sensor
 from lightpage.errors import InvalidInputError
 from lightpage.recording.layout import hash_frames
 from lightpage.recording.reader import Recording
+from lightpage.run_files import BEGUN
 from lightpage.simulator.recording_job import RecordingJob
 from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
 from lightpage.train.models.twin import RayTwin, TorchTwin
-from lightpage.train.runs import BEGUN, begin
+from lightpage.train.runs import begin
 
 LEVELS = 256
 CALIBRATED = 2

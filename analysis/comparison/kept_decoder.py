@@ -18,6 +18,7 @@ from lightpage.export.graph import DecoderGraph, table_tensors
 from lightpage.export.parity import torch_answer
 from lightpage.page.symbols import pilot_mask, symbol_phases
 from lightpage.recording.reader import Recording
+from lightpage.run_files import BEGUN
 from lightpage.train.data.features import FeatureExtractor
 from lightpage.train.data.known_light import explained
 from lightpage.train.fitting.concentration_scale import calibrating_factor
@@ -26,7 +27,7 @@ from lightpage.train.fitting.validation import without_piston
 from lightpage.train.models.decoder import SymbolDecoder
 from lightpage.train.models.hyperparameters import Hyperparameters
 from lightpage.train.models.twin import RayTwin, TorchTwin
-from lightpage.train.runs import BEGUN, renamed
+from lightpage.train.runs import renamed
 from lightpage.train.trainers.refinement import fit_prediction
 from lightpage.train.trainers.symbols import MATCHED_PAGES
 

@@ -27,11 +27,12 @@ from lightpage.calibration.document import load_calibration
 from lightpage.cli.main import run as run_command
 from lightpage.cli.paths import OutputFolder
 from lightpage.recording.reader import Recording
+from lightpage.run_files import BEGUN
 from lightpage.train.fitting.fitted import FITTED_WEIGHTS
 from lightpage.train.models.hyperparameters import Hyperparameters
 from lightpage.train.published.localizers import NAMES as PUBLISHED
 from lightpage.train.published.training import PublishedChoices
-from lightpage.train.runs import BEGUN, renamed, sole_writer
+from lightpage.train.runs import renamed, sole_writer
 from lightpage.train.trainers.symbols import MATCHED_PAGES
 
 FOURTH_DIGIT = 0.0005

@@ -18,9 +18,10 @@ from torch.utils.data import Dataset
 from analysis.comparison.kept_weights import read_weights, steps, write_weights
 from lightpage.errors import InvalidInputError
 from lightpage.files import replace_file
+from lightpage.run_files import BEGUN
 from lightpage.train.data.pages import Page
 from lightpage.train.fitting.fitted import CHECKPOINTS, FITTED, FITTED_WEIGHTS, Fitted
-from lightpage.train.runs import BEGUN, FORMAT, renamed
+from lightpage.train.runs import FORMAT, renamed
 
 TRAINED = Path(__file__).parents[1] / "weights"
 CALIBRATION = "calibration.toml"

@@ -211,6 +211,9 @@ def refine(
     quadrature_phase: float,
     progress: Progress = lambda what, share: None,
     modulation: Modulation = NOMINAL,
+    near: CalibratedDevice | None = None,
+    *,
+    rough: bool = False,
 ) -> Registered:
     """Register known pages from an earlier calibration that has drifted: the reflections need no search from nominal.
 
@@ -218,6 +221,8 @@ def refine(
         start: [P] earlier parameters.
         quadrature_phase: earlier angle between the homodyne arms.
         modulation: earlier one, which is fitted again, see `DRIFTS`.
+        near: device at which the fit begins, if not at the earlier calibration. The priors stay about that one.
+        rough: whether the fit may end before its optimum, in half of the time. Its `goodness` is not measured then.
         twin, solve_field, profile, references, pages, progress: see `calibrate`.
 
     Raises:
@@ -225,8 +230,11 @@ def refine(
     """
     work = _Registration(twin, solve_field, profile, references, list(pages), progress)
     work.parameters, work.centre, work.quadrature_phase = start.copy(), start, quadrature_phase
-    work.modulation, work.levels = modulation, LevelPrior(modulation, DRIFTS)
-    work.total = len(_DRIFTED) + 3
+    work.modulation, work.levels, work.rough = modulation, LevelPrior(modulation, DRIFTS), rough
+    if near is not None:
+        work.parameters, work.quadrature_phase = near.parameters.copy(), near.quadrature_phase_rad
+        work.modulation = near.modulation
+    work.total = len(_DRIFTED) + (2 if rough else 3)
     known = tuple(group for group in _ALL_GROUPS if max(indices(group)) < twin.known)
     for stage in _DRIFTED:
         work.complex_field(replace(stage, groups=known), _DRIFT_SCALE)
@@ -299,7 +307,7 @@ class _Registration:
             )
         self.grid = field_grid(profile)
         self.parameters, self.centre = nominal(), nominal()
-        self.any_orientation, self.orientations = False, tuple[str, ...]()
+        self.any_orientation, self.orientations, self.rough = False, tuple[str, ...](), False
         self.deviations = np.zeros_like(self.parameters)
         self.quadrature_phase = np.pi / 2
         self.levels = LevelPrior()
@@ -308,7 +316,7 @@ class _Registration:
         self.illumination: NDArray[np.complexfloating] | None = None
         self.total = 1
         self._stage, self._done = "", 0
-        self._pixel = profile.camera.pitch_m
+        self._pixel = profile.image_pixel_m
         self._looked: list[Measurement] = []
         self._found: list[Measurement] = []
 
@@ -415,6 +423,7 @@ class _Registration:
             self._tell,
             self.modulation,
             self.levels,
+            rough=self.rough,
         )
         self.parameters, self.deviations = found.parameters, found.deviations
         self.quadrature_phase = found.quadrature_phase
@@ -452,7 +461,7 @@ class _Registration:
 
     def _goodness(self) -> Goodness | None:
         """Verdict on the fit, by the light of the first page."""
-        if self.illumination is None:
+        if self.illumination is None or self.rough:
             return None
         self._begin("unexplained light")
         device = CalibratedDevice(

@@ -129,7 +129,7 @@ class Design:
         def error(law: tuple[float, float]) -> Real:
             return np.asarray((law[0] + law[1] * unexplained) * np.sqrt(100 / symbols))
 
-        place_error = error(_PLACE_ERROR) * profile.symbol_pitch_m / profile.camera.pitch_m
+        place_error = error(_PLACE_ERROR) * profile.symbol_pitch_m / profile.image_pixel_m
         self._phase_error = error(_PHASE_ERROR)
         self._slope_error = error(_SLOPE_ERROR) / profile.symbol_pitch_m
         seen = np.zeros((len(measurements), 2))

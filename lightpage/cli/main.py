@@ -60,6 +60,7 @@ RUNTIME = "onnxruntime"
 """What computes pages; either of two extras brings it."""
 EXTRAS = {
     "train": frozenset({"torch", "torchmetrics", "lightning", "tensorboard", "jinja2", "onnx", "onnxscript"}),
+    "import": frozenset({"tifffile"}),
     "camera": frozenset({"harvesters", "genicam"}),
     "cluster": frozenset({"ray"}),
 }
@@ -77,9 +78,12 @@ SUMMARIES = {
     "encode": "Put a file on pages to write.",
     "evaluate": "Measure a bundle on a recording with known symbols.",
     "export": "Turn a training run into a bundle.",
+    "import": "Make a recording of frames and symbols that other programs have written.",
+    "inspect": "Say what a file is, what is wrong with it, and what can be done with it next.",
     "jobs": "Show, follow or cancel the recalibrations of a running service.",
     "lookup-table": "Correct a modulator's lookup table by a calibration.",
     "models": "List, add and change the models of a running service.",
+    "profile": "Make the profile of a device, check it, and see what follows from it.",
     "recalibrate": "Re-fit a drifted device's geometry and write a new bundle.",
     "record": "Record pages of cameras, or of any other source.",
     "recover": "Read a file back from recorded pages.",
@@ -88,6 +92,7 @@ SUMMARIES = {
     "serve": "Run the service.",
     "simulate": "Record pages of a simulated device.",
     "study": "Answer a question about the device or its decoders in a table and a picture.",
+    "unpack": "Write frames and symbols of a recording as files that other programs read.",
     "virtual-device": "Run a simulated device that looks like hardware: cameras, pulse generator, modulator.",
     "train": "Train a decoder on a recording.",
 }

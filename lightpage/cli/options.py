@@ -7,6 +7,8 @@ from typing import Any
 
 import click
 
+from lightpage.device.profile import Profile, load_profile
+
 
 class FiniteRange(click.FloatRange):
     """A number within bounds, and a number: infinity and NaN are within none."""
@@ -17,3 +19,16 @@ class FiniteRange(click.FloatRange):
         if not math.isfinite(number):
             self.fail(f"{value} is not a finite number.", param, ctx)
         return number
+
+
+profile_option = click.option(
+    "--profile",
+    "profile_name",
+    metavar="P",
+    help="Nominal device: a shipped name or a file.  [default: the recording's own]",
+)
+
+
+def named_profile(name: str | None) -> Profile | None:
+    """Return the profile that `profile_option` names; None where it names none."""
+    return None if name is None else load_profile(name)

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import click
 
-from lightpage.device.profile import load_profile
+from lightpage.cli.options import named_profile
+from lightpage.device.profile import Profile
 from lightpage.device.state import Device, load_device
 from lightpage.errors import InvalidInputError
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
@@ -17,7 +18,12 @@ from lightpage.simulator.recording_job import RecordingJob
 
 
 @click.command()
-@click.option("--profile", "profile_name", required=True, metavar="P", help="Nominal device: a shipped name or a file.")
+@click.option(
+    "--profile",
+    "profile_name",
+    metavar="P",
+    help="Nominal device: a shipped name or a file.  [default: that of --symbols]",
+)
 @click.option("--pages", type=click.IntRange(min=1), help="How many pages of random symbols.")
 @click.option("--symbols", type=click.Path(path_type=Path), help="Pages to write, PAGES.h5, as `encode` makes them.")
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="The recording, R.h5.")
@@ -38,7 +44,7 @@ from lightpage.simulator.recording_job import RecordingJob
 @click.option("--truth/--no-truth", default=True, help="Keep what only a simulator knows beside the pages.")
 @click.option("--force", is_flag=True, help="Overwrite a recording that exists, or pages begun with other settings.")
 def simulate(
-    profile_name: str,
+    profile_name: str | None,
     pages: int | None,
     symbols: Path | None,
     out: Path,
@@ -53,11 +59,7 @@ def simulate(
 
     Interrupted, the same command goes on where it stopped, and the recording is the same as without interruption.
     """
-    profile = load_profile(profile_name)
-    device = (load_device(device_file) if device_file else Device()).of_profile(profile).with_settings(list(settings))
-    if profile.pipe.angle_deg:
-        angle = device.geometry.pipe_angle_deg
-        note(f"the true pipe is at {angle:g} degree, its profile's at {profile.pipe.angle_deg:g} (--set, --device)")
+    profile = named_profile(profile_name)
     if out.is_dir():
         raise InvalidInputError(f"--out {out}", "a folder", "a file")
     if out.exists() and not force:
@@ -72,6 +74,19 @@ def simulate(
         many = levels or MAX_LEVELS if written is None else written.levels
         if written is not None:
             written.check()
+            profile = written.device(profile)
+        if profile is None:
+            raise InvalidInputError("options", "no --profile", "one, or --symbols with pages that carry it")
+        device = _true_device(profile, device_file, settings)
         job = RecordingJob(profile, device, many, seed, truth, out, written)
         job.claim(force)
         job.run(pages or len(written or ()))
+
+
+def _true_device(profile: Profile, device_file: str | None, settings: tuple[str, ...]) -> Device:
+    """Return the simulated device's true state; a profile of another pipe angle is told."""
+    device = (load_device(device_file) if device_file else Device()).of_profile(profile).with_settings(list(settings))
+    if profile.pipe.angle_deg:
+        angle = device.geometry.pipe_angle_deg
+        note(f"the true pipe is at {angle:g} degree, its profile's at {profile.pipe.angle_deg:g} (--set, --device)")
+    return device

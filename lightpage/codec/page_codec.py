@@ -18,7 +18,7 @@ from lightpage.codec.header import decode_header, encode_headers, header_symbols
 from lightpage.codec.ldpc.code import MOST_INFORMATION_BITS, Bits, LdpcCode
 from lightpage.codec.ldpc.decoder import decode
 from lightpage.codec.likelihood.information import page_information
-from lightpage.codec.mapping import bit_llrs, to_levels, upper_bits
+from lightpage.codec.mapping import bit_llrs, decide_in_coset, to_levels, upper_bits
 from lightpage.codec.page_bytes import FILE_BYTES, FileFacts, Header, Loss, PageBytes
 from lightpage.codec.random_bits import random_bytes, random_order
 from lightpage.codec.reed_solomon import LONGEST_WORD, SYMBOL_BITS, parity, repair
@@ -160,8 +160,7 @@ class PageCodec:
         header = decode_header(mu[self._header], kappa[self._header], self._levels)
         other = header is not None and header.code_id != self.code.id and expected is None
         own = mu[self._body].astype(np.float64)
-        llrs = bit_llrs(own, kappa[self._body], self._levels, self.code.coded_bits, self._threads).ravel()
-        blocks = gathered(llrs, self._order[: self.blocks * self.ldpc.sent_bits]).reshape(self.blocks, -1)
+        blocks = self._blocks(own, kappa[self._body])
         if other:
             return self._lost(header, Loss.CODE, blocks, 0, 0.0)
         found = decode(self.ldpc, blocks, threads=self._threads)
@@ -187,6 +186,37 @@ class PageCodec:
         else:
             loss = Loss.BODY if failed else Loss.CHECKSUM
         return self._lost(header, loss, blocks, failed, iterations)
+
+    def decide(
+        self, phase: NDArray[np.floating], concentration: NDArray[np.floating]
+    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        """Levels of a page whose bytes may be out of reach.
+
+        A block that converges is a word of the code, and so the cosets of its symbols are known. Near the limit of what
+        decodes, none of 451 blocks of 6,349 information bits was another word, and 16 of 10,483 of 200 bits were.
+
+        Args:
+            phase, concentration: as for `decode`.
+
+        Returns:
+            The nearest level of each symbol, or of its coset where blocks that converge settle that, uint8 [ny, nx];
+            where they do, bool [ny, nx].
+        """
+        mu, kappa = phase.ravel(), concentration.ravel()
+        levels, settled = self._levels.nearest(mu), np.zeros(mu.size, np.bool_)
+        own = mu[self._body].astype(np.float64)
+        found = decode(self.ldpc, self._blocks(own, kappa[self._body]), threads=self._threads)
+        converged = np.repeat(found.converged[:, None], self.ldpc.sent_bits, axis=1).astype(np.uint8)
+        sure = self._interleaved(converged[None], np.ones_like(self._filling)).all(axis=1)
+        label = self._interleaved(found.sent[None])[sure]
+        upper = decide_in_coset(own[sure], label, self._levels)
+        levels[self._body[sure]], settled[self._body[sure]] = to_levels(label, upper, self.code.levels), True
+        return levels.reshape(phase.shape), settled.reshape(phase.shape)
+
+    def _blocks(self, phase: NDArray[np.float64], concentration: NDArray[np.floating]) -> NDArray[np.float32]:
+        """LLRs of the sent bits of the body's symbols, [blocks, n]."""
+        llrs = bit_llrs(phase, concentration, self._levels, self.code.coded_bits, self._threads).ravel()
+        return gathered(llrs, self._order[: self.blocks * self.ldpc.sent_bits]).reshape(self.blocks, -1)
 
     def _lost(
         self, header: Header | None, loss: Loss, blocks: NDArray[np.float32], failed: int, iterations: float
@@ -224,14 +254,15 @@ class PageCodec:
         sent = self.ldpc.encode(information.reshape(-1, self.ldpc.information_bits))
         return self._interleaved(sent.reshape(len(information), self.blocks, -1))
 
-    def _interleaved(self, sent: Bits) -> Bits:
+    def _interleaved(self, sent: Bits, filling: Bits | None = None) -> Bits:
         """Sent bits [pages, blocks, n] in the places that they have on the page, [pages * symbols, b]."""
+        filling = self._filling if filling is None else filling
         pages = len(sent)
         label = np.empty((pages, self._coded_bits), np.uint8)
         reached = self.blocks * self.ldpc.sent_bits
         for page, bits in zip(label, sent.reshape(pages, -1), strict=True):
             scatter(bits, self._order[:reached], page)
-            scatter(self._filling, self._order[reached:], page)
+            scatter(filling, self._order[reached:], page)
         return label.reshape(-1, self.code.coded_bits)
 
     def _symbols(self, bits: Bits) -> NDArray[np.int64]:

@@ -12,6 +12,7 @@ from pydantic_core import ErrorDetails
 
 WANTED = ", wanted "
 """A `ValueError` of a validator says what came and what was wanted, with this in between."""
+_ONE_OF = "one of "
 _LONGEST = 60
 """Characters of a value that are told."""
 
@@ -58,7 +59,8 @@ class Problem:
         if self.kind == "missing":
             return f"no {self.place}"
         if self.kind == "unknown":
-            return f"unknown {self.place}"
+            close = not self.expected.startswith(_ONE_OF)
+            return f"unknown {self.place} ({f'did you mean {self.expected}?' if close else f'wanted {self.expected}'})"
         if self.kind == "value":
             return f"{self.place} = {self.got} (wanted {self.expected})"
         return f"{self.place}: {self.got}{WANTED}{self.expected}".removeprefix(": ")
@@ -104,7 +106,7 @@ def problem_of(model: type[BaseModel], error: ErrorDetails) -> Problem:
     if kind == "extra_forbidden":
         known = [name for owner in owners for name in keys_of(owner)]
         close = get_close_matches(key, known, 1)
-        return Problem(place, "an unknown key", close[0] if close else f"one of {', '.join(known)}", "unknown")
+        return Problem(place, "an unknown key", close[0] if close else f"{_ONE_OF}{', '.join(known)}", "unknown")
     if kind in ("union_tag_not_found", "union_tag_invalid"):
         tags = " or ".join(tag_of(one) for one in within)
         if kind == "union_tag_not_found":

@@ -49,24 +49,34 @@ T = TypeVar("T", bound=TomlTable)
 class Light(TomlTable):
     """The laser."""
 
-    wavelength_m: Length
+    wavelength_m: Length = Field(description="in vacuum")
 
 
 class Lens(TomlTable):
     """The launch and the de-launch lens, both in a 2f arrangement."""
 
-    focal_length_m: Length
+    focal_length_m: Length = Field(description="of both lenses, or of the launch lens alone")
+    camera_focal_length_m: Length | None = Field(None, description="of the de-launch lens, where it is another one")
+
+
+class Relay(TomlTable):
+    """Lenses that show the image to the cameras at another size than the de-launch lens makes it."""
+
+    magnification: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] = Field(
+        1.0,
+        description="size on the sensors over size behind the de-launch lens; a turned image is the cameras' matter",
+    )
 
 
 class LensPath(TomlTable):
     """Optical path of either lens beyond an ideal one's, by its terms, for the page's corner at the pipe's wall."""
 
-    piston_rad: Radians = 0.0
-    distortion_rad: Radians = 0.0
-    astigmatism_rad: Radians = 0.0
-    field_curvature_rad: Radians = 0.0
-    coma_rad: Radians = 0.0
-    spherical_rad: Radians = 0.0
+    piston_rad: Radians = Field(0.0, description="of the field alone, its fourth power")
+    distortion_rad: Radians = Field(0.0, description="of the third power of the field")
+    astigmatism_rad: Radians = Field(0.0, description="of the second power of the field along it")
+    field_curvature_rad: Radians = Field(0.0, description="of the second power of the field")
+    coma_rad: Radians = Field(0.0, description="of the field's first power")
+    spherical_rad: Radians = Field(0.0, description="of the aperture alone, its fourth power")
 
     def at(self, share: float) -> LensPath:
         """The same lenses, stated for a page whose corner lies at that share of this one's distance."""
@@ -88,62 +98,72 @@ class LensPath(TomlTable):
 class Pipe(TomlTable):
     """The light-pipe: a glass prism whose cross-section is a rhombus of height `width_m`, sheared by `angle_deg`."""
 
-    length_m: Length
-    width_m: Length
-    refractive_index: Annotated[float, Field(ge=1, le=4)]
-    angle_deg: Annotated[float, Field(ge=-5, le=5)] = 0.0
+    length_m: Length = Field(description="along the light")
+    width_m: Length = Field(description="between opposite walls")
+    refractive_index: Annotated[float, Field(ge=1, le=4)] = Field(description="of its glass, at the wavelength")
+    angle_deg: Annotated[float, Field(ge=-5, le=5)] = Field(
+        0.0, description="by which its cross-section misses the right angle"
+    )
 
 
 class Slm(TomlTable):
     """The spatial light modulator."""
 
-    pitch_m: Length
+    pitch_m: Length = Field(description="from one pixel to the next")
 
 
 class PageLayout(TomlTable):
     """How symbols lie on the SLM, and which of them are pilots."""
 
-    columns: Count
-    rows: Count
-    symbol_size_px: Count
-    pilot_fraction: Annotated[float, Field(gt=0, lt=0.5)] = 0.01
-    pilot_seed: Annotated[int, Field(ge=0)] = 0
+    columns: Count = Field(description="symbols side by side")
+    rows: Count = Field(description="symbols above one another")
+    symbol_size_px: Count = Field(description="edge of a symbol, modulator pixels")
+    pilot_fraction: Annotated[float, Field(gt=0, lt=0.5)] = Field(0.01, description="share of known symbols")
+    pilot_seed: Annotated[int, Field(ge=0)] = Field(0, description="of their places and values")
 
 
 class Camera(TomlTable):
     """The sensor of both cameras."""
 
-    columns_px: Side
-    rows_px: Side
-    pitch_m: Length
+    columns_px: Side = Field(description="width of a frame")
+    rows_px: Side = Field(description="height of a frame")
+    pitch_m: Length = Field(description="from one pixel of the sensor to the next")
 
 
 class Profile(TomlTable):
     """What the data sheet of a device says. Lengths in metres, angles in degrees, pixels where the key says so."""
 
-    schema_version: Literal[1]
-    name: Annotated[str, Field(min_length=1)]
+    schema_version: Literal[1] = Field(description="of this layout")
+    name: Annotated[str, Field(min_length=1)] = Field(description="of the device, for messages")
     light: Light
     lens: Lens
     pipe: Pipe
     slm: Slm
     page: PageLayout
     camera: Camera
+    relay: Relay = Relay()
     lens_path: LensPath = LensPath()
 
     @model_validator(mode="after")
     def _page_fits_the_optics(self) -> Self:
-        numerical_aperture = max(self.page_width_m, self.page_height_m) / 2 / self.lens.focal_length_m
+        half_m = max(self.page_width_m, self.page_height_m) / 2
+        numerical_aperture = half_m / self.lens.focal_length_m
         if numerical_aperture >= 0.5:
             raise ValueError(
                 f"page.columns, page.rows: the page's edge enters at {numerical_aperture:.2f} of the focal length, "
-                "wanted below 0.5"
+                f"wanted below 0.5: lens.focal_length_m above {2 * half_m:.4g}, or fewer symbols"
             )
         reflections = numerical_aperture * self.pipe.length_m / (self.pipe.refractive_index * self.pipe.width_m)
         if reflections > _MOST_REFLECTIONS:
+            length_m = self.pipe.length_m * _MOST_REFLECTIONS / reflections
             raise ValueError(
                 f"pipe.length_m, pipe.width_m: light of the page's edge meets a wall {reflections:.3g} times, "
-                f"wanted at most {_MOST_REFLECTIONS}"
+                f"wanted at most {_MOST_REFLECTIONS}: pipe.length_m up to {length_m:.4g}"
+            )
+        if self.lens.camera_focal_length_m is not None and not self.ideal_lenses:
+            raise ValueError(
+                "lens.camera_focal_length_m, lens_path: a path of two equal lenses and a second focal length, "
+                "wanted one of them"
             )
         return self
 
@@ -176,6 +196,18 @@ class Profile(TomlTable):
     def symbol_pitch_m(self) -> float:
         """Edge of one symbol on the SLM, metres."""
         return self.page.symbol_size_px * self.slm.pitch_m
+
+    @property
+    def camera_magnification(self) -> float:
+        """Size of a page's image on the sensors over the page's own: that of two lenses f1, f2 is f2 / f1."""
+        second = self.lens.camera_focal_length_m
+        lenses = 1.0 if second is None else second / self.lens.focal_length_m
+        return self.relay.magnification * lenses
+
+    @property
+    def image_pixel_m(self) -> float:
+        """Edge of a camera pixel where the page's image has the page's own size, metres."""
+        return self.camera.pitch_m / self.camera_magnification
 
     @property
     def page_shape(self) -> tuple[int, int]:
@@ -218,15 +250,21 @@ class Profile(TomlTable):
         return self.model_copy(update={"lens_path": LensPath()})
 
     def to_toml(self) -> str:
-        """The profile as TOML text, which `parse_profile` reads back to an equal one; ideal lenses are left out."""
-        return to_toml(self, without=("lens_path",) if self.ideal_lenses else ())
+        """The profile as TOML text, which `parse_profile` reads back to an equal one.
+
+        Tables that the format had later are left out where they say nothing, so that earlier profiles keep their text.
+        """
+        return to_toml(self, without=[name for name in ("relay", "lens_path") if getattr(self, name) == _SILENT[name]])
+
+
+_SILENT: dict[str, TomlTable] = {"relay": Relay(), "lens_path": LensPath()}
 
 
 def to_toml(table: TomlTable, without: Collection[str] = ()) -> str:
     """Write a checked table (scalars first, then its sub-tables one level down) as TOML text, some keys left out."""
     scalars: list[str] = []
     tables: list[str] = []
-    for key, value in table.model_dump(exclude=set(without)).items():
+    for key, value in table.model_dump(exclude=set(without), exclude_none=True).items():
         if isinstance(value, dict):
             tables += ["", f"[{key}]", *(f"{k} = {toml_value(v)}" for k, v in value.items())]
         else:

@@ -66,25 +66,44 @@ class Header:
     def own_profile(self) -> Profile | None:
         """The nominal profile that the recording carries; None where it has none that can be read."""
         try:
-            return None if self.profile_text is None else parse_profile(self.profile_text, "profile of the recording")
+            return None if self.profile_text is None else self._parsed(self.profile_text)
         except ProfileError:
             return None
 
-    def differences(self, profile: Profile) -> list[str]:
-        """What the recording's own nominal profile says otherwise than `profile`, a line each.
+    def device(self, given: Profile | None) -> Profile:
+        """The nominal profile of the pages: the one that was given, or else the recording's own.
 
-        Empty where it has none that can be read: another program's notes are no reason to stop.
+        A recording's own that cannot be read contradicts nothing: another program's notes are no reason to stop.
+
+        Raises:
+            RecordingError: there is none, frames or page have another shape, or both profiles say otherwise.
+            ProfileError: the recording's own is needed, and cannot be read.
         """
-        if (own := self.own_profile()) is None:
-            return []
-        told, expected = own.model_dump(), profile.model_dump()
-        return [
-            f"{table}.{key} = {value} (profile {profile.name}: {expected[table][key]})"
-            for table, values in told.items()
-            if isinstance(values, dict)
-            for key, value in values.items()
-            if expected[table][key] != value
-        ]
+        subject = f"{self.subject}: attribute 'profile'"
+        if given is None:
+            if self.profile_text is None:
+                raise RecordingError(subject, "none", "one, or --profile P")
+            given = self._parsed(self.profile_text)
+        self.check_against(given)
+        if (own := self.own_profile()) is not None and (others := _differences(own, given)):
+            expected = f"what profile {given.name} says: leave --profile out, or import the frames anew with it"
+            raise RecordingError(subject, "; ".join(others), expected)
+        return given
+
+    def _parsed(self, text: str) -> Profile:
+        return parse_profile(text, f"{self.subject}: attribute 'profile'")
+
+
+def _differences(own: Profile, given: Profile) -> list[str]:
+    """Return what a recording's own profile says otherwise than the one that was given, a line each."""
+    told, expected = own.model_dump(), given.model_dump()
+    return [
+        f"{table}.{key} = {value} (profile {given.name}: {expected[table][key]})"
+        for table, values in told.items()
+        if isinstance(values, dict)
+        for key, value in values.items()
+        if expected[table][key] != value
+    ]
 
 
 def read_header(file: ArrayFile) -> Header:
@@ -94,7 +113,7 @@ def read_header(file: ArrayFile) -> Header:
         RecordingError: no recording, one that is newer than this program, or one that contradicts itself.
         StorageError, SurroundingsError: it cannot be read.
     """
-    if (found := file.attribute("format")) != FORMAT:
+    if not isinstance(found := file.attribute("format"), str) or found != FORMAT:
         got = "none" if found is None else repr(found)
         raise RecordingError(f"{file.subject}: attribute 'format'", got, repr(FORMAT))
     _whole(file, "version", VERSION, VERSION, f"version {VERSION}")

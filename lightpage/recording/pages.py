@@ -16,13 +16,13 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.device.profile import Profile
+from lightpage.device.profile import Profile, parse_profile
 from lightpage.errors import RecordingError
 from lightpage.failures import os_failure
 from lightpage.files import move_into_place
 from lightpage.page.levels import check_levels
 from lightpage.page.symbols import check_symbols
-from lightpage.recording.hdf5 import open_hdf5
+from lightpage.recording.hdf5 import open_hdf5, read_attribute
 from lightpage.recording.hdf_file import open_to_write
 from lightpage.recording.stored import ArrayFile
 
@@ -136,6 +136,18 @@ class Pages:
         """
         return cls(open_hdf5(path, f"pages {path}"), path)
 
+    @staticmethod
+    def are_in(path: Path) -> bool:
+        """Return whether an HDF5 file says that it holds pages to write.
+
+        Raises:
+            RecordingError: it is no HDF5 file, or cannot be read.
+        """
+        subject = f"file {path}"
+        with open_hdf5(path, subject) as file:
+            told = read_attribute(file, "format", subject)
+            return isinstance(told, str) and told == FORMAT
+
     def __enter__(self) -> Self:
         return self
 
@@ -161,6 +173,21 @@ class Pages:
     def page_shape(self) -> tuple[int, int]:
         """Symbols as (rows, columns)."""
         return self._shape[1:]
+
+    def device(self, given: Profile | None) -> Profile:
+        """The nominal profile of the pages: the one that was given, or else the file's own.
+
+        Raises:
+            RecordingError: there is none, or the pages have another shape.
+            ProfileError: the file's own is needed, and cannot be read.
+        """
+        subject = f"{self._subject}: attribute 'profile'"
+        if given is None:
+            if not isinstance(text := self._file.attribute("profile"), str):
+                raise RecordingError(subject, "none", "one, or --profile P")
+            given = parse_profile(text, subject)
+        self.check_against(given)
+        return given
 
     def check_against(self, profile: Profile) -> None:
         """Check that the pages are for devices of this profile.

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile
-from lightpage.errors import NoSuchPageError, RecordingError
+from lightpage.errors import InvalidInputError, NoSuchPageError, RecordingError
 from lightpage.failures import error_number, hdf5_failure, os_failure, short_resource
 from lightpage.files import lock
 from lightpage.recording.hdf5 import retried
@@ -35,6 +35,7 @@ class Identity:
         bit_depth: bits of a camera count.
         code: what the pages hold, JSON text, where they were made by an encoder.
         symbols: of the pages, where they are known before they are recorded.
+        black_level: counts of a camera in the dark, which frames still have.
     """
 
     profile: Profile
@@ -42,11 +43,13 @@ class Identity:
     bit_depth: int
     code: str | None = None
     symbols: Symbols | None = None
+    black_level: int = 0
 
     def attributes(self) -> dict[str, object]:
         """The root attributes that say so."""
         told = {"format": FORMAT, "version": VERSION, "camera_bit_depth": self.bit_depth, "levels": self.levels}
-        return told | {"profile": self.profile.to_toml()} | ({} if self.code is None else {"code": self.code})
+        told |= {"profile": self.profile.to_toml()} | ({} if self.code is None else {"code": self.code})
+        return told | ({"black_level": self.black_level} if self.black_level else {})
 
     def difference(self, file: h5py.File, pages: int) -> str:
         """Of what else the pages of a file are; empty if they are the same."""
@@ -54,6 +57,7 @@ class Identity:
         for names, what in (
             (("profile",), "another profile"),
             (("camera_bit_depth",), "another bit depth"),
+            (("black_level",), "another black level"),
             (("levels", "code"), "other symbols"),
             (("format", "version"), "another format"),
         ):
@@ -73,6 +77,38 @@ class Identity:
 def partial_path(path: Path) -> Path:
     """Where a recording lies until it is complete and gets its name `path`."""
     return path.with_name(path.name + ".partial")
+
+
+def settings_path(path: Path) -> Path:
+    """Return the file that says what the pages of the unfinished recording `path` are made of."""
+    return path.with_name(path.name + ".partial.toml")
+
+
+def claim(path: Path, settings: str, *, force: bool) -> None:
+    """Note what the pages of the recording `path` are made of, until it is complete, unless others are begun there.
+
+    Args:
+        path: final name of the recording.
+        settings: what its pages are made of, as text.
+        force: whether pages of something else may be lost.
+
+    Raises:
+        InvalidInputError: there are pages of something else, they are being written, or the note cannot be.
+    """
+    partial, note = partial_path(path), settings_path(path)
+    try:
+        begun = note.read_text("utf-8") if note.exists() else None
+        if partial.exists() and begun != settings:
+            if not force:
+                raise InvalidInputError(
+                    f"--out {path}",
+                    f"pages begun with other settings ({partial.name})",
+                    "the same settings, to go on with them, or --force, to start anew",
+                )
+            discard_partial(path)
+        note.write_text(settings, "utf-8")
+    except OSError as error:
+        raise os_failure(f"--out {path}", error, "a place that can be written") from None
 
 
 def pages_there(path: Path, identity: Identity, *, overwrite: bool = False) -> int:

@@ -80,6 +80,7 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
         keep_references: bool = False,
         symbols: Symbols | None = None,
         overwrite: bool = True,
+        black_level: int = 0,
     ) -> None:
         """Start a new recording; a partial file of the same name that nobody is writing is overwritten.
 
@@ -97,10 +98,11 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
             symbols: of the pages to come; a recording whose pages have others is not gone on with.
             overwrite: whether a file that has the final name, then or at the end, and pages of a recording that is not
                 gone on with, may be lost.
+            black_level: counts of a camera in the dark, which all frames still have; readers take it off.
 
         Raises:
-            RecordingError: wrong bit depth, frames or pilots, or the file cannot be written or is being written; or
-                there is something that may not be lost.
+            RecordingError: wrong bit depth, black level, frames or pilots, or the file cannot be written or is being
+                written; or there is something that may not be lost.
             PageError: a level count outside 2..256.
         """
         self.path, self.pages = Path(path), 0
@@ -109,7 +111,9 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
         check_levels(levels, f"{self._subject}: levels")
         if not MIN_BIT_DEPTH <= bit_depth <= MAX_BIT_DEPTH:
             raise RecordingError(f"{self._subject}: bit depth", bit_depth, f"{MIN_BIT_DEPTH} to {MAX_BIT_DEPTH}")
-        self._identity = Identity(profile, levels, bit_depth, code, symbols)
+        if not 0 <= black_level < (most := 2**bit_depth - 1):
+            raise RecordingError(f"{self._subject}: black level", black_level, f"0 to {most - 1}")
+        self._identity = Identity(profile, levels, bit_depth, code, symbols, black_level)
         self._overwrite = overwrite
         if not overwrite and self.path.exists():
             raise self._exists()

@@ -43,7 +43,7 @@ class CameraView:
     """View of one camera: the points of the common camera plane that its pixels see.
 
     Args:
-        camera: sensor size and pitch.
+        camera: sensor size, and pitch where the image has the page's own size.
         pose: similarity transform of the sensor.
         distortion_relative: relative radial displacement of the image at `distortion_radius_m`.
         distortion_radius_m: normalising radius.

@@ -87,10 +87,14 @@ class LightBound:
 
     def _weight(self, electrons: Real) -> Real:
         """See `_View`."""
-        sensor, camera = self._optics.device.sensor, self._optics.profile.camera
+        sensor, camera, pixel = (
+            self._optics.device.sensor,
+            self._optics.profile.camera,
+            self._optics.profile.image_pixel_m,
+        )
         step = sensor.full_well_e / (2**sensor.bit_depth - 1)
         weight = np.where(electrons < sensor.full_well_e, 1 / (electrons + sensor.read_noise_e**2 + step**2 / 12), 0)
         x, y = self._optics.camera_axes_m
-        weight[np.abs(y) > camera.rows_px * camera.pitch_m / 2] = 0
-        weight[:, np.abs(x) > camera.columns_px * camera.pitch_m / 2] = 0
+        weight[np.abs(y) > camera.rows_px * pixel / 2] = 0
+        weight[:, np.abs(x) > camera.columns_px * pixel / 2] = 0
         return weight

@@ -10,12 +10,11 @@ import numpy as np
 from lightpage.device.profile import Profile, to_toml
 from lightpage.device.state import Device
 from lightpage.errors import InvalidInputError, RecordingError
-from lightpage.failures import os_failure
 from lightpage.page.symbols import random_symbols
 from lightpage.progress import track
 from lightpage.recording.hdf5 import patiently
 from lightpage.recording.pages import Pages
-from lightpage.recording.unfinished import discard_partial, partial_path
+from lightpage.recording.unfinished import claim, settings_path
 from lightpage.recording.writer import RecordingWriter
 from lightpage.simulator.simulator import LIGHT, Simulator
 
@@ -54,8 +53,6 @@ class RecordingJob:
         if written is not None:
             written.check_against(profile)
         self._simulator = Simulator(profile, device, levels, seed)
-        self.partial = partial_path(out)
-        self.settings = out.with_name(out.name + ".partial.toml")
 
     def claim(self, force: bool) -> None:
         """Note the settings, unless pages begun with others are there.
@@ -69,19 +66,7 @@ class RecordingJob:
             digest = patiently(self._digest, f"pages {self._written.path}", otherwise=RecordingError)
             text += f"symbols = {digest}\n"
         text += f"{to_toml(self.device)}\n# profile\n{self.profile.to_toml()}"
-        try:
-            begun = self.settings.read_text("utf-8") if self.settings.exists() else None
-            if self.partial.exists() and begun != text:
-                if not force:
-                    raise InvalidInputError(
-                        f"--out {self.out}",
-                        f"pages begun with other settings ({self.partial.name})",
-                        "the same settings, to go on with them, or --force, to start anew",
-                    )
-                discard_partial(self.out)
-            self.settings.write_text(text, "utf-8")
-        except OSError as error:
-            raise os_failure(f"--out {self.out}", error, "a place that can be written") from None
+        claim(self.out, text, force=force)
 
     def _digest(self) -> str:
         assert self._written is not None  # or there is nothing to tell apart
@@ -109,7 +94,7 @@ class RecordingJob:
             simulator.skip(writer.pages)
             for page in track(range(writer.pages, pages), "simulate", total=pages, done=writer.pages):
                 self._append(writer, simulator, page)
-        self.settings.unlink(missing_ok=True)
+        settings_path(self.out).unlink(missing_ok=True)
 
     def _append(self, writer: RecordingWriter, simulator: Simulator, page: int) -> None:
         if self._written is None:

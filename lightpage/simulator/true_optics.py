@@ -92,7 +92,7 @@ class TrueOptics:
 
         def axis(pixels: int) -> Real:
             count = int(pixels * _GRID_MARGIN) + 48
-            return np.asarray((np.arange(count) - (count - 1) / 2) * camera.pitch_m)
+            return np.asarray((np.arange(count) - (count - 1) / 2) * self.profile.image_pixel_m)
 
         return axis(camera.columns_px), axis(camera.rows_px)
 
@@ -102,7 +102,8 @@ class TrueOptics:
         page_x, page_y = self.page_axes_m
         camera_x, camera_y = self.camera_axes_m
         camera, pitch = self.profile.camera, self.profile.slm.pitch_m
-        sensor = camera.columns_px * camera.pitch_m / 2, camera.rows_px * camera.pitch_m / 2
+        pixel = self.profile.image_pixel_m
+        sensor = camera.columns_px * pixel / 2, camera.rows_px * pixel / 2
         return WaveChannel(
             self.geometry,
             page_x,
@@ -138,7 +139,7 @@ class TrueOptics:
         symbols = np.exp(2j * np.pi * np.random.default_rng(0).random(self.profile.page_shape))
         field = self._through(np.kron(symbols, np.ones((size, size))))
         # the de-launch is unitary on samples of the camera's pitch, and the page is imaged at its own size
-        samples = self.profile.page_width_m * self.profile.page_height_m / self.profile.camera.pitch_m**2
+        samples = self.profile.page_width_m * self.profile.page_height_m / self.profile.image_pixel_m**2
         return float(np.sqrt(samples) / np.linalg.norm(field))
 
     def exit_field(self, page_phase: Real, noise_rad: Real | float = 0.0, flicker_rad: float = 0.0) -> Complex:
@@ -239,7 +240,8 @@ class TrueOptics:
         )
         distortion = self.device.aberration.distortion_relative
         edges = self.profile.page_width_m / 2, self.profile.page_height_m / 2
-        return CameraView(self.profile.camera, moved, distortion, self.profile.corner_m, edges).positions_m()
+        camera = self.profile.camera.model_copy(update={"pitch_m": self.profile.image_pixel_m})
+        return CameraView(camera, moved, distortion, self.profile.corner_m, edges).positions_m()
 
     @property
     def electrons_per_unit(self) -> float:

@@ -82,28 +82,34 @@ class FieldGrid:
 def check_camera(profile: Profile) -> None:
     """Check that the cameras see all of the page's image, and the pipe's light finely enough.
 
-    The image has the page's own size, since both lenses have the same focal length. The intensity of light from a pipe
-    of width w has frequencies up to w / (lambda f), twice the field's; two samples a period on a grid of
+    All is compared where the image has the page's own size (`Profile.image_pixel_m`). The intensity of light from a
+    pipe of width w has frequencies up to w / (lambda f), twice the field's; two samples a period on a grid of
     `GRID_STEP_PX` pixels need pixels of at most lambda f / (2 GRID_STEP_PX w).
 
     Raises:
         ProfileError: the camera's pixels are too coarse or too few; the message says what would do.
     """
     camera, subject = profile.camera, f"profile {profile.name}: camera"
+    pixel, magnification = profile.image_pixel_m, profile.camera_magnification
     coarsest = profile.light.wavelength_m * profile.lens.focal_length_m / (2 * GRID_STEP_PX * profile.pipe.width_m)
-    if camera.pitch_m > coarsest * (1 + _ROUNDING):
+    if pixel > coarsest * (1 + _ROUNDING):
+        least = profile.relay.magnification * pixel / coarsest
         raise ProfileError(
-            f"{subject}.pitch_m", f"{camera.pitch_m:.4g} m", f"at most {coarsest:.4g} m, to resolve the pipe's light"
+            f"{subject}.pitch_m",
+            f"{camera.pitch_m:.4g} m",
+            f"at most {coarsest * magnification:.4g} m, to resolve the pipe's light, or a relay.magnification of at "
+            f"least {least:.4g}",
         )
     for key, count, extent in (
         ("columns_px", camera.columns_px, profile.page_width_m),
         ("rows_px", camera.rows_px, profile.page_height_m),
     ):
-        least = int(np.ceil(extent / camera.pitch_m * (1 - _ROUNDING)))
+        least = int(np.ceil(extent / pixel * (1 - _ROUNDING)))
         if count < least:
-            raise ProfileError(
-                f"{subject}.{key}", count, f"at least {least}, to see the page's image of {extent * 1e3:.4g} mm"
-            )
+            most = profile.relay.magnification * count * pixel / extent
+            told = f"to see the page's image of {extent * magnification * 1e3:.4g} mm"
+            expected = f"at least {least}, {told}, or a relay.magnification of at most {most:.4g}"
+            raise ProfileError(f"{subject}.{key}", count, expected)
 
 
 def field_grid(profile: Profile, step_px: int = GRID_STEP_PX) -> FieldGrid:
@@ -118,7 +124,7 @@ def field_grid(profile: Profile, step_px: int = GRID_STEP_PX) -> FieldGrid:
         InvalidInputError: a pitch finer than the usual one, or too coarse for the pipe's band.
     """
     check_camera(profile)
-    pixel = profile.camera.pitch_m
+    pixel = profile.image_pixel_m
     pitch = step_px * pixel
 
     def axis(extent_m: float) -> Real:

@@ -13,17 +13,15 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lightpage.calibration.calibrate import KnownPage, refine
-from lightpage.calibration.common_error import common_error
+from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.document import Calibration
 from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.parameters import as_dict
 from lightpage.calibration.sampling_table import moved_cameras
 from lightpage.codec.code import Code
-from lightpage.codec.page_bytes import Header, PageBytes
-from lightpage.codec.page_codec import PageCodec
+from lightpage.codec.page_bytes import Header, Loss, PageBytes
 from lightpage.errors import (
     CalibrationError,
     FrameError,
@@ -32,7 +30,7 @@ from lightpage.errors import (
     RecalibrationRefusedError,
     raised_as,
 )
-from lightpage.page.pilots import LEAST_CONFIRMED_NATS, Pilots, read_pilots
+from lightpage.page.pilots import LEAST_CONFIRMED_NATS
 from lightpage.page.symbols import symbol_phases
 from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
@@ -40,11 +38,11 @@ from lightpage.recording.layout import hash_frames
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_drift import BundleSearch
 from lightpage.runtime.model.decoding.image_position import ImagePosition
-from lightpage.runtime.model.decoding.page import Inference
 from lightpage.runtime.model.execution.twin import OnnxTwin
 from lightpage.runtime.recalibration.known_pages import KnownPages
 from lightpage.runtime.recalibration.recalibration import Refit, RefitResult, refitted_bundle
 from lightpage.runtime.recalibration.refit import refit, traced
+from lightpage.runtime.recalibration.unknown_pages import UnknownPages
 
 TOGETHER = 6
 """Pages at most that one healing takes: the pilots of six show a smooth error as well as it can be shown."""
@@ -170,16 +168,15 @@ class _Healing:
         lit = [(number, pair) for number, pair in enumerate(pages.pairs) if _shows_light(decoder, pair)]
         distinct = {hash_frames(pair): number for number, pair in reversed(lit)}
         taken = sorted(distinct.values())[:TOGETHER]
-        self.pairs = tuple(pages.pairs[number] for number in taken)
-        self._expected = tuple(pages.expected[number] if pages.expected else None for number in taken)
-        if not self.pairs:
+        if not taken:
             raise RecalibrationRefusedError("healing", "no page with light", "at least one")
         if pages.references is not None:
             decoder.check(pages.references, "reference: ")
         self._references = pages.references or decoder.references
         self._levels = pages.code.levels
-        self._pilots = bundle.written_pilots(self._levels)
-        self._seen: dict[Decoder, tuple[list[Inference], tuple[PageBytes, ...]]] = {}
+        self.pairs = tuple(pages.pairs[number] for number in taken)
+        expected = tuple(pages.expected[number] if pages.expected else None for number in taken)
+        self._shown = UnknownPages(self.pairs, expected, pages.code, bundle.written_pilots(self._levels), twin)
         self._image = self._found()
         moved = moved_cameras(bundle.calibration.vector, np.array([self._image.shift_x_px, self._image.shift_y_px]))
         self._start = bundle.calibration.model_copy(update={"parameters": as_dict(moved)})
@@ -192,14 +189,14 @@ class _Healing:
             RecalibrationRefusedError: no page shows it.
         """
         decoder = self._decoder
-        search, shown = BundleSearch(decoder, self._twin), Pilots(decoder.bundle.pilot_mask, self._phases(decoder))
+        search, pilots = BundleSearch(decoder, self._twin), self._shown.pilots_of(decoder)
         around = np.concatenate([_AROUND_PX, [self._pages.image_px]])
         for pair in self.pairs:
-            found = search.find(pair, shown, around, self._references)
+            found = search.find(pair, pilots, around, self._references)
             if found.found:
                 x, y = map(float, found.shift_px)
                 return ImagePosition(x, y, searched=True, found=True)
-        checks = [decoder.post_process(one, self._levels, shown).check for one in self._looked(decoder)[0]]
+        checks = [page.check for page in self._shown.look(decoder).pages]
         told = sum(check.confirmed_bits * np.log(2) * check.pilots - check.gained_nats for check in checks)
         if told >= LEAST_CONFIRMED_NATS:
             return ImagePosition(0.0, 0.0, searched=True, found=False)
@@ -208,83 +205,65 @@ class _Healing:
         )
         raise RecalibrationRefusedError("healing", got, _WANTED)
 
-    def _phases(self, decoder: Decoder) -> NDArray[np.float64]:
-        """Phases that a decoder expects of the pilots, radians."""
-        return decoder.bundle.modulation.phase(symbol_phases(self._pilots, self._levels))
-
     def _with(self, calibration: Calibration, fitted: FramePair | None = None) -> _Model:
         """The model with another geometry, and by which page that was fitted."""
         result = traced(self._decoder, self._twin, self._references, calibration)
         return _Model(self._decoder.of_bundle(refitted_bundle(self._decoder.bundle, result)), result, fitted)
 
-    def _looked(self, decoder: Decoder) -> tuple[list[Inference], tuple[PageBytes, ...]]:
-        """What a decoder says of the pages, and what they give it."""
-        if decoder not in self._seen:
-            known, codec = Pilots(decoder.bundle.pilot_mask, self._phases(decoder)), self._codec(decoder)
-            inferences, read = list[Inference](), list[PageBytes]()
-            for pair, expected in zip(self.pairs, self._expected, strict=True):
-                inferences.append(decoder.infer(pair, doubtful=True))
-                page = decoder.post_process(inferences[-1], self._levels, known)
-                read.append(codec.decode(page.phase, page.concentration, expected))
-            self._seen[decoder] = inferences, tuple(read)
-        return self._seen[decoder]
-
-    def _codec(self, decoder: Decoder) -> PageCodec:
-        return PageCodec(self._pages.code, decoder.bundle.pilot_mask, decoder.bundle.levels(self._levels))
+    def _read(self, model: _Model) -> tuple[PageBytes, ...]:
+        """Return what the pages give a model."""
+        return self._shown.look(model.decoder, model.fitted).read
 
     def count(self, model: _Model) -> int:
         """How many pages a model reads."""
-        return sum(page.loss is None for page in self._looked(model.decoder)[1])
+        return sum(page.loss is None for page in self._read(model))
 
     def unread(self, model: _Model) -> str:
-        """That no page is read, and how far the one is from it that is nearest."""
-        lacking = min(-page.margin_bits for page in self._looked(model.decoder)[1])
-        least = f"the nearest lacks {lacking:.2f} bit a symbol by its own claims"
-        return f"{len(self.pairs)} pages of which none is read after {MOST_ROUNDS} rounds; {least}"
+        """Return that no page is read, and how far the one is from it that is nearest."""
+        pages = self._read(model)
+        told = f"the nearest lacks {min(-page.margin_bits for page in pages):.2f} bit a symbol by its own claims"
+        if decoded := sum(page.loss is Loss.CHECKSUM for page in pages):
+            told = f"{decoded} fail in bits that their LDPC blocks, which all converge, leave out"
+        return f"{len(pages)} pages of which none is read after {MOST_ROUNDS} rounds; {told}"
 
     def known(self, model: _Model) -> KnownPages | None:
         """The pages that come right, the fitted one first, then by what they have to spare; None if none does."""
-        read = [
-            (page, pair)
-            for page, pair in zip(self._looked(model.decoder)[1], self.pairs, strict=True)
-            if page.loss is None
-        ]
+        read = [(page, pair) for page, pair in zip(self._read(model), self.pairs, strict=True) if page.loss is None]
         if not read:
             return None
         read.sort(key=lambda one: (one[1] is not model.fitted, -one[0].margin_bits))
-        codec = self._codec(model.decoder)
-        symbols = tuple(codec.encode_again(page, self._pilots) for page, _ in read)
+        codec = self._shown.codec(model.decoder)
+        symbols = tuple(codec.encode_again(page, self._shown.pilots) for page, _ in read)
         image_px = self._image.shift_x_px, self._image.shift_y_px
         pairs = tuple(pair for _, pair in read)
-        return KnownPages(pairs, symbols, self._levels, self._references, model.decoder.bundle.pilot_mask, image_px)
+        mask, near = model.decoder.bundle.pilot_mask, None if model.fitted is None else self._near(model)
+        return KnownPages(pairs, symbols, self._levels, self._references, mask, image_px, near)
+
+    def _near(self, model: _Model) -> CalibratedDevice:
+        """Return the device as a model has it."""
+        bundle = model.decoder.bundle
+        return bundle.calibration.device(bundle.profile, self._references)
 
     def fitted(self, model: _Model, progress: Progress) -> _Model:
         """The model of a fit to what `model` decides, its smooth error off."""
         progress("decide", 0.0)
-        inferences, bundle = self._looked(model.decoder)[0], model.decoder.bundle
-        mask, shown = bundle.pilot_mask, Pilots(bundle.pilot_mask, self._phases(model.decoder))
-        phases = np.stack([one.phase - read_pilots(one.p, shown).piston.angle_rad for one in inferences])
-        claimed = np.stack([one.concentration for one in inferences]).astype(np.float64)
-        written = symbol_phases(self._pilots, self._levels)
-        error = common_error(phases.astype(np.float64), claimed, mask, written, bundle.modulation)
-        page = int(np.argmax(np.median(claimed, axis=(1, 2))))
-        levels = error.modulation.page_levels(self._levels)
-        symbols = levels.nearest(phases[page] - error.phase - error.pistons[page])
-        symbols[mask] = self._pilots
-        earlier = self._start
+        page, symbols = self._shown.decided(model.decoder, model.fitted)
+        profile, earlier = model.decoder.bundle.profile, self._start
         registered = refine(
             self._twin,
-            model.decoder.field_solver,
-            bundle.profile,
+            self._decoder.field_solver,
+            profile,
             self._references,
             [KnownPage(self.pairs[page], np.exp(1j * symbol_phases(symbols, self._levels)))],
             start=earlier.vector,
             quadrature_phase=earlier.turn_rad,
             progress=progress,
             modulation=earlier.modulator,
+            near=self._near(model),
+            rough=True,
         )
         hashes = [hash_frames(self.pairs[page])]
-        found = earlier.followed_by(Calibration.from_registered(registered, bundle.profile, hashes))
+        found = earlier.followed_by(Calibration.from_registered(registered, profile, hashes))
         return self._with(found, self.pairs[page])
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.errors import FrameError, InvalidInputError, PageError
 from lightpage.page.symbols import check_symbols
 from lightpage.progress import warn
@@ -32,6 +33,7 @@ class KnownPages:
         references: reference-only frames taken with them, or None: then those of the last recalibration hold.
         pilot_mask: where the pilots are, bool [ny, nx], or None for the device's usual positions.
         image_px: where the image was last seen against the model's calibration, (x, y), camera pixels.
+        near: a device that is known to be near the one that shows them: a fit begins there, and looks for no image.
     """
 
     pairs: tuple[FramePair, ...]
@@ -40,6 +42,7 @@ class KnownPages:
     references: FramePair | None = None
     pilot_mask: NDArray[np.bool_] | None = None
     image_px: tuple[float, float] = (0.0, 0.0)
+    near: CalibratedDevice | None = None
 
     def check(self, decoder: Decoder) -> None:
         """Check everything against the device of `decoder`.

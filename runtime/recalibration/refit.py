@@ -62,7 +62,10 @@ def refit(
     references = pages.references or decoder.references
     twin = OnnxTwin(bundle) if twin is None else twin
     progress("find the image", 0.0)
-    image = _find(decoder, twin, pages, references)
+    if pages.near is None:
+        image = _find(decoder, twin, pages, references)
+    else:
+        image = ImagePosition(*pages.image_px, searched=True, found=True)
     start = earlier.vector
     if image is not None:
         start = moved_cameras(start, np.array([image.shift_x_px, image.shift_y_px]))
@@ -81,6 +84,7 @@ def refit(
             quadrature_phase=earlier.turn_rad,
             progress=progress,
             modulation=earlier.modulator,
+            near=pages.near,
         )
     except CalibrationError as error:
         if image is None:

@@ -141,7 +141,7 @@ def _crosshairs(settings: Settings, progress: Progress) -> Result:
     per_unit = _BRIGHTEST * device.sensor.full_well_e / float(np.quantile(power, 0.999))
     frames = _QUICK_FRAMES if settings.quick else round(HOURS * 60 / MINUTES) + 1
     hours, truth = simulated_walk(frames, settings.seed)
-    scale = profile.slm.pitch_m / profile.camera.pitch_m
+    scale = profile.slm.pitch_m / profile.image_pixel_m
     rng = np.random.default_rng([settings.seed, 1])
     found = []
     first = None

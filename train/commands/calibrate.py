@@ -14,9 +14,10 @@ from lightpage.calibration.coherence import seen_share
 from lightpage.calibration.document import Calibration
 from lightpage.calibration.goodness.figure import goodness_figure
 from lightpage.calibration.known_pages import first_lit_pages, known_pages
+from lightpage.cli.options import named_profile, profile_option
 from lightpage.cli.paths import OutputFile
 from lightpage.cli.progress_bar import percent_bar
-from lightpage.device.profile import Profile, load_profile
+from lightpage.device.profile import Profile
 from lightpage.files import replace_file, write_json
 from lightpage.pictures import write_figure_png
 from lightpage.progress import Progress, warn
@@ -32,7 +33,7 @@ MAX_PAGES = 4
 
 
 @click.command()
-@click.option("--profile", "profile_name", required=True, metavar="P", help="Nominal device: a shipped name or a file.")
+@profile_option
 @click.option("--recording", required=True, type=click.Path(path_type=Path), help="Pages with known symbols, R.h5.")
 @click.option("--out", required=True, type=OutputFile(), help="Where the calibration goes, TOML.")
 @click.option(
@@ -50,7 +51,7 @@ MAX_PAGES = 4
 )
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def calibrate(
-    profile_name: str,
+    profile_name: str | None,
     recording: Path,
     out: Path,
     pages: int,
@@ -63,10 +64,9 @@ def calibrate(
     The fit is called good where a decoder loses less than 0.1 bit a symbol by what it leaves unexplained, usable
     below 0.3, else wrong. A wrong one is written too, and ends the command with an error.
     """
-    profile = load_profile(profile_name)
     start = time.perf_counter()
     with Recording.open(recording) as file, percent_bar() as progress:
-        file.header.check_against(profile)
+        profile = file.header.device(named_profile(profile_name))
         chosen = first_lit_pages(file, pages, warn)
         calibration = calibrate_recording(file, profile, chosen, progress, any_orientation=orientation == "any")
     seconds = time.perf_counter() - start
@@ -102,12 +102,10 @@ def calibrate_recording(
     """Calibrate from nominal with some pages of a recording.
 
     Raises:
-        RecordingError: no symbols, no such page, or shapes that are not the profile's.
+        RecordingError: no symbols, no such page, or a recording of another profile.
         CalibrationError: nothing within the capture range explains the frames.
     """
-    recording.header.check_against(profile)
-    if others := recording.header.differences(profile):
-        warn(f"recording {recording.path} says of its device: {'; '.join(others)}")
+    recording.header.device(profile)
     known = known_pages(recording, profile, pages)
     registered = register(
         TorchTwin(RayTwin(profile)),

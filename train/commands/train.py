@@ -8,10 +8,10 @@ from typing import Any
 import click
 
 from lightpage.calibration.document import Calibration, load_calibration
-from lightpage.cli.options import FiniteRange
+from lightpage.cli.options import FiniteRange, named_profile, profile_option
 from lightpage.cli.paths import OutputFile, OutputFolder
 from lightpage.cli.progress_bar import percent_bar
-from lightpage.device.profile import Profile, load_profile
+from lightpage.device.profile import Profile
 from lightpage.errors import RecordingError
 from lightpage.files import write_json
 from lightpage.progress import reporting
@@ -27,7 +27,7 @@ from lightpage.train.trainers.whole_run import Split, make_run, usable_pages
 
 
 @click.command()
-@click.option("--profile", "profile_name", required=True, help="Shipped profile or TOML file.")
+@profile_option
 @click.option("--recording", "recording_path", required=True, type=click.Path(path_type=Path), help="Known pages.")
 @click.option(
     "--localizer",
@@ -62,7 +62,7 @@ from lightpage.train.trainers.whole_run import Split, make_run, usable_pages
 )
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def train(
-    profile_name: str,
+    profile_name: str | None,
     recording_path: Path,
     localizer: str | None,
     out: Path,
@@ -85,9 +85,8 @@ def train(
     context.meta["lightpage.resume"] = "run the same command again; it goes on where it was"
     if not is_first_process():
         context.with_resource(reporting(Silence()))
-    profile = load_profile(profile_name)
     with Recording.open(recording_path) as recording:
-        recording.header.check_against(profile)
+        profile = recording.header.device(named_profile(profile_name))
         if not recording.has_symbols:
             raise RecordingError(f"recording {recording_path}", "no dataset 'symbols'", "known symbols to train on")
         context.with_resource(sole_writer(out))

@@ -183,7 +183,7 @@ class FeatureExtractor:
         return PageState((float(shift[0]), float(shift[1])), piston)
 
     def _moved(self, field: NDArray[np.complex64], shift: Real) -> NDArray[np.complex64]:
-        return moved(field, shift * self.device.profile.camera.pitch_m / self.grid.pitch_m)
+        return moved(field, shift * self.device.profile.image_pixel_m / self.grid.pitch_m)
 
     def _light(self, field: NDArray[np.complex64], shift: Real) -> NDArray[np.float32]:
         return demodulate(self._coherent, field, self.table, shift)

@@ -55,7 +55,7 @@ class RayTwin(nn.Module):
         self.corner = profile.corner_m
         self.ideal_lenses = profile.ideal_lenses
         self.symbol_pitch = profile.symbol_pitch_m
-        self.camera_pitch = profile.camera.pitch_m
+        self.camera_pitch = profile.image_pixel_m
         self.camera_centre = ((profile.camera.columns_px - 1) / 2, (profile.camera.rows_px - 1) / 2)
         pipe, focal_length_m = profile.pipe, profile.lens.focal_length_m
         spread = pipe.length_m / focal_length_m / pipe.refractive_index / pipe.width_m * _WIDEST_SPREAD

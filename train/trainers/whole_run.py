@@ -19,6 +19,7 @@ from lightpage.page.symbols import pilot_mask, pilot_symbols, symbol_phases
 from lightpage.progress import note, warn
 from lightpage.recording.layout import hash_frames
 from lightpage.recording.reader import Recording
+from lightpage.run_files import DESCRIPTION
 from lightpage.train.data.features import FeatureExtractor
 from lightpage.train.data.training_inputs import TrainingInputs
 from lightpage.train.fitting.provenance import provenance
@@ -27,7 +28,6 @@ from lightpage.train.models.hyperparameters import Hyperparameters
 from lightpage.train.processes import AS_IT_IS, Processes, is_first_process
 from lightpage.train.published.trainer import PublishedTrainer
 from lightpage.train.runs import (
-    DESCRIPTION,
     GOLDEN,
     REFERENCES,
     Run,

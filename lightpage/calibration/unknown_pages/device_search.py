@@ -153,7 +153,7 @@ class _Search:
         shares = self._light.shares(nominal(), _BRANCHES[:1])[0]
         sloping = shares[:, None] * np.exp(-1j * (self._light.centres / self._half) @ slopes.T)
         sloping = (sloping / np.linalg.norm(shares)).astype(np.complex64)
-        pixel = self._profile.camera.pitch_m
+        pixel = self._profile.image_pixel_m
         window = search_window(_REACH_PX * pixel, _STEP_PX * pixel)
         told = []
         for number, shift in enumerate(window):

@@ -178,6 +178,8 @@ class WaveFit:
         progress: Callable[[float], None] = lambda share: None,
         modulation: Modulation = NOMINAL,
         levels: LevelPrior | None = None,
+        *,
+        rough: bool = False,
     ) -> WaveFitted:
         """Fit the parameters of `groups` and the angle between the arms.
 
@@ -192,6 +194,7 @@ class WaveFit:
                 0 to 1. It may raise to stop the work.
             modulation: light that the modulator makes of its levels, to start from.
             levels: prior of the modulation where it is fitted too, None where it is held.
+            rough: whether the derivative of the light is taken but once.
         """
         without_effect = _OF_REAL_LENSES if self._profile.ideal_lenses else ()
         of_light = [index for index in indices(*groups) if index not in (*SEEN_BY_CAMERAS, *without_effect)]
@@ -209,7 +212,7 @@ class WaveFit:
             residual = float(np.sqrt(np.mean(left**2)))
             if not residual < (1 - _CONVERGED) * best.residual:
                 break
-            if slopes is None or residual < (1 - _STALE) * taken_at:
+            if slopes is None or (residual < (1 - _STALE) * taken_at and not rough):
                 told, taken_at = partial(_within_round, progress, number), residual
                 slopes = self._slopes(state, of_light, of_cameras, told, levels=levels is not None)
             directions = _directions(state.light, bends=bends)

@@ -28,6 +28,7 @@ from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import DECODER, FIELD
 from lightpage.runtime.model.decoding.batch_graph import REGISTRATION
 from lightpage.runtime.model.decoding.batches import NO_BATCHES, Batches, Batching, OneByOne
+from lightpage.runtime.model.decoding.camera_view import CameraView
 from lightpage.runtime.model.decoding.golden import check_golden
 from lightpage.runtime.model.decoding.page import OUTPUTS, DecodedPage, Inference, Timings, check_residual
 from lightpage.runtime.model.decoding.phase_refit import PhaseRefit
@@ -125,7 +126,7 @@ class Decoder:
         Raises:
             InvalidInputError: a table that does not fit.
         """
-        return self._like(self.bundle, self.graph.with_table(table))
+        return _like(self, self.bundle, self.graph.with_table(table))
 
     def taken(self, table: SamplingTable) -> SamplingTable:
         """The tensors of a traced table that the graph takes; of parameters those that it knows, the first ones."""
@@ -142,11 +143,7 @@ class Decoder:
             BundleError: its table does not fit.
         """
         with raised_as(BundleError, InvalidInputError, about=f"{bundle.subject}: "):
-            return self._like(bundle, self.graph.with_table(bundle.table))
-
-    def _like(self, bundle: Bundle, graph: TableGraph) -> Decoder:
-        threads, batching = self._code_threads, self._batching
-        return Decoder(bundle, self.threads, graph, code_threads=threads, batching=batching, batches=self.batches)
+            return _like(self, bundle, self.graph.with_table(bundle.table))
 
     @property
     def references(self) -> FramePair:
@@ -226,7 +223,7 @@ class Decoder:
                 p, phase, concentration, *rest = self.graph.run(self._outputs, feeds)
             page = Inference(p, phase, concentration, float(np.max(rest[0])) if rest else 0.0)
         check_residual(page.residual, self.bundle.manifest.residual_limit, doubtful=doubtful)
-        return page
+        return self.view.seen(page, table.get(REGISTRATION))
 
     @cached_property
     def field_solver(self) -> BundleFieldSolver:
@@ -236,6 +233,13 @@ class Decoder:
             BundleError: no graph of the bundle shows the field.
         """
         return BundleFieldSolver(self.bundle, self.graph, self.threads)
+
+    @cached_property
+    def view(self) -> CameraView:
+        """Says which symbols the cameras show."""
+        ports, told = self.graph.ports, ("registration", "places")
+        values = [self.graph.value(name) for name in told] if ports.keys() >= set(told) else None
+        return CameraView(self.bundle.profile, *(values or (None, None)))
 
     @cached_property
     def phase_refit(self) -> PhaseRefit:
@@ -292,7 +296,7 @@ class Decoder:
     def post_process(self, inference: Inference, levels: int, pilots: Pilots | None = None) -> DecodedPage:
         """Piston, smooth phase error, trust and decision: all that is behind the graph, timings left at zero."""
         known, shown = pilots or self.pilots(levels), self.bundle.levels(levels)
-        reading = read_pilots(inference.p, known)
+        reading = read_pilots(inference.p * (inference.concentration > 0), known)
         phase = remove_piston(inference.phase, reading.piston.angle_rad)
         error = self.phase_refit.error(phase, inference.concentration, shown, known)
         phase = remove_piston(phase, error)
@@ -339,6 +343,12 @@ class Decoder:
             return self.infer(pair).p
 
         check_golden(self.bundle, answer, self.bundle.manifest.precision)
+
+
+def _like(decoder: Decoder, bundle: Bundle, graph: TableGraph) -> Decoder:
+    """The decoder of the same graphs with another table; whatever is open is shared."""
+    codes, batching, batches = decoder._code_threads, decoder._batching, decoder.batches
+    return Decoder(bundle, decoder.threads, graph, code_threads=codes, batching=batching, batches=batches)
 
 
 class BundleFieldSolver:

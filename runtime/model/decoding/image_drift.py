@@ -157,24 +157,26 @@ class DriftModel:
         return coarse if fine is None or fine.over_claim > _MOST_OVER_CLAIM else fine
 
 
-def drift_slopes(decoder: Decoder, twin: Twin, parameters: Real) -> Real:
+def drift_slopes(decoder: Decoder, twin: Twin, parameters: Real, pair: FramePair | None = None) -> Real:
     """Change of each symbol's decoded phase with drift, [4, ny, nx], radians a unit of drift.
 
-    What shift does shows on the golden page, with four runs of the graph; what tilt does follows from the twin.
+    What shift does shows on a page, with four runs of the graph; what tilt does follows from the twin.
 
     Args:
         decoder: of a bundle.
         twin, parameters: of its device.
+        pair: a page that it reads; the golden page by default.
 
     Raises:
         BundleError: the golden page is refused when its image is looked for a little off its place.
     """
-    registration = decoder.graph.value("registration")
-    pair, profile = decoder.bundle.golden.pair, decoder.bundle.profile
+    registration, given = decoder.graph.value("registration"), pair is not None
+    profile, pair = decoder.bundle.profile, decoder.bundle.golden.pair if pair is None else pair
 
     def phase(shift_px: Real) -> NDArray[np.float32]:
         try:
-            return decoder.infer(pair, {"registration": shifted(registration, shift_px)}, alone=True).phase
+            table = {"registration": shifted(registration, shift_px)}
+            return decoder.infer(pair, table, doubtful=given, alone=True).phase
         except FrameError as error:
             subject = f"{decoder.bundle.subject}: golden page, moved by {PROBE_PX} px"
             raise BundleError(subject, error.got, error.expected) from None
@@ -249,7 +251,7 @@ class BundleTables:
         """Tilt (x, y) of the signal against a reference that stays while the image shifts, radians."""
         profile = self._decoder.bundle.profile
         half = profile.page_width_m / 2, profile.page_height_m / 2
-        return tilt_of_shift(self._calibration.parameters, shift_px * profile.camera.pitch_m, *half)
+        return tilt_of_shift(self._calibration.parameters, shift_px * profile.image_pixel_m, *half)
 
     def traced(self, tilt_rad: Real) -> Decoder:
         """The decoder with the table of a device whose signal is tilted so against the reference."""

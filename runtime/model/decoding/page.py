@@ -24,6 +24,8 @@ _SYMBOLS = 4096
 class Inference:
     """What the graph says of a page: p float32 [2, ny, nx], its angle and its length [ny, nx]; piston still in it.
 
+    The length is zero where a camera does not show the symbol, whatever p is.
+
     `residual` is the power that is left of the homodyne equations over the field's, zero where the graph tells none;
     `waited_s` are the seconds for which the page waited for others of its batch.
     """

@@ -17,9 +17,9 @@ from lightpage.calibration.document import Calibration
 from lightpage.calibration.parameters import NAMES
 from lightpage.device.state import Device, ideal_device
 from lightpage.page.symbols import pilot_mask
+from lightpage.run_files import BEGUN
 from lightpage.simulator.true_optics import true_parameters
 from lightpage.train.fitting.fitted import FITTED_WEIGHTS
-from lightpage.train.runs import BEGUN
 from tests.lightpage.small import small_profile
 
 PROFILE = small_profile()

@@ -50,6 +50,17 @@ def kappa_of(levels: int, deviation: float) -> float:
     return (levels / (2 * np.pi * deviation)) ** 2
 
 
+def test_blocks_that_converge_on_a_page_that_fails_settle_their_symbols() -> None:
+    codec, rng = codec_of(256, 2, 900, 2, shape=(100, 100)), np.random.default_rng(0)
+    _, symbols = written(codec, header_of(codec), rng)
+    seen = noisy(symbols, 256, kappa_of(256, 0.24), rng)
+    assert (codec.decode(*seen).failed_blocks, codec.blocks) == (1, 3)
+    decided, settled = codec.decide(*seen)
+    assert settled.mean() == pytest.approx(4 / 9, abs=0.05)  # both bits of a symbol lie in the two of three
+    np.testing.assert_array_equal(decided[settled], symbols[settled])
+    assert np.mean(decided != symbols) > 0.01
+
+
 class TestRoundTrip:
     @pytest.mark.parametrize(("levels", "coded", "rate", "corrections"), CODES)
     def test_what_is_written_is_read(self, levels: int, coded: int, rate: int, corrections: int) -> None:

@@ -1,10 +1,13 @@
 """Profiles: shipped ones load, every kind of bad profile is refused and names the key, TOML survives a round trip."""
 
+import hashlib
+import re
 from pathlib import Path
 
 import pytest
 
 from lightpage.device.profile import SHIPPED, load_profile, parse_profile
+from lightpage.device.profile_keys import commented_toml, key_table, keys
 from lightpage.errors import ProfileError
 from tests.lightpage.refused import refused
 
@@ -41,6 +44,13 @@ def test_a_name_of_any_characters_survives_it_too(tmp_path: Path) -> None:
         ("[light]", "[light]\ncolour = 1", "light.colour"),
         ("columns = 87", "columns = 100000", "page.columns"),
         ("length_m = 0.01875", "length_m = 50.0", "pipe.length_m, pipe.width_m"),
+        ("angle_deg = 0.0", "angel_deg = 0.0", "did you mean angle_deg?"),
+        ("[light]", "[relay]\nmagnification = 0.0\n\n[light]", "relay.magnification"),
+        (
+            "[pipe]",
+            "camera_focal_length_m = 0.04\n\n[lens_path]\ncoma_rad = 1.0\n\n[pipe]",
+            "lens.camera_focal_length_m",
+        ),
     ],
 )
 def test_a_bad_profile_is_refused_and_the_key_named(bench_text: str, old: str, new: str, key: str) -> None:
@@ -54,6 +64,23 @@ def test_every_offending_key_is_named_at_once(bench_text: str) -> None:
     for key in ("light.wavelength_m", "page.rows"):
         with refused(got=key, kind=ProfileError):
             parse_profile(bad)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_profile_to_fill_in_has_every_key_and_is_the_same(name: str) -> None:
+    text = commented_toml(load_profile(name))
+    assert parse_profile(text) == load_profile(name)
+    for key in keys():
+        assert re.search(rf"^(# )?{key.name} = ?.*# .*: {key.meaning}$", text, re.MULTILINE), key
+
+
+def test_the_document_lists_every_key() -> None:
+    assert key_table() in (Path(__file__).parents[3] / "docs" / "formats.md").read_text("utf-8")
+
+
+def test_earlier_profiles_keep_their_text_and_hash() -> None:
+    hashes = [hashlib.sha256(load_profile(name).to_toml().encode()).hexdigest()[:8] for name in SHIPPED]
+    assert hashes == ["5be7b504", "3cbeffd1"]
 
 
 @pytest.mark.parametrize("text", ["", "not = [toml"])

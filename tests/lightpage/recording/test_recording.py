@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lightpage.device.profile import Profile, load_profile, parse_profile
-from lightpage.errors import PageError, RecordingError
+from lightpage.errors import PageError, ProfileError, RecordingError
 from lightpage.page.symbols import pilot_mask, random_symbols
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import hash_frames
@@ -144,17 +144,22 @@ class TestReading:
             assert recording.page_hash(0) == hash_frames(recording.frames(0)) != stored
 
     def test_it_tells_where_its_own_profile_says_otherwise(self, foreign: Path) -> None:
-        profile = load_profile("bench")
+        profile = small_profile()
         other = profile.model_copy(update={"pipe": profile.pipe.model_copy(update={"length_m": 0.2})})
-        for text, expected in (
-            (other.to_toml(), [f"pipe.length_m = 0.2 (profile bench: {profile.pipe.length_m})"]),
-            (profile.to_toml(), []),
-            ("somebody else's notes", []),
-        ):
+        for text, own in ((other.to_toml(), other), (profile.to_toml(), profile), ("somebody else's notes", None)):
             with h5py.File(foreign, "r+") as file:
                 file.attrs["profile"] = text
             with Recording.open(foreign) as recording:
-                assert recording.header.differences(profile) == expected
+                if own is None:
+                    with refused("attribute 'profile'", kind=ProfileError):
+                        recording.header.device(None)
+                else:
+                    assert recording.header.device(None) == own
+                if own is other:
+                    with refused("attribute 'profile'", "pipe.length_m = 0.2 (profile bench", RecordingError):
+                        recording.header.device(profile)
+                else:
+                    assert recording.header.device(profile) == profile
 
     def test_left_aligned_counts_are_told_of_once(self, foreign: Path, caplog: pytest.LogCaptureFixture) -> None:
         with h5py.File(foreign, "r+") as file:

@@ -4,6 +4,7 @@ import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import pytest
@@ -11,11 +12,14 @@ from click.testing import CliRunner
 
 from lightpage.cli.simulate import simulate
 from lightpage.codec.code import Code
+from lightpage.codec.page_bytes import Loss
 from lightpage.device.state import Device
-from lightpage.errors import Reason, RecalibrationRefusedError
+from lightpage.errors import LostPageError, Reason, RecalibrationRefusedError, RecordingError
 from lightpage.page.pilots import Pilots
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
+from lightpage.runtime.archives.recordings import page_reader
+from lightpage.runtime.archives.recordings.page_reader import PageReader
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.commands.archives.encode import encode
 from lightpage.runtime.commands.archives.recover import recover
@@ -141,6 +145,41 @@ def test_frames_that_do_not_show_the_device_are_refused_before_anything_is_fitte
     dark = FramePair(*(np.zeros_like(frame) for frame in frames))
     with pytest.raises(RecalibrationRefusedError, match="light"):
         heal(decoder, LostPages((dark,), CODE, references=references), untouched)
+
+
+@pytest.mark.parametrize("unreadable", [False, True], ids=["refused", "references unreadable"])
+def test_pages_wait_for_others_and_for_twice_as_many_where_that_brought_none(
+    unreadable: bool, small_bundle: Path, drifted: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoder, decoded, tried = Decoder.load(small_bundle, threads=1), list[int](), list[int]()
+
+    class Blind(NoTracker):
+        def decode(self, *_: object) -> NoReturn:
+            decoded.append(len(decoded))
+            raise LostPageError("page", "nothing", "a page")
+
+    def refused(*_: object) -> NoReturn:
+        tried.append(len(decoded))
+        raise (RecordingError if unreadable else RecalibrationRefusedError)("healing", "nothing", "pages")
+
+    monkeypatch.setattr(page_reader, "heal", refused)
+    with Recording.open(drifted / "R.h5") as recording:
+        if unreadable:
+            monkeypatch.setattr(recording, "references", refused)
+        reader = PageReader(decoder, recording, Blind(decoder), CODE)
+        pages = [*reader.read([*range(4)] * 6, lambda page, found: None)]
+    assert tried == [6, 18, 24]
+    assert [page.page for page in pages] == [*range(4)] * 6
+    assert {page.loss for page in pages} == {Loss.OPTICS}
+
+
+def test_a_bundle_without_a_calibration_is_not_healed(small_bundle: Path, drifted: Path) -> None:
+    bundle = Bundle.open(small_bundle)
+    manifest = bundle.manifest.model_copy(update={"calibration": ""})
+    with Recording.open(drifted / "R.h5") as recording:
+        lost = LostPages((recording.frames(0),), CODE, references=recording.references())
+    with pytest.raises(RecalibrationRefusedError):
+        heal(Decoder(replace(bundle, manifest=manifest), threads=1), lost, untouched)
 
 
 def test_a_models_own_decisions_speak_for_it_and_pages_that_come_right_for_the_better_one(small_bundle: Path) -> None:

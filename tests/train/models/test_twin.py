@@ -8,7 +8,7 @@ import torch
 
 from lightpage.calibration.interfaces import BRANCHES
 from lightpage.calibration.parameters import NAMES, PRIORS, nominal
-from lightpage.device.profile import Profile, load_profile
+from lightpage.device.profile import Profile, Relay, load_profile
 from lightpage.train.models.twin import RayTwin, TorchTwin
 from tests.lightpage.small import THICK, small_profile
 
@@ -200,6 +200,14 @@ class TestPaths:
             moved = twin.pixels(only(**shift), points)
             np.testing.assert_allclose(moved[camera] - base[camera], np.tile([3.0, 0.0], (20, 1)), atol=1e-9)
             np.testing.assert_allclose(moved[other], base[other])
+
+    def test_a_relay_that_magnifies_as_pixels_grow_changes_none(self) -> None:
+        plain = small_profile()
+        camera = plain.camera.model_copy(update={"pitch_m": 2 * plain.camera.pitch_m})
+        larger = plain.model_copy(update={"camera": camera, "relay": Relay(magnification=2)})
+        parameters, places = (torch.tensor(each) for each in (some_device(2), page_points(plain, 3)))
+        seen = [RayTwin(profile).pixels(parameters, places) for profile in (plain, larger)]
+        assert torch.equal(*seen)
 
     def test_phases_over_page_and_camera_are_what_their_names_say(self) -> None:
         profile = small_profile()

@@ -429,6 +429,14 @@ def test_a_pinned_model_stays_in_service_until_it_is_let_go_of(loop: Loop) -> No
     assert loop.look(BUSY_S) == "toy-1+r1"
 
 
+def test_a_caller_with_lost_pages_is_told_at_once_that_a_pinned_model_stays(loop: Loop) -> None:
+    loop.plane.models.pin("toy-1", True)
+    with loop.running:
+        assert loop.plane.heal is not None
+        assert not loop.plane.heal(Caller(), "toy-1", 2)
+    assert loop.version == "toy-1"
+
+
 def refusing(*_: object) -> RefitResult:
     raise CalibrationError("fit", "nothing", "a device within reach")
 

@@ -1,0 +1,254 @@
+"""`lightpage import`: make a recording of frames and symbols that other programs have written."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.cli.main import RESUME_KEY
+from lightpage.cli.options import named_profile
+from lightpage.cli.paths import NewPath, OutputFile
+from lightpage.device.profile import Profile
+from lightpage.errors import InvalidInputError
+from lightpage.files import write_json
+from lightpage.foreign.array import ForeignArray
+from lightpage.foreign.frames import Arrangement, Frames, Upright, both_cameras, one_camera
+from lightpage.foreign.frames import Pages as ForeignPages
+from lightpage.foreign.import_job import Material, describe, exposure_of, references_of, tell, write
+from lightpage.foreign.opening import open_array
+from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
+from lightpage.progress import warn
+from lightpage.recording.layout import MAX_BIT_DEPTH, MIN_BIT_DEPTH
+from lightpage.recording.pages import Pages
+from lightpage.recording.unfinished import claim, settings_path
+from lightpage.recording.writer import RecordingWriter
+
+FLIPS = ("none", "x", "y", "xy")
+TURNS = ("0", "90", "180", "270")
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+_CAMERAS = ("in-phase", "quadrature")
+
+
+def _source(name: str, told: str) -> Decorator:
+    return click.option(f"--{name}", metavar="FILE", help=told)
+
+
+def _upright(camera: str) -> Decorator:
+    """Return a decorator that adds the options by which the frames of a camera are set upright."""
+    flip = click.option(
+        f"--flip-{camera}", type=click.Choice(FLIPS), default="none", show_default=True, help="x: left for right."
+    )
+    turn = click.option(
+        f"--turn-{camera}",
+        type=click.Choice(TURNS),
+        default="0",
+        show_default=True,
+        help="Degrees clockwise, after it.",
+    )
+    return lambda command: flip(turn(command))
+
+
+@click.command(name="import")
+@_source("in-phase", "Frames of the in-phase camera.")
+@_source("quadrature", "Frames of the quadrature camera.")
+@_source("frames", "Or frames of both in one file.")
+@click.option(
+    "--arrangement", type=click.Choice([each.value for each in Arrangement]), help="How --frames holds both cameras."
+)
+@_source("reference-in-phase", "Frames of the reference beam alone; of several the mean is taken.")
+@_source("reference-quadrature", "The same of the quadrature camera.")
+@_source("references", "Or those of both in one file, arranged as --frames.")
+@_source("symbols", "What was written; PAGES.h5 of `encode`, or whole numbers [pages, ny, nx]. Unknown if left out.")
+@_source("pilots", "Where the known symbols are, zeros and others [ny, nx]; the profile's places if left out.")
+@click.option("--profile", "profile_name", metavar="P", help="Nominal device.  [default: that of --symbols PAGES.h5]")
+@click.option("--levels", type=click.IntRange(MIN_LEVELS, MAX_LEVELS), help="Of the symbols.  [default: 256]")
+@click.option(
+    "--bit-depth",
+    type=click.IntRange(MIN_BIT_DEPTH, MAX_BIT_DEPTH),
+    help="Of a count; found in the frames if left out.",
+)
+@click.option("--black-level", type=click.IntRange(min=0), default=0, help="Counts of a camera in the dark.")
+@_upright("in-phase")
+@_upright("quadrature")
+@click.option("--keep-unlit", is_flag=True, help="Take black and saturated frames too, and tell of them.")
+@click.option("--out", required=True, type=NewPath(), help="The recording, R.h5.")
+@click.option("--force", is_flag=True, help="Overwrite a recording that exists, or pages begun with other settings.")
+@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
+def import_frames(out: Path, force: bool, keep_unlit: bool, json_path: Path | None, **given: Any) -> None:
+    """Make a recording of frames and symbols that other programs have written.
+
+    FILE is a TIFF stack, .npy, .npz, .mat or HDF5, a folder of pictures, or a pattern in quotes that matches some.
+    FILE::NAME names one of several arrays. Pages lie along the first axis or, as in MATLAB, along the last.
+
+    Interrupted, the same command goes on where it stopped.
+    """
+    click.get_current_context().meta[RESUME_KEY] = "run the same command again; it goes on where it was"
+    if out.exists() and not force:
+        raise InvalidInputError(f"--out {out}", "a file that exists", "a new name, or --force")
+    with ExitStack() as opened:
+        sources = _Sources(given, opened)
+        material = sources.material()
+        material.check()
+        exposure = exposure_of(material, given["bit_depth"])
+        tell(exposure, material.black_level)
+        references = references_of(material, exposure)
+        claim(out, f"{sources.described()}\n# profile\n{material.profile.to_toml()}", force=force)
+        writer = RecordingWriter(
+            out,
+            material.profile,
+            material.levels,
+            exposure.bit_depth,
+            references,
+            material.pilots,
+            resume=True,
+            code=material.code,
+            symbols=None if material.symbols is None else material.page_symbols,
+            overwrite=force,
+            black_level=material.black_level,
+        )
+        with writer:
+            unlit = write(material, exposure, writer, keep_unlit=keep_unlit)
+    settings_path(out).unlink(missing_ok=True)
+    if unlit:
+        warn(f"pages {describe(unlit)}")
+    figures = {
+        "pages": material.pages,
+        "frame_shape": list(material.profile.frame_shape),
+        "levels": material.levels,
+        "symbols": material.symbols is not None,
+        "black_level": material.black_level,
+        **asdict(exposure),
+        "unlit": [asdict(each) for each in unlit],
+    }
+    write_json(json_path, figures)
+    click.echo(
+        f"{out}: {material.pages} pages, {exposure.bit_depth} bits, symbols "
+        f"{'of ' + str(material.levels) + ' levels' if material.symbols is not None else 'unknown'}; "
+        f"next: lightpage inspect {out}"
+    )
+
+
+@dataclass(frozen=True)
+class _Sources:
+    """The files that the options name.
+
+    Attributes:
+        given: the options.
+        opened: closes the files.
+    """
+
+    given: dict[str, Any]
+    opened: ExitStack
+
+    def material(self) -> Material:
+        """Open all files; sizes are checked, and nothing is read of frames yet."""
+        given, pages = self.given, self._pages()
+        profile = named_profile(given["profile_name"])
+        if profile is None and pages is None:
+            raise InvalidInputError("options", "no --profile", "one, or --symbols with pages that carry it")
+        if pages is not None:
+            profile = pages.device(profile)
+            if given["levels"] not in (None, pages.levels):
+                raise InvalidInputError("--levels", given["levels"], f"{pages.levels}, as {pages.path} has, or nothing")
+        assert profile is not None  # or it was refused above
+        symbols = None
+        if given["symbols"] is not None:
+            symbols = ForeignPages(self._open(given["symbols"]), profile.page_shape, _what("symbols", profile))
+        return Material(
+            profile,
+            self._cameras("frames", profile),
+            self._cameras("references", profile),
+            symbols,
+            given["levels"] or (MAX_LEVELS if pages is None else pages.levels),
+            self._pilots(profile),
+            None if pages is None else pages.code,
+            given["black_level"],
+        )
+
+    def described(self) -> str:
+        """Return what the pages are made of: the options, and size and time of each file."""
+        lines = []
+        for name, value in sorted(self.given.items()):
+            stamp = ""
+            if isinstance(value, str) and os.path.exists(path := value.rpartition("::")[0] or value):
+                found = os.stat(path)
+                stamp = f"  # {found.st_size} bytes, {found.st_mtime_ns}"
+            lines.append(f"{name} = {value!r}{stamp}")
+        return "\n".join(lines)
+
+    def _pages(self) -> Pages | None:
+        """Return the file of pages to write that the symbols are in; None where it is another one."""
+        path = Path(self.given["symbols"] or "")
+        if path.suffix.lower() not in (".h5", ".hdf5") or not path.is_file():
+            return None
+        if not Pages.are_in(path):
+            return None
+        pages = self.opened.enter_context(Pages.open(path))
+        pages.check()
+        return pages
+
+    def _open(self, named: str) -> ForeignArray:
+        return self.opened.enter_context(closing(open_array(named)))
+
+    def _uprights(self) -> tuple[Upright, Upright]:
+        first, second = (
+            Upright(_flip(self.given[f"flip_{camera}"]), _turn(self.given[f"turn_{camera}"]))
+            for camera in ("in_phase", "quadrature")
+        )
+        return first, second
+
+    def _cameras(self, kind: Literal["frames", "references"], profile: Profile) -> tuple[Frames, Frames]:
+        prefix = "" if kind == "frames" else "reference-"
+        names = [f"{prefix}{camera}" for camera in _CAMERAS]
+        single, both = [self.given[name.replace("-", "_")] for name in names], self.given[kind]
+        _check_named(single, both, names, kind)
+        what, uprights = _what("frames", profile), self._uprights()
+        if both is not None:
+            way = self.given["arrangement"]
+            arrangement = None if way is None else Arrangement(way)
+            return both_cameras(self._open(both), profile.frame_shape, uprights, arrangement, what)
+        first, second = (
+            one_camera(self._open(named), profile.frame_shape, upright, what)
+            for named, upright in zip(single, uprights, strict=True)
+        )
+        return first, second
+
+    def _pilots(self, profile: Profile) -> NDArray[np.bool_] | None:
+        if self.given["pilots"] is None:
+            return None
+        found = ForeignPages(self._open(self.given["pilots"]), profile.page_shape, _what("pilots", profile))
+        if found.count != 1:
+            raise InvalidInputError(found.subject, f"{found.count} pages of pilots", "one")
+        return np.asarray(found.page(0) != 0)
+
+
+def _check_named(single: Sequence[str | None], both: str | None, names: Sequence[str], kind: str) -> None:
+    """Check that the frames of both cameras are named, once."""
+    named = [f"--{name}" for name, value in zip((*names, kind), (*single, both), strict=True) if value is not None]
+    if named not in ([f"--{name}" for name in names], [f"--{kind}"]):
+        expected = f"--{names[0]} and --{names[1]}, or --{kind}"
+        if kind == "references":
+            expected += ": frames of the reference beam alone"
+        raise InvalidInputError("options", " and ".join(named) or f"no {kind}", expected)
+
+
+def _what(kind: str, profile: Profile) -> str:
+    return f"{kind} (profile {profile.name})"
+
+
+def _flip(text: str) -> Literal["", "x", "y", "xy"]:
+    found: dict[str, Literal["", "x", "y", "xy"]] = {"none": "", "x": "x", "y": "y", "xy": "xy"}
+    return found[text]
+
+
+def _turn(text: str) -> Literal[0, 90, 180, 270]:
+    found: dict[str, Literal[0, 90, 180, 270]] = {"0": 0, "90": 90, "180": 180, "270": 270}
+    return found[text]

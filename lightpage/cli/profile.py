@@ -1,0 +1,105 @@
+"""`lightpage profile`: make a device's profile, check it, and see what follows from it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+import click
+
+from lightpage.cli.groups import Group
+from lightpage.cli.paths import OutputFile
+from lightpage.device.profile import Profile, load_profile
+from lightpage.device.profile_keys import commented_toml, key_table
+from lightpage.errors import InvalidInputError, ProfileError, raised_as
+from lightpage.files import replace_text, write_json
+from lightpage.progress import warn
+from lightpage.recording.reader import Recording
+from lightpage.waves.consequences import Consequences, consequences
+from lightpage.waves.grid import check_camera
+
+_JSON = click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
+_NAME = click.argument("name", metavar="PROFILE")
+
+
+@click.group(cls=Group)
+def profile() -> None:
+    """Make the profile of a device, check it, and see what follows from it."""
+
+
+@profile.command()
+@click.option("--out", required=True, type=OutputFile(), help="The file to fill in, TOML.")
+@click.option("--like", default="bench", show_default=True, metavar="P", help="Whose numbers it starts with.")
+@click.option("--force", is_flag=True, help="Overwrite a file that is there.")
+def new(out: Path, like: str, force: bool) -> None:
+    """Write a profile with every key, what it means and which values it may have."""
+    if out.exists() and not force:
+        raise InvalidInputError(f"--out {out}", "a file that exists", "a new name, or --force")
+    replace_text(out, commented_toml(load_profile(like)), "profile")
+    click.echo(f"{out}: the numbers of {like}; enter your device's, then: lightpage profile check {out}")
+
+
+@profile.command()
+def keys() -> None:
+    """Print all keys as a table."""
+    click.echo(key_table(), nl=False)
+
+
+@profile.command()
+@_NAME
+@_JSON
+def show(name: str, json_path: Path | None) -> None:
+    """Show a profile, and what follows from it."""
+    found = load_profile(name)
+    told = _write(found, json_path)
+    click.echo(f"{found.to_toml()}\n{table(told)}")
+
+
+@profile.command()
+@_NAME
+@click.option("--recording", type=click.Path(path_type=Path), help="Whether it fits these frames too, R.h5.")
+@_JSON
+def check(name: str, recording: Path | None, json_path: Path | None) -> None:
+    """Check a profile: its keys, whether its optics can be read, and what may cost information.
+
+    A device that cannot be read makes the exit status 2.
+    """
+    found = load_profile(name)
+    told = _write(found, json_path)
+    click.echo(table(told))
+    if recording is not None:
+        with Recording.open(recording) as file:
+            file.header.check_against(found)
+    with raised_as(ProfileError, ProfileError, about=f"{name}: "):
+        check_camera(found)
+    for doubt in told.doubts:
+        warn(f"profile {name}: {doubt}")
+
+
+def table(told: Consequences) -> str:
+    """Return what follows from a profile as lines for people."""
+    return "\n".join(f"{name:<24} {value}" for name, value in _rows(told))
+
+
+def _rows(told: Consequences) -> Iterator[tuple[str, str]]:
+    yield "symbols a page", f"{told.symbols:,}, at most {told.most_bits / 8000:,.4g} kB of 256 levels"
+    yield "camera pixels a symbol", f"{told.pixels_per_symbol:.4g} along an edge"
+    yield (
+        "image on a camera",
+        f"{told.image_px[0]} x {told.image_px[1]} pixels, magnified {told.magnification:.4g} times",
+    )
+    yield "aperture", f"{told.aperture:.4g} at the page's corner"
+    yield "walls met", f"up to {told.walls_met[0]} along x, {told.walls_met[1]} along y"
+    yield "modes of the pipe", f"{told.modes[0]} x {told.modes[1]} carry the page"
+    yield "pipe's width", f"{told.carried:.3g} times what a symbol's first order needs"
+    yield "a frame pair", f"{told.pair_mb:.4g} MB of 8 bits, {2 * told.pair_mb:.4g} MB of more"
+    for preset, cost in told.cost.items():
+        yield f"decode, {preset}", f"about {cost.seconds:.2g} s a page on two cores, {cost.memory_gb:.2g} GB"
+
+
+def _write(found: Profile, json_path: Path | None) -> Consequences:
+    """Return what follows from a profile, written as JSON too where that is wanted."""
+    told = consequences(found)
+    write_json(json_path, {"profile": found.model_dump(), **asdict(told)})
+    return told

@@ -1,0 +1,150 @@
+"""Looks at files of other programs: what arrays they hold, how their counts lie, and how to import them."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.device.profile import Profile
+from lightpage.foreign.array import MOST_BYTES, SEPARATOR, ForeignArray
+from lightpage.foreign.hdf5_file import arrays_in
+from lightpage.foreign.mat_file import mat_arrays
+from lightpage.foreign.numpy_file import arrays_of
+from lightpage.foreign.opening import open_array
+from lightpage.inspection.exposure import histogram, sampled
+from lightpage.inspection.finding import Finding, Picture, shape_text, spread
+from lightpage.recording.hdf5 import hdf, open_hdf5
+
+_SAMPLED = 4
+_SAMPLE_BYTES = 1 << 26
+_LARGEST_SYMBOL = 256
+_NEEDED = "an array of counts"
+_TOLD = 20
+
+
+def look_at_hdf5(path: Path, profile: Profile | None = None) -> Finding:
+    """Return what arrays an HDF5 file of another program has, or a .mat file that is one.
+
+    Raises:
+        InvalidInputError, StorageError, SurroundingsError: it cannot be read.
+    """
+    matlab = path.suffix.lower() == ".mat"
+    found = Finding(path, "MATLAB file" if matlab else "HDF5 file of another program")
+    with found.trying("a file that is whole"), open_hdf5(path, f"file {path}") as file:
+        _several(found, arrays_in(file, matlab), profile)
+    return found
+
+
+def look_at_archive(path: Path, profile: Profile | None = None) -> Finding:
+    """Return what arrays an .npz file has."""
+    found = Finding(path, "arrays of NumPy")
+    with found.trying("an archive that is whole"):
+        _several(found, arrays_of(path), profile)
+    return found
+
+
+def look_at_mat(path: Path, profile: Profile | None = None) -> Finding:
+    """Return what arrays a .mat file has, of any version."""
+    if hdf.is_hdf5(path):
+        return look_at_hdf5(path, profile)
+    found = Finding(path, "MATLAB file")
+    with found.trying("a file that is whole"):
+        _several(found, mat_arrays(path), profile)
+    return found
+
+
+def look_at_array(path: Path, kind: str, profile: Profile | None = None) -> Finding:
+    """Return what the one array of a file, or the pictures of a folder, are."""
+    found = Finding(path, kind)
+    with found.trying(_NEEDED), closing(open_array(str(path))) as array:
+        _one(found, array, found.quoted, profile)
+    return found
+
+
+def _several(found: Finding, arrays: dict[str, tuple[int, ...]], profile: Profile | None) -> None:
+    for name, shape in list(arrays.items())[:_TOLD]:
+        found.facts[f"array {name}"] = shape_text(shape)
+    if len(arrays) > _TOLD:
+        found.facts["further arrays"] = len(arrays) - _TOLD
+    if not arrays:
+        found.problems.append("no array of numbers with two to four axes")
+    for name in list(arrays)[:1]:
+        with closing(open_array(f"{found.path}{SEPARATOR}{name}")) as array:
+            _one(found, array, shlex.quote(f"{found.path}{SEPARATOR}{name}"), profile)
+
+
+def _one(found: Finding, array: ForeignArray, named: str, profile: Profile | None) -> None:
+    """Tell of an array, how frames in it are exposed, and whether it fits a profile."""
+    found.facts |= {"shape": shape_text(array.shape), "type": str(array.dtype)}
+    if profile is not None:
+        found.profile = profile
+        _fits(found, array, profile)
+    if not 2 <= len(array.shape) <= 4 or array.dtype.kind not in "uif" or 0 in array.shape:
+        found.problems.append(f"type {array.dtype} of shape {array.shape}: neither frames nor symbols")
+        return
+    if len(array.shape) == 3 and max(array.shape[-2:]) < _LARGEST_SYMBOL and array.dtype.itemsize == 1:
+        found.facts["may be"] = "symbols"
+        found.next.append(f"lightpage import --symbols {named} --in-phase I --quadrature Q ... --profile P --out R.h5")
+        return
+    axis = len(array.shape) - 1 if array.pages_last and len(array.shape) > 2 else 0
+    pages = array.shape[axis] if len(array.shape) > 2 else 1
+    if (size := math.prod(array.shape) // pages * array.dtype.itemsize) > MOST_BYTES:
+        found.problems.append(f"a page of {size / 1e9:.3g} GB, more than is looked at")
+        return
+    frames = _frames(array, axis, pages, max(1, _SAMPLE_BYTES // max(1, size)))
+    found.pictures = lambda: _pictures(str(named), frames)
+    pixels = [sampled(frame) for frame in frames]
+    if any(not np.isfinite(each).all() for each in pixels):
+        found.problems.append("values that are no numbers")
+    elif any(np.any(each != np.rint(each)) or each.min() < 0 for each in pixels):
+        found.problems.append("values that are no whole counts: multiply by full scale, and round")
+    else:
+        _counts(found, [each.astype(np.int64) for each in pixels])
+    found.next.append(
+        f"lightpage import --in-phase {named} --quadrature Q --reference-in-phase RI --reference-quadrature RQ "
+        "--symbols S --profile P --out R.h5"
+    )
+
+
+def _frames(array: ForeignArray, axis: int, pages: int, most: int) -> list[NDArray[Any]]:
+    """Return some pages of an array, which lie along an axis; the first ones where the last would take long."""
+    most = min(most, _SAMPLED, pages)
+    if len(array.shape) == 2:
+        return [array.take(0, 0, array.shape[0])]
+    looked_at = range(most) if array.in_sequence else spread(pages, most)
+    taken = (array.take(axis, page, page + 1).squeeze(axis) for page in looked_at)
+    return [page if page.ndim == 2 else page[0] for page in taken]
+
+
+def _counts(found: Finding, frames: list[NDArray[np.int64]]) -> None:
+    peak = max(int(frame.max()) for frame in frames)
+    bits = min(16, max(8, peak.bit_length()))
+    found.facts["counts"] = f"{min(int(frame.min()) for frame in frames)} to {peak}, so at least {bits} bits"
+    if peak == 0:
+        found.problems.append("all that was looked at is black")
+    if peak < 1 << 16:
+        found.histograms["frames"] = histogram(list(frames), bits)
+
+
+def _fits(found: Finding, array: ForeignArray, profile: Profile) -> None:
+    """Tell whether frames or symbols fit a profile."""
+    ends = array.shape[-2:], array.shape[:2]
+    if profile.frame_shape in ends:
+        found.facts["fits"] = f"frames of profile {profile.name}"
+    elif profile.page_shape in ends:
+        found.facts["fits"] = f"symbols of profile {profile.name}"
+    else:
+        wanted = f"{shape_text(profile.frame_shape)} pixels or {shape_text(profile.page_shape)} symbols"
+        turned = profile.frame_shape[::-1] in ends
+        more = "; turned by 90 degrees they fit: --turn-in-phase, --turn-quadrature" if turned else ""
+        found.problems.append(f"shape {array.shape}, and profile {profile.name} has {wanted}{more}")
+
+
+def _pictures(name: str, frames: list[NDArray[Any]]) -> list[Picture]:
+    return [(f"{Path(name).name}, frame looked at {number}", frame) for number, frame in enumerate(frames)]

@@ -1,0 +1,54 @@
+"""Draws what was found of a file: frames, references, fringes, a page, and how often counts come."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from lightpage.errors import InvalidInputError
+from lightpage.files import replace_file
+from lightpage.inspection.exposure import sampled
+from lightpage.inspection.finding import Finding, Picture, printable
+from lightpage.pictures import write_figure_png
+
+_COLUMNS = 3
+_SIDE_PX = 1800
+"""Pixels of a frame's longer side that are drawn."""
+_SHADES = (0.2, 99.5)
+"""Percentiles of the counts that are black and white: single bright pixels would leave the rest in the dark."""
+_DOTS = 110
+
+
+def draw(found: Finding, pictures: list[Picture], out: Path) -> None:
+    """Draw what was found to a PNG file.
+
+    Raises:
+        InvalidInputError: there is nothing to draw, or the file cannot be written.
+    """
+    if not pictures:
+        raise InvalidInputError(f"--picture {out}", f"a {found.kind}", "a file with frames or symbols")
+    panels = len(pictures) + bool(found.histograms)
+    rows = math.ceil(panels / _COLUMNS)
+    figure = Figure(figsize=(4.6 * _COLUMNS, 3.4 * rows), layout="constrained")
+    figure.suptitle(f"{printable(found.path.name)}: {found.kind}")
+    for place, (title, pixels) in enumerate(pictures, 1):
+        axis = figure.add_subplot(rows, _COLUMNS, place)
+        step = max(1, max(pixels.shape) // _SIDE_PX)
+        shown = pixels[::step, ::step]
+        low, high = np.percentile(sampled(shown), _SHADES)
+        image = axis.imshow(shown, cmap="gray", vmin=low, vmax=max(high, low + 1e-9))
+        axis.set_title(title, fontsize=9)
+        axis.set_xticks([])
+        axis.set_yticks([])
+        figure.colorbar(image, ax=axis, shrink=0.8)
+    if found.histograms:
+        axis = figure.add_subplot(rows, _COLUMNS, panels)
+        for name, each in found.histograms.items():
+            axis.stairs([max(share, 1e-6) for share in each.shares], each.edges, label=name.replace("_", "-"))
+        axis.set(xlabel="count", ylabel="share of the pixels", yscale="log")
+        axis.set_title("exposure", fontsize=9)
+        axis.legend()
+    replace_file(out, lambda file: write_figure_png(file, figure, dpi=_DOTS), "picture")

@@ -1,0 +1,164 @@
+"""`lightpage inspect`: of any file it says what it is or what is wrong with it; nothing is trusted, nothing crashes."""
+
+import io
+import json
+import os
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+from scipy.io import savemat
+
+from lightpage.cli import main
+from lightpage.errors import InvalidInputError
+from lightpage.inspection.apart import look_apart
+from lightpage.inspection.command import inspect, table
+from lightpage.inspection.look import look
+from lightpage.recording.decoded_file import DecodedWriter
+from tests.lightpage.refused import refused
+from tests.lightpage.small import small_profile
+from tests.runtime import coded, toy
+
+FRAMES = np.random.default_rng(1).integers(0, 4000, (3, 40, 60), dtype=np.uint16)
+
+
+def bomb(path: Path) -> None:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("manifest.json", b" " * (1 << 26))
+
+
+def huge_symbols(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file.attrs["format"] = "lightpage-recording"
+        file.create_dataset("symbols", (4, 1 << 18, 1 << 18), np.uint8, chunks=(1, 1024, 1024), compression="gzip")
+
+
+def npy_of(path: Path, shape: str) -> None:
+    header = f"{{'descr': '|u1', 'fortran_order': False, 'shape': {shape}}}\n".encode()
+    path.write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
+
+
+def mat73(path: Path) -> None:
+    with h5py.File(path, "w", userblock_size=512) as file:
+        file["stack"] = FRAMES
+
+
+def decoded(path: Path) -> None:
+    with DecodedWriter(path, 16) as writer:
+        writer.append(np.zeros((4, 5), np.uint8), np.ones((4, 5), np.float32), "v", None)
+
+
+def zipped(**arrays: np.ndarray) -> bytes:
+    packed = io.BytesIO()
+    np.savez_compressed(packed, **arrays)
+    return packed.getvalue()
+
+
+def png_folder(path: Path) -> None:
+    path.mkdir()
+    for number, frame in enumerate(FRAMES):
+        Image.fromarray(frame).save(path / f"{number}.png")
+
+
+def run_folder(path: Path) -> None:
+    path.mkdir()
+    (path / "begun.json").write_text(json.dumps({"--profile": small_profile().to_toml()}))
+
+
+def folder_loop(path: Path) -> None:
+    path.mkdir()
+    (path / "inner").symlink_to(path)
+
+
+def pages(path: Path) -> None:
+    folder = path.parent / "coded"
+    folder.mkdir()
+    coded.pages(coded.bundle(folder / "coded.zip"), folder)
+    (folder / "pages.h5").rename(path)
+
+
+SAVED = io.BytesIO()
+np.save(SAVED, FRAMES)
+PROFILE = small_profile().to_toml()
+MADE: dict[str, tuple[str, int, Callable[[Path], object]]] = {
+    "B.zip": ("bundle", 0, toy.write_toy_bundle),
+    "B": ("bundle", 0, toy.write_toy_bundle),
+    "pages.h5": ("pages to write", 0, pages),
+    "decoded.h5": ("decoded pages", 0, decoded),
+    "run": ("unfinished training run", 2, run_folder),
+    "p.toml": ("profile", 0, lambda path: path.write_text(PROFILE)),
+    "code.toml": ("code of pages", 0, lambda path: path.write_text(coded.CODE.to_toml())),
+    "rough.toml": ("state of a simulated device", 0, lambda path: path.write_text("[slm]\nphase_noise_rad = 0.1\n")),
+    "stack.tif": ("TIFF", 0, lambda path: tifffile.imwrite(path, FRAMES, photometric="minisblack")),
+    "a.npy": ("array of NumPy", 0, lambda path: path.write_bytes(SAVED.getvalue())),
+    "a.npz": ("arrays of NumPy", 0, lambda path: path.write_bytes(zipped(one=FRAMES, two=FRAMES[0]))),
+    "five.mat": ("MATLAB file", 0, lambda path: savemat(path, {"stack": FRAMES})),
+    "seven.mat": ("MATLAB file", 0, mat73),
+    "png": ("folder of pictures", 0, png_folder),
+    "e.json": ("figures of an evaluation", 0, lambda path: path.write_text('{"air_bits_per_symbol": 6}')),
+    "rgb.tif": ("RGB", 2, lambda path: tifffile.imwrite(path, np.zeros((40, 60, 3), np.uint8), photometric="rgb")),
+    "half.npy": ("all of shape", 2, lambda path: path.write_bytes(SAVED.getvalue()[:-9])),
+    "half.tif": ("TIFF", 2, lambda path: path.write_bytes(b"II*\0\x08\0\0\0\x01\0\x02\0")),
+    "half.npz": ("whole", 2, lambda path: path.write_bytes(zipped(one=FRAMES)[:-99])),
+    "wrong.toml": ("did you mean angle_deg", 2, lambda path: path.write_text(PROFILE.replace("angle", "angel"))),
+    "nan.npy": ("no numbers", 2, lambda path: np.save(path, np.full((2, 9, 9), np.nan))),
+    "black.npy": ("black", 2, lambda path: np.save(path, np.zeros((2, 9, 9), np.uint16))),
+    "empty": ("an empty file", 2, lambda path: path.touch()),
+    "cut.h5": ("complete HDF5 file", 2, lambda path: path.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(200))),
+    "pickle.npy": ("pickled", 2, lambda path: np.save(path, np.array([object, {}], object))),
+    "negative.npy": ("negative.npy", 2, lambda path: npy_of(path, "(-5, 9, 9)")),
+    "large.npy": ("all of shape", 2, lambda path: npy_of(path, "(9999999999, 9, 9)")),
+    "bomb.zip": ("manifest.json", 2, bomb),
+    "huge.h5": ("GB", 2, huge_symbols),
+    "deep.toml": ("deep.toml", 2, lambda path: path.write_text("a = " + "[" * 100_000)),
+    "deep.json": ("deep.json", 2, lambda path: path.write_text("[" * 100_000)),
+    "pipe": ("a pipe", 2, os.mkfifo),
+    "loop": ("loop", 2, lambda path: path.symlink_to(path.name)),
+    "folders": ("inner", 2, folder_loop),
+    "new\nline": ("new\\nline", 2, lambda path: path.write_bytes(b"\0\1\2")),
+    "zero": ("a device", 2, lambda path: path.symlink_to("/dev/zero")),
+    "none": ("none", 2, lambda path: None),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_it_says_what_a_file_is_or_what_is_wrong(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told, status, make = MADE[name]
+    make(tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    try:
+        found = look(Path(name))
+        said, problems = table(found), bool(found.problems)
+    except InvalidInputError as error:
+        said, problems = ascii(str(error)), True
+    assert told in said
+    assert problems == (status == 2)
+
+
+def test_a_file_that_is_never_read_to_its_end_is_given_up(tmp_path: Path) -> None:
+    (tmp_path / "p.toml").write_text(PROFILE)
+    with refused("p.toml", "does not come to its end"):
+        look_apart(tmp_path / "p.toml", None, drawn=False, longest_s=0.0)
+
+
+def test_a_recording_is_looked_at_and_drawn(small_device: list[str], tmp_path: Path) -> None:
+    recording, told = tmp_path / "R.h5", tmp_path / "J"
+    recording.write_bytes(Path(small_device[small_device.index("--recording") + 1]).read_bytes())
+    assert main.run(inspect, [str(recording), "--json", str(told), "--picture", str(tmp_path / "P.png")]) == 0
+    found = json.loads(told.read_text())
+    assert (found["kind"], found["profile"]) == ("recording", "small")
+    assert "lightpage calibrate --recording" in found["next"][0]
+    assert sum(found["histograms"]["in_phase"]["shares"]) == pytest.approx(1)
+    with Image.open(tmp_path / "P.png") as drawn:
+        assert np.asarray(drawn.convert("L")).std() > 10
+    with h5py.File(recording, "r+") as file:
+        file["quadrature"][0] = 0
+    assert main.run(inspect, [str(recording), "--profile", "bench", "--json", str(told)]) == 2
+    fit, black = json.loads(told.read_text())["problems"]
+    assert "bench" in fit
+    assert "page 0" in black
