@@ -10,15 +10,19 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
+import subprocess
 import sys
 import tempfile
 import time
+import urllib.request
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
 import click
 
-from analysis.service.running import RunningService
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.files import write_json
@@ -30,6 +34,26 @@ from lightpage.runtime.model.decoding.under_way import Device
 
 _WARM_S = 3.0
 """Seconds before those that count: sizes of batches are met for the first time."""
+
+
+@contextmanager
+def served(arguments: Sequence[str]) -> Iterator[str]:
+    """A service in a process of its own; yields the address of its metrics."""
+    command = [sys.executable, "-m", "lightpage", "serve", "--metrics-port", "0", *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None  # asked for
+            told = itertools.takewhile(lambda line: not line.startswith("serving"), process.stdout)
+            yield next(found[1] for line in told if (found := re.search(r"metrics at (\S+),", line)))
+        finally:
+            process.terminate()
+
+
+def metric(address: str, name: str) -> float:
+    """A figure of a service, by its name and labels; 0 where it has none."""
+    with urllib.request.urlopen(address, timeout=20) as answer:
+        lines = answer.read().decode().splitlines()
+    return sum(float(line.rpartition(" ")[2]) for line in lines if line.startswith(f"{name} "))
 
 
 def called(target: str, name: str, pairs: list[FramePair], levels: int, seconds: float) -> int:
@@ -68,17 +92,19 @@ def main(
         pairs = [narrow(file.frames(page), file.bit_depth) for page in range(min(pages, file.pages))]
         levels = file.levels
     with tempfile.TemporaryDirectory() as folder:
-        where = "--address", f"unix:{folder}/service", "--health-address", "off", "--shared-memory"
+        target = f"unix:{folder}/service"
+        where = "--address", target, "--health-address", "off", "--shared-memory"
         arguments = "--bundle", bundle, "--provider", provider, "--batches", str(batches), *where
-        with RunningService(*arguments) as service, ThreadPoolExecutor(callers) as pool:
-            begun = [
-                pool.submit(called, service.target, f"caller {number}", pairs, levels, seconds)
-                for number in range(callers)
-            ]
+        with served(arguments) as metrics, ThreadPoolExecutor(callers) as pool:
+            while not Path(f"{folder}/service").exists():
+                time.sleep(0.1)
+            names = [f"caller {number}" for number in range(callers)]
+            begun = [pool.submit(called, target, name, pairs, levels, seconds) for name in names]
             rate = sum(each.result() for each in begun) / seconds
-            runs = service.metric("lightpage_batch_pages_count")
-            spent = {state.value: service.metric("lightpage_device_seconds_total", state=state) for state in Device}
-            mean = service.metric("lightpage_batch_pages_sum") / runs if runs else 1.0
+            runs, all_pages = (metric(metrics, f"lightpage_batch_pages_{what}") for what in ("count", "sum"))
+            states = {state.value: f'lightpage_device_seconds_total{{state="{state}"}}' for state in Device}
+            spent = {state: metric(metrics, name) for state, name in states.items()}
+            mean = all_pages / runs if runs else 1.0
     told = {"pages_per_s": rate, "callers": callers, "batches": batches, "mean_batch": mean, "device_s": spent}
     click.echo(json.dumps(told, indent=1))
     if json_path is not None:

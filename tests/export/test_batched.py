@@ -80,7 +80,8 @@ def test_pages_of_a_batch_are_read_as_each_alone_where_each_image_lies(
     ]
     together = read(batches, batches.constants_of_bundle, rolled, shifts)
     for pair, (_, symbols), shift, found in zip(rolled, shown, shifts, together, strict=True):
-        expected = decoder.infer(pair, {REGISTRATION: shifted(registration, shift)})
+        place = shifted(registration, shift)
+        expected, found = decoder.infer(pair, {REGISTRATION: place}), decoder.view.seen(found, place)
         assert deviation(expected.p, found.p) < (0.15 if shift.any() else 0.03)
         assert found.residual == pytest.approx(expected.residual, rel=0.08)
         known = Pilots.of_symbols(mask, symbols, 256)
@@ -164,7 +165,7 @@ def test_a_stream_is_read_in_batches_as_page_by_page(
         decoders = zip((decoder, gathering), trackers, strict=True)
         both = [evaluate(one, recording, each.anew()).to_json() for one, each in decoders]
     names = "pages", "pages_left_out", "symbol_error_rate", "air_bits_per_symbol"
-    assert [both[1][name] for name in names] == pytest.approx([both[0][name] for name in names], abs=0.005)
+    assert [both[1][name] for name in names] == pytest.approx([both[0][name] for name in names], abs=0.01)
     assert trackers[1].image_px == pytest.approx(trackers[0].image_px, abs=0.02)
 
 
