@@ -1,6 +1,9 @@
 """Check that no wrong byte is ever given out: pages drawn at and below the code's limit, and pages damaged every way.
 
-python -m analysis.codec.safety --json runs/bench-codec/safety.json
+    python -m analysis.codec.safety --json runs/bench-codec/safety.json
+
+A healing takes the symbols of LDPC blocks that converge on pages which are lost. So the lost pages of all noises are
+counted too on which blocks converge, and those of them on which a block is another word than was sent.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import click
 import numpy as np
@@ -49,6 +53,16 @@ class Count:
     wrong: int = 0
 
 
+class Drawn(NamedTuple):
+    """A page with what was sent."""
+
+    sent: bytes
+    header: Header
+    phase: Floats
+    concentration: Floats
+    symbols: NDArray[np.uint8]
+
+
 class Pages:
     """Pages of random bytes on the bench device.
 
@@ -63,33 +77,41 @@ class Pages:
         self.codec, self.rng = PageCodec(code, mask), np.random.default_rng(seed)
         self._pilots = pilot_symbols(profile, code.levels)[mask]
 
-    def drawn(self, noise_rad: float) -> tuple[bytes, Header, Floats, Floats]:
-        """Bytes and header of a page, with its phases and concentrations in so much noise."""
+    def drawn(self, noise_rad: float) -> Drawn:
+        """Return a page with its phases and concentrations in so much noise."""
         code, rng = self.codec.code, self.rng
         header = Header(code.id, int(rng.integers(1 << 32)), int(rng.integers(1 << 24)), int(rng.integers(1 << 40)))
         data = rng.integers(0, 256, (1, self.codec.user_bytes), dtype=np.uint8)
         symbols = self.codec.encode([header], data, FileFacts(60, 4, int(rng.integers(1 << 32))), self._pilots)[0]
         phase = symbol_phases(symbols, code.levels) + noise_rad * rng.standard_normal(symbols.shape)
-        return data.tobytes(), header, phase, np.full(symbols.shape, noise_rad**-2)
+        return Drawn(data.tobytes(), header, phase, np.full(symbols.shape, noise_rad**-2), symbols)
 
     def limit(self) -> float:
         """Phase noise at which about half of the pages are lost, radians."""
         low, high = 0.0, 2 * np.pi / self.codec.code.levels
         for _ in range(_LIMIT_STEPS):
             noise = (low + high) / 2
-            lost = sum(self.outcome(*self.drawn(noise)) == "lost" for _ in range(_LIMIT_PAGES))
+            lost = sum(self.outcome(self.drawn(noise)) == "lost" for _ in range(_LIMIT_PAGES))
             low, high = (noise, high) if 2 * lost < _LIMIT_PAGES else (low, noise)
         return (low + high) / 2
 
-    def outcome(self, sent: bytes, header: Header, phase: Floats, concentration: Floats) -> str:
+    def outcome(self, page: Drawn) -> str:
         """Decode a page, and return its outcome: right, lost or wrong."""
         try:
-            found = self.codec.decode(phase, concentration)
+            found = self.codec.decode(page.phase, page.concentration)
         except LightpageError:
             return "lost"
         if found.data is None:
             return "lost"
-        return "right" if (found.data, found.header) == (sent, header) else "wrong"
+        return "right" if (found.data, found.header) == (page.sent, page.header) else "wrong"
+
+    def settled(self, page: Drawn) -> str:
+        """Return whether blocks of a page converge: none, right or wrong, where one of them is another word."""
+        decided, settled = self.codec.decide(page.phase, page.concentration)
+        if not settled.any():
+            return "none"
+        coset = 1 << self.codec.code.coded_bits
+        return "right" if np.array_equal(decided[settled] % coset, page.symbols[settled] % coset) else "wrong"
 
 
 def _patch(phase: Floats, concentration: Floats, rng: np.random.Generator) -> None:
@@ -154,24 +176,33 @@ def main(count: int, damaged: int, corrections: int, seed: int, json_path: Path 
     assert shipped is not None  # the shipped bundle has a code
     pages = Pages(shipped.model_copy(update={"corrections": corrections}), seed)
     counts: dict[str, Counter[str]] = {}
+    settled = Counter[str]()
     limit = pages.limit()
     click.echo(f"half of the pages are lost at a phase noise of {limit:.4f} rad")
     for index in track(range(count), "pages at the limit"):
         share = NOISES[index % len(NOISES)]
         drawn = pages.drawn(share * limit)
-        counts.setdefault(f"noise {share:g} of the limit", Counter())[pages.outcome(*drawn)] += 1
+        outcome = pages.outcome(drawn)
+        counts.setdefault(f"noise {share:g} of the limit", Counter())[outcome] += 1
+        if outcome == "lost":
+            settled[pages.settled(drawn)] += 1
     names = list(DAMAGES)
     for index in track(range(damaged), "damaged pages"):
         name = names[index % len(names)]
-        sent, header, phase, concentration = pages.drawn(0.9 * limit)
-        DAMAGES[name](phase, concentration, pages.rng)
-        counts.setdefault(name, Counter())[pages.outcome(sent, header, phase, concentration)] += 1
+        drawn = pages.drawn(0.9 * limit)
+        DAMAGES[name](drawn.phase, drawn.concentration, pages.rng)
+        counts.setdefault(name, Counter())[pages.outcome(drawn)] += 1
     click.echo(f"{'pages':<24} {'right':>7} {'lost':>7} {'wrong':>7}")
     for name, outcomes in counts.items():
         of = counted(outcomes)
         click.echo(f"{name:<24} {of.right:>7} {of.lost:>7} {of.wrong:>7}")
+    converged = settled["right"] + settled["wrong"]
+    click.echo(f"of {settled.total()} lost pages blocks converge on {converged}, on {settled['wrong']} to another word")
     if json_path is not None:
-        write_json(json_path, {name: vars(counted(outcomes)) for name, outcomes in counts.items()})
+        figures = {name: vars(counted(outcomes)) for name, outcomes in counts.items()}
+        write_json(
+            json_path, figures | {"converged on lost pages": {"right": settled["right"], "wrong": settled["wrong"]}}
+        )
     if any(outcomes["wrong"] for outcomes in counts.values()):
         raise click.exceptions.Exit(1)
 
