@@ -29,7 +29,7 @@ from lightpage.runtime.archives.workers.engines import LOCAL, RAY, engine_of
 from lightpage.runtime.archives.workers.fine_tuning import deep_recalibration
 from lightpage.runtime.commands.archives.bulk_metrics import check_metrics, watched
 from lightpage.runtime.commands.archives.bulk_result import Result
-from lightpage.runtime.commands.provider_option import PROVIDER
+from lightpage.runtime.commands.provider_option import BATCHES, PROVIDER
 from lightpage.runtime.model.bundle.shipped import DEFAULT
 from lightpage.runtime.model.execution.providers import Provider
 
@@ -71,6 +71,7 @@ _options = _together(
     ),
     click.option("--threads", type=click.IntRange(1), help="Threads of a worker; by default its share of cores."),
     PROVIDER,
+    BATCHES,
     click.option("--workers", type=click.IntRange(1), help="How many; by default one for every two cores."),
     click.option("--address", help="With --engine ray: of the cluster, `auto` for the one that runs here."),
     click.option("--engine", type=click.Choice([LOCAL, RAY]), default=LOCAL, show_default=True, help="Who works."),

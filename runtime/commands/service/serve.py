@@ -45,6 +45,7 @@ _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 _OPTIONS: dict[str, Key] = {
     **{f"--{key.replace('_', '-')}": ("service", key) for key in ServiceTable.model_fields if key != "insecure"},
+    "--batches": ("batches", "largest"),
     **{f"--{key}": ("tls", key) for key in ("ca", "certificate", "key")},
     "--metrics-port": ("metrics", "port"),
     "--metrics-host": ("metrics", "host"),
