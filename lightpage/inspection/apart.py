@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from signal import SIGKILL
 
 from lightpage.cli.main import missing
 from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError, StorageError, SurroundingsError, WorkerError
 from lightpage.helper_process import Helper, HelperProcess, same_packages
 from lightpage.inspection.finding import Finding, Picture
+from lightpage.systems import INHERITS_SOCKETS
 
+_KILLED = -9
+"""Exit status of a process that the system has ended since memory was short; not every system names the signal."""
 LONGEST_S = 60.0
 """Time that looking at a file may take: it reads samples, and a share may be slow."""
 
@@ -52,23 +54,23 @@ def look_apart(
         SurroundingsError: a resource is short.
         WorkerError: the process cannot be started, or fails by itself.
     """
+    if not INHERITS_SOCKETS:  # then a damaged file may end this process
+        return Inspector().look(path, profile, drawn)
     subject = f"file {path}"
     process = HelperProcess(f"{__name__}:Inspector", subject=subject, environment=same_packages(1))
     try:
         process.send("look", path, profile, drawn)
         if not process.poll(longest_s):
-            raise StorageError(
-                subject, f"no end of it within {longest_s:g} s", "a file that is whole, on quick storage"
-            )
+            got, expected = f"no end within {longest_s:g} s", "a file that is whole, on quick storage"
+            raise StorageError(subject, got, expected)
         found, pictures = process.answer()
         return found, pictures
     except WorkerError as error:
-        if process.status == -SIGKILL:  # which the system sends where memory is short
+        if process.status == _KILLED:
             raise SurroundingsError(subject, error.got, "more memory") from None
         if process.status is not None and process.status < 0:
-            raise InvalidInputError(
-                subject, f"data that reading crashes at ({error.got})", "a file that is whole"
-            ) from None
+            got = f"data at which reading crashes ({error.got})"
+            raise InvalidInputError(subject, got, "a file that is whole") from None
         raise
     finally:
         process.end()
