@@ -15,7 +15,9 @@ from PIL import Image
 from scipy.io import savemat
 
 from lightpage.cli import main
-from lightpage.errors import InvalidInputError, StorageError
+from lightpage.errors import InvalidInputError, LightpageError, StorageError, SurroundingsError, WorkerError
+from lightpage.helper_process import Helper, HelperProcess
+from lightpage.inspection import apart
 from lightpage.inspection.apart import look_apart
 from lightpage.inspection.command import inspect, table
 from lightpage.inspection.look import look
@@ -148,6 +150,26 @@ def test_a_file_that_is_never_read_to_its_end_is_given_up(tmp_path: Path) -> Non
     (tmp_path / "p.toml").write_text(PROFILE)
     with refused("p.toml", "0 s", StorageError):
         look_apart(tmp_path / "p.toml", None, drawn=False, longest_s=0.0)
+
+
+class Dies(Helper):
+    """The helper that ends as a path says."""
+
+    def look(self, path: Path, *_: object) -> None:
+        """End by a signal, or by an error that nobody foresaw."""
+        os.kill(os.getpid(), int(path.name))
+
+
+@pytest.mark.parametrize(
+    ("signal", "kind"), [("11", InvalidInputError), ("9", SurroundingsError), ("999", WorkerError)]
+)  # fmt: skip
+def test_a_file_is_blamed_only_where_reading_it_crashes(
+    signal: str, kind: type[LightpageError], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(apart, "HelperProcess", lambda _, **told: HelperProcess(f"{__name__}:Dies", **told))
+    with pytest.raises(kind) as caught:
+        look_apart(Path(signal), None, drawn=False)
+    assert type(caught.value) is kind
 
 
 def test_a_recording_is_looked_at_and_drawn(small_device: list[str], tmp_path: Path) -> None:
