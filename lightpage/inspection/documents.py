@@ -16,11 +16,15 @@ from lightpage.files import read_text
 from lightpage.foreign.array import readable
 from lightpage.inspection.finding import Finding
 from lightpage.run_files import EVALUATE, RECOVER, REPORT_MARKS
-from lightpage.runtime.service.settings import ServiceSettings
 from lightpage.waves.consequences import consequences
 
 MOST_BYTES = 16 << 20
 """Most bytes of a text."""
+SERVICE_TABLES = frozenset(
+    {"service", "batches", "tls", "inference", "metrics", "traces", "self_calibration", "flight_recorder"}
+    | {"limits", "logs", "audit"}
+)
+"""Tables of a service's settings, whose own module needs Linux."""
 
 
 def look_at_toml(path: Path, profile: Profile | None) -> Finding:
@@ -38,7 +42,7 @@ def look_at_toml(path: Path, profile: Profile | None) -> Finding:
         return _calibration(path, told, profile)
     if "coded_bits" in told:
         return _code(path)
-    if told.keys() & ServiceSettings.model_fields.keys():
+    if told.keys() & SERVICE_TABLES:
         found = Finding(path, "settings of a service")
         found.next.append(f"lightpage serve --config {found.quoted} --print-config")
         return found

@@ -248,9 +248,12 @@ class TestRefused:
             (FRAMES, "options", "no references"),
             (f"--frames in_phase.npy {REFERENCES}", "in_phase.npy", "does not tell"),
             (f"{FRAMES.replace('in_phase', 'all')} {REFERENCES}", "all.npy", "no such file"),
+            (f"{FRAMES} {REFERENCES} --black-level 300", "--black-level 300", "8 bits"),
+            (f"{FRAMES} {REFERENCES} --pilots ones.npy", "ones.npy", "pilots of"),
         ],
     )
-    def test_options_that_do_not_go_together(self, options: str, subject: str, got: str) -> None:
+    def test_options_that_do_not_go_together(self, options: str, subject: str, got: str, arrays: Arrays) -> None:
+        np.save("ones.npy", np.ones_like(arrays["symbols"][0]))
         with refused(subject, got):
             bring(f"{options} {REST}")
 

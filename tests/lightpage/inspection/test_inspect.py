@@ -20,8 +20,10 @@ from lightpage.helper_process import Helper, HelperProcess
 from lightpage.inspection import apart
 from lightpage.inspection.apart import look_apart
 from lightpage.inspection.command import inspect, table
+from lightpage.inspection.documents import SERVICE_TABLES
 from lightpage.inspection.look import look
 from lightpage.recording.decoded_file import DecodedWriter
+from lightpage.runtime.service.settings import ServiceSettings
 from tests.lightpage.refused import refused
 from tests.lightpage.small import small_profile
 from tests.runtime import coded, toy
@@ -150,6 +152,10 @@ def test_a_file_that_is_never_read_to_its_end_is_given_up(tmp_path: Path) -> Non
     (tmp_path / "p.toml").write_text(PROFILE)
     with refused("p.toml", "0 s", StorageError):
         look_apart(tmp_path / "p.toml", None, drawn=False, longest_s=0.0)
+
+
+def test_settings_of_a_service_are_known_by_any_of_their_tables() -> None:
+    assert ServiceSettings.model_fields.keys() == SERVICE_TABLES
 
 
 class Dies(Helper):
