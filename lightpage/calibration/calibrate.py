@@ -160,6 +160,9 @@ _DRIFT_SCALE: Real = np.array([_DRIFT_SHARES.get(parameter.group, 0.05) for para
 """Drift of a device, as a share of the prior about nominal. What a fit cannot tell well stays as it was: a decoder
 has learned the earlier calibration's errors, and loses 0.1 bit a symbol where a re-fit draws others."""
 
+_HELD = 1e-6
+"""Share of a prior that leaves a parameter where it is."""
+
 
 def calibrate(
     twin: Twin,
@@ -240,6 +243,20 @@ def refine(
         work.complex_field(replace(stage, groups=known), _DRIFT_SCALE)
     work.waves("waves", known, _DRIFT_SCALE)
     return work.result()
+
+
+def goodness_of(twin: Twin, device: CalibratedDevice, page: KnownPage) -> Goodness:
+    """Verdict on a device that is held as it is, by the light of a known page.
+
+    Raises:
+        CalibrationError: the cameras see no symbol.
+    """
+    start, group = device.parameters, ("launch",)  # with it the illumination does not bend the page's phases
+    fit = WaveFit(twin, device.profile, page.pair, device.references, page.symbols)
+    found = fit.fit(start, device.quadrature_phase_rad, group, start, _HELD, modulation=device.modulation, rough=True)
+    if found.illumination is None:
+        raise CalibrationError("calibration, verdict", "no light of a page", "some")
+    return measure_goodness(twin, device, found.illumination, page.pair, page.symbols)
 
 
 def least_coherence(symbols: int) -> float:
