@@ -184,7 +184,7 @@ def test_a_model_healed_by_decisions_alone_has_a_verdict_and_is_not_served_where
 
     decoder = Decoder.load(small_bundle, threads=1)
     with Recording.open(drifted / "R.h5") as recording:
-        lost = LostPages(tuple(map(recording.frames, range(4))), CODE, references=recording.references())
+        lost = LostPages(tuple(map(recording.frames, range(2))), CODE, references=recording.references())
     healed = heal(decoder, lost, fit=unfitted)
     found, report = healed.decoder.bundle.calibration, healed.result.report
     assert healed.rounds > 0

@@ -106,7 +106,7 @@ def test_a_pages_own_pilots_take_the_place_of_the_devices() -> None:
 
 def test_frames_that_are_refused_a_little_off_their_place_are_told_as_frames() -> None:
     refused = Mock()
-    refused.graph.value.return_value = np.zeros((2, 2, 10), np.float32)
+    refused.graph.value.return_value = np.ones((2, 2, 10), np.float32)
     refused.infer.side_effect = FrameError("frame pair", "no light", "light")
     frames = FramePair(*np.zeros((2, 4, 4), np.uint8))
     for pair, kind in ((frames, FrameError), (None, BundleError)):
