@@ -72,7 +72,8 @@ test-lowest: $(STAMP)  ## a share of the tests with the lowest versions that pyp
 	$(BIN)/uv pip compile --quiet --python $(LOWEST) --resolution lowest-direct --extra cpu pyproject.toml -o $(LOWEST)/requirements.txt
 	$(BIN)/uv pip install --quiet --python $(LOWEST) -r $(LOWEST)/requirements.txt pytest pytest-timeout onnx
 	$(ONE_THREAD) $(LOWEST)/bin/python -m pytest -q -p no:cacheprovider tests/lightpage/recording tests/lightpage/test_files.py \
-	    tests/runtime/model/bundle tests/runtime/model/decoding/test_following.py tests/runtime/client/wire tests/runtime/archives/run/test_storage.py
+	    tests/lightpage/cli tests/lightpage/codec/test_erasure.py tests/runtime/model tests/runtime/client tests/runtime/commands/test_commands.py \
+	    tests/runtime/commands/test_user_bytes.py tests/runtime/archives/run/test_storage.py tests/runtime/service/frames
 
 lint: $(STAMP)  ## ruff, layers of imports, mypy --strict, rules of tests and words, hadolint
 	$(BIN)/ruff check .
@@ -190,7 +191,7 @@ results: $(STAMP)  ## write docs/results.md from analysis/results: RESULTS_ARGS=
 	$(BIN)/python -m analysis.results.page $(RESULTS_ARGS)
 
 proto: $(STAMP)  ## regenerate the gRPC stubs from proto/
-	$(BIN)/python proto/generate.py
+	$(BIN)/uv run --quiet --python $(BIN)/python proto/generate.py
 
 image:  ## build the container image (IMAGE_TARGET=runtime, camera, deep, gpu or ray; RELEASE=1 BASE=NAME@sha256:DIGEST; IMAGE_PLATFORM)
 	LIGHTPAGE_RELEASE=$(RELEASE) LIGHTPAGE_BASE=$(BASE) LIGHTPAGE_PLATFORM=$(IMAGE_PLATFORM) \

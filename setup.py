@@ -1,11 +1,16 @@
 """Compiles the page code's arithmetic where a C compiler and the headers of Python are; elsewhere numpy does it.
 
 All else stands in pyproject.toml. With LIGHTPAGE_PAGE_CODE=compiled in the environment, failing to compile is an error.
+With LIGHTPAGE_PAGE_CODE=numpy nothing is compiled. A wheel without what is compiled is one for every system.
 """
 
 import os
 import sys
 import sysconfig
+import tempfile
+from distutils.ccompiler import new_compiler
+from distutils.sysconfig import customize_compiler
+from pathlib import Path
 
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
@@ -30,17 +35,34 @@ class BuildExtension(build_ext):
         super().build_extensions()
 
 
+def compiles() -> bool:
+    """Return whether a C compiler and the headers of Python are here, as a wheel's name must say before it is built."""
+    with tempfile.TemporaryDirectory() as folder:
+        source = Path(folder, "tried.c")
+        source.write_text("#include <Python.h>\n", "utf-8")
+        compiler = new_compiler()
+        customize_compiler(compiler)
+        try:
+            headers = [sysconfig.get_path("include"), sysconfig.get_path("platinclude")]
+            compiler.compile([str(source)], output_dir=folder, include_dirs=headers)
+        except Exception:  # each compiler's class has errors of its own
+            return False
+    return True
+
+
+WANTED = os.environ.get("LIGHTPAGE_PAGE_CODE")
 PAGE_CODE = Extension(
     "lightpage.codec.compiled.page_code",
     [f"{FOLDER}/page_code.c"],
     depends=[f"{FOLDER}/kernels.h"],
     define_macros=[("Py_LIMITED_API", LIMITED_API)],
     py_limited_api=True,
-    optional=os.environ.get("LIGHTPAGE_PAGE_CODE") != "compiled",
+    optional=WANTED != "compiled",
 )
 
-if sysconfig.get_config_var("Py_GIL_DISABLED"):
-    setup()  # a free-threaded Python has no stable ABI: numpy does it there
+# A free-threaded Python has no stable ABI: numpy does it there.
+if WANTED == "numpy" or sysconfig.get_config_var("Py_GIL_DISABLED") or not (WANTED == "compiled" or compiles()):
+    setup()
 else:
     setup(
         ext_modules=[PAGE_CODE],

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import click
 
-from lightpage.cli.paths import OutputFile, OutputFolder
+from lightpage.cli.options import JSON
+from lightpage.cli.paths import OutputFolder
 from lightpage.cli.progress_bar import percent_bar
 from lightpage.demo.demo import run_demo
 from lightpage.demo.result import DemoResult
@@ -22,7 +23,7 @@ from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 @click.option("--out", default="out/demo", show_default=True, type=OutputFolder(), help="Folder.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Of what is written.")
 @click.option("--source", "spec", help="A simulated device that runs as hardware, camera:FOLDER/device.toml.")
-@click.option("--json", "json_path", type=OutputFile(), help="Also write the figures to this file.")
+@JSON
 def demo(bundle: str, out: Path, seed: int, spec: str | None, json_path: Path | None) -> None:
     """Store a picture on the simulated device and read it back, before a drift, after it and healed by what was lost.
 

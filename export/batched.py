@@ -22,6 +22,9 @@ from torch import Tensor, nn
 
 from lightpage.export.graph import ANSWERS, APART, FRAME_INPUTS, DecoderGraph, answers
 from lightpage.export.onnx_files import FOLDED, OPSET, anonymous, halved, sharing
+from lightpage.progress import warn
+from lightpage.runtime.model.bundle.manifest import BATCH, CONSTANTS
+from lightpage.runtime.model.decoding.batch_graph import SHIFT
 from lightpage.train.models.batched.decoder import BatchedDecoder
 
 PAGES = "pages"
@@ -68,9 +71,12 @@ class BatchGraph(nn.Module):
         super().__init__()
         self.decoder, self.names, self.kappa_scale = decoder, names, kappa_scale
 
-    def forward(self, in_phase: Tensor, quadrature: Tensor, *constants: Tensor) -> tuple[Tensor, ...]:
-        """Frames [B, H, W] and constants to p [B, 2, ny, nx], phase and concentration [B, ny, nx], residual [B]."""
-        p, residual = self.decoder(in_phase, quadrature, dict(zip(self.names, constants, strict=True)))
+    def forward(self, in_phase: Tensor, quadrature: Tensor, shift: Tensor, *constants: Tensor) -> tuple[Tensor, ...]:
+        """Frames [B, H, W], shifts [B, 2, 2] and constants to p [B, 2, ny, nx] and the other `OUTPUTS`.
+
+        Phase and concentration are [B, ny, nx], the residual is [B]; see `BatchedDecoder.forward`.
+        """
+        p, residual = self.decoder(in_phase, quadrature, shift, dict(zip(self.names, constants, strict=True)))
         return *answers(p * self.kappa_scale, 1), residual
 
 
@@ -95,12 +101,24 @@ def batched_onnx(
     rows, columns = graph.recovery.rows_px, graph.recovery.columns_px
     frames = torch.zeros((_EXAMPLE, rows, columns), dtype=getattr(torch, frame_dtype))
     batch = BatchGraph(decoder, constants.names, graph.kappa_scale).eval()
-    inputs = frames, frames.clone(), *made
-    second = traced(batch, inputs, (*FRAME_INPUTS, *constants.names), OUTPUTS, (*FRAME_INPUTS, *OUTPUTS))
+    inputs = frames, frames.clone(), torch.zeros((_EXAMPLE, 2, 2)), *made
+    of_pages = *FRAME_INPUTS, SHIFT
+    second = traced(batch, inputs, (*of_pages, *constants.names), OUTPUTS, (*of_pages, *OUTPUTS))
     taken = {entry.name for entry in second.graph.input}
     constants.names = tuple(name for name in constants.names if name in taken)
     first = traced(constants, tuple(tensors), constants.inputs, constants.names)
     return bytes(first.SerializeToString()), bytes(second.SerializeToString())
+
+
+def files_for_batches(
+    graph: DecoderGraph, frame_dtype: str, defaults: dict[str, NDArray[np.generic]]
+) -> dict[str, bytes]:
+    """Both graphs in float16 as files of a bundle; none, with a warning, for a device that they do not decode."""
+    made = batched_onnx(graph, frame_dtype, defaults, torch.float16)
+    if made is None:
+        warn("no decoder for many pages: the cameras of this device stand apart")
+        return {}
+    return dict(zip((CONSTANTS, BATCH), made, strict=True))
 
 
 def traced(

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from lightpage.cli.paths import NewPath, OutputFile
+from lightpage.cli.options import JSON
+from lightpage.cli.paths import NewPath
 from lightpage.cli.progress_bar import percent_bar
 from lightpage.export.from_run import export_run
 from lightpage.export.half import PRECISIONS
@@ -37,7 +38,7 @@ from lightpage.train.runs import load_run
     help="Hold the decoder for many pages too, which a GPU runs.",
 )
 @click.option(ACCEPT, "accept_wrong_fit", is_flag=True, help="Export a run whose calibration is a wrong fit too.")
-@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
+@JSON
 def export(
     run: Path,
     out: Path,

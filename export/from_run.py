@@ -8,16 +8,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 
 from lightpage.errors import BundleError, InvalidInputError
-from lightpage.export.batched import batched_onnx
+from lightpage.export.batched import files_for_batches
 from lightpage.export.graph import APART, FRAME_INPUTS, DecoderGraph, FieldGraph
 from lightpage.export.half import LARGEST_DEVIATION, check_deviation, in_half, rounded
 from lightpage.export.onnx_files import decoder_onnx, field_onnx, twin_onnx
 from lightpage.export.parity import check_parity
-from lightpage.export.run_graph import Tensors, golden_of, graph_of
+from lightpage.export.run_graph import golden_of, graph_of
 from lightpage.progress import Progress, note, warn
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import narrow
@@ -26,8 +24,6 @@ from lightpage.runtime.archives.recordings.coded_pages import choose_code
 from lightpage.runtime.archives.recordings.evaluation import check_recording
 from lightpage.runtime.model.bundle.bundle import Bundle, npz, write_bundle
 from lightpage.runtime.model.bundle.manifest import (
-    BATCH,
-    CONSTANTS,
     DECODER,
     FIELD,
     FLOAT16,
@@ -41,7 +37,9 @@ from lightpage.runtime.model.bundle.manifest import (
     check_version,
     sha256,
 )
-from lightpage.runtime.model.decoding.decoder import GOLDEN_TOLERANCE, PAGE_INPUTS, Decoder
+from lightpage.runtime.model.decoding.batch_graph import with_proven_batches
+from lightpage.runtime.model.decoding.decoder import PAGE_INPUTS, Decoder
+from lightpage.runtime.model.decoding.golden import GOLDEN_TOLERANCE
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.execution.session import open_session
 from lightpage.train.models.twin import RayTwin
@@ -144,41 +142,20 @@ def export_run(
     }
     if batches and isinstance(graph, DecoderGraph):
         progress("decoder for many pages to ONNX", 0.7)
-        files |= _for_batches(graph, frame_dtype, defaults, pair, expected["p"], str(out))
+        files |= files_for_batches(graph, frame_dtype, defaults)
     progress("load the bundle as the service does", 0.8)
-    manifest = _proven(out, manifest, files, recording, progress)
+    manifest, files = _proven(out, manifest, files, recording, progress)
     write_bundle(out, manifest, files)
     return Bundle.open(out), error
 
 
-def _for_batches(
-    graph: DecoderGraph, frame_dtype: str, defaults: Tensors, pair: FramePair, expected: NDArray[np.float32], out: str
-) -> dict[str, bytes]:
-    """Files of the decoder for many pages, proven on the golden page; none where there is no such decoder."""
-    made = batched_onnx(graph, frame_dtype, defaults, torch.float16)
-    if made is None:
-        warn("no decoder for many pages: the cameras of this device stand apart")
-        return {}
-    names = CONSTANTS, BATCH
-    first, second = (open_session(model, f"{out}: {name}", pages=2) for model, name in zip(made, names, strict=True))
-    outputs = [node.name for node in first.get_outputs()]
-    table = {node.name: defaults[node.name] for node in first.get_inputs()}
-    feeds = dict(zip(outputs, first.run(outputs, table), strict=True))
-    pages = [pair, FramePair(pair.quadrature, pair.in_phase)]  # another one beside it
-    feeds |= {name: np.stack([getattr(each, name) for each in pages]) for name in ("in_phase", "quadrature")}
-    (answer,) = second.run(["p"], feeds)
-    try:
-        check_parity(expected, answer[0], f"{out}, {BATCH}", GOLDEN_TOLERANCE[FLOAT16])
-    except BundleError as differing:
-        warn(f"no decoder for many pages: {differing}")
-        return {}
-    return dict(zip(names, made, strict=True))
-
-
 def _proven(
     out: Path, manifest: Manifest, files: dict[str, bytes], recording: Path | None, progress: Progress
-) -> Manifest:
-    """Load the bundle beside `out` as the service does; returns its manifest, with a code where a recording chose one.
+) -> tuple[Manifest, dict[str, bytes]]:
+    """Load the bundle beside `out` as the service does.
+
+    Returns:
+        its manifest, with a code where a recording chose one, and its files, those for many pages only if they decode.
 
     Raises:
         RecordingError: the recording is of another device.
@@ -189,18 +166,19 @@ def _proven(
     try:
         write_bundle(partial, manifest, files)
         proven = Decoder.load(partial)
+        files = dict(with_proven_batches(proven.bundle, proven.graph).files)
         if recording is not None:
             progress("choose the code of user bytes", 0.9)
             with Recording.open(recording) as pages:
                 check_recording(proven, pages)
                 try:
                     best, _ = choose_code(proven, pages, tracker_for(proven))
-                    return manifest.model_copy(update={"code": best.code.to_toml()})
+                    manifest = manifest.model_copy(update={"code": best.code.to_toml()})
                 except InvalidInputError as lacking:
                     warn(f"no code for user bytes: {lacking}")
     finally:
         _remove(partial)
-    return manifest
+    return manifest, files
 
 
 def _version(name: str, created: datetime, decoder: bytes) -> str:

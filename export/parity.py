@@ -10,7 +10,7 @@ from lightpage.errors import BundleError
 from lightpage.export.graph import Graph
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.manifest import FLOAT32
-from lightpage.runtime.model.decoding.decoder import GOLDEN_TOLERANCE
+from lightpage.runtime.model.decoding.golden import GOLDEN_TOLERANCE
 
 
 def torch_answer(

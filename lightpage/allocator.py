@@ -13,6 +13,6 @@ def set_options(*options: tuple[int, int]) -> bool:
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt
-    except (AttributeError, OSError):
+    except (AttributeError, OSError, TypeError):  # the last on Windows
         return False
     return all([mallopt(number, value) for number, value in options])

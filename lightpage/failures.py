@@ -175,3 +175,9 @@ def short_resource(subject: str, error: BaseException) -> SurroundingsError | No
         if words in text.lower():
             return SurroundingsError(subject, text, f"more {what}")
     return None
+
+
+def lacks_memory(error: BaseException) -> bool:
+    """Return whether a failure says that memory is short, this machine's or a device's."""
+    short = short_resource("", error)
+    return short is not None and short.expected == "more memory"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import codecs
 import errno
-import fcntl
 import glob
 import json
 import math
@@ -22,6 +21,7 @@ from typing import IO, Any, TextIO
 from lightpage.errors import InvalidInputError, LightpageError
 from lightpage.failures import os_failure
 from lightpage.progress import warn
+from lightpage.systems import open_file, try_lock
 
 STDOUT = Path("-")
 """Name that users write for stdout in place of a JSON file, and for stdin in place of a file to read."""
@@ -64,7 +64,7 @@ def new_file(folder: Path, name: str) -> tuple[int, Path]:
         begin = os.fsencode(f".{name}")[: _NAME_BYTES - len(end)]
         path = folder / (os.fsdecode(begin).encode("utf-8", "surrogateescape").decode("utf-8", "ignore") + end)
         with suppress(FileExistsError):
-            return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666), path
+            return open_file(path, new=True), path
 
 
 def lock(descriptor: int, subject: str, *, shared: bool = False, ranges: bool = False) -> bool:
@@ -84,13 +84,10 @@ def lock(descriptor: int, subject: str, *, shared: bool = False, ranges: bool = 
         OSError: storage fails.
     """
     try:
-        how = fcntl.LOCK_NB | (fcntl.LOCK_SH if shared else fcntl.LOCK_EX)
-        (fcntl.lockf if ranges else fcntl.flock)(descriptor, how)
+        try_lock(descriptor, shared=shared, ranges=ranges)
     except BlockingIOError:
         raise
     except OSError as error:
-        if error.errno == errno.EACCES:  # so some shares say that another has it
-            raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN)) from None
         if error.errno not in _LACKING:
             raise
         if (device := os.fstat(descriptor).st_dev) not in WITHOUT_LOCKS:
@@ -212,6 +209,8 @@ def reserve(path: Path) -> None:
     """
     with path.open("r+b") as file:
         try:
+            if not hasattr(os, "posix_fallocate"):  # Windows keeps room for all of a file, macOS for none
+                return
             os.posix_fallocate(file.fileno(), 0, os.fstat(file.fileno()).st_size)
         except OSError as error:
             if error.errno not in _LACKING:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import platform
 import socket
 import subprocess
 import sys
@@ -25,6 +26,7 @@ from typing import IO, Any, ClassVar
 
 from lightpage.errors import LightpageError, WorkerError
 from lightpage.failures import short_resource
+from lightpage.systems import INHERITS_SOCKETS, NEEDS_LINUX
 
 _PROGRESS, _ANSWER, _ERROR, _END = "progress", "answer", "error", "end"
 _END_S = 5.0
@@ -75,6 +77,8 @@ class HelperProcess:
         environment: Mapping[str, str] | None = None,
         log: IO[bytes] | None = None,
     ) -> None:
+        if not INHERITS_SOCKETS:
+            raise WorkerError(subject, platform.system(), NEEDS_LINUX)
         self._subject = subject
         self._requests = SimpleQueue[list[Any]]()
         self._told = SimpleQueue[tuple[str, Any]]()

@@ -1,4 +1,11 @@
-"""Generates the Python stubs in runtime/ from the .proto files: `python proto/generate.py [ROOT]`."""
+# /// script
+# dependencies = ["grpcio-tools==1.72.1", "setuptools<81"]
+# ///
+"""Generates the Python stubs in runtime/ from the .proto files: `uv run proto/generate.py [ROOT]`.
+
+An old protoc makes them, in an environment of its own, which the head of this file describes. Stubs run with the
+protobuf that made them and with those of the next major version, so old ones live beside other packages.
+"""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ def _of_bulk(folder: Path, recording: Path | None) -> tuple[str, str, str]:
 
 
 def _of_run(folder: Path, recording: Path | None) -> tuple[str, str, str]:
-    from lightpage.report import decoder_page  # torch takes seconds, and only these two need it
+    from lightpage.report import decoder_page
     from lightpage.report.contents.from_run import report_of_run
 
     data = report_of_run(folder, recording)

@@ -2,30 +2,36 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 
 from lightpage.report import figures
-from lightpage.report.contents.data import ReportData, exit_centroids
+from lightpage.report.contents.data import ReportData
 from lightpage.report.tables import geometry, zones
 
 TEMPLATE = "report.html.j2"
+NOT_TRACED = "Nothing is traced here: that needs the extra train, pip install 'lightpage[train]'."
 
 
 def shown(data: ReportData) -> dict[str, Any]:
     """Tables and pictures, as the template takes them."""
-    centroids = exit_centroids(data.profile, data.calibration)
+    centroids = paths = None
+    if find_spec("torch") is not None:
+        from lightpage.report.traced import exit_centroids, ray_paths
+
+        centroids, paths = exit_centroids(data.profile, data.calibration), ray_paths(data)
     return {
         "measures": data.measures,
         "calibration": data.calibration,
         "turn_deg": float(np.rad2deg(data.calibration.turn_rad)),
         "geometry": geometry(data),
         "goodness": figures.goodness(data),
-        "zones": zones(data, centroids),
+        "zones": NOT_TRACED if centroids is None else zones(data, centroids),
         "maps": figures.maps(data, centroids),
         "reliability": [figures.reliability(data), figures.concentration(data)],
         "training": data.curves if isinstance(data.curves, str) else figures.training(data.curves),
         "page": data.golden if isinstance(data.golden, str) else figures.page(data.golden),
-        "rays": figures.rays(data),
+        "rays": NOT_TRACED if paths is None else figures.rays(data, paths),
     }

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from matplotlib import colormaps, patheffects
 from matplotlib.axes import Axes
 from matplotlib.colors import Colormap
@@ -16,20 +16,20 @@ from lightpage.calibration.goodness.figure import goodness_figure
 from lightpage.report.contents.data import Golden, Real, ReportData
 from lightpage.report.drawing import BLUE, GREEN, GREY, ORANGE, Picture, as_picture, new_figure, one_axis
 from lightpage.report.words import number, signed
-from lightpage.train.fitting.curves import Curve
-from lightpage.train.published.rays import RayTracer
+
+if TYPE_CHECKING:
+    from lightpage.train.fitting.curves import Curve
 
 _MISSING = "#bbbbbb"
 _TRIMMED = 1.0
 """Per cent at either end that do not stretch a colour scale."""
 _BRIGHTEST = 99.8
 """Per cent of a frame's pixels that are not drawn white."""
-_RAYS = 15
 _LEAST_KAPPA = 1e-2
 
 
-def maps(data: ReportData, centroids: Real) -> list[Picture]:
-    """AIR, own-MI, over-claim and phase error over the page, with the borders of the zones [2, ny, nx]."""
+def maps(data: ReportData, centroids: Real | None) -> list[Picture]:
+    """AIR, own-MI, over-claim and phase error over the page, with the borders of the zones where `centroids` tell."""
     air, own = data.maps.air, data.maps.own_mi
     low, high = np.nanpercentile([air, own], [_TRIMMED, 100 - _TRIMMED])
     claim = own - air
@@ -81,17 +81,18 @@ def goodness(data: ReportData) -> list[Picture]:
 
 
 def _map(
-    label: str, values: Real, colours: Colormap, limits: tuple[float, float], centroids: Real, caption: str
+    label: str, values: Real, colours: Colormap, limits: tuple[float, float], centroids: Real | None, caption: str
 ) -> Picture:
     figure, axis = one_axis(image=True)
     shown = axis.imshow(values, cmap=colours.with_extremes(bad=_MISSING), vmin=limits[0], vmax=limits[1])
     figure.colorbar(shown, ax=axis, label=label, extend="both", orientation="horizontal", aspect=35)
-    for centroid, style in zip(centroids, ("solid", "dashed"), strict=True):
+    for centroid, style in zip(() if centroids is None else centroids, ("solid", "dashed"), strict=False):
         borders = np.arange(np.floor(centroid.min()) + 0.5, centroid.max())
         if len(borders):
             lines = axis.contour(centroid, levels=borders, colors="white", linestyles=style, linewidths=1.3)
             lines.set_path_effects([patheffects.withStroke(linewidth=2.4, foreground="black")])
-    _name_zones(axis, np.rint(centroids).astype(int))
+    if centroids is not None:
+        _name_zones(axis, np.rint(centroids).astype(int))
     axis.set(xlabel="column, symbols", ylabel="row, symbols")
     return as_picture(figure, f"Map over the page. {caption}", caption, image=True)
 
@@ -200,7 +201,8 @@ def training(passes: Sequence[Mapping[str, Curve]]) -> list[Picture]:
 
 def _in_a_row(passes: Sequence[Mapping[str, Curve]], tag: str) -> list[Curve]:
     """The curves of a tag, each pass's steps counted on from those of the passes before it."""
-    found, before = list[Curve](), 0
+    found: list[Curve] = []
+    before = 0
     for curves in passes:
         if curve := curves.get(tag):
             found.append([(before + step, value) for step, value in curve])
@@ -233,18 +235,10 @@ def page(golden: Golden) -> list[Picture]:
     return [*pictures, as_picture(figure, "Decoded phase of every symbol of the page.", caption, image=True)]
 
 
-def rays(data: ReportData) -> list[Picture]:
+def rays(data: ReportData, traced: Sequence[tuple[Real, NDArray[np.int64]]]) -> list[Picture]:
     """Rays of a row and of a column of the page, from the side: all of the way, and inside of the pipe."""
-    tracer = RayTracer(data.profile, data.rays.lens)
-    angle = torch.tensor(math.radians(data.rays.angle_deg), dtype=torch.float64)
     pictures = []
-    for axis, (name, wall, extent) in enumerate(
-        (("x", "x", data.profile.page_width_m), ("y", "y'", data.profile.page_height_m))
-    ):
-        points = torch.zeros(_RAYS, 2, dtype=torch.float64)
-        points[:, axis] = torch.linspace(-0.49, 0.49, _RAYS, dtype=torch.float64) * extent
-        with torch.no_grad():
-            path, met = 1e3 * tracer.path(points, angle).numpy(), tracer(points, angle).reflections[:, axis].numpy()
+    for axis, ((path, met), (name, wall)) in enumerate(zip(traced, (("x", "x"), ("y", "y'")), strict=True)):
         pictures += [_side(data, path, met, axis, name, wall, inside=inside) for inside in (False, True)]
     return pictures
 
@@ -280,7 +274,7 @@ def _side(
     figure.legend(frameon=False, loc="outside upper center", ncols=4, fontsize=8, title="reflections", title_fontsize=8)
     where = "inside of the pipe" if inside else "from modulator (left) to camera (right)"
     caption = f"{name}–z, {where}; black: walls." if inside else f"{name}–z, {where}; grey: lenses, black: walls."
-    return as_picture(figure, f"Side view {name} against z of {_RAYS} rays {where}.", caption)
+    return as_picture(figure, f"Side view {name} against z of {path.shape[1]} rays {where}.", caption)
 
 
 def _xy(curve: Curve) -> tuple[list[int], list[float]]:

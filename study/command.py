@@ -7,8 +7,8 @@ from pathlib import Path
 import click
 import torch
 
-from lightpage.cli.options import FiniteRange
-from lightpage.cli.paths import OutputFile, OutputFolder
+from lightpage.cli.options import JSON, FiniteRange
+from lightpage.cli.paths import OutputFolder
 from lightpage.cli.progress_bar import percent_bar
 from lightpage.device.profile import load_profile
 from lightpage.errors import InvalidInputError
@@ -50,7 +50,7 @@ _RESULTS = "results"
     help="Of a study that varies many things, the cases whose names begin so; others can follow in the same OUT.",
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
-@click.option("--json", "json_path", type=OutputFile(), help="Write settings and table to this file too.")
+@JSON
 def study(
     name: str,
     out: Path,

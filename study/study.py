@@ -146,7 +146,7 @@ def load_result(path: Path) -> Result:
         InvalidInputError: it is missing or damaged.
     """
     try:
-        kept = json.loads(path.read_text())
+        kept = json.loads(path.read_text("utf-8"))
         arrays = load_arrays(_arrays(path))
         return dict(kept["values"]) | {name: arrays[name] for name in kept["arrays"]}
     except (OSError, ValueError, TypeError, KeyError, InvalidInputError) as error:

@@ -12,6 +12,7 @@ import torch
 from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import InvalidInputError, LightpageError
 from lightpage.progress import State
+from lightpage.systems import cores
 
 if TYPE_CHECKING:
     from lightning.fabric.plugins.environments.cluster_environment import ClusterEnvironment
@@ -83,7 +84,7 @@ class Processes:
         if torch.cuda.is_available():
             there, what = torch.cuda.device_count(), "GPUs"
         else:
-            there, what = len(os.sched_getaffinity(0)), "cores, without a GPU"
+            there, what = cores(), "cores, without a GPU"
         if devices > there:
             raise InvalidInputError("--devices", devices, f"at most {there}: this machine's {what}")
 

@@ -24,6 +24,7 @@ from lightpage.device.profile import Profile, parse_profile
 from lightpage.errors import InvalidInputError
 from lightpage.files import lock, replace_file, replace_text
 from lightpage.run_files import BEGUN, DESCRIPTION
+from lightpage.systems import open_folder_to_lock
 from lightpage.train.fitting.fitted import CHECKPOINTS, FITTED
 from lightpage.train.models.decoder import SymbolDecoder
 from lightpage.train.models.hyperparameters import Hyperparameters
@@ -103,7 +104,7 @@ def sole_writer(folder: Path) -> Iterator[None]:
     made = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(folder, os.O_RDONLY)
+        descriptor = open_folder_to_lock(folder)
     except OSError as error:
         raise InvalidInputError(f"--out {folder}", error, "a folder that can be written") from None
     try:
@@ -141,7 +142,7 @@ def check_begun(folder: Path, options: dict[str, Any]) -> bool:
         InvalidInputError: see `begin`.
     """
     try:
-        kept = json.loads((folder / BEGUN).read_text())
+        kept = json.loads((folder / BEGUN).read_text("utf-8"))
         if not isinstance(kept, dict):
             raise ValueError("no table of options")
         kept = renamed(kept)
@@ -199,7 +200,7 @@ def load_run(folder: Path) -> Run:
     """
     path = folder / DESCRIPTION
     try:
-        data = json.loads(path.read_text())
+        data = json.loads(path.read_text("utf-8"))
         found = data.pop("format", None)
         choices = data["hyperparameters"]
         if data["localizer"] in PUBLISHED:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from analysis.comparison.levels import LevelFigures
 from lightpage.calibration.document import Calibration
 from lightpage.device.profile import Profile
-from lightpage.report.contents.data import exit_centroids
+from lightpage.report.traced import exit_centroids
 from lightpage.train.fitting.curves import Curve
 
 WALLS = {"no wall": (0, 0), "x": (1, 0), "y": (0, 1), "both": (1, 1)}

@@ -33,6 +33,7 @@ from analysis.gpu.kept_form import Form, Scene, form_of, scene_of
 from lightpage.errors import InvalidInputError
 from lightpage.export.operators.batches import BatchFile
 from lightpage.files import write_json
+from lightpage.runtime.model.decoding.batch_graph import SHIFT
 from lightpage.runtime.model.execution.providers import Provider
 from lightpage.runtime.model.execution.session import BoundSession, open_session
 
@@ -143,9 +144,10 @@ class Batches:
 
     def __init__(self, machine: Machine, form: Form, constants: Mapping[str, NDArray[Any]], pages: int) -> None:
         self.machine, self.pages, device = machine, pages, machine.device
-        self.session = open_session(form.batch, form.name, provider=machine.provider, pages=pages)
+        self.session = open_session(form.batch, form.name, provider=machine.provider, rounded=True)
         self._held = BoundSession(self.session, machine.provider, constants, form.name)
         self.frames = [torch.zeros((pages, *form.frame_shape), dtype=torch.uint8, device=device) for _ in range(2)]
+        self.shift = torch.zeros((pages, 2, 2), dtype=torch.float32, device=device)
         self.p = torch.zeros((pages, 2, *form.page_shape), dtype=torch.float32, device=device)
         self.residual = torch.zeros(pages, dtype=torch.float32, device=device)
 
@@ -154,6 +156,7 @@ class Batches:
         binding, kind = self._held.binding(), self.machine.device.type
         for name, tensor, dtype in (("in_phase", frames[0], np.uint8), ("quadrature", frames[1], np.uint8)):
             binding.bind_input(name, kind, 0, dtype, tuple(tensor.shape), tensor.data_ptr())
+        binding.bind_input(SHIFT, kind, 0, np.float32, tuple(self.shift.shape), self.shift.data_ptr())
         for name, tensor in (("p", self.p), ("residual", self.residual)):
             binding.bind_output(name, kind, 0, np.float32, tuple(tensor.shape), tensor.data_ptr())
         return binding

@@ -32,6 +32,7 @@ from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.page import DecodedPage
 from lightpage.runtime.model.decoding.tracking import NoTracker
+from lightpage.runtime.model.decoding.turns import Turn
 from lightpage.runtime.service.caller import Call, Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.models.loader import Loader
@@ -49,7 +50,9 @@ class _Disbelief(NoTracker):
         super().__init__(decoder)
         self._page = decoder.decode(pair)
 
-    def decode(self, pair: FramePair, levels: int, pilots: Pilots | None = None) -> DecodedPage:
+    def decode(
+        self, pair: FramePair, levels: int, pilots: Pilots | None = None, turn: Turn | None = None
+    ) -> DecodedPage:
         """See `Tracker`."""
         copies = {name: getattr(self._page, name).copy() for name in ("symbols", "phase", "concentration")}
         lost = UnconfirmedPageError("pilots", "0.02 of 6.59 claimed bits", "more", Reason.PILOTS_DISAGREE)

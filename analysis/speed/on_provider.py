@@ -20,6 +20,7 @@ from lightpage.page.pilots import Pilots
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import DECODER, FLOAT32, Precision
+from lightpage.runtime.model.decoding.batches import Batching
 from lightpage.runtime.model.decoding.decoder import PAGE_INPUTS, Decoder
 from lightpage.runtime.model.decoding.page import DecodedPage
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
@@ -185,15 +186,17 @@ def made_by(
     usual: Sequence[DecodedPage],
     callers: Sequence[int],
     seconds: float,
+    batches: int = 1,
 ) -> Made:
     """Figures of one bundle; arguments as the attributes of `Made` and the options of the command name them.
 
     Args:
         usual: the CPU's answers in float32.
+        batches: pages that callers' are computed together, at most.
     """
     nodes = placed(bundle, provider)
     start = time.perf_counter()
-    decoder = Decoder(bundle, provider=provider)
+    decoder = Decoder(bundle, provider=provider, batching=Batching(batches))
     load_s = time.perf_counter() - start
     data = ~decoder.bundle.pilot_mask
     rates, deviations, changed = [], [], []

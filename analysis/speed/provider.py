@@ -84,6 +84,7 @@ def lines(made: Made) -> list[str]:
 @click.option(
     "--callers", multiple=True, type=click.IntRange(1, 64), default=(1, 2, 4), show_default=True, help="At once."
 )
+@click.option("--batches", default=1, show_default=True, type=click.IntRange(1, 64), help="Computed together at most.")
 @click.option("--seconds", default=5.0, show_default=True, type=click.FloatRange(0.01, 600), help="For each of them.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def main(
@@ -93,6 +94,7 @@ def main(
     pages: int,
     precisions: tuple[Precision, ...],
     callers: tuple[int, ...],
+    batches: int,
     seconds: float,
     json_path: Path | None,
 ) -> None:
@@ -108,7 +110,7 @@ def main(
         del on_cpu
         for precision in dict.fromkeys(precisions):
             form = in_precision(bundle, precision)
-            made.append(made_by(provider, form, precision, shown, levels, usual, callers, seconds))
+            made.append(made_by(provider, form, precision, shown, levels, usual, callers, seconds, batches))
             click.echo("\n".join(lines(made[-1])))
             if json_path is not None:  # after each: the next may fail
                 write_json(json_path, {"onnxruntime": VERSION, "made": [asdict(each) for each in made]})

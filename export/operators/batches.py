@@ -13,6 +13,7 @@ from onnx import TensorProto, helper, shape_inference
 
 from lightpage.export.batched import PAGES
 from lightpage.export.graph import FRAME_INPUTS
+from lightpage.runtime.model.decoding.batch_graph import SHIFT
 
 _FREE = frozenset(["Reshape", "Squeeze", "Unsqueeze", "Flatten", "Identity", "Constant", "Shape"])
 """Operators that move nothing."""
@@ -59,7 +60,7 @@ class BatchFile:
             self._types[value.name] = kind.elem_type, tuple(axis.dim_value for axis in kind.shape.dim)
         for tensor in graph.initializer:
             self._types[tensor.name] = tensor.data_type, tuple(tensor.dims)
-        self.varying = set(FRAME_INPUTS)
+        self.varying = {*FRAME_INPUTS, SHIFT}
         """Tensors that differ from page to page."""
         for node in graph.node:
             if node.op_type != "Shape" and self.varying.intersection(node.input):
@@ -87,10 +88,14 @@ class BatchFile:
         nodes = (node for node in self.model.graph.node if node.op_type.startswith("Reduce"))
         return [node.name for node in nodes if node.input[0] in self.varying and self._is_plane(node.input[0])]
 
-    def computed_places(self) -> list[str]:
-        """Nodes that sample at places which a batch computes, by name: they may have gone through a rounded product."""
+    def rounded_places(self) -> list[str]:
+        """Nodes that sample at places that went through a product or a convolution, by name: it may be rounded."""
+        rounded: set[str] = set()
+        for node in self.model.graph.node:
+            if node.op_type in ("MatMul", "Gemm", "Conv") or rounded.intersection(node.input):
+                rounded.update(node.output)
         nodes = (node for node in self.model.graph.node if node.op_type == "GridSample")
-        return [node.name for node in nodes if node.input[1] in self.varying]
+        return [node.name for node in nodes if node.input[1] in rounded]
 
     def wide_planes(self, page_shape: tuple[int, int]) -> list[str]:
         """Planes in float32 that neither go into the sampling nor come from it, by name.
@@ -99,7 +104,9 @@ class BatchFile:
             page_shape: of p, which is float32.
         """
         sampled = {name for node in self.model.graph.node if node.op_type == "GridSample" for name in node.output}
-        around = sampled | {node.input[0] for node in self.model.graph.node if node.op_type == "GridSample"}
+        around = sampled | {
+            name for node in self.model.graph.node if node.op_type == "GridSample" for name in node.input[:2]
+        }
         for node in reversed(self.model.graph.node):  # views of what is sampled
             if node.op_type in _FREE and around.intersection(node.output):
                 around.add(node.input[0])

@@ -22,6 +22,7 @@ from lightpage.page import modulation as modulations
 from lightpage.page.modulation import NOMINAL, Modulation
 from lightpage.progress import warn
 from lightpage.recording.frame_pair import FramePair
+from lightpage.words import brief, counted
 
 Real = NDArray[np.float64]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -93,6 +94,13 @@ class Calibration(TomlTable):
     modulation: Annotated[dict[str, Finite], _just(modulations.NAMES)] = NOMINAL.as_dict()
     modulation_deviations: Annotated[dict[str, NonNegative], _just(modulations.NAMES)] = NOMINAL.as_dict()
     goodness: Goodness | None = None
+
+    def __repr__(self) -> str:
+        verdict = "" if self.goodness is None else f", a {self.goodness.verdict} fit"
+        found = f"coherence {self.coherence_after:.3f}{verdict}"
+        return brief(self, f"of profile {self.profile_name}", found, f"by {counted(self.pages_used, 'page')}")
+
+    __str__ = __repr__  # pydantic's own tells a hundred numbers
 
     @field_serializer("calibrated_pages")
     def _as_list(self, pages: tuple[str, ...]) -> list[str]:

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.cli.main import RESUME_KEY
-from lightpage.cli.options import named_profile
-from lightpage.cli.paths import NewPath, OutputFile
+from lightpage.cli.options import JSON, named_profile
+from lightpage.cli.paths import NewPath
 from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError
 from lightpage.files import write_json
@@ -81,7 +81,7 @@ def _upright(camera: str) -> Decorator:
 @click.option("--keep-unlit", is_flag=True, help="Take black and saturated frames too, and tell of them.")
 @click.option("--out", required=True, type=NewPath(), help="The recording, R.h5.")
 @click.option("--force", is_flag=True, help="Overwrite a recording that exists, or pages begun with other settings.")
-@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
+@JSON
 def import_frames(out: Path, force: bool, keep_unlit: bool, json_path: Path | None, **given: Any) -> None:
     """Make a recording of frames and symbols that other programs have written.
 

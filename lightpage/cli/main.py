@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import signal
 import sys
 import threading
@@ -15,24 +16,28 @@ from types import FrameType
 from typing import Any, NoReturn, Self
 
 import click
-from click.shell_completion import shell_complete
+from click.shell_completion import CompletionItem, shell_complete
 
 from lightpage.cli.groups import help_at
+from lightpage.cli.options import alike
 from lightpage.cli.paths import check_outputs, writes_to_stdout
 from lightpage.cli.progress_bar import Bars
 from lightpage.cli.stand_ins import stand_ins
 from lightpage.cli.streams import LastingStream, take_streams
+from lightpage.cli.usage import misused
 from lightpage.errors import (
     InvalidInputError,
     LightpageError,
     LostDataError,
     MissingResultsError,
     StorageError,
+    SurroundingsError,
     TakenError,
 )
 from lightpage.failures import understood
 from lightpage.files import results_on_stdout
 from lightpage.progress import reporting
+from lightpage.systems import ENDING, LINUX_MODULES, NEEDS_LINUX
 from lightpage.temporary import settle_matplotlib
 
 GROUP = "lightpage.commands"
@@ -59,12 +64,15 @@ COMPLETE = "_LIGHTPAGE_COMPLETE"
 RUNTIME = "onnxruntime"
 """What computes pages; either of two extras brings it."""
 EXTRAS = {
-    "train": frozenset({"torch", "torchmetrics", "lightning", "tensorboard", "jinja2", "onnx", "onnxscript"}),
+    "train": frozenset({"torch", "torchmetrics", "lightning", "tensorboard", "onnx", "onnxscript"}),
+    "report": frozenset({"jinja2"}),
     "import": frozenset({"tifffile"}),
     "camera": frozenset({"harvesters", "genicam"}),
     "cluster": frozenset({"ray"}),
 }
 EXTRA_MODULES = frozenset({RUNTIME}).union(*EXTRAS.values())
+SLOW = frozenset({"h5py", "matplotlib", "scipy"})
+"""Packages that take long to import, and that no help needs."""
 
 SUMMARIES = {
     "bench": "Measure speed: inference alone, whole decode, through gRPC.",
@@ -126,16 +134,26 @@ class LazyGroup(click.Group):
         """
         if cmd_name not in self.points:
             return None
+        if ctx.resilient_parsing:  # a shell asks what may follow, and somebody waits
+            with stand_ins(LINUX_MODULES), stand_ins(EXTRA_MODULES | SLOW, even_installed=True):
+                found: click.Command = self.points[cmd_name].load()
+            return found
         try:
             command = self.points[cmd_name].load()
         except ModuleNotFoundError as error:
             if not ctx.meta.get(HELP_KEY):
                 raise missing(f"lightpage {cmd_name}", error) from error
-            with stand_ins(EXTRA_MODULES):
+            with stand_ins(EXTRA_MODULES | LINUX_MODULES):
                 command = self.points[cmd_name].load()
         if not isinstance(command, click.Command):
             raise LightpageError(f"command {cmd_name}", type(command).__name__, "a click command")
         return _checked(command)
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        """Return what may follow, without importing a command."""
+        names = [name for name in self.list_commands(ctx) if name.startswith(incomplete)]
+        options = click.Command.shell_complete(self, ctx, incomplete)
+        return [*(CompletionItem(name, help=SUMMARIES.get(name)) for name in names), *options]
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the overview without importing a command."""
@@ -147,6 +165,8 @@ class LazyGroup(click.Group):
 
 def _checked(command: click.Command) -> click.Command:
     """The command, which sees to it that it overwrites nothing that it reads, and what it may print on stdout."""
+    for param in command.params:
+        alike(param)
     checked, run_it = copy(command), command.callback
     if isinstance(checked, click.Group):
         checked.commands = {name: _checked(each) for name, each in checked.commands.items()}
@@ -167,6 +187,8 @@ def _checked(command: click.Command) -> click.Command:
 def missing(subject: str, error: ModuleNotFoundError) -> LightpageError:
     """The error that says which extra to install for a module that is not there."""
     top = (error.name or "").partition(".")[0]
+    if top in LINUX_MODULES:
+        return SurroundingsError(subject, f"{platform.system()} without Python's module {top}", NEEDS_LINUX)
     if top == RUNTIME:
         expected = "the extra cpu, or the extra gpu on a machine with an NVIDIA GPU: pip install 'lightpage[cpu]'"
         return LightpageError(subject, f"no module {top}", expected)
@@ -222,13 +244,15 @@ def run(command: click.Command, arguments: Sequence[str] | None = None, name: st
             command.invoke(ctx)
     except click.exceptions.Exit as end:
         return end.exit_code
+    except click.UsageError as error:
+        return _fail(misused(error))
     except click.ClickException as error:
         error.show()
         return error.exit_code
     except LightpageError as error:
         return _fail(error)
     except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] not in EXTRA_MODULES:
+        if (error.name or "").partition(".")[0] not in EXTRA_MODULES | LINUX_MODULES:
             raise
         return _fail(missing("lightpage", error))
     except (KeyboardInterrupt, click.Abort):
@@ -255,7 +279,7 @@ class _Termination:
     def __enter__(self) -> Self:
         self._before: dict[int, Any] = {}
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGTERM, signal.SIGHUP):
+            for number in ENDING:
                 if signal.getsignal(number) != signal.SIG_IGN:
                     self._before[number] = signal.signal(number, self._interrupt)
         return self
@@ -266,8 +290,8 @@ class _Termination:
 
     def _interrupt(self, number: int, _: FrameType | None) -> NoReturn:
         self.came = number
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # it may come with SIGTERM, and is not impatience
+        for other in ENDING:  # a hangup may come with SIGTERM, and is not impatience
+            signal.signal(other, signal.SIG_DFL if other == signal.SIGTERM else signal.SIG_IGN)
         raise KeyboardInterrupt
 
 

@@ -1,13 +1,38 @@
-"""Types of command-line options that more than one command has; those that name files are in `lightpage.files`."""
+"""Parts that options of several commands share: `--json`, types, and what stands for their values in help."""
 
 from __future__ import annotations
 
 import math
+import os
+from copy import copy
 from typing import Any
 
 import click
 
+from lightpage.cli.paths import NewPath, OutputFile, OutputFolder
 from lightpage.device.profile import Profile, load_profile
+from lightpage.errors import InvalidInputError
+
+JSON = click.option(
+    "--json", "json_path", type=OutputFile(), help="Write the figures to this file as JSON; - is stdout."
+)
+"""Option of every command that reports something; the command's argument is `json_path`."""
+
+_NAMED = {
+    "--address": "HOST:PORT",
+    "--bundle": "BUNDLE",
+    "--health-address": "HOST:PORT",
+    "--like": "PROFILE",
+    "--metrics-host": "HOST",
+    "--name": "NAME",
+    "--pixel-format": "FORMAT",
+    "--profile": "PROFILE",
+    "--provider": "PROVIDER",
+    "--recording": "RECORDING",
+    "--source": "SOURCE",
+    "--version": "VERSION",
+}
+"""Stand-ins for the value of an option of this name, whichever command has it."""
 
 
 class FiniteRange(click.FloatRange):
@@ -19,6 +44,47 @@ class FiniteRange(click.FloatRange):
         if not math.isfinite(number):
             self.fail(f"{value} is not a finite number.", param, ctx)
         return number
+
+
+class _NamedPath(click.Path):
+    """A path that is named: an empty one would be the working folder."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the path.
+
+        Raises:
+            InvalidInputError: it is empty.
+        """
+        if not os.fspath(value):
+            what = "a folder" if not self.file_okay else "a path"
+            raise InvalidInputError(param.opts[0] if param is not None else "path", "an empty name", what)
+        return super().convert(value, param, ctx)
+
+
+def alike(param: click.Parameter) -> None:
+    """Have a parameter of a command show its value as others do, and refuse an empty path."""
+    if type(param.type) is click.Path:
+        param.type = copy(param.type)
+        param.type.__class__ = _NamedPath
+    if isinstance(param, click.Option) and not param.is_flag:
+        param.metavar = _NAMED.get(param.opts[0]) or param.metavar or _metavar(param.type)
+
+
+def _metavar(kind: click.ParamType[Any]) -> str | None:
+    match kind:
+        case click.IntRange() | click.types.IntParamType():
+            return "N"
+        case click.FloatRange() | click.types.FloatParamType():
+            return "X"
+        case OutputFile():
+            return "FILE"
+        case OutputFolder():
+            return "FOLDER"
+        case NewPath():
+            return "PATH"
+        case click.Path():
+            return "FILE" if kind.file_okay else "FOLDER"
+    return None  # choices show themselves
 
 
 profile_option = click.option(

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,8 +14,13 @@ from lightpage.errors import InvalidInputError
 from lightpage.failures import os_failure
 from lightpage.files import STDOUT, is_special, new_file
 
+if TYPE_CHECKING:
+    _PathType = click.ParamType[Path]
+else:
+    _PathType = click.ParamType  # earlier versions of click have no type behind it
 
-class NewPath(click.ParamType[Path]):
+
+class NewPath(_PathType):
     """An option that names a new file or folder: known before the work begins to be one that can be made."""
 
     name = "path"
@@ -35,7 +40,7 @@ class NewPath(click.ParamType[Path]):
         return path
 
 
-class OutputFile(click.ParamType[Path]):
+class OutputFile(_PathType):
     """An option that names a file to write: known before the work begins to be one that `replace_text` can write.
 
     `--json` may name `STDOUT`.
@@ -59,7 +64,7 @@ class OutputFile(click.ParamType[Path]):
         return path
 
 
-class OutputFolder(click.ParamType[Path]):
+class OutputFolder(_PathType):
     """An option that names the folder that a command works in, there or yet to be made."""
 
     name = "folder"

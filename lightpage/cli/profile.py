@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 
 from lightpage.cli.groups import Group
+from lightpage.cli.options import JSON
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import Profile, load_profile
 from lightpage.device.profile_keys import commented_toml, key_table
@@ -19,7 +20,6 @@ from lightpage.recording.reader import Recording
 from lightpage.waves.consequences import Consequences, consequences
 from lightpage.waves.grid import check_camera
 
-_JSON = click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 _NAME = click.argument("name", metavar="PROFILE")
 
 
@@ -48,7 +48,7 @@ def keys() -> None:
 
 @profile.command()
 @_NAME
-@_JSON
+@JSON
 def show(name: str, json_path: Path | None) -> None:
     """Show a profile, and what follows from it."""
     found = load_profile(name)
@@ -59,7 +59,7 @@ def show(name: str, json_path: Path | None) -> None:
 @profile.command()
 @_NAME
 @click.option("--recording", type=click.Path(path_type=Path), help="Whether it fits these frames too, R.h5.")
-@_JSON
+@JSON
 def check(name: str, recording: Path | None, json_path: Path | None) -> None:
     """Check a profile: its keys, whether its optics can be read, and what may cost information.
 

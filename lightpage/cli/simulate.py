@@ -7,10 +7,11 @@ from pathlib import Path
 
 import click
 
-from lightpage.cli.options import named_profile
+from lightpage.cli.options import JSON, named_profile
 from lightpage.device.profile import Profile
 from lightpage.device.state import Device, load_device
 from lightpage.errors import InvalidInputError
+from lightpage.files import write_json
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 from lightpage.progress import note
 from lightpage.recording.pages import Pages
@@ -43,6 +44,7 @@ from lightpage.simulator.recording_job import RecordingJob
 @click.option("--set", "settings", multiple=True, metavar="TABLE.KEY=VALUE", help="Change one number of that state.")
 @click.option("--truth/--no-truth", default=True, help="Keep what only a simulator knows beside the pages.")
 @click.option("--force", is_flag=True, help="Overwrite a recording that exists, or pages begun with other settings.")
+@JSON
 def simulate(
     profile_name: str | None,
     pages: int | None,
@@ -54,6 +56,7 @@ def simulate(
     settings: tuple[str, ...],
     truth: bool,
     force: bool,
+    json_path: Path | None,
 ) -> None:
     """Record pages of a simulated device.
 
@@ -80,7 +83,10 @@ def simulate(
         device = _true_device(profile, device_file, settings)
         job = RecordingJob(profile, device, many, seed, truth, out, written)
         job.claim(force)
-        job.run(pages or len(written or ()))
+        count = pages or len(written or ())
+        job.run(count)
+    made = {"recording": str(out), "pages": count, "levels": many, "seed": seed, "profile": profile.name}
+    write_json(json_path, made)
 
 
 def _true_device(profile: Profile, device_file: str | None, settings: tuple[str, ...]) -> Device:

@@ -1,4 +1,4 @@
-"""Stand-ins for packages that are not installed, with which a command is imported to show its help and nothing else."""
+"""Stand-ins for packages with which a command is imported to show its help, or what may follow, and nothing else."""
 
 from __future__ import annotations
 
@@ -75,9 +75,15 @@ def _is_installed(package: str) -> bool:
 
 
 @contextmanager
-def stand_ins(packages: Set[str]) -> Iterator[None]:
-    """Have packages that are not installed replaced while the `with` statement lasts; what it imported is forgotten."""
-    before, finder = set(sys.modules), _Finder({package for package in packages if not _is_installed(package)})
+def stand_ins(packages: Set[str], *, even_installed: bool = False) -> Iterator[None]:
+    """Have packages replaced while the `with` statement lasts; what it imported is forgotten.
+
+    Args:
+        packages: names.
+        even_installed: whether those too that are installed: torch takes seconds to import.
+    """
+    replaced = packages if even_installed else {package for package in packages if not _is_installed(package)}
+    before, finder = set(sys.modules), _Finder(replaced)
     sys.meta_path.insert(0, finder)
     try:
         yield

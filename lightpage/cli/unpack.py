@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from lightpage.cli.paths import NewPath, OutputFile
+from lightpage.cli.options import JSON
+from lightpage.cli.paths import NewPath
 from lightpage.errors import InvalidInputError
 from lightpage.files import write_json
 from lightpage.foreign.unpacking import Form
@@ -20,7 +21,7 @@ from lightpage.recording.reader import Recording
 @click.option(
     "--form", type=click.Choice([each.value for each in Form]), default="tiff", show_default=True, help="Of the files."
 )
-@click.option("--json", "json_path", type=OutputFile(), help="Write the names of the files to this file.")
+@JSON
 def unpack(recording: Path, out: Path, form: str, json_path: Path | None) -> None:
     """Write frames, reference frames and symbols of a recording as TIFF, .npy, PNG, .mat (7.3) or HDF5.
 

@@ -6,15 +6,18 @@ group is the sum over its data pages j of data[j] / ((k + i) xor j), a Cauchy ma
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import lru_cache
-from typing import Any
+from collections.abc import Mapping, Sequence
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
 
 from lightpage.errors import InvalidInputError
 
-_FRAGMENT_HEADER = 80
-"""Bytes that the library puts before each fragment. They follow from the sizes and stay off the page."""
 MOST_GROUP_PAGES = 255
+_POLYNOMIAL = 0x11D
+
+_Bytes = NDArray[np.uint8]
 
 
 def check_group(data_pages: int, parity_pages: int) -> None:
@@ -31,14 +34,6 @@ def check_group(data_pages: int, parity_pages: int) -> None:
         )
 
 
-@lru_cache(8)
-def _coder(data_pages: int, parity_pages: int) -> Any:
-    from pyeclib.ec_iface import ECDriver
-
-    # not isa_l_rs_vand, which cannot restore some patterns of as many losses as there are parity pages
-    return ECDriver(k=data_pages, m=parity_pages, ec_type="isa_l_rs_cauchy")
-
-
 def parity_of(data: list[bytes], parity_pages: int) -> list[bytes]:
     """Parity of a group's data pages, all of one length.
 
@@ -49,14 +44,10 @@ def parity_of(data: list[bytes], parity_pages: int) -> list[bytes]:
     check_group(len(data), parity_pages)
     if parity_pages == 0:
         return []
-    fragments = _coder(len(data), parity_pages).encode(b"".join(data))
-    return [fragment[_FRAGMENT_HEADER:][: len(data[0])] for fragment in fragments[len(data) :]]
-
-
-@lru_cache(8)
-def _fragment_headers(data_pages: int, parity_pages: int, size: int) -> tuple[bytes, ...]:
-    fragments = _coder(data_pages, parity_pages).encode(bytes(data_pages * size))
-    return tuple(fragment[:_FRAGMENT_HEADER] for fragment in fragments)
+    coefficients = _coefficients(range(parity_pages), range(len(data)), len(data))
+    parity = [np.zeros(len(data[0]), np.uint8) for _ in range(parity_pages)]
+    _add(parity, coefficients, [np.frombuffer(page, np.uint8) for page in data])
+    return [page.tobytes() for page in parity]
 
 
 def restore(pages: Mapping[int, bytes], data_pages: int, parity_pages: int) -> list[bytes] | None:
@@ -72,7 +63,52 @@ def restore(pages: Mapping[int, bytes], data_pages: int, parity_pages: int) -> l
         return [pages[place] for place in range(data_pages)]
     if len(pages) < data_pages or parity_pages == 0:
         return None
-    size = len(next(iter(pages.values())))
-    headers = _fragment_headers(data_pages, parity_pages, size)
-    whole = _coder(data_pages, parity_pages).decode([headers[place] + page for place, page in pages.items()])
-    return [whole[start : start + size] for start in range(0, data_pages * size, size)]
+    found = {place: np.frombuffer(page, np.uint8) for place, page in pages.items()}
+    lost = [place for place in range(data_pages) if place not in found]
+    known = [place for place in range(data_pages) if place in found]
+    parity = [place for place in found if place >= data_pages][: len(lost)]
+    rows = [place - data_pages for place in parity]
+    of_lost = [found[place].copy() for place in parity]
+    _add(of_lost, _coefficients(rows, known, data_pages), [found[place] for place in known])
+    restored = [np.zeros_like(page) for page in of_lost]
+    _add(restored, _inverse(_coefficients(rows, lost, data_pages)), of_lost)
+    return [pages[place] if place in pages else restored[lost.index(place)].tobytes() for place in range(data_pages)]
+
+
+@cache
+def _products() -> _Bytes:
+    """Return the products of all pairs of elements of the field, [256, 256]."""
+    powers, logarithms, power = np.empty(510, np.uint8), np.zeros(256, np.intp), 1
+    for exponent in range(255):
+        powers[exponent] = powers[exponent + 255] = power
+        logarithms[power] = exponent
+        power = power << 1 ^ (_POLYNOMIAL if power & 0x80 else 0)
+    products: _Bytes = powers[logarithms[:, None] + logarithms]
+    products[0] = products[:, 0] = 0
+    return products
+
+
+def _coefficients(parity: Sequence[int], data: Sequence[int], data_pages: int) -> _Bytes:
+    """Return the coefficients of data pages in parity pages, [parity, data]."""
+    inverses = np.argmax(_products() == 1, axis=1).astype(np.uint8)
+    matrix: _Bytes = inverses[(data_pages + np.array(parity, np.intp))[:, None] ^ np.array(data, np.intp)]
+    return matrix
+
+
+def _add(sums: Sequence[_Bytes], coefficients: _Bytes, pages: Sequence[_Bytes]) -> None:
+    """Add pages to sums, each times the coefficient of its column in the row of the sum."""
+    for total, row in zip(sums, coefficients, strict=True):
+        for coefficient, page in zip(row, pages, strict=True):
+            total ^= _products()[coefficient][page]
+
+
+def _inverse(matrix: _Bytes) -> _Bytes:
+    """Return the inverse of a square part of the Cauchy matrix; all parts have one, so no pivot is zero."""
+    size, products = len(matrix), _products()
+    work = np.concatenate([matrix, np.eye(size, dtype=np.uint8)], axis=1)
+    for place in range(size):
+        work[place] = products[np.argmax(products[work[place, place]] == 1)][work[place]]
+        factors = work[:, place].copy()
+        factors[place] = 0
+        work ^= products[factors[:, None], work[place]]
+    return work[:, size:]

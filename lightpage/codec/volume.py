@@ -7,7 +7,7 @@ g. Data pages beyond the file's end have numbers but are not written; they count
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from io import SEEK_END
 from typing import IO
@@ -81,6 +81,17 @@ class Volume:
         first = group * self.group_pages
         data = range(first, first + self.data_in(group))
         return [*data, *range(first + self.data_pages, first + self.group_pages)]
+
+    def bytes_of(self, numbers: Iterable[int]) -> list[tuple[int, int]]:
+        """Return the bytes of the file that data pages hold: first, and behind the last; neighbours together."""
+        spans: list[tuple[int, int]] = []
+        for number in sorted(numbers):
+            group, place = divmod(number, self.group_pages)
+            start = (group * self.data_pages + place) * self.page_bytes
+            end = min(start + self.page_bytes, self.file_bytes)
+            begin = spans.pop()[0] if spans and spans[-1][1] == start else start
+            spans.append((begin, end))
+        return spans
 
     @property
     def pages(self) -> int:

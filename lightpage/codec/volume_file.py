@@ -16,6 +16,7 @@ from lightpage.codec.volume import Volume, restore_group
 from lightpage.errors import InvalidInputError, LostDataError
 from lightpage.failures import os_failure
 from lightpage.files import lock, move_into_place
+from lightpage.systems import open_file
 
 MOST_VOLUMES = 16
 """Collected at once: each has a file of its own on the disk."""
@@ -58,7 +59,7 @@ class VolumeFile:
         self.repeated = 0
         """Pages that came again, with the same bytes."""
         try:
-            self._file = os.fdopen(os.open(self._partial, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666), "r+b")
+            self._file = os.fdopen(open_file(self._partial), "r+b")
         except OSError as error:
             raise os_failure(f"file {self._partial}", error, "a file that can be written") from None
         try:

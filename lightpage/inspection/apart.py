@@ -9,6 +9,7 @@ from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError, WorkerError
 from lightpage.helper_process import Helper, HelperProcess, same_packages
 from lightpage.inspection.finding import Finding, Picture
+from lightpage.systems import INHERITS_SOCKETS
 
 LONGEST_S = 60.0
 """Time that looking at a file may take: it reads samples, and a share may be slow."""
@@ -49,6 +50,8 @@ def look_apart(
         InvalidInputError: it is nothing that is known here, or reading it crashes or takes too long.
         StorageError, SurroundingsError: it cannot be read.
     """
+    if not INHERITS_SOCKETS:  # then a damaged file may end this process
+        return Inspector().look(path, profile, drawn)
     process = HelperProcess(f"{__name__}:Inspector", subject=f"file {path}", environment=same_packages(1))
     try:
         found, pictures = process.ask("look", path, profile, drawn, timeout_s=longest_s)

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from lightpage.cli.main import EXIT_ERROR
-from lightpage.cli.options import named_profile
+from lightpage.cli.options import JSON, named_profile
 from lightpage.cli.paths import OutputFile
 from lightpage.files import write_json
 from lightpage.inspection.apart import look_apart
@@ -19,7 +19,7 @@ from lightpage.inspection.finding import Finding, printable
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option("--profile", "profile_name", metavar="P", help="Whether it fits this device, and not only its own.")
 @click.option("--picture", type=OutputFile(), help="Draw frames, references, fringes, a page and exposure to this PNG.")
-@click.option("--json", "json_path", type=OutputFile(), help="Write what was found to this file.")
+@JSON
 def inspect(file: Path, profile_name: str | None, picture: Path | None, json_path: Path | None) -> None:
     """Say what FILE is, what is wrong with it, and what can be done with it next.
 

@@ -13,6 +13,7 @@ from lightpage.errors import PageError
 from lightpage.page.levels import Levels
 from lightpage.page.symbols import pilot_mask, pilot_symbols, symbol_phases
 from lightpage.von_mises import information, mean_resultant
+from lightpage.words import brief, sides
 
 _CREDIT = 20.0
 """Pilots that count for the decoder before any is seen: noise of 54 pilots then costs under 0.01 bit a symbol."""
@@ -42,7 +43,7 @@ _NOTHING = 1e-9
 """Below it a sum of weights, or a mean square of radians, is rounding."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Pilots:
     """Known symbols of a page.
 
@@ -53,6 +54,9 @@ class Pilots:
 
     mask: NDArray[np.bool_]
     phases: NDArray[np.float64]
+
+    def __repr__(self) -> str:
+        return brief(self, f"{self.phases.size} of {sides(self.mask.shape)} symbols")
 
     def __post_init__(self) -> None:
         """Check that there is one phase a pilot.

@@ -8,10 +8,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.words import brief, sides
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class FramePair:
     """The two frames of one page, camera counts [row, column]."""
 
     in_phase: NDArray[np.integer[Any]]
     quadrature: NDArray[np.integer[Any]]
+
+    def __repr__(self) -> str:
+        return brief(self, *(f"{name} {_counts(frame)}" for name, frame in vars(self).items()))
+
+
+def _counts(frame: NDArray[np.integer[Any]]) -> str:
+    spread = f" of {frame.min()} to {frame.max()}" if frame.size else ""
+    return f"{sides(frame.shape)} {frame.dtype}{spread}"

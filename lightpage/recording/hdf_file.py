@@ -14,6 +14,7 @@ from lightpage.errors import RecordingError
 from lightpage.failures import os_failure
 from lightpage.files import lock
 from lightpage.recording.hdf5 import retried
+from lightpage.systems import open_file
 
 
 def open_to_write(
@@ -50,7 +51,7 @@ class HdfFile(FileIO):
     """
 
     def __init__(self, path: Path, *, keep: bool = False) -> None:
-        super().__init__(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666), "r+")
+        super().__init__(open_file(path), "r+")
         self._error: OSError | None = None
         self._before: list[tuple[int, bytes]] = []
         """Where the file has been overwritten since the last `check`, and what was there."""
@@ -107,11 +108,21 @@ class HdfFile(FileIO):
     def _keep(self, start: int, size: int) -> None:
         size = min(size, self._size - start)
         if size > 0 and self._error is None:
-            self._before.append((start, retried(lambda: os.pread(self.fileno(), size, start))))
+            place = self.tell()
+            self._before.append((start, retried(partial(self._read_at, start, size))))
+            self.seek(place)
+
+    def _read_at(self, start: int, size: int) -> bytes:
+        os.lseek(self.fileno(), start, os.SEEK_SET)
+        return os.read(self.fileno(), size)
+
+    def _write_at(self, start: int, data: bytes) -> None:
+        os.lseek(self.fileno(), start, os.SEEK_SET)
+        os.write(self.fileno(), data)
 
     def _fail(self, error: OSError) -> None:
         self._error = error
         with suppress(OSError):  # it may fail on; then HDF5 says whether the file can be gone on with
             for start, data in reversed(self._before):
-                retried(partial(os.pwrite, self.fileno(), data, start))
+                retried(partial(self._write_at, start, data))
             os.ftruncate(self.fileno(), self._size)

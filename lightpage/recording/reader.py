@@ -11,6 +11,7 @@ Datasets: `in_phase` and `quadrature` [page, row, column], `reference_in_phase` 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,10 +41,13 @@ from lightpage.recording.layout import (
     hash_frames,
 )
 from lightpage.recording.stored import ArrayFile
+from lightpage.words import brief, counted, sides
 
 
 class Recording(AbstractContextManager["Recording"]):
     """A recording opened for reading and checked; use it in a `with` statement, or close it.
+
+    `len` tells its pages, and a `for` loop yields their frame pairs in order.
 
     Attributes:
         path: of the file.
@@ -84,6 +88,21 @@ class Recording(AbstractContextManager["Recording"]):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def __len__(self) -> int:
+        return self.pages
+
+    def __iter__(self) -> Iterator[FramePair]:
+        return map(self.frames, range(self.pages))
+
+    def __repr__(self) -> str:
+        page = "" if self.page_shape is None else f" of {sides(self.page_shape)} symbols"
+        return brief(
+            self,
+            str(self.path),
+            f"{counted(self.pages, 'page')}{page} in {self.levels} levels, {'' if self.has_symbols else 'not '}known",
+            f"frames of {sides(self.frame_shape)} pixels in {self.bit_depth} bits",
+        )
 
     def close(self) -> None:
         """Close the file; nothing can be read afterwards."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ from lightpage.failures import error_number, hdf5_failure, os_failure, short_res
 from lightpage.files import lock
 from lightpage.recording.hdf5 import retried
 from lightpage.recording.layout import FORMAT, FRAMES, SHOT_DATA, VERSION
+from lightpage.systems import open_file
 from lightpage.words import counted
 
 Symbols = Callable[[int], NDArray[np.uint8]]
@@ -152,7 +154,7 @@ def taken(partial: Path, *, remove: bool) -> bool:
     """
     subject = f"recording {partial}"
     try:
-        with partial.open("rb+") as file:
+        with os.fdopen(open_file(partial, make=False), "rb+") as file:
             lock(file.fileno(), subject)
             if remove:
                 partial.unlink()

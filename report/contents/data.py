@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.calibration.document import Calibration
-from lightpage.calibration.sampling_table import symbol_centres
 from lightpage.device.lenses import LensPrescription
 from lightpage.device.profile import Profile
 from lightpage.metrics.information import page_kilobytes
 from lightpage.metrics.measures import PageMeasures, SymbolMaps
 from lightpage.metrics.reliability import ConcentrationBin, ConfidenceBin
 from lightpage.recording.frame_pair import FramePair
-from lightpage.train.fitting.curves import Curve
-from lightpage.train.models.twin import RayTwin, TorchTwin
+
+if TYPE_CHECKING:
+    from lightpage.train.fitting.curves import Curve
 
 Real = NDArray[np.float64]
 
@@ -91,12 +92,3 @@ class ReportData:
     def summary(self) -> str:
         """Headline figure, in a few words."""
         return f"AIR {self.measures.air_bits_per_symbol:.3f} bit/symbol"
-
-
-def exit_centroids(profile: Profile, calibration: Calibration) -> Real:
-    """Return the exit centroid of each symbol in a pipe without walls, over its width, (x, y') [2, ny, nx].
-
-    Rounded, these are the symbol's zone: how often it meets the walls x and y', with the sign of the side.
-    """
-    positions = TorchTwin(RayTwin(profile)).trace(calibration.vector, symbol_centres(profile)).positions
-    return np.ascontiguousarray(positions.T.reshape(2, *profile.page_shape))

@@ -106,7 +106,7 @@ def validation_pages(run: Run, recording: Recording) -> list[int]:
 def _states(folder: Path, run: Run) -> list[PageState]:
     path = folder / "states.json"
     try:
-        kept = json.loads(path.read_text())["states"][run.pages[0] :]
+        kept = json.loads(path.read_text("utf-8"))["states"][run.pages[0] :]
         return [PageState((s["shift_px"][0], s["shift_px"][1]), s["piston_rad"]) for s in kept]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InvalidInputError(f"states {path}", error, "the states of the pages that training left there") from None

@@ -14,6 +14,7 @@ from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import PIXEL_TYPES, answer_of, array_of, member_of
 from lightpage.runtime.client.wire.status import error_from
 from lightpage.runtime.model.decoding.image_position import ImagePosition
+from lightpage.words import brief, sides
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class RemoteFrame:
     host_time_s: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class RemotePage:
     """A page that a service decoded.
 
@@ -98,6 +99,11 @@ class RemotePage:
     frames: tuple[RemoteFrame, ...] = ()
     replayed: bool = False
     level_phases: tuple[float, ...] | None = None
+
+    def __repr__(self) -> str:
+        number = [] if self.page is None else [f"number {self.page}"]
+        symbols = f"{sides(self.symbols.shape)} symbols of {self.levels} levels"
+        return brief(self, *number, symbols, f"confidence {self.confidence.mean():.3f}", f"by {self.model_version}")
 
 
 def remote_page(reply: pb.DecodeReply, read: pb.ReadPageReply | None = None) -> RemotePage:
@@ -174,7 +180,7 @@ class ServiceLimits:
     shared_bytes: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Description:
     """What a service is."""
 
@@ -197,6 +203,11 @@ class Description:
     default_levels: int
     """What `levels` 0 stands for where no user bytes are asked for."""
     limits: ServiceLimits
+
+    def __repr__(self) -> str:
+        page, frame = f"pages of {sides(self.page_shape)} symbols", f"frames of {sides(self.frame_shape)} pixels"
+        source = self.source or "no source"
+        return brief(self, f"service {self.service_version}", f"model {self.model.version}", source, page, frame)
 
 
 def description(reply: pb.DescribeReply) -> Description:

@@ -15,6 +15,7 @@ from lightpage.runtime.client.jobs import JobsClient
 from lightpage.runtime.client.models import ModelsClient
 from lightpage.runtime.client.pages import PagesClient
 from lightpage.runtime.client.wire.channel import TlsFiles
+from lightpage.words import brief
 
 CALL_S = 60.0
 """Deadline of a call where none is given."""
@@ -66,6 +67,9 @@ class LightpageClient:
         self.display = DisplayClient(self._connection)
         self.jobs = JobsClient(self._connection)
         self.models = ModelsClient(self._connection)
+
+    def __repr__(self) -> str:
+        return brief(self, self.target)
 
     def __enter__(self) -> Self:
         return self

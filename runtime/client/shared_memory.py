@@ -52,7 +52,7 @@ class SharedMemory:
     """
 
     def __init__(self, target: str, size: int) -> None:
-        if not target.startswith("unix:"):
+        if not target.startswith("unix:") or not hasattr(socket, "AF_UNIX"):
             raise InvalidInputError("target of shared memory", target, "unix:PATH: memory is shared on one machine")
         check_socket_path("socket of shared memory", memory_path(target))
         if not 0 < size < 1 << 63:

@@ -1,4 +1,4 @@
-"""Options of commands that decode: the bundle, threads, execution provider, and where TensorRT keeps its engines."""
+"""Options of commands that decode: bundle, threads, execution provider, batches, and where TensorRT keeps engines."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from typing import Any
 
 import click
 
-from lightpage.runtime.commands.provider_option import PROVIDER
+from lightpage.runtime.commands.provider_option import BATCHES, PROVIDER
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
+from lightpage.runtime.model.decoding.batches import Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.execution.providers import CPU, Provider
 
@@ -32,12 +33,20 @@ def decoder_options(command: Callable[..., Any]) -> Callable[..., Any]:
     @click.option("--bundle", default=DEFAULT, show_default=True, help="A bundle's path, or the name of a shipped one.")
     @THREADS
     @PROVIDER
+    @BATCHES
     @ENGINE_CACHE
     @functools.wraps(command)
     def with_decoder(
-        *, bundle: str, threads: int | None, provider: str | None, engine_cache: Path | None, **others: Any
+        *,
+        bundle: str,
+        threads: int | None,
+        provider: str | None,
+        batches: int | None,
+        engine_cache: Path | None,
+        **others: Any,
     ) -> Any:
         chosen = Provider.parse(CPU if provider is None else provider, engine_cache)
-        return command(load=lambda: Decoder.load(bundle_path(bundle), threads, chosen), **others)
+        batching = Batching(batches or 1)
+        return command(load=lambda: Decoder.load(bundle_path(bundle), threads, chosen, batching), **others)
 
     return with_decoder

@@ -7,9 +7,10 @@ from pathlib import Path
 import click
 import numpy as np
 
+from lightpage.cli.options import JSON
 from lightpage.cli.paths import OutputFile
 from lightpage.errors import InvalidInputError
-from lightpage.files import replace_text
+from lightpage.files import replace_text, write_json
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 from lightpage.page.symbols import symbol_phases
 from lightpage.runtime.device.modulator.lookup_table import GREYS, calibration_text, levels_text, read_table
@@ -25,8 +26,14 @@ from lightpage.runtime.device.modulator.lookup_table import GREYS, calibration_t
     type=click.Path(path_type=Path),
     help="The table with which the known pages of so many --levels were shown; without, 256 grey values were one wave.",
 )
+@JSON
 def lookup_table(
-    calibration: Path | None, bundle: str | None, out: Path, levels: int | None, in_use: Path | None
+    calibration: Path | None,
+    bundle: str | None,
+    out: Path,
+    levels: int | None,
+    in_use: Path | None,
+    json_path: Path | None,
 ) -> None:
     """Write a lookup table with which the modulator's levels are even.
 
@@ -55,3 +62,4 @@ def lookup_table(
     curve = dict(zip(greys.tolist(), modulation.phase(symbol_phases(np.arange(count), count)).tolist(), strict=True))
     text = calibration_text(curve) if levels is None else levels_text(curve, levels, f"modulator of {subject}")
     replace_text(out, text, "lookup table")
+    write_json(json_path, {"table": str(out), "of": subject, "levels": levels, "modulation": modulation.as_dict()})

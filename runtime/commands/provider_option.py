@@ -1,4 +1,4 @@
-"""The option that says what computes pages, for commands that decode, and for those that have others decode."""
+"""Options that say what computes pages, for commands that decode, and for those that have others decode."""
 
 from __future__ import annotations
 
@@ -12,4 +12,12 @@ PROVIDER = click.option(
     show_envvar=True,
     show_default=CPU,
     help=f"What computes pages: {WANTED}.",
+)
+
+BATCHES = click.option(
+    "--batches",
+    type=click.IntRange(1, 64),
+    envvar="LIGHTPAGE_BATCHES__LARGEST",
+    show_envvar=True,
+    help="Pages computed together at most, on a GPU; by default each by itself.",
 )

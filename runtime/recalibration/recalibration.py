@@ -22,6 +22,7 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import hash_frames
 from lightpage.runtime.model.bundle.bundle import Bundle, in_few_counts, npz, shows_page, write_bundle
 from lightpage.runtime.model.bundle.manifest import GOLDEN, TABLE, Manifest, Provenance, check_version
+from lightpage.runtime.model.decoding.batch_graph import with_proven_batches
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_position import ImagePosition
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
@@ -161,7 +162,8 @@ def recalibrate(
     bundle = refitted.bundle
     golden, p = _golden(refitted, held_back.pairs[0])
     files = {**bundle.files, GOLDEN: npz(in_phase=golden.in_phase, quadrature=golden.quadrature, p=p)}
-    write_bundle(out, _new_manifest(bundle.manifest, pages, version, verdict), files)
+    bundle = with_proven_batches(replace(bundle, files=files), refitted.graph)
+    write_bundle(out, _new_manifest(bundle.manifest, pages, version, verdict), bundle.files)
     return RecalibrationOutcome(
         path=out,
         version=version,
@@ -181,9 +183,13 @@ def recalibrate(
 def _golden(decoder: Decoder, pair: FramePair) -> tuple[FramePair, NDArray[np.float32]]:
     """The golden page's frames, in few counts where they still show a page, and the answer to them."""
     manifest = decoder.bundle.manifest
-    coarse, answer, limit = in_few_counts(pair, manifest.camera_bit_depth), decoder.infer(pair), manifest.residual_limit
+    coarse, answer, limit = (
+        in_few_counts(pair, manifest.camera_bit_depth),
+        decoder.infer(pair, alone=True),
+        manifest.residual_limit,
+    )
     try:
-        to_coarse = decoder.infer(coarse)
+        to_coarse = decoder.infer(coarse, alone=True)
     except FrameError:
         return pair, answer.p
     if limit is not None and not shows_page(to_coarse.residual, limit):

@@ -35,7 +35,7 @@ Bytes = np.ndarray[tuple[int], np.dtype[np.uint8]]
 
 _RETRY_S = 1.0
 _UNSEEN = 2
-"""References to spare memory that nobody has a view of: the budget's, and the argument of the count itself."""
+"""References to spare memory that nobody has a view of: its name here, and the argument of the count itself."""
 
 
 @dataclass(eq=False)
@@ -243,6 +243,7 @@ class ReceiveBudget:
 
     Args:
         size: bytes.
+        spares: pairs whose memory is kept for later ones.
 
     Attributes:
         size: bytes that there are.
@@ -250,9 +251,9 @@ class ReceiveBudget:
         taken: bytes that were ever taken.
     """
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int, spares: int = 1) -> None:
         self.size, self.used, self.taken = size, 0, 0
-        self._spare: Bytes | None = None
+        self._spares: deque[Bytes] = deque(maxlen=spares)
         self._lock = threading.Lock()
 
     def take(self, count: int) -> None:
@@ -279,12 +280,14 @@ class ReceiveBudget:
         The system would have to fill new memory with zeros first, which takes as long as the pair does.
         """
         with self._lock:
-            if self._spare is not None and self._spare.size == size and sys.getrefcount(self._spare) == _UNSEEN:
-                spare, self._spare = self._spare, None
-                return spare
+            for _ in range(len(self._spares)):
+                spare = self._spares.popleft()
+                if spare.size == size and sys.getrefcount(spare) == _UNSEEN:
+                    return spare
+                self._spares.append(spare)
         return np.empty(size, np.uint8)
 
     def spare(self, memory: Bytes) -> None:
-        """Leave memory of a pair to a later one; one is kept."""
+        """Leave memory of a pair to a later one; the last ones are kept."""
         with self._lock:
-            self._spare = memory
+            self._spares.append(memory)

@@ -70,8 +70,11 @@ def assembled(settings: ServiceSettings, observer: Observer) -> Iterator[Assembl
     key = None if service.bundle_key is None else BundleKey(service.bundle_key)
     provider = Provider.parse(service.provider, service.engine_cache)
     bundle = Bundle.open(bundle_path(service.bundle), key=key)
-    base = Decoder(bundle, service.threads, provider=provider, code_threads=service.code_threads)
+    together, codes = settings.batches.batching(), service.code_threads
+    base = Decoder(bundle, service.threads, provider=provider, code_threads=codes, batching=together)
     metrics = ServiceMetrics()
+    if base.batches.largest > 1:
+        metrics.watch_batches(together.pages)
     monitor = Monitor(metrics=metrics)
     own = settings.self_calibration
     kept = KeptPages(settings.limits.kept_bytes) if own.is_on and not own.pages else None

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
+
+import numpy as np
 
 from lightpage.clock import SYSTEM, Clock
 from lightpage.codec.page_bytes import Header, Loss, PageBytes
@@ -40,6 +43,9 @@ from lightpage.runtime.service.shared_memory import SharedMemory
 from lightpage.runtime.service.stages import Stage, Stages
 
 _log = logging.getLogger(__name__)
+
+_LEAST_WAIT_S = 1e-3
+"""A page that waited for its batch, or its turn, for less is not told to have queued."""
 
 
 class Seen:
@@ -162,13 +168,16 @@ class DataPlane:
         self._source = source
         if source is not None:
             _check_source(source, models.current.decoder)
-        self.received = ReceiveBudget(self.limits.receive_bytes)
         self.shared: SharedMemory | None = None
         """Memory that clients share with the service."""
         self.heal: Callable[[Caller, str, int], bool] | None = None
         """Makes the model fit the device again and waits for that, see `SelfCalibration.heal`; None where none does."""
         self.heart = Heart(self.limits.decode_s, clock.now)
-        self.decodes = Slots(self.limits.concurrent_decodes, "decodes", self.limits.deadline_s, clock)
+        self.together = models.current.decoder.batches.largest
+        """Pages that may be computed together, 1 for none."""
+        both = 2 * self.together if self.together > 1 else 1  # a batch runs while the next one is gathered
+        self.received, slots = ReceiveBudget(self.limits.receive_bytes, both), max(self.limits.concurrent_decodes, both)
+        self.decodes = Slots(slots, "decodes", self.limits.deadline_s, clock)
         self.ranges = Slots(self.limits.concurrent_ranges, "ranges of pages", self.limits.deadline_s, clock)
         self.watches = Slots(self.limits.concurrent_watches, "watches of the display", self.limits.deadline_s, clock)
         self.uploads = Slots(1, "uploads of models", self.limits.deadline_s, clock)
@@ -197,6 +206,17 @@ class DataPlane:
     def has_source(self) -> bool:
         """Whether `read_page` can work."""
         return self._source is not None
+
+    def ahead(self, alone: int = 1) -> int:
+        """Pages of one call that are on their way at a time: so many `alone`, or else a batch and the next one.
+
+        As many at most as their frames fill half of the memory for what is received.
+        """
+        if self.together == 1:
+            return alone
+        frames = self.models.current.decoder.bundle
+        pair = 2 * math.prod(frames.profile.frame_shape) * np.dtype(frames.manifest.frame_dtype).itemsize
+        return max(alone, min(2 * self.together, self.received.size // (2 * pair)))
 
     @property
     def default_levels(self) -> int:
@@ -275,11 +295,15 @@ class DataPlane:
 
 
 def _inferred(page: DecodedPage, stages: Stages) -> None:
-    """Tell what of a decode, which has run as inference until now, was inference.
+    """Tell what of a decode, which has run as inference until now, was inference, and what was waiting.
 
     The graph may run more than once, with post-processing between: all its runs count as if they were the first part.
     """
-    stages.begin(Stage.POST_PROCESSING, page.timings.check_s + page.timings.inference_s)
+    inferred_s, waited_s = page.timings.check_s + page.timings.inference_s, page.timings.waiting_s
+    if waited_s >= _LEAST_WAIT_S:
+        stages.begin(Stage.QUEUE, inferred_s)
+        inferred_s = waited_s
+    stages.begin(Stage.POST_PROCESSING, inferred_s)
 
 
 def levels_for(decoder: Decoder, asked: int | None, usual: int, user_data: bool) -> int:

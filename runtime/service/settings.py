@@ -23,6 +23,7 @@ from lightpage.progress import warn
 from lightpage.runtime.client.wire.address import check_address, is_local
 from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.model.bundle.shipped import DEFAULT
+from lightpage.runtime.model.decoding.batches import Batching
 from lightpage.runtime.model.execution.providers import CPU, Provider
 from lightpage.runtime.service.caller import named_session
 from lightpage.runtime.service.jobs.self_calibration import SelfCalibrationSettings
@@ -98,6 +99,19 @@ class ServiceTable(SettingsTable):
         yield self.source is not None or self.pages is None, "pages", "service.source: a source that shows them"
 
 
+class BatchesTable(SettingsTable):
+    """Batches of pages that are computed together, by bundles that have a graph for it."""
+
+    largest: int = Field(1, ge=1, le=64, description="Pages computed together at most, on a GPU; 1: each by itself.")
+    longest_wait_ms: Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)] = 5.0
+    """For which a batch waits for pages whose frames are there and are being checked: it bounds what one slow caller
+    costs the others."""
+
+    def batching(self) -> Batching:
+        """Return how pages are gathered."""
+        return Batching(self.largest, self.longest_wait_ms / 1e3)
+
+
 class TlsTable(SettingsTable):
     """Certificates, PEM; all three or none. With them, callers of the service and of its console need some too."""
 
@@ -160,6 +174,7 @@ class ServiceSettings(SettingsTable):
     """The whole file."""
 
     service: ServiceTable = ServiceTable()
+    batches: BatchesTable = BatchesTable()
     tls: TlsTable = TlsTable()
     inference: InferenceTable = InferenceTable()
     metrics: MetricsTable = MetricsTable()

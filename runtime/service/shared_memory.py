@@ -15,14 +15,12 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from lightpage.errors import InvalidInputError, LightpageError, LimitError, OverloadedError
 from lightpage.runtime.client.shared_memory import GRANTED, HANDLE_BYTES, REFUSED, SIZE, WHY_BYTES
 from lightpage.runtime.client.wire.address import check_free
 
-_SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
-"""Nobody changes the size of a region any more: reading beyond the end of a shrunken one would end the service."""
 _LOOK_S = 0.1
 _PAUSE_S = 0.01
 """After trouble, so that one that lasts takes no core."""
@@ -48,7 +46,9 @@ class Region:
         self.descriptor = os.memfd_create("lightpage", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         try:
             os.ftruncate(self.descriptor, size)
-            fcntl.fcntl(self.descriptor, fcntl.F_ADD_SEALS, _SEALS)
+            # Nobody changes its size any more: reading beyond the end of a shrunken one would end the service.
+            seals = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
+            fcntl.fcntl(self.descriptor, fcntl.F_ADD_SEALS, seals)
             self._memory = mmap.mmap(self.descriptor, size, mmap.MAP_SHARED, mmap.PROT_READ)
         except BaseException:
             os.close(self.descriptor)
@@ -100,7 +100,13 @@ def unknown_region() -> InvalidInputError:
     return InvalidInputError("header.shared.region", "an unknown handle", expected)
 
 
-class _Server(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):
+if TYPE_CHECKING:
+    _UnixServer = socketserver.UnixStreamServer
+else:
+    _UnixServer = getattr(socketserver, "UnixStreamServer", object)  # Windows has none, and shows help all the same
+
+
+class _Server(socketserver.ThreadingMixIn, _UnixServer):
     """Listens for clients, each of which has a thread for as long as it is connected."""
 
     daemon_threads, block_on_close = True, False
@@ -189,10 +195,8 @@ class SharedMemory:
         """Listen.
 
         Raises:
-            InvalidInputError: the socket cannot be made, or this system has no memory to share.
+            InvalidInputError: the socket cannot be made.
         """
-        if not hasattr(os, "memfd_create"):
-            raise InvalidInputError("service.shared_memory", "a system without memfd_create", "Linux")
         check_free("socket", f"unix:{self._path}")
         try:
             self._path.unlink(missing_ok=True)  # left behind by a process that was killed

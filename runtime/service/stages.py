@@ -15,7 +15,7 @@ class Stage(StrEnum):
     RECEIVE = "receive"
     """Its frames come: from the caller, whose wait to send them counts, black level taken off; or from cameras."""
     QUEUE = "queue"
-    """It waits: for a slot, for that of a range, for pairs before it in its call, for the same request in another."""
+    """It waits: for a slot, for that of a range, for its batch, for pages before it, for its request elsewhere."""
     INFERENCE = "inference"
     """Its frames are checked, and the graph runs, every attempt counted."""
     POST_PROCESSING = "post_processing"

@@ -21,6 +21,7 @@ from lightpage.runtime.console.server import serving
 from lightpage.runtime.console.state import ConsoleState
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.under_way import UnderWay
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.models.models import Models
@@ -71,6 +72,7 @@ def shown(toy_zip: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
     monitor, models = Monitor(metrics=metrics), Models(Decoder(bundle, threads=1), store)
     plane = DataPlane(models, source, metrics=metrics, observers=[last_pages], monitor=monitor)
     metrics.watch_certificates(lambda: 2e9)
+    metrics.watch_batches(UnderWay())
     for _ in range(3):
         stages = Stages()
         read_page(plane, None, None, Caller(), stages=stages)

@@ -1,5 +1,6 @@
 """The decoder for many pages in a bundle: it reads as that for one page does, and a GPU has nothing slow to do."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,9 +9,9 @@ import pytest
 import torch
 from torch import nn
 
-from lightpage.calibration.sampling_table import sampling_table
+from lightpage.calibration.sampling_table import sampling_table, shifted
 from lightpage.device.state import Device
-from lightpage.errors import BundleError, FrameError, InvalidInputError
+from lightpage.errors import BundleError, UnconfirmedPageError
 from lightpage.export.batched import batched_onnx, traced
 from lightpage.export.graph import DecoderGraph, table_tensors
 from lightpage.export.half import deviation
@@ -21,9 +22,14 @@ from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
-from lightpage.runtime.model.bundle.manifest import BATCH, CONSTANTS
-from lightpage.runtime.model.decoding.batch_decoder import BatchDecoder
+from lightpage.runtime.archives.recordings.evaluation import evaluate
+from lightpage.runtime.model.bundle.bundle import npz
+from lightpage.runtime.model.bundle.manifest import BATCH, CONSTANTS, GOLDEN
+from lightpage.runtime.model.decoding.batch_graph import REGISTRATION, BatchGraph, Constants, with_proven_batches
+from lightpage.runtime.model.decoding.batches import Batches, Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.image_tracker import tracker_for
+from lightpage.runtime.model.decoding.page import Inference
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
 from lightpage.train.models.decoder import SymbolDecoder
@@ -42,8 +48,8 @@ def decoder(small_bundle: Path) -> Decoder:
 
 
 @pytest.fixture(scope="module")
-def batches(decoder: Decoder) -> BatchDecoder:
-    return BatchDecoder(decoder, PAGES)
+def batches(decoder: Decoder) -> BatchGraph:
+    return BatchGraph(decoder.bundle, decoder.graph, PAGES)
 
 
 @pytest.fixture(scope="module")
@@ -54,13 +60,29 @@ def shown(small_device: list[str]) -> list[tuple[FramePair, np.ndarray]]:
     return [(pair, symbols) for pair, symbols in pages if symbols is not None]
 
 
-def test_pages_of_a_batch_are_read_as_each_alone(
-    decoder: Decoder, batches: BatchDecoder, shown: list[tuple[FramePair, np.ndarray]]
+def read(batches: BatchGraph, constants: Constants, pairs: list[FramePair], shifts: np.ndarray) -> list[Inference]:
+    """Pages of one run whose images lie elsewhere by `shifts`, (x, y) of both cameras, [B, 2] pixels."""
+    buffer = batches.buffer()
+    for place, (pair, shift) in enumerate(zip(pairs, shifts, strict=True)):
+        buffer.put(place, pair, np.stack([shift, shift]).astype(np.float32))
+    return batches.run(constants, buffer, slice(0, len(pairs)))
+
+
+def test_pages_of_a_batch_are_read_as_each_alone_where_each_image_lies(
+    decoder: Decoder, batches: BatchGraph, shown: list[tuple[FramePair, np.ndarray]]
 ) -> None:
-    mask = decoder.bundle.pilot_mask
-    for (pair, symbols), found in zip(shown, batches.infer([pair for pair, _ in shown]), strict=True):
-        expected = decoder.infer(pair)
-        assert deviation(expected.p, found.p) < 0.03
+    mask, registration = decoder.bundle.pilot_mask, decoder.graph.value(REGISTRATION)
+    moved = [(0, 0), (0, 1), (-1, 0)]
+    shifts = np.array([[0, 0], [0.1, -0.2], [0.04, 0.3]]) + moved
+    rolled = [
+        FramePair(*(np.roll(frame, (y, x), (0, 1)) for frame in (pair.in_phase, pair.quadrature)))
+        for (pair, _), (x, y) in zip(shown, moved, strict=True)
+    ]
+    together = read(batches, batches.constants_of_bundle, rolled, shifts)
+    for pair, (_, symbols), shift, found in zip(rolled, shown, shifts, together, strict=True):
+        place = shifted(registration, shift)
+        expected, found = decoder.infer(pair, {REGISTRATION: place}), decoder.view.seen(found, place)
+        assert deviation(expected.p, found.p) < (0.15 if shift.any() else 0.03)
         assert found.residual == pytest.approx(expected.residual, rel=0.08)
         known = Pilots.of_symbols(mask, symbols, 256)
         pages = [decoder.post_process(each, 256, known) for each in (expected, found)]
@@ -71,42 +93,80 @@ def test_pages_of_a_batch_are_read_as_each_alone(
         assert rates[1] == pytest.approx(rates[0], abs=0.01)
 
 
-def test_fewer_pages_are_read_too_and_more_are_refused(
-    batches: BatchDecoder, shown: list[tuple[FramePair, np.ndarray]]
-) -> None:
-    pairs = [pair for pair, _ in shown]
-    alone, together = batches.infer(pairs[1:2])[0], batches.infer(pairs)[1]
-    np.testing.assert_allclose(alone.p, together.p, rtol=1e-3, atol=1e-3 * float(np.abs(together.p).max()))
-    for wrong in ([], [*pairs, pairs[0]]):
-        with pytest.raises(InvalidInputError):
-            batches.infer(wrong)
+def test_constants_serve_shifts_within_reach_and_nothing_else(decoder: Decoder, batches: BatchGraph) -> None:
+    constants, registration = batches.constants_of_bundle, decoder.graph.value(REGISTRATION)
+    np.testing.assert_allclose(constants.shift_of(shifted(registration, [2, -1])), [[2, -1]] * 2, atol=1e-4)
+    larger = registration.copy()
+    larger[0, 0, 1] += 1
+    assert constants.shift_of(larger) is None
+    assert constants.shift_of(shifted(registration, [0.02 * PROFILE.frame_shape[1], 0])) is None
 
 
-def test_a_page_that_contradicts_itself_is_refused_within_a_batch(
-    batches: BatchDecoder, shown: list[tuple[FramePair, np.ndarray]]
-) -> None:
-    right = shown[0][0]
-    with pytest.raises(FrameError):
-        batches.infer([right, FramePair(right.quadrature, right.in_phase)])
+def test_fewer_pages_are_read_as_all(batches: BatchGraph, shown: list[tuple[FramePair, np.ndarray]]) -> None:
+    pairs, constants = [pair for pair, _ in shown], batches.constants_of_bundle
+    (alone,), together = (read(batches, constants, some, np.zeros((len(some), 2))) for some in (pairs[1:2], pairs))
+    np.testing.assert_allclose(alone.p, together[1].p, rtol=1e-3, atol=1e-3 * float(np.abs(alone.p).max()))
 
 
-def test_other_numbers_in_the_table_reach_both_forms(decoder: Decoder, batches: BatchDecoder) -> None:
+def test_other_numbers_in_the_table_reach_both_forms(decoder: Decoder, batches: BatchGraph) -> None:
     drifted = Device().with_settings([f"geometry.pipe_angle_deg={Device().geometry.pipe_angle_deg + 0.15}"])
     pair = Simulator(PROFILE, drifted, seed=9).page(random_symbols(PROFILE, 256, 1, np.random.default_rng(9))[0])
     parameters = true_parameters(PROFILE, drifted)
     table = sampling_table(TorchTwin(RayTwin(PROFILE)), parameters, drifted.homodyne.turn_rad, PROFILE)
     refitted = decoder.with_table(decoder.taken(table))
-    found = BatchDecoder(refitted, PAGES, like=batches).infer([pair])[0]
-    before = batches.infer([pair])[0]
+    both = batches.constants(refitted.graph), batches.constants_of_bundle
+    found, before = (read(batches, constants, [pair], np.zeros((1, 2)))[0] for constants in both)
     expected = refitted.infer(pair)
     assert deviation(expected.p, found.p) < 0.04 < deviation(expected.p, before.p)
 
 
-def test_a_bundle_without_the_graph_is_refused_and_serves_pages(decoder: Decoder) -> None:
+def test_a_bundle_without_the_graph_is_refused(decoder: Decoder) -> None:
     files = {name: data for name, data in decoder.bundle.files.items() if name not in (BATCH, CONSTANTS)}
-    earlier = Decoder(replace(decoder.bundle, files=files))
     with pytest.raises(BundleError):
-        BatchDecoder(earlier, PAGES)
+        BatchGraph(replace(decoder.bundle, files=files), decoder.graph, PAGES)
+
+
+def test_a_graph_that_says_something_else_to_the_golden_page_is_left_out(decoder: Decoder) -> None:
+    golden = decoder.bundle.golden
+    files = decoder.bundle.files | {GOLDEN: npz(**vars(golden.pair), p=1.1 * golden.p)}
+    left = with_proven_batches(replace(decoder.bundle, files=files), decoder.graph)
+    assert files.keys() - left.files.keys() == {BATCH, CONSTANTS}
+
+
+def test_a_stream_is_read_in_batches_as_page_by_page(
+    decoder: Decoder, batches: BatchGraph, small_device: list[str]
+) -> None:
+    """The image walks, jumps before the fifth page, and the third one is not of this device."""
+    mask, lost, jump = decoder.bundle.pilot_mask, 2, 4
+    with Recording.open(small_device[3]) as recording:
+        pages = [(recording.frames(page), np.asarray(recording.symbols(page))) for page in range(7)]
+    known = [Pilots.of_symbols(mask, symbols, 256) for _, symbols in pages]
+    known[lost] = Pilots(mask, known[lost].phases[::-1])
+    pairs = [
+        FramePair(*(np.roll(frame, page >= jump, 1) for frame in (pair.in_phase, pair.quadrature)))
+        for page, (pair, _) in enumerate(pages)
+    ]
+    tracker, batching = tracker_for(decoder), Batching(PAGES)
+    gathering = Decoder(decoder.bundle, None, decoder.graph, batches=Batches(batches, decoder.graph, batching))
+    trackers, rates = (tracker, tracker.refitted(gathering)), []
+    for each, threads in zip(trackers, (1, 7), strict=True):
+        with ThreadPoolExecutor(threads) as pool:
+            read = [
+                pool.submit(each.decode, pair, 256, pilots, each.turn())
+                for pair, pilots in zip(pairs, known, strict=True)
+            ]
+        assert [page for page, one in enumerate(read) if isinstance(one.exception(), UnconfirmedPageError)] == [lost]
+        right = [(one.result(), symbols) for one, (_, symbols) in zip(read, pages, strict=True) if not one.exception()]
+        read_well = [(page.phase[~mask], page.concentration[~mask], symbols[~mask]) for page, symbols in right]
+        rates.append(np.mean([measure(*page, 256).air_bits_per_symbol for page in read_well]))
+    assert max(batching.pages.runs) > 1
+    assert rates[1] == pytest.approx(rates[0], abs=0.005)
+    with Recording.open(small_device[3]) as recording:
+        decoders = zip((decoder, gathering), trackers, strict=True)
+        both = [evaluate(one, recording, each.anew()).to_json() for one, each in decoders]
+    names = "pages", "pages_left_out", "symbol_error_rate", "air_bits_per_symbol"
+    assert [both[1][name] for name in names] == pytest.approx([both[0][name] for name in names], abs=0.01)
+    assert trackers[1].image_px == pytest.approx(trackers[0].image_px, abs=0.02)
 
 
 def graph_for_batches(preset: str) -> BatchFile:
@@ -133,7 +193,7 @@ def test_a_gpu_has_nothing_slow_to_do(preset: str, kernels: int, megabytes: floa
     file = graph_for_batches(preset)
     assert file.left_constants() == []
     assert file.reduced_planes() == []
-    assert file.computed_places() == []
+    assert file.rounded_places() == []
     assert file.wide_planes(PROFILE.page_shape) == []
     assert fallbacks(file.model.SerializeToString(), "cuda") == []
     cost = file.cost()

@@ -3,6 +3,8 @@
 import json
 import math
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +17,11 @@ from lightpage.errors import InvalidInputError, RecordingError
 from lightpage.page.levels import Levels
 from lightpage.page.symbols import pilot_mask
 from lightpage.report.command import report
-from lightpage.report.contents.data import exit_centroids
 from lightpage.report.contents.from_evaluation import report_of_evaluation
 from lightpage.report.contents.from_run import levels_of, report_of_run
 from lightpage.report.json_file import JsonFile
 from lightpage.report.tables import geometry, zones
+from lightpage.report.traced import exit_centroids
 from lightpage.runtime.commands.archives.evaluate import evaluate
 from lightpage.runtime.model.bundle.bundle import in_few_counts
 from lightpage.runtime.model.decoding.decoder import Decoder
@@ -108,6 +110,18 @@ def test_an_evaluation_and_its_maps(evaluation: Path, tmp_path: Path) -> None:
     assert np.array_equal(np.isnan(maps["air"]), pilot_mask(small_profile()))
     for name in ("air", "own_mi"):
         assert np.nanmean(maps[name]) == pytest.approx(found[f"{name}_bits_per_symbol"], abs=ROUNDING)
+
+
+def test_an_evaluation_is_shown_without_torch_all_but_what_is_traced(evaluation: Path, tmp_path: Path) -> None:
+    script = f"""
+import sys
+sys.modules.update(dict.fromkeys(["torch", "tensorboard", "lightning"]))  # as if they were not there
+from lightpage.cli.main import lightpage, run
+sys.exit(run(lightpage, ["report", {str(evaluation)!r}, "--out", {str(tmp_path / "E.html")!r}]))
+"""
+    assert subprocess.run([sys.executable, "-c", script], timeout=120).returncode == 0
+    text = (tmp_path / "E.html").read_text("utf-8")
+    assert text.count("lightpage[train]") == 2  # zones and rays
 
 
 def test_a_golden_page_comes_from_the_bundle_that_was_evaluated_or_not_at_all(

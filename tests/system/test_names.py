@@ -78,7 +78,12 @@ def test_a_wheel_has_one_name_and_is_small(tmp_path: Path) -> None:
     for name in FOLDERS:
         shutil.copytree(ROOT / name, source / name, ignore=_compiled)
     pip = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
-    subprocess.run([*pip, "--wheel-dir", str(tmp_path), "."], cwd=source, check=True, timeout=120)
+    for environment in ({}, {"CC": "/no/compiler"}):
+        command, own = [*pip, "--wheel-dir", str(tmp_path), "."], {**os.environ, **environment}
+        subprocess.run(command, cwd=source, env=own, check=True, timeout=120)
+        shutil.rmtree(source / "build")
+    (pure,) = tmp_path.glob("lightpage-*-py3-none-any.whl")  # where nothing is compiled, of every system
+    assert not [name for name in zipfile.ZipFile(pure).namelist() if name.endswith((".so", ".pyd"))]
     (wheel,) = tmp_path.glob("lightpage-*-cp311-abi3-*.whl")  # of this platform, for Python 3.11 and later
     assert wheel.stat().st_size <= 5e6
     names = zipfile.ZipFile(wheel).namelist()

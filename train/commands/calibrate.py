@@ -14,7 +14,7 @@ from lightpage.calibration.coherence import seen_share
 from lightpage.calibration.document import Calibration
 from lightpage.calibration.goodness.figure import goodness_figure
 from lightpage.calibration.known_pages import first_lit_pages, known_pages
-from lightpage.cli.options import named_profile, profile_option
+from lightpage.cli.options import JSON, named_profile, profile_option
 from lightpage.cli.paths import OutputFile
 from lightpage.cli.progress_bar import percent_bar
 from lightpage.device.profile import Profile
@@ -49,7 +49,7 @@ MAX_PAGES = 4
 @click.option(
     "--picture", type=OutputFile(), help="Draw to this PNG where the light lies that the fit does not explain."
 )
-@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
+@JSON
 def calibrate(
     profile_name: str | None,
     recording: Path,

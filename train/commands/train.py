@@ -8,8 +8,8 @@ from typing import Any
 import click
 
 from lightpage.calibration.document import Calibration, load_calibration
-from lightpage.cli.options import FiniteRange, named_profile, profile_option
-from lightpage.cli.paths import OutputFile, OutputFolder
+from lightpage.cli.options import JSON, FiniteRange, named_profile, profile_option
+from lightpage.cli.paths import OutputFolder
 from lightpage.cli.progress_bar import percent_bar
 from lightpage.device.profile import Profile
 from lightpage.errors import RecordingError
@@ -60,7 +60,7 @@ from lightpage.train.trainers.whole_run import Split, make_run, usable_pages
     show_default=True,
     help="Lightning's, of several processes; auto is ddp where there are several.",
 )
-@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
+@JSON
 def train(
     profile_name: str | None,
     recording_path: Path,

@@ -143,7 +143,7 @@ def _told(folder: Path) -> Iterator[None]:
 def _kept(folder: Path, key: str) -> tuple[int, tuple[float, float], float]:
     """Pages that an earlier call completed under the same key, the last one's shift, and the seconds that they took."""
     try:
-        state = json.loads((folder / _STATE).read_text())
+        state = json.loads((folder / _STATE).read_text("utf-8"))
         if state["key"] == key:
             shift = float(state["shift_px"][0]), float(state["shift_px"][1])
             return int(state["done"]), shift, float(state["seconds"])

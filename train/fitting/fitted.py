@@ -88,7 +88,7 @@ def fitted_curves(run: Path) -> dict[str, Curve]:
 def _kept(run: Path) -> dict[str, Any]:
     """Read the figures of a finished training, by the names of `Fitted`."""
     try:
-        kept = json.loads((run / FITTED).read_text())
+        kept = json.loads((run / FITTED).read_text("utf-8"))
         curves = {str(name): [(int(step), float(value)) for step, value in c] for name, c in kept["curves"].items()}
         return {"validation_air": float(kept["validation_air"]), "seconds": float(kept["seconds"]), "curves": curves}
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:

@@ -51,7 +51,7 @@ def page_states(
 
 def _kept(path: Path, key: str) -> tuple[list[PageState], float]:
     try:
-        kept = json.loads(path.read_text())
+        kept = json.loads(path.read_text("utf-8"))
         if kept["key"] == key:
             states = [PageState((s["shift_px"][0], s["shift_px"][1]), s["piston_rad"]) for s in kept["states"]]
             return states, float(kept["seconds"])

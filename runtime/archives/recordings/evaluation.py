@@ -20,18 +20,20 @@ from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import narrow, page_hashes
 from lightpage.recording.reader import Recording
-from lightpage.runtime.archives.recordings.read_ahead import read_ahead
+from lightpage.runtime.archives.recordings.decoding_ahead import Shown, Symbols, decoded_ahead
 from lightpage.runtime.archives.recordings.refused import RefusedPage, refusal, refused_json
 from lightpage.runtime.model.bundle.manifest import GOLDEN
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.page import DecodedPage, Timings
 from lightpage.runtime.model.decoding.tracking import Tracker
+from lightpage.runtime.model.decoding.turns import Turn
+from lightpage.words import brief, counted
 
 _MAP_DECIMALS = 4
 """Of maps in JSON: finer than the noise of any number of pages, and short enough to write."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Evaluation:
     """Figures over the data symbols of held-out pages.
 
@@ -68,6 +70,11 @@ class Evaluation:
     pages_recalibration_due: int = 0
     refused: tuple[RefusedPage, ...] = ()
     air_before_refit_bits_per_symbol: float = float("nan")
+
+    def __repr__(self) -> str:
+        air = f"AIR {self.figures.air_bits_per_symbol:.3f} bits a symbol"
+        page = f"{self.page_kb:.2f} kB a page"
+        return brief(self, f"of {self.bundle_version}", air, page, f"by {counted(self.pages, 'page')}")
 
     @property
     def page_kb(self) -> float:
@@ -144,6 +151,7 @@ def decode_unseen(
     mask: NDArray[np.bool_],
     frames: FramePair,
     symbols: NDArray[np.uint8] | None,
+    turn: Turn | None = None,
 ) -> DecodedPage | None:
     """A page of a recording, decoded by its own pilots; None where its symbols are unknown, or the bundle has seen it.
 
@@ -151,6 +159,7 @@ def decode_unseen(
         decoder, recording, tracker: see `evaluate`.
         mask: where the pilots are, see `pilots_of`.
         frames, symbols: the page.
+        turn: of it.
 
     Raises:
         InvalidInputError, LostPageError: see `Tracker.decode`.
@@ -158,7 +167,7 @@ def decode_unseen(
     if symbols is None or was_seen(decoder, frames):
         return None
     pilots = Pilots.of_symbols(mask, symbols, decoder.bundle.levels(recording.levels))
-    return tracker.decode(narrow(frames, recording.bit_depth), recording.levels, pilots)
+    return tracker.decode(narrow(frames, recording.bit_depth), recording.levels, pilots, turn)
 
 
 def unseen_pages(
@@ -178,11 +187,15 @@ def unseen_pages(
         more: errors that it takes pages for, too.
     """
     losses: tuple[type[LightpageError], ...] = (InvalidInputError, LostPageError, *more)
-    mask, shown = pilots_of(decoder, recording), read_ahead(recording.shown, range(recording.pages))
-    for index, read in track(shown, what, total=recording.pages):
+    mask = pilots_of(decoder, recording)
+
+    def decode(page: Shown, frames: FramePair, symbols: Symbols) -> DecodedPage | None:
+        return decode_unseen(decoder, recording, tracker, mask, frames, symbols, page.turn)
+
+    pages = decoded_ahead(recording, range(recording.pages), lambda: tracker, decoder.batches.largest, decode)
+    for index, result in track(pages, what, total=recording.pages):
         try:
-            frames, symbols = read.result()
-            page = decode_unseen(decoder, recording, tracker, mask, frames, symbols)
+            page, symbols = result()
         except losses as error:
             refused.append(RefusedPage.of(index, error))
             continue

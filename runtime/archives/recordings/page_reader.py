@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lightpage.codec.code import Code
 from lightpage.codec.page_bytes import LOSSES, Header, Loss, PageBytes
@@ -27,13 +25,15 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.coded_pages import air_bits
+from lightpage.runtime.archives.recordings.decoding_ahead import Shown, Symbols, decoded_ahead
 from lightpage.runtime.archives.recordings.evaluation import check_recording, pilots_of
-from lightpage.runtime.archives.recordings.read_ahead import read_ahead
 from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.page import DecodedPage
 from lightpage.runtime.model.decoding.tracking import Tracker
 from lightpage.runtime.recalibration.healing import TOGETHER, LostPages, heal
 
-Shown = tuple[FramePair, NDArray[np.uint8] | None]
+Decoded = tuple[tuple[DecodedPage, float], Symbols]
+"""A page with the seconds that it took, and its symbols where they are known."""
 Take = Callable[[int, PageBytes], Volume | None]
 
 _CURABLE = frozenset({Loss.OPTICS, Loss.HEADER, Loss.BODY, Loss.CHECKSUM})
@@ -127,9 +127,9 @@ class PageReader:
             StorageError: frames could not be read, which says nothing of the page, and it is not given up.
         """
         waiting, right, together = list[tuple[RecoveredPage, Header | None]](), None, TOGETHER
-        for index, shown in read_ahead(self._recording.shown, pages):
+        for index, result in self._decoded(pages):
             expected = self._next.header
-            page = self._read(index, shown, expected, take)
+            page = self._read(index, result, expected, take)
             if page.loss is None and waiting:  # one from before may be from before a knock
                 right = index
             if heals and page.loss in _CURABLE:
@@ -158,9 +158,9 @@ class PageReader:
             return [page for page, _ in waiting]
         following, before, found = self._next, (self._decoder, self._tracker), list[RecoveredPage]()
         self._use(healed.decoder, self._tracker.refitted(healed.decoder))
-        shown = read_ahead(self._recording.shown, [page.page for page, _ in waiting])
-        for (page, expected), (index, frames) in zip(waiting, shown, strict=True):
-            again = self._read(index, frames, expected, take)
+        decoded = self._decoded([page.page for page, _ in waiting])
+        for (page, expected), (index, result) in zip(waiting, decoded, strict=True):
+            again = self._read(index, result, expected, take)
             found.append(page if again.loss else replace(again, healed_rounds=healed.rounds))
         self._next, read = following, sum(page.loss is None for page in found)
         note(f"{read} of them are read after {healed.rounds} rounds, {healed.seconds:.0f} s")
@@ -186,12 +186,23 @@ class PageReader:
             self._tracker.image_px,
         )
 
-    def _read(self, index: int, shown: Future[Shown], expected: Header | None, take: Take) -> RecoveredPage:
+    def _decoded(self, pages: Sequence[int]) -> Iterator[tuple[int, Callable[[], Decoded]]]:
+        """Pages on their way through the optics, by the model that is in use when they are asked for."""
+
+        def decode(page: Shown, frames: FramePair, symbols: Symbols) -> tuple[DecodedPage, float]:
+            start = time.perf_counter()
+            pair = narrow(frames, self._recording.bit_depth)
+            found = page.tracker.decode(pair, self._levels.count, self._pilots, page.turn)
+            return found, time.perf_counter() - start
+
+        return decoded_ahead(self._recording, pages, lambda: self._tracker, self._decoder.batches.largest, decode)
+
+    def _read(self, index: int, result: Callable[[], Decoded], expected: Header | None, take: Take) -> RecoveredPage:
         """Read a page.
 
         Args:
             index: of it in the recording.
-            shown: its frames and, where they are known, its symbols.
+            result: gives it decoded, with its symbols where they are known.
             expected: the page of its volume that it should be.
             take: see `read`.
 
@@ -199,12 +210,10 @@ class PageReader:
             StorageError: see `read`.
         """
         try:
-            frames, symbols = shown.result()
-            start = time.perf_counter()
-            page = self._tracker.decode(narrow(frames, self._recording.bit_depth), self._levels.count, self._pilots)
+            (page, seconds), symbols = result()
             decoded = time.perf_counter()
             found = self.codec.decode(page.phase, page.concentration, expected)
-            read = time.perf_counter()
+            code_seconds = time.perf_counter() - decoded
         except (InvalidInputError, LostPageError, StorageError) as error:
             of_storage = isinstance(error, StorageError)
             if of_storage and not self._give_up:
@@ -226,8 +235,8 @@ class PageReader:
             found.failed_blocks,
             found.iterations,
             None if symbols is None else air_bits(page, symbols, ~self.codec.pilots, self._levels),
-            decoded - start,
-            read - decoded,
+            seconds,
+            code_seconds,
         )
 
 

@@ -1,32 +1,54 @@
-"""Reading a recording while its pages are decoded: disk, unpacking and transfer beside the arithmetic."""
+"""Working ahead: pages are read while others are decoded, or several are decoded at a time."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from typing import TypeVar
 
 T = TypeVar("T")
+Key = TypeVar("Key")
 
 
-def read_ahead(read: Callable[[int], T], pages: Iterable[int]) -> Generator[tuple[int, Future[T]], None, None]:
-    """Every page's number and what is read of it, in order; the next page is read while the caller works on one.
+def read_ahead(
+    read: Callable[[Key], T], pages: Iterable[Key], ahead: int = 1
+) -> Generator[tuple[Key, Future[T]], None, None]:
+    """Every page and what is read of it, in order; the next ones are read while the caller works on one.
 
-    One page is held beside the caller's, whatever a page weighs. A recording has one lock for all that is read of it,
+    So many are held beside the caller's, whatever a page weighs. A recording has one lock for all that is read of it,
     so what the caller reads of it meanwhile waits.
 
     Args:
         read: what is wanted of a page; `result()` raises what it raises.
-        pages: their numbers.
+        pages: their numbers, or whatever names them.
+        ahead: threads that read, each one page at a time.
     """
-    reader = ThreadPoolExecutor(1, "read-ahead")
-    ahead: deque[tuple[int, Future[T]]] = deque()
+    reader = ThreadPoolExecutor(ahead, "read-ahead")
+    begun: deque[tuple[Key, Future[T]]] = deque()
     try:
         for page in pages:
-            ahead.append((page, reader.submit(read, page)))
-            if len(ahead) > 1:
-                yield ahead.popleft()
-        yield from ahead
-    finally:
+            begun.append((page, reader.submit(read, page)))
+            if len(begun) > ahead:
+                yield begun.popleft()
+        while begun:
+            yield begun.popleft()
+    except BaseException:  # the caller wants no more; those that were handed out are read to the end otherwise
         reader.shutdown(cancel_futures=True)
+        raise
+    reader.shutdown()
+
+
+def beside(work: Callable[[Key], T], pages: Iterable[Key], threads: int) -> Iterator[tuple[Key, Callable[[], T]]]:
+    """Every page, in order, and what does its work: now, or, with several threads, that waits for what is done ahead.
+
+    Args:
+        work: what is done with a page.
+        pages: their numbers, or whatever names them.
+        threads: that work.
+    """
+    if threads == 1:
+        yield from ((page, partial(work, page)) for page in pages)
+    else:
+        yield from ((page, begun.result) for page, begun in read_ahead(work, pages, threads))

@@ -96,6 +96,7 @@ class Recovery:
             "pages_missing": len(self.missing),
             "pages_repeated": self.repeated,
             "lost": list(self.lost),
+            "lost_bytes": [] if volume is None else volume.bytes_of(self.lost),
             "restored": list(self.restored),
             "missing": list(self.missing),
             "other_volumes": self.foreign,

@@ -19,6 +19,7 @@ from lightpage.files import check_utf8, lock
 from lightpage.runtime.archives.run.job import Job, Source
 from lightpage.runtime.archives.run.shard import RECORD, PageRecord, ShardRecord, holds_losses
 from lightpage.runtime.archives.run.task import Operation, Plain, RecordedFile, Task
+from lightpage.systems import open_file
 
 _LOCKING = "HDF5_USE_FILE_LOCKING"
 """Variable of the environment by which HDF5, and this, are told to go without locks."""
@@ -139,7 +140,7 @@ class Ledger:
         """
         subject = f"lock {self.folder / name}"
         with os_errors(self._subject, _WRITABLE):
-            descriptor = os.open(self.folder / name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            descriptor = open_file(self.folder / name)
         try:
             if not lock(descriptor, subject, shared=shared) and os.environ.get(_LOCKING) not in ("FALSE", "0"):
                 expected = f"storage that has locks, or {_LOCKING}=FALSE where no other run is at work there"

@@ -178,7 +178,7 @@ def write_user_bytes(shard: Path, pages: Sequence[tuple[int, PageBytes]]) -> Non
         "files": np.array([list(facts) for _, _, facts, _ in told], np.uint8),
         "data": np.stack([np.frombuffer(data, np.uint8) for *_, data in told]) if told else np.zeros((0, 0), np.uint8),
     }
-    replace_file(with_end(shard, USER_BYTES), lambda file: np.savez(file, allow_pickle=False, **arrays), "shard")
+    replace_file(with_end(shard, USER_BYTES), lambda file: np.savez(file, **arrays), "shard")
 
 
 def read_user_bytes(shard: Path) -> Iterable[tuple[int, PageBytes]]:

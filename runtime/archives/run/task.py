@@ -128,6 +128,7 @@ class Choices(Plain):
         heals: whether the model is re-fitted by pages whose user bytes it does not read.
         code: of the pages whose user bytes are read; None for each recording's, or else its bundle's.
         provider: what pages are computed with.
+        batches: pages that are computed together at most.
         known_pages: that a device is recalibrated with; None for `KNOWN_PAGES`, or all of them with `fine_tuning`.
         fine_tuning: how devices are trained on after the fit of their geometry; None to fit the geometry alone.
         parts: that processes do independently of each other.
@@ -140,6 +141,7 @@ class Choices(Plain):
     heals: bool = True
     code: Code | None = None
     provider: str = CPU
+    batches: int = 1
     known_pages: int | None = None
     fine_tuning: FineTuning | None = None
     parts: int = 1

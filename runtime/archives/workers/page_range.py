@@ -7,9 +7,6 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from lightpage.codec.page_bytes import PageBytes
 from lightpage.codec.volume import Volume
 from lightpage.errors import InvalidInputError, LightpageError, LostPageError, StorageError
@@ -20,9 +17,9 @@ from lightpage.recording.decoded_file import DecodedWriter
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording
+from lightpage.runtime.archives.recordings.decoding_ahead import Shown, Symbols, decoded_ahead
 from lightpage.runtime.archives.recordings.evaluation import check_symbols, decode_unseen, pilots_of
 from lightpage.runtime.archives.recordings.page_reader import PageReader, RecoveredPage
-from lightpage.runtime.archives.recordings.read_ahead import read_ahead
 from lightpage.runtime.archives.recordings.recovery import code_of
 from lightpage.runtime.archives.run.shard import SYMBOLS, Findings, PageRecord, PageState, with_end, write_user_bytes
 from lightpage.runtime.archives.run.task import Operation, Task
@@ -31,7 +28,6 @@ from lightpage.runtime.model.decoding.page import DecodedPage
 from lightpage.runtime.model.decoding.tracking import Tracker
 
 T = TypeVar("T")
-Symbols = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -68,9 +64,9 @@ class PageRange:
         shown = self.decoder.bundle.levels(levels)
         records: list[PageRecord] = []
 
-        def decode(frames: FramePair, symbols: Symbols | None) -> DecodedPage:
+        def decode(page: Shown, frames: FramePair, symbols: Symbols) -> DecodedPage:
             pilots = self.decoder.pilots(levels, mask) if symbols is None else Pilots.of_symbols(mask, symbols, shown)
-            return self.tracker.decode(narrow(frames, self.recording.bit_depth), levels, pilots)
+            return self.tracker.decode(narrow(frames, self.recording.bit_depth), levels, pilots, page.turn)
 
         with ExitStack() as stack:
             writer = None
@@ -96,8 +92,8 @@ class PageRange:
         accumulator = Accumulator(self.decoder.bundle.levels(self.recording.levels), ~mask, len(self.task.pages))
         records: list[PageRecord] = []
 
-        def decode(frames: FramePair, symbols: Symbols | None) -> DecodedPage | None:
-            return decode_unseen(self.decoder, self.recording, self.tracker, mask, frames, symbols)
+        def decode(page: Shown, frames: FramePair, symbols: Symbols) -> DecodedPage | None:
+            return decode_unseen(self.decoder, self.recording, self.tracker, mask, frames, symbols, page.turn)
 
         for page, found, symbols in self._read(decode, records):
             if found is None or symbols is None:
@@ -123,16 +119,17 @@ class PageRange:
         return Findings(pages=tuple(sorted(records, key=lambda record: record.page)))
 
     def _read(
-        self, decode: Callable[[FramePair, Symbols | None], T], records: list[PageRecord]
-    ) -> Iterator[tuple[int, T, Symbols | None]]:
+        self, decode: Callable[[Shown, FramePair, Symbols], T], records: list[PageRecord]
+    ) -> Iterator[tuple[int, T, Symbols]]:
         """Yield number, what was decoded, and symbols of each page; those that are lost go into `records`."""
         findings: tuple[type[LightpageError], ...] = (InvalidInputError, LostPageError)
         if self.task.give_up:
             findings += (StorageError,)
-        for page, shown in read_ahead(self.recording.shown, self.task.pages):
+        together = self.decoder.batches.largest
+        pages = decoded_ahead(self.recording, self.task.pages, lambda: self.tracker, together, decode)
+        for page, result in pages:
             try:
-                frames, symbols = shown.result()
-                found = decode(frames, symbols)
+                found, symbols = result()
             except findings as error:
                 records.append(lost_page(page, error))
                 continue

@@ -16,10 +16,11 @@ from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.evaluation import check_recording
 from lightpage.runtime.archives.run.job import bundle_sha256
 from lightpage.runtime.archives.run.shard import Findings, ShardRecord
-from lightpage.runtime.archives.run.task import Done, Failed, NamedBundle, Outcome, Problem, Stamp, Step, Task
+from lightpage.runtime.archives.run.task import Choices, Done, Failed, NamedBundle, Outcome, Problem, Stamp, Step, Task
 from lightpage.runtime.archives.workers.device import recalibrated
 from lightpage.runtime.archives.workers.fine_tuning import DeepRecalibration, deep_recalibration
 from lightpage.runtime.archives.workers.page_range import PageRange, lost_page
+from lightpage.runtime.model.decoding.batches import Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.decoding.tracking import NoTracker, Tracker
@@ -45,7 +46,7 @@ class Worker:
     ) -> None:
         self._threads, self._fit, self._deep = threads, fit, deep
         self.tell: Callable[[Step], None] = lambda step: None
-        self._warm: tuple[NamedBundle, str, _Warm] | None = None
+        self._warm: tuple[NamedBundle, Choices, _Warm] | None = None
 
     def work(self, task: Task) -> Outcome:
         """Read a range and write its shard, or say why there is none.
@@ -55,7 +56,7 @@ class Worker:
         start, read_bytes = time.perf_counter(), 0
         opened = read = opening = False
         try:
-            warm = self._opened(task.bundle, task.choices.provider)
+            warm = self._opened(task.bundle, task.choices)
             opening = True
             _check_stamp(task)
             with _recording_of(task) as recording:
@@ -81,18 +82,19 @@ class Worker:
         tracker = warm.tracker.anew() if task.choices.tracking else NoTracker(warm.decoder)
         return PageRange(task, recording, warm.decoder, tracker).findings()
 
-    def _opened(self, bundle: NamedBundle, provider: str) -> _Warm:
+    def _opened(self, bundle: NamedBundle, choices: Choices) -> _Warm:
         """The decoder of a bundle; the one before it is let go first, so that there is one at a time.
 
         Raises:
             BundleError: another bundle than was named.
             ProviderError: there is no such provider here.
         """
-        if self._warm is None or self._warm[:2] != (bundle, provider):
+        provider, batching = Provider.parse(choices.provider), Batching(choices.batches)
+        if self._warm is None or self._warm[:2] != (bundle, choices):
             self._warm = None
             if (found := bundle_sha256(bundle.path)) != bundle.sha256:
                 raise BundleError(f"bundle {bundle.path}", f"SHA-256 {found}", f"{bundle.sha256}, as at the start")
-            self._warm = bundle, provider, _Warm(Decoder.load(bundle.path, self._threads, Provider.parse(provider)))
+            self._warm = bundle, choices, _Warm(Decoder.load(bundle.path, self._threads, provider, batching))
         return self._warm[2]
 
 

@@ -11,7 +11,7 @@ import click
 
 from lightpage.cli.groups import Group
 from lightpage.cli.main import RESUME_KEY
-from lightpage.cli.options import FiniteRange
+from lightpage.cli.options import JSON, FiniteRange
 from lightpage.cli.paths import OutputFile, OutputFolder
 from lightpage.clock import SYSTEM
 from lightpage.codec.code import Code, load_code
@@ -29,7 +29,7 @@ from lightpage.runtime.archives.workers.engines import LOCAL, RAY, engine_of
 from lightpage.runtime.archives.workers.fine_tuning import deep_recalibration
 from lightpage.runtime.commands.archives.bulk_metrics import check_metrics, watched
 from lightpage.runtime.commands.archives.bulk_result import Result
-from lightpage.runtime.commands.provider_option import PROVIDER
+from lightpage.runtime.commands.provider_option import BATCHES, PROVIDER
 from lightpage.runtime.model.bundle.shipped import DEFAULT
 from lightpage.runtime.model.execution.providers import Provider
 
@@ -65,12 +65,13 @@ _options = _together(
     click.option("--metrics-file", type=OutputFile(), help="Write metrics at the end, for node_exporter: *.prom."),
     click.option("--metrics-insecure", is_flag=True, help="Let other machines read the metrics, without TLS."),
     click.option("--metrics", "metrics_address", metavar="HOST:PORT", help="Show metrics there while it runs."),
-    click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file."),
+    JSON,
     click.option(
         "--part", metavar="K/N", help="Do every Nth recording or device from the Kth, K from 0; others do the rest."
     ),
     click.option("--threads", type=click.IntRange(1), help="Threads of a worker; by default its share of cores."),
     PROVIDER,
+    BATCHES,
     click.option("--workers", type=click.IntRange(1), help="How many; by default one for every two cores."),
     click.option("--address", help="With --engine ray: of the cluster, `auto` for the one that runs here."),
     click.option("--engine", type=click.Choice([LOCAL, RAY]), default=LOCAL, show_default=True, help="Who works."),

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import click
 
+from lightpage.cli.options import JSON
 from lightpage.cli.paths import NewPath, OutputFile
 from lightpage.codec.choose import HEADER, HEADROOM, bytes_without_headroom
 from lightpage.errors import BundleError, CalibrationError, InvalidInputError
@@ -45,7 +46,7 @@ _UNITS = ", ".join(f"{name} ({kind.unit})" for name, kind in KINDS.items())
     metavar="KIND AMOUNT",
     help=f"Keep as much as this drift costs, where that is more; several come together. Kinds: {_UNITS}.",
 )
-@click.option("--json", "json_path", type=OutputFile(), help="Write the choices to this file.")
+@JSON
 def code(
     load: Load,
     recording: str,

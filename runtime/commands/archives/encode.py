@@ -13,6 +13,7 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.cli.options import JSON
 from lightpage.cli.paths import OutputFile
 from lightpage.codec.code import Code, load_code
 from lightpage.codec.page_codec import PageCodec
@@ -82,7 +83,7 @@ def _opened(file: Path) -> BinaryIO:
 @click.option("--data-pages", default=DATA_PAGES, show_default=True, help="Data pages of a group.")
 @click.option("--parity-pages", default=PARITY_PAGES, show_default=True, help="Pages of a group that may be lost.")
 @click.option("--force", is_flag=True, help="Overwrite pages that exist.")
-@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
+@JSON
 def encode(
     file: Path,
     bundle: str | None,

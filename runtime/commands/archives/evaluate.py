@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from lightpage.cli.paths import OutputFile
+from lightpage.cli.options import JSON
 from lightpage.files import write_json
 from lightpage.progress import warn
 from lightpage.recording.reader import Recording
@@ -21,7 +21,7 @@ from lightpage.runtime.model.decoding.tracking import NoTracker
 @click.command()
 @decoder_options
 @click.option("--recording", required=True, type=click.Path(), help="HDF5 recording with known symbols.")
-@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
+@JSON
 @click.option("--tracking/--no-tracking", default=True, show_default=True, help="Follow the image, and find it again.")
 def evaluate(load: Load, recording: str, json_path: Path | None, tracking: bool) -> None:
     """Measure a bundle on the pages of a recording that it has not seen.

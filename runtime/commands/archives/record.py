@@ -11,6 +11,7 @@ from pathlib import Path
 import click
 
 from lightpage.cli.main import RESUME_KEY
+from lightpage.cli.options import JSON
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import Profile, load_profile
 from lightpage.errors import FrameError, InvalidInputError, LostDataError, LostPageError, LostShotError, SourceError
@@ -43,7 +44,7 @@ _SHOT_S = 30.0
 )
 @click.option("--dark/--no-dark", default=True, show_default=True, help="Take dark frames first; mend hot pixels.")
 @click.option("--force", is_flag=True, help="Overwrite a recording that exists.")
-@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
+@JSON
 def record(
     spec: str,
     pages: int | None,

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from lightpage.cli.options import JSON
 from lightpage.cli.paths import OutputFile
 from lightpage.codec.code import load_code
 from lightpage.codec.volume_file import parse_volume, ranges
@@ -28,7 +29,7 @@ from lightpage.runtime.model.decoding.tracking import NoTracker
 @click.option("--holes", is_flag=True, help="Write zeros where data are lost, in place of no file.")
 @click.option("--give-up", is_flag=True, help="Take pages that storage does not give for lost.")
 @click.option("--heal/--no-heal", default=True, show_default=True, help="Re-fit by pages that are not read.")
-@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
+@JSON
 @click.option("--tracking/--no-tracking", default=True, show_default=True, help="Follow the image, and find it again.")
 def recover(
     load: Load,
@@ -74,6 +75,7 @@ def describe(result: Recovery) -> str:
         ("healed", _healed(result)),
         ("restored", f"data pages {ranges(result.restored)}" if result.restored else restored),
         ("lost", lost),
+        ("bytes lost", ", ".join(f"{start} to {end - 1}" for start, end in figures["lost_bytes"]) or "none"),
         ("volume", "unknown" if volume is None else f"{volume.id}: {volume.file_bytes} bytes on {volume.pages} pages"),
         ("user bytes a page", f"{result.user_bytes_per_page}"),
         ("of the AIR", "symbols unknown" if share is None else f"{share:.3f} of {air:.0f} bytes"),

@@ -5,14 +5,35 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import click
+from click.core import ParameterSource
 
 from lightpage.errors import InvalidInputError
 from lightpage.runtime.client.wire.channel import TlsFiles
 
-TARGET = click.option("--target", metavar="HOST:PORT", required=True, help="The running service.")
+_Command = TypeVar("_Command", bound=Callable[..., Any])
+
+
+def target_option(*, required: bool, help: str = "The running service.") -> Callable[[_Command], _Command]:
+    """Gives a command the option that names a service, which a variable of the environment gives too."""
+    return click.option(
+        "--target",
+        metavar="HOST:PORT",
+        required=required,
+        envvar="LIGHTPAGE_CLIENT_TARGET",
+        show_envvar=True,
+        help=help,
+    )
+
+
+def from_environment(name: str) -> bool:
+    """Return whether a variable of the environment gave an argument of the command that runs."""
+    return click.get_current_context().get_parameter_source(name) is ParameterSource.ENVIRONMENT
+
+
+TARGET = target_option(required=True)
 
 _FILES = {
     "ca": "authorities that the service's certificate may come from",

@@ -13,6 +13,7 @@ import click
 import numpy as np
 
 from lightpage.cli.main import RESUME_KEY
+from lightpage.cli.options import JSON
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import parse_profile
 from lightpage.errors import InvalidInputError, LightpageError, LostPageError, RecordingError, SourceError, StorageError
@@ -47,7 +48,7 @@ _FIGURES = (
 @click.option("--pages", type=click.IntRange(1), help="How many pages; all of a recording, or one of the source.")
 @click.option("--levels", type=click.IntRange(2, 256), help="Level count; that of the recording or source by default.")
 @click.option("--out", type=OutputFile(), help="Write symbols and confidences to this HDF5 file.")
-@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
+@JSON
 def decode(
     target: str,
     tls: TlsFiles | None,

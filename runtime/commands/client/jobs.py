@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, replace
 from datetime import datetime
+from pathlib import Path
+from typing import Any
 
 import click
 
 from lightpage.cli.main import RESUME_KEY
-from lightpage.cli.options import FiniteRange
+from lightpage.cli.options import JSON, FiniteRange
 from lightpage.cli.progress_bar import percent_bar
 from lightpage.errors import InvalidInputError
+from lightpage.files import write_json
 from lightpage.runtime.client.answers import JobInfo, JobState
 from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.client.jobs import RECALIBRATION_S
@@ -31,7 +35,15 @@ from lightpage.runtime.commands.client.recalibrate import summary, table, watche
     type=FiniteRange(0, min_open=True),
     help="With --watch: seconds to wait for the end; the job goes on after them.",
 )
-def jobs(target: str, tls: TlsFiles | None, watch: str | None, cancel: str | None, timeout_s: float) -> None:
+@JSON
+def jobs(
+    target: str,
+    tls: TlsFiles | None,
+    watch: str | None,
+    cancel: str | None,
+    timeout_s: float,
+    json_path: Path | None,
+) -> None:
     """Show, follow or cancel the recalibrations of a service; without an option all that it remembers, newest first."""
     if watch is not None and cancel is not None:
         raise InvalidInputError("options", "--watch and --cancel", "one of them")
@@ -41,10 +53,18 @@ def jobs(target: str, tls: TlsFiles | None, watch: str | None, cancel: str | Non
             click.get_current_context().meta[RESUME_KEY] = again
             with percent_bar() as progress:
                 result = watched(client, watch, progress, timeout_s)
-            click.echo(table(summary(result, result.seconds)))
+            data = summary(result, result.seconds)
+            write_json(json_path, data)
+            click.echo(table(data))
         else:
             found = client.jobs.list() if cancel is None else [client.jobs.cancel(cancel)]
+            write_json(json_path, {"jobs": list(map(_figures, found))})
             click.echo("\n".join(map(_line, found)) if found else "no jobs")
+
+
+def _figures(job: JobInfo) -> dict[str, Any]:
+    """Return a job under the names that other programs read."""
+    return {**asdict(replace(job, error=None)), "error": job.error and str(job.error)}
 
 
 def _line(job: JobInfo) -> str:

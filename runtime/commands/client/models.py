@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 import click
 
 from lightpage.cli.groups import Group
+from lightpage.cli.options import JSON
+from lightpage.files import write_json
 from lightpage.runtime.client.answers import ModelInfo
 from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.client.wire.channel import TlsFiles
@@ -19,64 +22,84 @@ _VERSION = click.argument("version")
 @click.group(cls=Group, invoke_without_command=True)
 @TARGET
 @with_tls
+@JSON
 @click.pass_context
-def models(ctx: click.Context, target: str, tls: TlsFiles | None) -> None:
+def models(ctx: click.Context, target: str, tls: TlsFiles | None, json_path: Path | None) -> None:
     """List, add and change the models of a running service; without a command, list those that are loaded."""
     ctx.obj = ctx.with_resource(LightpageClient(target, tls=tls))
     if ctx.invoked_subcommand is None:
-        ctx.invoke(list_models)
+        ctx.invoke(list_models, json_path=json_path)
 
 
 @models.command("list")
 @click.option("--stored", is_flag=True, help="Those of the store too.")
+@JSON
 @click.pass_obj
-def list_models(client: LightpageClient, stored: bool) -> None:
+def list_models(client: LightpageClient, json_path: Path | None, stored: bool = False) -> None:
     """List the models; * is in service."""
-    for model in client.models.list(stored):
+    found = client.models.list(stored)
+    write_json(json_path, {"models": list(map(asdict, found))})
+    for model in found:
         click.echo(_line(model))
 
 
 @models.command()
 @click.argument("bundle", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@JSON
 @click.pass_obj
-def upload(client: LightpageClient, bundle: Path) -> None:
+def upload(client: LightpageClient, bundle: Path, json_path: Path | None) -> None:
     """Give the service a bundle, a .zip; `activate` puts it in service."""
-    click.echo(f"{client.models.upload(bundle).version} is in the store")
+    model = client.models.upload(bundle)
+    write_json(json_path, asdict(model))
+    click.echo(f"{model.version} is in the store")
 
 
 @models.command()
 @_VERSION
 @_EXPECT
+@JSON
 @click.pass_obj
-def activate(client: LightpageClient, version: str, expect: str) -> None:
+def activate(client: LightpageClient, version: str, expect: str, json_path: Path | None) -> None:
     """Put a model in service."""
-    current, before = client.models.activate(version, expect)
-    click.echo(f"{current} is in service, {before} was")
+    _changed(client.models.activate(version, expect), json_path)
 
 
 @models.command()
 @_EXPECT
+@JSON
 @click.pass_obj
-def forward(client: LightpageClient, expect: str) -> None:
+def forward(client: LightpageClient, expect: str, json_path: Path | None) -> None:
     """Undo a roll-back."""
-    current, before = client.models.roll_forward(expect)
-    click.echo(f"{current} is in service, {before} was")
+    _changed(client.models.roll_forward(expect), json_path)
 
 
 @models.command()
 @_VERSION
+@JSON
 @click.pass_obj
-def pin(client: LightpageClient, version: str) -> None:
+def pin(client: LightpageClient, version: str, json_path: Path | None) -> None:
     """See that a model is never deleted, and not replaced by the service itself."""
-    click.echo(_line(client.models.pin(version)))
+    model = client.models.pin(version)
+    write_json(json_path, asdict(model))
+    click.echo(_line(model))
 
 
 @models.command()
 @_VERSION
+@JSON
 @click.pass_obj
-def unpin(client: LightpageClient, version: str) -> None:
+def unpin(client: LightpageClient, version: str, json_path: Path | None) -> None:
     """Let go of a pinned model."""
-    click.echo(_line(client.models.pin(version, False)))
+    model = client.models.pin(version, False)
+    write_json(json_path, asdict(model))
+    click.echo(_line(model))
+
+
+def _changed(versions: tuple[str, str], json_path: Path | None) -> None:
+    """Say which model is in service now, and which was."""
+    current, before = versions
+    write_json(json_path, {"version": current, "previous_version": before})
+    click.echo(f"{current} is in service, {before} was")
 
 
 def _line(model: ModelInfo) -> str:

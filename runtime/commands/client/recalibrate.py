@@ -10,8 +10,8 @@ from pathlib import Path
 import click
 
 from lightpage.calibration.known_pages import first_lit_pages
-from lightpage.cli.options import FiniteRange
-from lightpage.cli.paths import NewPath, OutputFile
+from lightpage.cli.options import JSON, FiniteRange
+from lightpage.cli.paths import NewPath
 from lightpage.cli.progress_bar import percent_bar
 from lightpage.errors import InvalidInputError, LightpageError
 from lightpage.files import write_json
@@ -24,7 +24,7 @@ from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.client.jobs import RECALIBRATION_S
 from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.client.wire.messages import answer_of
-from lightpage.runtime.commands.client.connection import TARGET, with_tls
+from lightpage.runtime.commands.client.connection import TARGET, from_environment, target_option, with_tls
 from lightpage.runtime.model.bundle.manifest import check_version
 from lightpage.runtime.model.bundle.shipped import bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
@@ -44,7 +44,7 @@ DEFAULT_PAGES = 2
     help="Pages with known symbols: a file, or with --target and without --send a name in the service's folder.",
 )
 @click.option("--out", type=NewPath(), help="Offline: where the new bundle goes; a zip where it ends in .zip.")
-@click.option("--target", metavar="HOST:PORT", help="Recalibrate this running service instead of a bundle.")
+@target_option(required=False, help="Recalibrate this running service instead of a bundle.")
 @with_tls
 @click.option("--pages", default=DEFAULT_PAGES, show_default=True, type=click.IntRange(2), help="Known pages to use.")
 @click.option(
@@ -62,7 +62,7 @@ DEFAULT_PAGES = 2
     is_flag=True,
     help="Offline: the recording is of another device than the bundle's, its pages are of user data.",
 )
-@click.option("--json", "json_path", type=OutputFile(), help="Write the result to this file.")
+@JSON
 def recalibrate(
     bundle: str | None,
     recording: str | None,
@@ -92,6 +92,8 @@ def recalibrate(
     the pilots of the first eight pages, and then healed by the pages themselves.
     """
     start, report = time.perf_counter(), RefitReport()
+    if bundle and from_environment("target"):
+        target = None
     if target is not None:
         if bundle or out or version is not None or other_device:
             got = "with --bundle, --out, --version or --other-device"
@@ -214,8 +216,10 @@ def _offline(
 @TARGET
 @with_tls
 @click.option("--expect", metavar="VERSION", default="", help="Only if this version is in service.")
-def rollback(target: str, tls: TlsFiles | None, expect: str) -> None:
+@JSON
+def rollback(target: str, tls: TlsFiles | None, expect: str, json_path: Path | None) -> None:
     """Put a service's previous model back in service; `lightpage models forward` undoes it."""
     with LightpageClient(target, tls=tls) as client:
         current, before = client.models.roll_back(expect)
+    write_json(json_path, {"version": current, "previous_version": before})
     click.echo(f"{current} is in service again, {before} is not")

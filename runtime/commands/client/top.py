@@ -6,9 +6,7 @@ import math
 import os
 import select
 import sys
-import termios
 import time
-import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
@@ -25,6 +23,12 @@ from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.commands.client.connection import with_tls
 from lightpage.runtime.console.scrapes import WINDOW_S, Change, Scrapes, scrape
 from lightpage.runtime.service.stages import Stage
+
+try:
+    import termios
+    import tty
+except ModuleNotFoundError:  # as on Windows, where Ctrl-C ends it
+    termios = None  # type: ignore[assignment]
 
 _WIDTH = 100
 """Columns where the output is no terminal."""
@@ -193,7 +197,7 @@ def _bytes(value: float) -> str:
 def _keys() -> Iterator[Callable[[float], str]]:
     """Yields what waits up to so many seconds for keys, and tells which were pressed."""
     keyboard = sys.stdin.fileno()
-    typed = os.isatty(keyboard)
+    typed = termios is not None and os.isatty(keyboard)
     before = termios.tcgetattr(keyboard) if typed else None
 
     def pressed(seconds: float) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from lightpage.cli.paths import OutputFile
+from lightpage.cli.options import JSON
 from lightpage.codec.compiled.choice import in_use as page_code_in_use
 from lightpage.files import write_json
 from lightpage.progress import track
@@ -28,7 +28,7 @@ WARM_UP = 2
 @click.command()
 @decoder_options
 @click.option("--rounds", default=20, show_default=True, type=click.IntRange(3, 1000), help="Timed rounds.")
-@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
+@JSON
 def bench(load: Load, rounds: int, json_path: Path | None) -> None:
     """Time one page three ways in turn, so that a machine whose speed drifts does not tilt the comparison."""
     decoder = load()

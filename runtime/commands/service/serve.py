@@ -38,12 +38,14 @@ from lightpage.runtime.service.settings import (
     ServiceTable,
     service_settings,
 )
+from lightpage.systems import check_linux
 
 _log = logging.getLogger(__name__)
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 _OPTIONS: dict[str, Key] = {
     **{f"--{key.replace('_', '-')}": ("service", key) for key in ServiceTable.model_fields if key != "insecure"},
+    "--batches": ("batches", "largest"),
     **{f"--{key}": ("tls", key) for key in ("ca", "certificate", "key")},
     "--metrics-port": ("metrics", "port"),
     "--metrics-host": ("metrics", "host"),
@@ -99,6 +101,7 @@ def serve(context: click.Context, /, config: Path | None, print_config: bool, **
     if print_config:
         click.echo(effective.to_toml(), nl=False)
         return
+    check_linux("lightpage serve")
     settings = effective.settings
     settings.check_paths()
     share_freed_memory()

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Discriminator, Field, Tag, ValidationError, model_validator
 
 from lightpage.device.problems import Problem, problems_of
 from lightpage.device.profile import StrictTable, TomlTable
@@ -26,6 +26,35 @@ KEYS = "docs/cameras.md, all keys"
 
 class CameraTable(View, CameraSettings):
     """One camera, and how it sees the image."""
+
+    kind: Literal["genicam"] = "genicam"
+
+
+class PluginTable(StrictTable):
+    """A device by a driver that another package brings, an entry point.
+
+    Attributes:
+        driver: its name.
+        options: what it is to know, as it says itself.
+    """
+
+    kind: Literal["plugin"]
+    driver: Annotated[str, Field(min_length=1)]
+    options: dict[str, Any] = {}  # noqa: RUF012  # pydantic copies it
+
+
+class PluginCameraTable(View, PluginTable):
+    """Camera by such a driver, and how it sees the image."""
+
+
+def _kind_of_camera(table: object) -> object:
+    return table.get("kind", "genicam") if isinstance(table, dict) else getattr(table, "kind", "genicam")
+
+
+AnyCameraTable = Annotated[
+    Annotated[CameraTable, Tag("genicam")] | Annotated[PluginCameraTable, Tag("plugin")],
+    Discriminator(_kind_of_camera),
+]
 
 
 class PulseGeneratorTable(PulseGeneratorSettings):
@@ -106,11 +135,12 @@ class DeviceTable(StrictTable):
     profile: str
     levels: Annotated[int, Field(ge=MIN_LEVELS, le=MAX_LEVELS)] | None = None
     pages: str | None = None
-    in_phase: CameraTable
-    quadrature: CameraTable
-    trigger: Annotated[PulseGeneratorTable | SoftwareTriggerTable, Field(discriminator="kind")]
+    in_phase: AnyCameraTable
+    quadrature: AnyCameraTable
+    trigger: Annotated[PulseGeneratorTable | SoftwareTriggerTable | PluginTable, Field(discriminator="kind")]
     modulator: Annotated[
-        ScreenTable | ExternalModulatorTable | SimulatedTable | NoModulatorTable, Field(discriminator="kind")
+        ScreenTable | ExternalModulatorTable | SimulatedTable | NoModulatorTable | PluginTable,
+        Field(discriminator="kind"),
     ] = NoModulatorTable()
     beams: Annotated[
         ShuttersTable | ExternalBeamsTable | SimulatedTable | OperatorTable, Field(discriminator="kind")
@@ -121,7 +151,7 @@ class DeviceTable(StrictTable):
     @model_validator(mode="after")
     def _two_cameras(self) -> Self:
         for key in ("serial", "address"):
-            first, second = (getattr(table, key) for table in (self.in_phase, self.quadrature))
+            first, second = (getattr(table, key, None) for table in (self.in_phase, self.quadrature))
             if first is not None and first == second:
                 raise ValueError(f"{key} {first} for in_phase and for quadrature, wanted two cameras")
         return self

@@ -21,6 +21,8 @@ from lightpage.runtime.device.acquisition.camera_config import (
     ExternalModulatorTable,
     NoModulatorTable,
     OperatorTable,
+    PluginCameraTable,
+    PluginTable,
     PulseGeneratorTable,
     ScreenTable,
     ShuttersTable,
@@ -39,18 +41,28 @@ from lightpage.runtime.device.modulator.modulator import Beams, Modulator, Opera
 from lightpage.runtime.device.modulator.screen.screen import ScreenModulator
 from lightpage.runtime.device.modulator.shutters import ShutterBeams
 from lightpage.runtime.device.modulator.simulated import SimulatedModulator
+from lightpage.runtime.device.plugins import CAMERAS, MODULATORS, TRIGGERS, opened_by_driver
 from lightpage.runtime.device.trigger.pulse_generator import PulseGenerator
 from lightpage.runtime.device.trigger.trigger import SoftwareTrigger, Trigger
 
 
-def _camera(table: CameraTable, folder: Path, profile: Profile, role: str) -> Camera:
+def _camera(table: CameraTable | PluginCameraTable, place: str, folder: Path, profile: Profile, role: str) -> Camera:
+    if isinstance(table, PluginCameraTable):
+        return opened_by_driver(CAMERAS, table.driver, place, Camera, table.options, profile.frame_shape, role)
     if table.producer is None:
         return AravisCamera(table, profile.frame_shape, role)
     producer = str((folder / table.producer).resolve())
     return GenTLCamera(table.model_copy(update={"producer": producer}), profile.frame_shape, role)
 
 
-def _trigger(table: PulseGeneratorTable | SoftwareTriggerTable, folder: Path, cameras: tuple[Camera, ...]) -> Trigger:
+def _trigger(
+    table: PulseGeneratorTable | SoftwareTriggerTable | PluginTable,
+    place: str,
+    folder: Path,
+    cameras: tuple[Camera, ...],
+) -> Trigger:
+    if isinstance(table, PluginTable):
+        return opened_by_driver(TRIGGERS, table.driver, place, Trigger, table.options, cameras)
     if isinstance(table, SoftwareTriggerTable):
         return SoftwareTrigger(cameras)
     if "://" not in table.port:
@@ -58,7 +70,7 @@ def _trigger(table: PulseGeneratorTable | SoftwareTriggerTable, folder: Path, ca
     return PulseGenerator(table)
 
 
-def _modulator(table: DeviceTable, folder: Path, profile: Profile, levels: int | None) -> Modulator | None:
+def _modulator(table: DeviceTable, place: str, folder: Path, profile: Profile, levels: int | None) -> Modulator | None:
     """What shows the pages, of so many levels where that is known yet."""
     match table.modulator:
         case NoModulatorTable():
@@ -69,6 +81,8 @@ def _modulator(table: DeviceTable, folder: Path, profile: Profile, levels: int |
             return SimulatedModulator(folder / address)
         case ScreenTable() as screen:
             return ScreenModulator(screen, profile, _greys(screen, folder, levels))
+        case PluginTable(driver=driver, options=options):
+            return opened_by_driver(MODULATORS, driver, place, Modulator, options, profile)
 
 
 def _greys(table: ScreenTable, folder: Path, levels: int | None) -> Callable[[int], NDArray[np.uint8]]:
@@ -105,7 +119,7 @@ def open_camera(rest: str) -> CameraSource:
     path_text, _, query = rest.partition("?")
     asked = dict(parse_qsl(query, keep_blank_values=True))
     path = Path(path_text)
-    table, folder = load_device_table(path), path.parent
+    table, folder, place = load_device_table(path), path.parent, f"camera configuration {path}"
     profile_path = folder / table.profile
     profile = load_profile(profile_path if profile_path.is_file() else table.profile)
     if set(asked) - {"pages"}:
@@ -115,15 +129,15 @@ def open_camera(rest: str) -> CameraSource:
     with ExitStack() as stack:
         stack.callback(store.close)
         cameras = (
-            _camera(table.in_phase, folder, profile, "in-phase camera"),
-            _camera(table.quadrature, folder, profile, "quadrature camera"),
+            _camera(table.in_phase, f"{place}: in_phase", folder, profile, "in-phase camera"),
+            _camera(table.quadrature, f"{place}: quadrature", folder, profile, "quadrature camera"),
         )
-        trigger = _trigger(table.trigger, folder, cameras)
+        trigger = _trigger(table.trigger, f"{place}: trigger", folder, cameras)
         source = CameraSource(
             profile,
             cameras,
             trigger,
-            _modulator(table, folder, profile, store.levels),
+            _modulator(table, f"{place}: modulator", folder, profile, store.levels),
             _beams(table, folder, trigger, lambda text: source.operator(text)),
             store,
             table.pairing,

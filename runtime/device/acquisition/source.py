@@ -9,7 +9,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from typing import Self
 
 import numpy as np
@@ -22,6 +21,7 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import FrameInfo
 from lightpage.runtime.device.acquisition.page_store import PageStore
 from lightpage.runtime.device.modulator.modulator import Beams, Modulator
+from lightpage.runtime.device.plugins import SOURCES, driver_of, names_of
 
 SHOT_S = 10.0
 """Usual time that a shot may take."""
@@ -196,10 +196,10 @@ def open_source(spec: str) -> FrameSource:
     Raises:
         InvalidInputError: another kind, or one whose recording, profile or device does not validate.
     """
-    kinds = {point.name: point for point in entry_points(group="lightpage.sources")}
+    kinds = names_of(SOURCES)
     kind, colon, rest = spec.partition(":")
     if not (colon and rest and kind in kinds):
-        expected = f"KIND:REST, KIND being one of {', '.join(sorted(kinds))}, e.g. recording:FILE or simulator:PROFILE"
+        expected = f"KIND:REST, KIND being one of {', '.join(kinds)}, e.g. recording:FILE or simulator:PROFILE"
         raise InvalidInputError("source", repr(spec), expected)
-    opener: Callable[[str], FrameSource] = kinds[kind].load()
+    opener: Callable[[str], FrameSource] = driver_of(SOURCES, kind, f"source {spec}")
     return opener(rest)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import os
 import re
-import termios
 from collections import Counter
 from contextlib import suppress
 from typing import TYPE_CHECKING, Annotated
@@ -26,7 +25,12 @@ from lightpage.errors import LostShotError, Reason, SourceError
 if TYPE_CHECKING:
     from serial import Serial
 
-GONE = (OSError, termios.error, TypeError)
+try:
+    from termios import error as _TerminalError
+except ModuleNotFoundError:  # as on Windows
+    _TerminalError = OSError  # type: ignore[misc,assignment]
+
+GONE = (OSError, _TerminalError, TypeError)
 """What pyserial raises of a port that was unplugged: its own SerialException is an OSError, `termios.error` is none,
 and TypeError comes of a descriptor that is gone."""
 REFUSALS = {

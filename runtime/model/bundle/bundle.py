@@ -8,7 +8,7 @@ import shutil
 import tempfile
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -75,10 +75,10 @@ class Golden:
     """
 
     pair: FramePair
-    p: NDArray[np.float32]
+    p: NDArray[np.float32] = field(repr=False)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Bundle:
     """A bundle whose files match their hashes. `Decoder` checks its decoder and runs its golden page;
     `lightpage.runtime.model.execution.twin.OnnxTwin` checks the twin, where it is needed.
@@ -93,6 +93,9 @@ class Bundle:
     manifest: Manifest
     files: Mapping[str, bytes]
     digest: str
+
+    def __repr__(self) -> str:
+        return f"<Bundle {self.path}, {self.version}, of {self.manifest.created}>"
 
     @classmethod
     def open(cls, path: str | Path, key: BundleKey | None = None, signature: bytes = b"") -> Bundle:
@@ -341,10 +344,10 @@ def _coarse(frame: NDArray[np.integer[Any]], step: int) -> NDArray[np.integer[An
     return np.ascontiguousarray(rounded.repeat(_SIDE_PX, 0).repeat(_SIDE_PX, 1)[:rows, :columns])
 
 
-def npz(**arrays: NDArray[Any]) -> bytes:
+def npz(**arrays: Any) -> bytes:
     """Arrays as the bytes of a compressed .npz file, for `write_bundle`."""
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    np.savez_compressed(buffer, **arrays)
     return buffer.getvalue()
 
 

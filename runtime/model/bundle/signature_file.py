@@ -15,6 +15,9 @@ SUFFIX = ".sig"
 MOST_BYTES = 1 << 10
 """A signature is less than a hundred bytes."""
 
+_HOW = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+"""Windows has neither."""
+
 
 def signature_path(bundle: Path) -> Path:
     """Where the signature of a bundle lies."""
@@ -37,13 +40,15 @@ def read_signature(bundle: Path) -> bytes:
 
 
 def read_plain_file(path: Path | str, most_bytes: int, subject: str) -> bytes:
-    """The first bytes of a file; the kernel refuses a link, and nobody waits for whoever writes to a pipe.
+    """The first bytes of a file; a link is refused, and nobody waits for whoever writes to a pipe.
 
     Raises:
         BundleError: it is no plain file.
         OSError: it cannot be read, or is a link.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    if not _HOW and os.path.islink(path):
+        raise BundleError(subject, "a link", "a plain file")
+    descriptor = os.open(path, os.O_RDONLY | _HOW | getattr(os, "O_BINARY", 0))
     with os.fdopen(descriptor, "rb") as file:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             raise BundleError(subject, "no plain file", "a plain file")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -16,41 +15,37 @@ from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.errors import (
     BundleError,
     FrameError,
-    FramesDisagreeError,
     InvalidInputError,
     NoCodeError,
-    ProviderError,
-    SurroundingsError,
     raised_as,
 )
-from lightpage.failures import short_resource
 from lightpage.metrics.information import decide_with_confidence
 from lightpage.page.levels import MAX_LEVELS, check_levels
 from lightpage.page.pilots import Pilots, read_pilots, remove_piston, stroke_error
 from lightpage.recording.exposure import check_light
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.bundle import Bundle
-from lightpage.runtime.model.bundle.manifest import DECODER, FIELD, FLOAT16, FLOAT32, GOLDEN, Precision
+from lightpage.runtime.model.bundle.manifest import DECODER, FIELD
+from lightpage.runtime.model.decoding.batch_graph import REGISTRATION
+from lightpage.runtime.model.decoding.batches import NO_BATCHES, Batches, Batching, OneByOne
 from lightpage.runtime.model.decoding.camera_view import CameraView
-from lightpage.runtime.model.decoding.page import DecodedPage, Inference, Timings
+from lightpage.runtime.model.decoding.golden import check_golden
+from lightpage.runtime.model.decoding.page import OUTPUTS, DecodedPage, Inference, Timings, check_residual
 from lightpage.runtime.model.decoding.phase_refit import PhaseRefit
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
 from lightpage.runtime.model.execution.session import Port, open_session, running
 from lightpage.runtime.model.execution.table_graph import GraphFile, TableGraph
 from lightpage.waves.grid import field_grid
+from lightpage.words import brief
 
 if TYPE_CHECKING:
     from lightpage.codec.page_codec import PageCodec
 
-OUTPUTS = ("p", "phase", "concentration")
 FIELD_OUTPUTS = ("field", "unexplained")
 """Outputs of the field graph, or of a decoder that shows them, [2, Gy, Gx] each: the recovered field, and what is left
 of the homodyne equations."""
-PAGE_INPUTS = frozenset(["registration"])
+PAGE_INPUTS = frozenset([REGISTRATION])
 """Table inputs that may differ from page to page, as the image shifts. All others are built into the graph."""
-GOLDEN_TOLERANCE = {FLOAT32: 1e-3, FLOAT16: 1e-2}
-"""Largest error of p on the golden page, relative to its norm, by precision: room for another processor's rounding, not
-for another net."""
 
 
 def open_graph(bundle: Bundle, threads: int | None = None, provider: Provider = ON_CPU) -> TableGraph:
@@ -68,8 +63,16 @@ def open_graph(bundle: Bundle, threads: int | None = None, provider: Provider = 
         return TableGraph(file, subject, PAGE_INPUTS, threads, bundle.table, provider=provider)
 
 
+def _told(decoder: Decoder) -> str:
+    """Return what a decoder says of itself."""
+    profile = f"profile {decoder.bundle.profile.name}"
+    return brief(decoder, decoder.version, profile, f"on {decoder.graph.provider}")
+
+
 class Decoder:
     """The decoder of one bundle. Its methods may be called from many threads at once.
+
+    It does not follow the image as it moves: a `FollowingDecoder`, which `lightpage.load` gives, does.
 
     Args:
         bundle: an opened bundle.
@@ -77,6 +80,8 @@ class Decoder:
         graph: of the bundle, where it is open already; then neither it nor the golden page is looked at.
         provider: what pages are computed with; all else is computed on the CPU.
         code_threads: threads that share the code of a page, where it is compiled.
+        batching: how its pages are gathered with those of other callers.
+        batches: that gather them, where they are open already.
 
     Raises:
         ProviderError: there is no such provider here.
@@ -91,9 +96,12 @@ class Decoder:
         graph: TableGraph | None = None,
         provider: Provider = ON_CPU,
         code_threads: int = 1,
+        batching: Batching = NO_BATCHES,
+        batches: OneByOne | None = None,
     ) -> None:
         self.bundle, self.threads, self._code_threads = bundle, threads, code_threads
         self.graph = graph or open_graph(bundle, threads, provider)
+        self.batches, self._batching = batches or OneByOne(), batching
         residual = bundle.manifest.residual_output
         self._outputs = [*OUTPUTS, *([residual] if residual else [])]
         self._pilots: dict[int, Pilots] = {}
@@ -103,15 +111,25 @@ class Decoder:
             if bundle.code is not None:
                 _ = self.page_codec
             self._check_golden()
+            self.batches = Batches.opened(bundle, self.graph, batching, threads)
+
+    __repr__ = _told
 
     @classmethod
-    def load(cls, path: str | Path, threads: int | None = None, provider: Provider = ON_CPU) -> Decoder:
+    def load(
+        cls,
+        path: str | Path,
+        threads: int | None = None,
+        provider: Provider = ON_CPU,
+        batching: Batching = NO_BATCHES,
+    ) -> Decoder:
         """Open the bundle at `path` and its decoder; raises as `Bundle.open` and the constructor do."""
-        return cls(Bundle.open(path), threads, provider=provider)
+        return cls(Bundle.open(path), threads, provider=provider, batching=batching)
 
     def of_another(self, bundle: Bundle) -> Decoder:
         """The decoder of another bundle, on the same threads and provider; raises as the constructor does."""
-        return Decoder(bundle, self.threads, provider=self.graph.provider, code_threads=self._code_threads)
+        provider, batching = self.graph.provider, self._batching
+        return Decoder(bundle, self.threads, provider=provider, code_threads=self._code_threads, batching=batching)
 
     def with_table(self, table: SamplingTable) -> Decoder:
         """This decoder with other tensors in its table, by name; those left out stay. The golden page is not looked at.
@@ -119,7 +137,7 @@ class Decoder:
         Raises:
             InvalidInputError: a table that does not fit.
         """
-        return Decoder(self.bundle, self.threads, self.graph.with_table(table), code_threads=self._code_threads)
+        return _like(self, self.bundle, self.graph.with_table(table))
 
     def taken(self, table: SamplingTable) -> SamplingTable:
         """The tensors of a traced table that the graph takes; of parameters those that it knows, the first ones."""
@@ -136,8 +154,7 @@ class Decoder:
             BundleError: its table does not fit.
         """
         with raised_as(BundleError, InvalidInputError, about=f"{bundle.subject}: "):
-            graph = self.graph.with_table(bundle.table)
-            return Decoder(bundle, self.threads, graph, code_threads=self._code_threads)
+            return _like(self, bundle, self.graph.with_table(bundle.table))
 
     @property
     def references(self) -> FramePair:
@@ -190,13 +207,16 @@ class Decoder:
                 raise FrameError(name, f"type {frame.dtype}", dtype)
             check_light(name, frame, self.bundle.manifest.camera_bit_depth)
 
-    def infer(self, pair: FramePair, table: SamplingTable | None = None, *, doubtful: bool = False) -> Inference:
-        """Run the graph on a checked pair.
+    def infer(
+        self, pair: FramePair, table: SamplingTable | None = None, *, doubtful: bool = False, alone: bool = False
+    ) -> Inference:
+        """Run the graph on a checked pair, together with other callers' where pages are computed in batches.
 
         Args:
             pair: both frames, as `check` accepts them.
             table: tensors for this page alone, of `PAGE_INPUTS`; all others take `with_table`.
             doubtful: whether frames that contradict the homodyne equations are taken too.
+            alone: whether it is computed by itself, as exactly as the golden page says.
 
         Raises:
             InvalidInputError: a table that does not fit.
@@ -207,11 +227,14 @@ class Decoder:
         self.graph.check(table)
         if others := set(table) - PAGE_INPUTS:
             raise InvalidInputError("table of a page", ", ".join(sorted(others)), f"only {', '.join(PAGE_INPUTS)}")
-        feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **table}
-        p, phase, concentration, *rest = self.graph.run(self._outputs, feeds)
-        residual = float(np.max(rest[0])) if rest else 0.0
-        check_residual(residual, self.bundle.manifest.residual_limit, doubtful=doubtful)
-        return self.view.seen(Inference(p, phase, concentration, residual), table.get("registration"))
+        page = None if alone else self.batches.infer(self.graph, pair, table.get(REGISTRATION))
+        if page is None:
+            feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **table}
+            with self.batches.alone:
+                p, phase, concentration, *rest = self.graph.run(self._outputs, feeds)
+            page = Inference(p, phase, concentration, float(np.max(rest[0])) if rest else 0.0)
+        check_residual(page.residual, self.bundle.manifest.residual_limit, doubtful=doubtful)
+        return self.view.seen(page, table.get(REGISTRATION))
 
     @cached_property
     def field_solver(self) -> BundleFieldSolver:
@@ -272,12 +295,14 @@ class Decoder:
         """
         start = time.perf_counter()
         check_levels(levels)
-        self.check(pair)
-        checked = time.perf_counter()
-        inference = self.infer(pair)
-        inferred = time.perf_counter()
-        page = self.post_process(inference, levels, pilots)
-        return replace(page, timings=Timings(checked - start, inferred - checked, time.perf_counter() - inferred))
+        with self.batches.under_way():
+            self.check(pair)
+            checked = time.perf_counter()
+            inference = self.infer(pair)
+            inferred = time.perf_counter()
+            page = self.post_process(inference, levels, pilots)
+        waited, behind = inference.waited_s, time.perf_counter() - inferred
+        return replace(page, timings=Timings(checked - start, inferred - checked - waited, behind, waiting_s=waited))
 
     def post_process(self, inference: Inference, levels: int, pilots: Pilots | None = None) -> DecodedPage:
         """Piston, smooth phase error, trust and decision: all that is behind the graph, timings left at zero."""
@@ -331,41 +356,10 @@ class Decoder:
         check_golden(self.bundle, answer, self.bundle.manifest.precision)
 
 
-def check_residual(residual: float, limit: float | None, *, doubtful: bool = False) -> None:
-    """Check how badly a pair of frames fits the homodyne equations; see `Decoder.infer`.
-
-    Raises:
-        FrameError: as said there.
-    """
-    seen = np.isfinite(residual)
-    if limit is not None and not residual <= limit and not (doubtful and seen):
-        got = f"frames that contradict each other (residual {residual:.3g})"
-        raise (FramesDisagreeError if seen else FrameError)(
-            "frame pair",
-            got if seen else "no light of a page over the reference beam",
-            f"an in-phase and a quadrature frame of one shot, not swapped, cameras and exposure as they were "
-            f"calibrated (residual up to {limit:.3g}; where frames are right, recalibrate)",
-        )
-
-
-def check_golden(bundle: Bundle, answer: Callable[[FramePair], NDArray[np.float32]], precision: Precision) -> None:
-    """Check what a graph of a bundle says to the golden page.
-
-    Raises:
-        BundleError: something else than the bundle says, or nothing.
-    """
-    golden, subject = bundle.golden, f"{bundle.subject}: {GOLDEN}"
-    try:
-        p = answer(golden.pair)
-    except (BundleError, ProviderError, SurroundingsError):
-        raise
-    except Exception as error:  # onnxruntime's errors share no base class
-        raise short_resource(subject, error) or BundleError(subject, error, "a golden page that decodes") from None
-    if golden.p.shape != p.shape:
-        raise BundleError(f"{subject}: p", f"shape {golden.p.shape}", f"shape {p.shape}")
-    error_norm = float(np.linalg.norm(p - golden.p) / max(float(np.linalg.norm(golden.p)), 1e-30))
-    if not error_norm <= (tolerance := GOLDEN_TOLERANCE[precision]):
-        raise BundleError(subject, f"an answer off by {error_norm:.3g} of its norm", f"p within {tolerance:g}")
+def _like(decoder: Decoder, bundle: Bundle, graph: TableGraph) -> Decoder:
+    """The decoder of the same graphs with another table; whatever is open is shared."""
+    codes, batching, batches = decoder._code_threads, decoder._batching, decoder.batches
+    return Decoder(bundle, decoder.threads, graph, code_threads=codes, batching=batching, batches=batches)
 
 
 class BundleFieldSolver:

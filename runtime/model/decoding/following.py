@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from functools import cached_property
+from pathlib import Path
 
 from lightpage.page.pilots import Pilots
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.bundle.shipped import bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.decoding.page import DecodedPage
@@ -51,3 +53,30 @@ class FollowingDecoder(Decoder):
             FrameError, PageError: see `Decoder.decode`.
         """
         return self.tracker.decode(pair, levels, pilots)
+
+
+def load(
+    name_or_path: str | Path,
+    threads: int | None = None,
+    provider: str = "cpu",
+    engine_cache: str | Path | None = None,
+    *,
+    tracking: bool = True,
+) -> FollowingDecoder:
+    """Return a bundle's decoder: it follows the image from page to page, and raises where pilots contradict a page.
+
+    Args:
+        name_or_path: of a bundle, or the name of a shipped one.
+        threads: of an inference; by default all cores.
+        provider: what pages are computed with: ``cpu``, ``cuda``, ``tensorrt``, or ``cuda:1`` for the second GPU.
+        engine_cache: folder where TensorRT keeps its engines; without, it builds them each time.
+        tracking: whether the image is followed; else each page is decoded where calibration saw it.
+
+    Raises:
+        BundleError: there is none, or it is damaged.
+        InvalidInputError: the text names no provider, or one that keeps no engines.
+        ProviderError: there is no such provider here.
+    """
+    cache = None if engine_cache is None else Path(engine_cache)
+    bundle = Bundle.open(bundle_path(str(name_or_path)))
+    return FollowingDecoder(bundle, threads, Provider.parse(provider, cache), tracking=tracking)

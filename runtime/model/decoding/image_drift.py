@@ -177,7 +177,7 @@ def drift_slopes(decoder: Decoder, twin: Twin, parameters: Real, pair: FramePair
     def phase(shift_px: Real) -> NDArray[np.float32]:
         try:
             table = {"registration": shifted(registration, shift_px)}
-            return decoder.infer(pair, table, doubtful=given).phase
+            return decoder.infer(pair, table, doubtful=given, alone=True).phase
         except FrameError as error:
             kind, page = (FrameError, "page") if given else (BundleError, f"{decoder.bundle.subject}: golden page")
             raise kind(f"{page}, moved by {PROBE_PX} px", error.got, error.expected) from None

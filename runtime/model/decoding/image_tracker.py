@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import logging
-import threading
 import time
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from lightpage.runtime.model.decoding.image_drift import SHIFT, TILT, BundleSear
 from lightpage.runtime.model.decoding.image_position import ImagePosition
 from lightpage.runtime.model.decoding.page import DecodedPage, Inference, Timings
 from lightpage.runtime.model.decoding.tracking import NoTracker, Tracker, TrackerMemory, confirmed
+from lightpage.runtime.model.decoding.turns import Turn, Turns
 from lightpage.runtime.model.execution.twin import OnnxTwin
 
 Real = NDArray[np.float64]
@@ -46,6 +47,15 @@ LARGEST_WALK_PX = 0.3
 
 WIDEST = np.array([3.0, 3.0, 0.03, 0.03])
 """Standard deviation of a jump, as far as phases can show it."""
+
+STALE_PX = 0.04
+"""Distance from where an image was looked at, up to which pages behind are read from there, computed before
+this one was read. On 30 pages of a bench device that walks by 0.02 px a page, in bright light, 0.03, 0.04, 0.05 and
+0.08 px cost 0.003, 0.005, 0.009 and 0.019 bit on average; the place changed with every 3rd, 4th, 7th and 15th page."""
+
+MOST_AHEAD, FEWEST_AHEAD = 64, 4
+"""Pages that are computed ahead of the one that is read: one more after each page that leaves the place where they are
+looked at as it is, and half as many after one that changes it, for which they are computed again."""
 
 SEARCHED_PX = 0.03
 """Correction of a found image's place from which the page is decoded again: half a percent of the AIR is worth it."""
@@ -101,6 +111,7 @@ class ImageState:
         covariance: of the drift of the next page about it, [4, 4].
         decoder: whose table holds `traced_tilt` of it.
         table: tensors that are fed for the page.
+        looked_px: shift that is in `table`, [2].
         traced_tilt: [2].
         walk: variance of the drift from one page to the next, as the last pages showed it, [4].
         settled: whether a page was confirmed yet. Until then the image is looked for before anything is decoded.
@@ -112,6 +123,7 @@ class ImageState:
     covariance: Real
     decoder: Decoder
     table: SamplingTable
+    looked_px: Real
     traced_tilt: Real
     walk: Real
     settled: bool = False
@@ -121,7 +133,7 @@ class ImageState:
     @property
     def untraced(self) -> Real:
         """Drift that the table does not hold, [4]."""
-        return np.concatenate([np.zeros(2), self.drift[TILT] - self.traced_tilt])
+        return np.asarray(self.drift - np.concatenate([self.looked_px, self.traced_tilt]))
 
 
 @dataclass(frozen=True)
@@ -149,7 +161,7 @@ class _Attempt:
     @property
     def correction_px(self) -> float:
         """How far from where it was looked at the image is now taken to lie, along the worse axis."""
-        return float(np.abs(self.after.drift - self.state.drift)[SHIFT].max())
+        return float(np.abs(self.after.drift[SHIFT] - self.state.looked_px).max())
 
 
 class ImageTracker:
@@ -173,9 +185,9 @@ class ImageTracker:
     ) -> None:
         self._decoder, self._model, self._tables, self._search = decoder, model, tables, search
         start = np.diag([SEARCH_ERROR_PX, SEARCH_ERROR_PX, START_TILT, START_TILT]) ** 2
-        self._lock = threading.Lock()
-        """Held by whoever replaces the state; never held while anything is computed."""
-        self.state = ImageState(np.zeros(4), start, decoder, {}, np.zeros(2), WALK**2)
+        self._turns = Turns()
+        self._in_batches, self._ahead = decoder.batches.largest > 1, MOST_AHEAD
+        self.state = ImageState(np.zeros(4), start, decoder, {}, np.zeros(2), np.zeros(2), WALK**2)
         """What the next page is decoded with."""
         if memory is not None:
             self.state = self._remembered(memory)
@@ -199,6 +211,7 @@ class ImageTracker:
         return ImageState(
             decoder=self._tables.traced(traced) if traced.any() else self._decoder,
             table=self._tables.shifted(learnt["drift"][SHIFT]),
+            looked_px=learnt["drift"][SHIFT],
             settled=memory.settled,
             share=memory.share,
             **learnt,
@@ -220,39 +233,87 @@ class ImageTracker:
         search = None if self._search is None else BundleSearch(decoder, twin)
         return ImageTracker(decoder, self._model, BundleTables(decoder, twin), search)
 
-    def decode(self, pair: FramePair, levels: int, pilots: Pilots | None = None) -> DecodedPage:
+    def turn(self) -> Turn:
+        """See `Tracker`."""
+        return self._turns.take()
+
+    def decode(
+        self, pair: FramePair, levels: int, pilots: Pilots | None = None, turn: Turn | None = None
+    ) -> DecodedPage:
         """Decode a page where its image lies.
 
         The image is looked for before anything is decoded at the start, and later where the pilots confirm too little.
         What is learnt counts for the next page only where this one's pilots confirm it: a page that is not this
-        device's moves nothing.
+        device's moves nothing. Pages that are decoded at the same time are taken in their order, whatever they wait
+        for: each begins with what the one before it has taught.
         """
-        _ = self._model.slopes  # of a new tracker still being measured; two inferences at once may not fit the memory
-        begun, clock = self.state, _Clock()
-        shown = self._decoder.bundle.levels(levels)
-        self._decoder.check(pair)
-        pilots = pilots or self._decoder.pilots(levels)
-        clock.add("check_s")
+        with self._turns.taken(turn) as turn:
+            clock, shown = _Clock(), self._decoder.bundle.levels(levels)
+            _ = self._model.slopes  # may still be measured; two inferences at once may not fit the memory
+            turn.wait(lambda before: before < self._ahead)
+            clock.add("waiting_s")
+            with self._decoder.batches.under_way():
+                self._decoder.check(pair)
+                pilots = pilots or self._decoder.pilots(levels)
+                clock.add("check_s")
+                begun, inference = self._in_turn(turn, pair, clock)
+                best, found = self._followed(pair, begun, inference, shown, pilots, clock)
+                turn.close()
+                page = self._decoder.post_process(best.inference, levels, pilots)
+                clock.add("decision_s")
+        page = replace(page, check=best.check, image=_position(best.after, found), timings=clock.timings)
+        return confirmed(page, found)
+
+    def _in_turn(self, turn: Turn, pair: FramePair, clock: _Clock) -> tuple[ImageState, Inference | None]:
+        """The state that the page before has left, and what the graph says of a page by it; nothing before any page.
+
+        The graph runs beforehand, and again where a page before it shows that the image is to be looked at elsewhere.
+        """
+        while True:
+            state, inference = self.state, None
+            if state.settled:
+                inference = state.decoder.infer(pair, state.table)
+                clock.add("inference_s", inference.waited_s)
+            is_next = turn.wait(partial(self._has_left, state))
+            clock.add("waiting_s")
+            if is_next and not self._has_left(state):
+                return replace(self.state, table=state.table, looked_px=state.looked_px), inference
+
+    def _has_left(self, state: ImageState, before: int = 0) -> bool:
+        """Return whether a page with so many before it, that was decoded with a state, is now to be decoded anew."""
+        if before >= self._ahead:
+            return False
+        now, moved = self.state, np.abs(self.state.looked_px - state.looked_px).max()
+        at_most = 0.0 if self._in_batches else STALE_PX
+        return now.settled != state.settled or now.decoder is not state.decoder or bool(moved > at_most)
+
+    def _followed(
+        self,
+        pair: FramePair,
+        begun: ImageState,
+        inference: Inference | None,
+        levels: Levels,
+        pilots: Pilots,
+        clock: _Clock,
+    ) -> tuple[_Attempt, FoundImage | None]:
+        """The attempt at a page that counts, which is learnt from, and the outcome of a search for its image."""
         state, found = begun, None
         if not begun.settled and self._search is not None and len(pilots.phases) >= FEWEST_SEARCHED:
             found = self._search.find(pair, pilots, self._around(begun))
             state = self._moved_to(found, begun)
             clock.add("search_s")
-        best = self._attempts(pair, state, shown, pilots, found, clock)
+        best = self._attempts(pair, state, levels, pilots, found, clock, inference)
         step = best.step if found is None else None
         if found is None and self._search is not None and _search_may_pay(best.check, begun):
             found = self._search.find(pair, pilots, self._around(begun))
             moved = self._moved_to(found, best.after)
             clock.add("search_s")
             if moved is not best.after:
-                there = self._attempts(pair, moved, shown, pilots, found, clock)
+                there = self._attempts(pair, moved, levels, pilots, found, clock)
                 if not _worse(there, best):
                     best, step = there, None
-        page = self._decoder.post_process(best.inference, levels, pilots)
         self._learn(begun, best, step, searched=found is not None)
-        clock.add("decision_s")
-        page = replace(page, check=best.check, image=_position(best.after, found), timings=clock.timings)
-        return confirmed(page, found)
+        return best, found
 
     def _attempts(
         self,
@@ -262,13 +323,19 @@ class ImageTracker:
         pilots: Pilots,
         found: FoundImage | None,
         clock: _Clock,
+        inference: Inference | None = None,
     ) -> _Attempt:
-        """Decode at a place, and again where the page shows that its image lies: the best one, with the first step."""
+        """Decode at a place, and again where the page shows that its image lies: the best one, with the first step.
+
+        Args:
+            inference: what the graph has said of the page there already.
+        """
         enough = SEARCHED_PX if found is not None and found.found else np.inf
         best: _Attempt | None = None
         for _ in range(1 + CORRECTIONS):
-            inference = state.decoder.infer(pair, state.table)
-            clock.add("inference_s")
+            if inference is None:
+                inference = state.decoder.infer(pair, state.table)
+                clock.add("inference_s", inference.waited_s)
             attempt = self._read(inference, state, levels, pilots)
             clock.add("decision_s")
             if best is not None and _worse(attempt, best):
@@ -277,7 +344,8 @@ class ImageTracker:
             if not attempt.again and attempt.correction_px <= enough:
                 break
             # the same page once more: what it has taught already is no knowledge from before it
-            state, enough = replace(attempt.after, covariance=attempt.prior), np.inf
+            state = replace(self._looking_there(attempt.after), covariance=attempt.prior)
+            inference, enough = None, np.inf
         assert best is not None  # at least one attempt
         return best
 
@@ -301,7 +369,8 @@ class ImageTracker:
         read = [self._freed(known, tilt, levels, pilots, prior) for tilt in tilts]
         freed, drift, covariance, check = max(read, key=lambda each: each[3].confirmed_bits)
         after = self._state_at(state.drift + drift, covariance, replace(state, jump_px=np.zeros(2)))
-        return _Attempt(state, after, freed, check, prior, jumped or after.decoder is not state.decoder, step)
+        again = after.decoder is not state.decoder or (jumped and after.table is not state.table)
+        return _Attempt(state, after, freed, check, prior, again, step)
 
     def _freed(
         self, known: Inference, tilt: Real, levels: Levels, pilots: Pilots, prior: Real
@@ -322,8 +391,19 @@ class ImageTracker:
         decoder, traced = like.decoder, like.traced_tilt
         if np.any((away > RETRACE_RAD) & (away > SIGNIFICANT_DEVIATIONS * error)):
             decoder, traced = self._tables.traced(drift[TILT]), drift[TILT].copy()
-        table = self._tables.shifted(drift[SHIFT])
-        return replace(like, drift=drift, covariance=covariance, decoder=decoder, table=table, traced_tilt=traced)
+        state = replace(like, drift=drift, covariance=covariance, decoder=decoder, traced_tilt=traced)
+        at_most = max(STALE_PX, float(np.sqrt(np.diag(covariance)[SHIFT]).max()))  # less is not known
+        stays = self._in_batches and np.abs(drift[SHIFT] - like.looked_px).max() <= at_most
+        return state if stays else self._looking_there(state)
+
+    def _looking_there(self, state: ImageState) -> ImageState:
+        """The state with the shift that it knows in its table."""
+        shift = state.drift[SHIFT].copy()
+        return (
+            state
+            if np.array_equal(shift, state.looked_px)
+            else replace(state, table=self._tables.shifted(shift), looked_px=shift)
+        )
 
     def _moved_to(self, found: FoundImage, state: ImageState) -> ImageState:
         """The state where the image was found; the same one where that is nothing new."""
@@ -336,7 +416,7 @@ class ImageTracker:
         return self._state_at(np.concatenate([found.shift_px, state.drift[TILT]]), covariance, moved)
 
     def _learn(self, begun: ImageState, best: _Attempt, step: Estimate | None, *, searched: bool) -> None:
-        """Keep what a page showed for the next one, unless another page has been learnt from in the meantime.
+        """Keep what a page showed for the next one.
 
         Args:
             begun: what the page began with.
@@ -350,10 +430,12 @@ class ImageTracker:
             share = min(1.0, best.check.share)
             lately = share if searched else begun.share + SHARE_MEMORY * (share - begun.share)
             after = replace(best.after, settled=True, walk=walk, share=lately)
-        after = replace(after, covariance=after.covariance + np.diag(after.walk))
-        with self._lock:
-            if self.state is begun:
-                self.state = after
+        stays = after.decoder is begun.decoder and after.table is begun.table
+        with self._turns.changed:
+            if self._in_batches:
+                self._ahead = min(self._ahead + 1, MOST_AHEAD) if stays else max(self._ahead // 2, FEWEST_AHEAD)
+            self.state = replace(after, covariance=after.covariance + np.diag(after.walk))
+            self._turns.changed.notify_all()
 
     @staticmethod
     def _around(state: ImageState) -> Real:
@@ -417,8 +499,9 @@ class _Clock:
         self._last = time.perf_counter()
         self.timings = Timings(0.0, 0.0, 0.0)
 
-    def add(self, part: str) -> None:
-        """Count the time since the last call as one of `Timings`' parts."""
-        now = time.perf_counter()
-        self.timings = replace(self.timings, **{part: getattr(self.timings, part) + now - self._last})
+    def add(self, part: str, waited_s: float = 0.0) -> None:
+        """Count the time since the last call as one of `Timings`' parts, but what was waited of it."""
+        now, told = time.perf_counter(), self.timings
+        waited = replace(told, waiting_s=told.waiting_s + waited_s)
+        self.timings = replace(waited, **{part: getattr(waited, part) + now - self._last - waited_s})
         self._last = now

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.errors import FrameError, FramesDisagreeError
 from lightpage.page.pilots import PilotCheck
 from lightpage.runtime.model.decoding.image_position import ImagePosition
 from lightpage.von_mises import information
+from lightpage.words import brief, sides
 
+OUTPUTS = ("p", "phase", "concentration")
+"""Of a decoder's graph."""
 _SYMBOLS = 4096
 """Symbols at most by which a page's information is estimated: their mean is exact to a few thousandths, and soon taken.
 """
@@ -23,19 +27,21 @@ class Inference:
 
     The length is zero where a camera does not show the symbol, whatever p is.
 
-    `residual` is the power that is left of the homodyne equations over the field's, zero where the graph tells none.
+    `residual` is the power that is left of the homodyne equations over the field's, zero where the graph tells none;
+    `waited_s` are the seconds for which the page waited for others of its batch.
     """
 
     p: NDArray[np.float32]
     phase: NDArray[np.float32]
     concentration: NDArray[np.float32]
     residual: float = 0.0
+    waited_s: float = 0.0
 
     def turned(self, by: NDArray[np.floating]) -> Inference:
         """The same with `by` (radians [ny, nx]) added to the phases."""
         phase = (self.phase + by).astype(np.float32)
         p = self.concentration * np.stack([np.cos(phase), np.sin(phase)])
-        return Inference(p, phase, self.concentration, self.residual)
+        return replace(self, p=p, phase=phase)
 
 
 @dataclass(frozen=True)
@@ -47,20 +53,22 @@ class Timings:
         inference_s: runs of the graph.
         decision_s: piston, tracking and decision.
         search_s: looking for the image.
+        waiting_s: waiting for the other pages of a batch, and for the batch before it.
     """
 
     check_s: float
     inference_s: float
     decision_s: float
     search_s: float = 0.0
+    waiting_s: float = 0.0
 
     @property
     def total_s(self) -> float:
         """All of it."""
-        return self.check_s + self.inference_s + self.decision_s + self.search_s
+        return self.check_s + self.inference_s + self.decision_s + self.search_s + self.waiting_s
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class DecodedPage:
     """A page of symbols with what is known about each.
 
@@ -97,6 +105,11 @@ class DecodedPage:
     image: ImagePosition | None = None
     stroke_relative: float = np.nan
 
+    def __repr__(self) -> str:
+        symbols = f"{sides(self.symbols.shape)} symbols of {self.levels} levels"
+        claimed = f"confidence {self.confidence.mean():.3f}, {self.information_bits:.2f} bits a symbol"
+        return brief(self, symbols, claimed, f"pilot coherence {self.pilot_coherence:.2f}")
+
     @cached_property
     def information_bits(self) -> float:
         """Information that the page claims of a symbol's phase, bits, the mean of many symbols.
@@ -111,3 +124,24 @@ class DecodedPage:
     def residual_rad(self) -> float:
         """Smooth phase error that was taken off the page, root mean square, radians."""
         return float(np.sqrt(np.mean(np.square(self.phase_error))))
+
+
+def check_residual(residual: float, limit: float | None, *, doubtful: bool = False) -> None:
+    """Check how badly a pair of frames fits the homodyne equations.
+
+    Args:
+        residual, limit: of the page, and the bundle's.
+        doubtful: see `lightpage.runtime.model.decoding.decoder.Decoder.infer`.
+
+    Raises:
+        FrameError: as `Decoder.infer` says.
+    """
+    seen = np.isfinite(residual)
+    if limit is not None and not residual <= limit and not (doubtful and seen):
+        got = f"frames that contradict each other (residual {residual:.3g})"
+        raise (FramesDisagreeError if seen else FrameError)(
+            "frame pair",
+            got if seen else "no light of a page over the reference beam",
+            f"an in-phase and a quadrature frame of one shot, not swapped, cameras and exposure as they were "
+            f"calibrated (residual up to {limit:.3g}; where frames are right, recalibrate)",
+        )

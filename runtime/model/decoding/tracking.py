@@ -12,6 +12,7 @@ from lightpage.page.pilots import LEAST_CONFIRMED_SHARE, Pilots
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.page import DecodedPage
+from lightpage.runtime.model.decoding.turns import Turn, Turns
 
 
 class TrackerMemory(BaseModel):
@@ -41,11 +42,17 @@ class TrackerMemory(BaseModel):
 class Tracker(Protocol):
     """Decodes the pages of one device in their order; calls come from many threads."""
 
-    def decode(self, pair: FramePair, levels: int, pilots: Pilots | None = None) -> DecodedPage:
+    def turn(self) -> Turn:
+        """The page's turn that comes next, for whoever has pages decoded at the same time and says in which order."""
+
+    def decode(
+        self, pair: FramePair, levels: int, pilots: Pilots | None = None, turn: Turn | None = None
+    ) -> DecodedPage:
         """Decode a page.
 
         Args:
             pair, levels, pilots: as for `Decoder.decode`.
+            turn: of the page; by default it comes behind all that have begun. It is closed at the end.
 
         Raises:
             UnconfirmedPageError: the page's pilots do not bear out what the decoder claims of it.
@@ -83,7 +90,13 @@ class NoTracker:
     def __init__(self, decoder: Decoder) -> None:
         self._decoder = decoder
 
-    def decode(self, pair: FramePair, levels: int, pilots: Pilots | None = None) -> DecodedPage:
+    def turn(self) -> Turn:
+        """See `Tracker`: one that waits for nothing."""
+        return Turns().take()
+
+    def decode(
+        self, pair: FramePair, levels: int, pilots: Pilots | None = None, turn: Turn | None = None
+    ) -> DecodedPage:
         """See `Tracker`."""
         return confirmed(self._decoder.decode(pair, levels, pilots=pilots))
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-import os
 from pathlib import Path
+
+from lightpage.systems import cores
 
 CGROUP_ROOT = Path("/sys/fs/cgroup")
 
@@ -19,9 +20,9 @@ def available_cpus(root: Path = CGROUP_ROOT, membership: Path = Path("/proc/self
         root: where control groups are mounted.
         membership: the kernel's list of this process's groups.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    there = cores()
     quotas = [quota for folder in _folders(root, membership) if (quota := _quota(folder)) is not None]
-    return max(1, min([cores, *(math.ceil(quota) for quota in quotas)]))
+    return max(1, min([there, *(math.ceil(quota) for quota in quotas)]))
 
 
 def _folders(root: Path, membership: Path) -> list[Path]:

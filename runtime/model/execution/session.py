@@ -66,7 +66,7 @@ def open_session(
     once: bool = False,
     profile: Path | None = None,
     provider: Provider = ON_CPU,
-    pages: int | None = None,
+    rounded: bool = False,
 ) -> Session:
     """Open an ONNX model held in memory.
 
@@ -77,7 +77,7 @@ def open_session(
         once: whether it will run a single time: then it is not worth while to prepare much.
         profile: beginning of the path of a file in which the runtime notes how long each node takes.
         provider: what it runs on.
-        pages: of a graph for batches, how many it will decode in a run; such a graph's products may be rounded.
+        rounded: whether its products may be rounded, as those of a graph for batches.
 
     Raises:
         BundleError: the bytes are no ONNX model that this onnxruntime can run.
@@ -92,8 +92,6 @@ def open_session(
     options.add_session_config_entry("session.force_spinning_stop", "1")
     # A plan of its memory saves one run in forty of a page's time, and takes a quarter more of it.
     options.enable_mem_pattern = False
-    if pages is not None:
-        options.add_free_dimension_override_by_name("pages", pages)
     if once:
         options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
         options.enable_cpu_mem_arena = False
@@ -109,7 +107,7 @@ def open_session(
     try:
         with running(subject, provider):
             # by default it would print the cause, and compute elsewhere
-            chain = provider.chain(version, rounded=pages is not None)
+            chain = provider.chain(version, rounded=rounded)
             session = onnxruntime.InferenceSession(model, options, providers=chain, enable_fallback=0)
     except (ProviderError, SurroundingsError):
         raise

@@ -33,7 +33,8 @@ from lightpage.runtime.service.rpc import rpc
 from lightpage.runtime.service.stages import Stage, Stages
 
 _ON_THEIR_WAY = 2
-"""Pairs of one DecodePages that are received or decoded at a time: one is decoded while the next one comes."""
+"""Pairs of one DecodePages that are received or decoded at a time: one is decoded while the next one comes. Where pages
+are computed together, there are more."""
 
 
 class _Counted:
@@ -81,7 +82,7 @@ class FrameCalls:
     async def DecodePages(self, requests: AsyncIterator[FramePart], call: Call) -> AsyncIterator[pb.DecodePagesReply]:
         """Receive frame pairs, one after another, and decode each while the next one comes."""
         pending: asyncio.Queue[tuple[asyncio.Future[pb.DecodePagesReply], Stages] | None] = asyncio.Queue()
-        room = asyncio.Semaphore(_ON_THEIR_WAY)
+        room = asyncio.Semaphore(self._plane.ahead(_ON_THEIR_WAY))
 
         async def receive() -> None:
             try:

@@ -15,6 +15,7 @@ from lightpage.errors import StoreError, SurroundingsError, raised_as
 from lightpage.files import lock, new_file, synchronise
 from lightpage.runtime.model.bundle.signature_file import signature_path
 from lightpage.runtime.service.models.database import DATABASE
+from lightpage.systems import open_file
 from lightpage.temporary import temporary_folder
 
 _log = logging.getLogger(__name__)
@@ -148,12 +149,12 @@ class BundleFolder:
         """Lock the folder, where that can be done; see whether SQLite, which locks ranges of bytes, can."""
         path = folder / LOCK
         try:
-            self._lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            self._lock = open_file(path)
         except OSError as error:
             if not path.exists():  # nobody can write there, and nobody ever has
                 _log.warning("%s: cannot be locked: %s", self.subject, error)
                 return
-            self._lock = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+            self._lock = os.open(path, os.O_RDONLY)
         try:
             self.has_locks = lock(self._lock, self.subject)
             descriptor, name = new_file(folder, PROBE.strip(".-"))  # shares let no file have locks of both kinds

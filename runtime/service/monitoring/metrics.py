@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
@@ -16,7 +17,7 @@ from prometheus_client import (
     PlatformCollector,
     ProcessCollector,
 )
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
@@ -27,6 +28,7 @@ from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.device.acquisition.source import FrameSource
 from lightpage.runtime.model.decoding.page import DecodedPage
 from lightpage.runtime.model.decoding.tracking import unconfirmed_page
+from lightpage.runtime.model.decoding.under_way import UnderWay
 from lightpage.runtime.service.models.store_health import Reason, StoreHealth, Trouble
 
 if TYPE_CHECKING:
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
 _SECONDS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 _FINE_SECONDS = tuple(sorted({*_SECONDS, 0.001, 0.002, 0.03, 0.07, 0.15, 0.3, 0.7, 1.5, 3.0, 7.0, 20.0, 60.0}))
 """From handing over a small reply to the longest wait for a slot; no bucket is much wider than the time in it."""
+_BATCH_PAGES = (1, 2, 4, 8, 16, 32, 64)
 _READ = "none"
 """Loss of a page whose bytes were read."""
 _LOOK_S = 2.0
@@ -173,6 +176,10 @@ class ServiceMetrics:
         """Show how busy the service is, whenever somebody looks."""
         self.registry.register(_Figures(partial(_load, decodes, received)))
 
+    def watch_batches(self, pages: UnderWay) -> None:
+        """Show how full batches are, and what the device does that computes them, whenever somebody looks."""
+        self.registry.register(_Figures(partial(_batches, pages)))
+
     def watch(self, source: FrameSource) -> None:
         """Show what the source counts, whenever somebody looks."""
         self.registry.register(_Figures(partial(_source, source)))
@@ -217,6 +224,19 @@ def _load(decodes: Slots, received: ReceiveBudget) -> Iterator[Metric]:
     yield CounterMetricFamily("lightpage_received_bytes", "Frames that callers sent.", value=received.taken)
     yield GaugeMetricFamily("lightpage_receive_buffer_bytes", "Of them not yet decoded.", value=received.used)
     yield GaugeMetricFamily("lightpage_receive_buffer_limit_bytes", "At most so many.", value=received.size)
+
+
+def _batches(pages: UnderWay) -> Iterator[Metric]:
+    """Yield how full batches are, and what the device does that computes them."""
+    runs = pages.runs.copy()
+    bounds = {**{str(bound): bound for bound in _BATCH_PAGES}, "+Inf": math.inf}
+    buckets = [(told, sum(runs[size] for size in runs if size <= bound)) for told, bound in bounds.items()]
+    about, total = "Pages of a batch.", sum(size * count for size, count in runs.items())
+    yield HistogramMetricFamily("lightpage_batch_pages", about, buckets=buckets, sum_value=total)
+    spent = CounterMetricFamily("lightpage_device_seconds", "What computes batches, by what it did.", labels=["state"])
+    for state, seconds in pages.seconds().items():
+        spent.add_metric([state.value], seconds)
+    yield spent
 
 
 def _source(source: FrameSource) -> Iterator[Metric]:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import partial
 
 from lightpage.clock import Clock
 from lightpage.errors import CallerLeft, InvalidInputError, LimitError, SlotsTakenError
+from lightpage.runtime.archives.recordings.read_ahead import beside
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import message_of
 from lightpage.runtime.client.wire.status import detail_of, reason_told, refusal_of
+from lightpage.runtime.model.decoding.turns import Turn, Turns
 from lightpage.runtime.service.caller import Call, Caller, Role
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.frames.frames import check_options, decode_reply, user_data_message
@@ -71,25 +74,35 @@ class PageCalls:
         self._check_count("pages" if request.pages else "count", len(request.pages) or request.count)
         caller = _caller(request.options, call)
         numbers: list[int | None] = list(request.pages) or [None] * request.count
-        for number in numbers:
-            one = pb.ReadPageRequest(options=request.options, want_written=request.want_written)
-            one.correlation_id = request.correlation_id
-            if number is not None:
-                one.page = number
-            stages = call.times.page()
-            try:
-                with self._plane.ranges.held(caller):  # not while the caller takes its time to read the reply
-                    reply = pb.ReadPagesReply(read=self._read(one, caller, stages))
-            except (CallerLeft, SlotsTakenError):
-                raise
-            except Exception as error:
-                stages.begin(Stage.RESPOND)
-                self._plane.metrics.rejected(reason_told(error))
-                refused = refusal_of(error)
-                refused.page, refused.correlation_id = number or 0, request.correlation_id
-                reply = pb.ReadPagesReply(refused=refused)
+        turns, read = Turns(), partial(self._of_range, request, caller, call)
+        pages = beside(read, ((number, turns.take()) for number in numbers), self._plane.ahead())
+        for _ in numbers:
+            with self._plane.ranges.held(caller):  # not while the caller takes its time to read the reply
+                _, result = next(pages)
+                reply, stages = result()
             yield reply
             call.times.done(stages)
+
+    def _of_range(
+        self, request: pb.ReadPagesRequest, caller: Caller, call: Call, at: tuple[int | None, Turn]
+    ) -> tuple[pb.ReadPagesReply, Stages]:
+        """Read one of several pages."""
+        number, order = at
+        one = pb.ReadPageRequest(options=request.options, want_written=request.want_written)
+        one.correlation_id = request.correlation_id
+        if number is not None:
+            one.page = number
+        stages = call.times.page()
+        try:
+            return pb.ReadPagesReply(read=self._read(one, caller, stages, order)), stages
+        except (CallerLeft, SlotsTakenError):
+            raise
+        except Exception as error:
+            stages.begin(Stage.RESPOND)
+            self._plane.metrics.rejected(reason_told(error))
+            refused = refusal_of(error)
+            refused.page, refused.correlation_id = number or 0, request.correlation_id
+            return pb.ReadPagesReply(refused=refused), stages
 
     @rpc(Role.DECODE, is_range=True)
     def ReadData(self, request: pb.ReadDataRequest, call: Call) -> Iterator[pb.ReadDataReply]:
@@ -118,10 +131,12 @@ class PageCalls:
             if page.stages is not None:
                 call.times.done(page.stages)
 
-    def _read(self, request: pb.ReadPageRequest, caller: Caller, stages: Stages) -> pb.ReadPageReply:
+    def _read(
+        self, request: pb.ReadPageRequest, caller: Caller, stages: Stages, order: Turn | None = None
+    ) -> pb.ReadPageReply:
         page, options = request.page if request.HasField("page") else None, request.options
         levels, user_data = options.levels or None, options.want_user_data
-        read = read_page(self._plane, page, levels, caller, user_data=user_data, stages=stages)
+        read = read_page(self._plane, page, levels, caller, user_data=user_data, stages=stages, order=order)
         return read_reply(read, request)
 
     def _check_count(self, subject: str, count: int) -> None:

@@ -22,7 +22,9 @@ from lightpage.errors import (
     SourceError,
 )
 from lightpage.page.pilots import Pilots
+from lightpage.runtime.archives.recordings.read_ahead import beside
 from lightpage.runtime.device.acquisition.source import FrameSource, Shot, own_fault
+from lightpage.runtime.model.decoding.turns import Turn, Turns
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import Answer, DataPlane, Seen, levels_for, observed
 from lightpage.runtime.service.monitoring.monitor import SHOWS_DEVICE
@@ -97,6 +99,7 @@ def read_page(
     user_data: bool = False,
     expected: Header | None = None,
     stages: Stages | None = None,
+    order: Turn | None = None,
 ) -> ReadAnswer:
     """Read a page from the source and decode it; `levels` None stands for the source's own, or the code's.
 
@@ -108,6 +111,7 @@ def read_page(
         user_data: whether to read the page's bytes too.
         expected: the page of its volume that should be there, where that is known.
         stages: times the page.
+        order: of the pages of its call, in which they are taken from the source; by default it is alone.
 
     Raises:
         BundleError, InvalidInputError: see `decode`.
@@ -117,12 +121,13 @@ def read_page(
     source, stages, monitor = plane.source, stages or Stages(), plane.monitors.device
     stages.begin(Stage.QUEUE)
     # The slot first: pages that wait for one shall not be read yet, nor lie in memory.
-    with plane.decodes.held(caller):
+    with order or Turns().take() as order, plane.decodes.held(caller):
         model, begun = plane.models.current, time.perf_counter()
         seen = Seen(f"{'next page' if page is None else f'page {page}'} of {source.name}", page, model.version)
         with observed(plane.monitors.told_by(monitor), seen):
             stages.begin(Stage.RECEIVE)
             found = _shot(plane, source, page, caller, user_data)
+            order.close()
             subject = f"page {found.page_index} of {source.name}"
             seen.note(subject=subject, page_index=found.page_index, levels=source.levels)
             seen.note(pair=found.pair, infos=found.infos, symbols=found.symbols, pilot_mask=found.pilot_mask)
@@ -226,10 +231,21 @@ def read_data(
         PageError: there is no page `first`.
     """
     _ = plane.source, plane.models.current.decoder.page_codec  # they are there
-    successor, unread = Successor(), unread or Unread()
-    for index in range(first, first + count):
+    successor, unread, turns = Successor(), unread or Unread(), Turns()
+    known = first, successor
+
+    def read(at: tuple[int, Turn]) -> tuple[DataPage, Header | None]:
+        (index, order), (since, expected) = at, known
+        for _ in range(since, index):
+            expected = expected.after()
+        return _data_page(plane, index, expected.header, caller, timed(), order), expected.header
+
+    numbers = ((index, turns.take()) for index in range(first, first + count))
+    for (index, _), result in beside(read, numbers, plane.ahead()):
         try:
-            page = _data_page(plane, index, successor.header, caller, timed())
+            page, expected = result()
+            if _lacks_header(page) and successor.header not in (None, expected):  # it was not known yet
+                page = _data_page(plane, index, successor.header, caller, timed())
         except PageError:
             if index == first:
                 raise
@@ -248,6 +264,7 @@ def read_data(
             header = page.found.header if page.found is not None else None
             unread.add(index, header or successor.header, page.model_version or plane.models.current.version)
         successor = successor.after()
+        known = index + 1, successor
         yield page
     for group in list(unread.groups.values()):
         yield from unread.restored(group)
@@ -275,19 +292,26 @@ def read_again(
         yield from unread.restored(group)
 
 
-def _data_page(plane: DataPlane, index: int, expected: Header | None, caller: Caller, stages: Stages) -> DataPage:
+def _data_page(
+    plane: DataPlane, index: int, expected: Header | None, caller: Caller, stages: Stages, order: Turn | None = None
+) -> DataPage:
     """Read a page of a range.
 
     Raises:
         PageError: there is none.
     """
     try:
-        answer = read_page(plane, index, None, caller, user_data=True, expected=expected, stages=stages).answer
+        read = read_page(plane, index, None, caller, user_data=True, expected=expected, stages=stages, order=order)
+        answer = read.answer
     except (LostPageError, SourceError) as error:
         stages.begin(Stage.RESPOND)
         return DataPage(index, None, error, stages=stages)
     assert answer.user_data is not None  # it was asked for
     return DataPage(index, answer.user_data, model_version=answer.model_version, stages=stages)
+
+
+def _lacks_header(page: DataPage) -> bool:
+    return page.found is not None and page.found.loss is Loss.HEADER
 
 
 def _curable(page: DataPage) -> bool:

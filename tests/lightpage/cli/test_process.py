@@ -5,15 +5,15 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import click
 import pytest
 import tqdm.std
-from click.shell_completion import ShellComplete
 
 from lightpage.cli import progress_bar
-from lightpage.cli.main import COMPLETE, EXIT_ERROR, lightpage, run
+from lightpage.cli.main import EXIT_ERROR, HELP_KEY, lightpage, run
 from lightpage.errors import RecordingError, SurroundingsError
 from lightpage.failures import os_failure, understood
 from tests.clock import HandClock
@@ -120,10 +120,76 @@ def test_every_command_shows_its_help_without_extras_and_required_options() -> N
     assert {"train", "calibrate", "export", "models list", "bulk recover"} <= set(done.stdout.splitlines())
 
 
-def test_shells_complete_commands_and_options() -> None:
-    complete = ShellComplete(lightpage, {}, "lightpage", COMPLETE)
-    assert [item.value for item in complete.get_completions([], "sim")] == ["simulate"]
-    assert "--holes" in [item.value for item in complete.get_completions(["bulk", "recover"], "--ho")]
+COMPLETED = """
+import sys
+from click.shell_completion import ShellComplete
+from lightpage.cli.main import COMPLETE, lightpage
+complete = ShellComplete(lightpage, {}, "lightpage", COMPLETE)
+commands = [item.value for item in complete.get_completions([], "")]
+assert {"simulate", "train"} <= set(commands)
+print(len([name for name in sys.modules if name.startswith("lightpage.runtime")]))
+for name in ("train", "export", "evaluate", "serve"):
+    assert complete.get_completions([name], "-"), name
+print("--holes" in [item.value for item in complete.get_completions(["bulk", "recover"], "--ho")])
+print([name for name in ("torch", "onnxruntime", "h5py") if hasattr(sys.modules.get(name), "__file__")])
+"""
+
+
+def test_shells_complete_commands_and_options_and_import_nothing_heavy(tmp_path: Path) -> None:
+    done = subprocess.run([sys.executable, "-c", COMPLETED], capture_output=True, text=True, timeout=120)
+    assert done.stdout.splitlines() == ["0", "True", "[]"], done.stderr
+    for name in ("bash", "zsh", "fish"):
+        made = shell("lightpage", tmp_path, _LIGHTPAGE_COMPLETE=f"{name}_source").stdout
+        assert f"_LIGHTPAGE_COMPLETE={name}_complete" in made
+
+
+def parameters() -> Iterator[tuple[str, click.Parameter]]:
+    """Every parameter of every command, with the command's name."""
+    context = click.Context(lightpage)
+    context.meta[HELP_KEY] = True
+    for name in lightpage.list_commands(context):
+        command = lightpage.get_command(context, name)
+        for each in (command, *getattr(command, "commands", {}).values()):
+            assert each is not None
+            yield from ((each.name or name, param) for param in each.params)
+
+
+def test_options_say_alike_what_their_values_are_and_what_reports_has_json() -> None:
+    found, reports = dict[str, set[str]](), set[str]()
+    for command, param in parameters():
+        if "--json" in param.opts:
+            reports.add(command)
+        if isinstance(param, click.Option) and not param.is_flag and not isinstance(param.type, click.Choice):
+            found.setdefault(param.opts[0], set()).add(param.make_metavar(click.Context(lightpage)))
+    every = set[str]().union(*found.values())
+    assert not every & {"TEXT", "DIRECTORY", "INTEGER", "INTEGER RANGE", "FLOAT", "FLOAT RANGE", "P"}
+    several = {name: sorted(names) for name, names in found.items() if len(names) > 1}
+    assert set(several) <= {"--out", "--recordings", "--pages", "--volume"}  # of files, of folders, of many, to choose
+    silent = {"console", "new", "report", "serve", "top", "virtual-device"}
+    assert {name for name, _ in parameters()} - reports <= silent | {"bulk"}
+
+
+@pytest.mark.parametrize(
+    ("line", "subject", "got", "wanted"),
+    [
+        ("simulat", "lightpage", "simulat", "simulate"),
+        ("evaluate --bundel x", "lightpage evaluate", "--bundel", "--bundle"),
+        ("evaluate", "lightpage evaluate", "--recording", "RECORDING"),
+        ("simulate --pages 0", "lightpage simulate --pages", "0", "x>=1"),
+        ("bulk evaluate out --engine no", "lightpage bulk evaluate --engine", "no", "local"),
+        ("evaluate --recording= ", "--recording", "empty", "path"),
+        ("evaluate --bundle nosuch --recording R.h5", "bundle nosuch", "no such", "bench"),
+    ],
+)
+def test_a_wrong_line_is_told_in_one_line(
+    line: str, subject: str, got: str, wanted: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(lightpage, line.split()) == EXIT_ERROR
+    (told,) = capsys.readouterr().err.splitlines()
+    assert told.startswith(f"lightpage: error: {subject}: got ")
+    came, _, expected = told.removeprefix("lightpage: error: ").partition(", wanted ")
+    assert got in came
+    assert wanted in expected
 
 
 def test_a_name_that_is_too_long_is_named(capsys: pytest.CaptureFixture[str]) -> None:

@@ -360,7 +360,9 @@ def test_pages_of_the_source_that_came_before_the_end_are_kept(
     assert ("before is kept" in told.err) == (end is KeyboardInterrupt)
 
 
-def test_recalibrate_and_rollback_work_on_a_running_service(start: Start, tmp_path: Path) -> None:
+def test_recalibrate_and_rollback_work_on_a_running_service(
+    start: Start, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     service, report = start(), tmp_path / "r.json"
     toy.write_toy_recording(tmp_path / "known.h5", toy.ToyDevice(), 16, 5)
     sent = ["--recording", tmp_path / "known.h5", "--send"]
@@ -368,7 +370,22 @@ def test_recalibrate_and_rollback_work_on_a_running_service(start: Start, tmp_pa
         assert run("recalibrate", "--target", service.server.target, *more, "--pages", "3", "--json", report) == 0
         told = json.loads(report.read_text())
         assert (told["version"], told["pages_used"]) == (version, 3)
-    assert [run("rollback", "--target", service.server.target) for _ in range(4)] == [0, 0, 0, 2]
+    assert [run("rollback", "--target", service.server.target) for _ in range(3)] == [0, 0, 0]
+    monkeypatch.setenv("LIGHTPAGE_CLIENT_TARGET", service.server.target)
+    capsys.readouterr()
+    for line, known in (
+        ("models --json -", "models"),
+        ("models list --json -", "models"),
+        ("models forward --json -", "previous_version"),
+        ("rollback --json -", "previous_version"),
+        ("models pin toy-1 --json -", "pinned"),
+        ("jobs --json -", "jobs"),
+    ):
+        assert run(*line.split()) == 0
+        assert known in json.loads(capsys.readouterr().out)
+    assert run("rollback") == 2
+    assert run("recalibrate", "--bundle", "toy.zip") == 2  # offline, whatever service the environment names
+    assert "no --recording, --out" in capsys.readouterr().err
 
 
 def test_a_detached_job_is_named_listed_cancelled_and_watched(

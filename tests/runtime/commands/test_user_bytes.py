@@ -85,11 +85,12 @@ def test_too_many_lost_pages_are_named_and_leave_no_file(bundle: Path, pages: np
     for told in ("data pages 1-2", "recorded pages 1, 3", "recorded page 2"):
         assert told in str(result.exception)
     assert figures["lost"] == [1, 2]
+    size = figures["user_bytes_per_page"]
+    assert figures["lost_bytes"] == [[size, 3 * size]]
     assert not (tmp_path / "read.bin").exists()
     assert not list(tmp_path.glob("*.partial"))
     asked = f"recover --bundle {bundle} --recording {recording} --out {tmp_path / 'holes.bin'} --holes --no-tracking"
     assert run(lightpage, asked.split()) == 3
-    size = figures["user_bytes_per_page"]
     read = (tmp_path / "holes.bin").read_bytes()
     assert read == coded.CONTENT[:size] + bytes(2 * size) + coded.CONTENT[3 * size :]
 

@@ -78,10 +78,20 @@ class BatchedDecoder(nn.Module):
         """In which a constant is held."""
         return torch.float32 if PLACES in name else self.dtype
 
-    def forward(self, in_phase: Tensor, quadrature: Tensor, tables: Tables) -> tuple[Tensor, Tensor]:
-        """Frames [B, H, W] to p [B, 2, ny, nx], and what is left of the equations over the field [B], float32."""
+    def forward(self, in_phase: Tensor, quadrature: Tensor, shift: Tensor, tables: Tables) -> tuple[Tensor, Tensor]:
+        """Frames of B pages to p, by constants of a device.
+
+        Args:
+            in_phase, quadrature: [B, H, W].
+            shift: of either camera's image against the registration of the constants, pixels, [B, 2, 2] float32.
+            tables: constants.
+
+        Returns:
+            p [B, 2, ny, nx], and what is left of the equations over the field [B], float32.
+        """
         own = {part: of_part(tables, part) for part in ("frames", "field", "way", "network", "prediction")}
-        seen = Seen(*(self.frames(each, own["frames"], camera) for camera, each in enumerate((in_phase, quadrature))))
+        cameras = enumerate((in_phase, quadrature))
+        seen = Seen(*(self.frames(each, shift[:, camera], own["frames"], camera) for camera, each in cameras))
         field = self.field(seen, own["field"])
         power = self.field.power(field)
         residual = self.field.residual(seen, field, power, own["field"])

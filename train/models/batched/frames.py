@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lightpage.train.models.batched.products import Tables, padded, sizes
-from lightpage.train.models.field import FieldRecovery, References, sampled
+from lightpage.train.models.field import FieldRecovery, References
 
 BLOCK = 16
 """Pixels of a row that a convolution takes for channels: so both axes of the prefilter are one product."""
@@ -43,31 +43,42 @@ class BatchedFrames(nn.Module):
     def tables(self, blocks: Tensor, seen: References) -> Tables:
         """Constants of references [2, rows, columns] in blocks of pixels, and what they say.
 
-        Brightness times the squared amplitude is what was sampled times `weight`, and `offset` on it, [1, ny, nx] each
-        of either camera; `where` [2, ny, nx, 2] float32 is where it was sampled.
+        Brightness times the squared amplitude is what was sampled beyond the `beam` times `weight`, and `squared` on
+        it, [1, ny, nx] each; `where` [1, ny, nx, 2] float32 is where a camera was sampled, `pixel` [2] a pixel there.
         """
-        plain = sampled(self.recovery.filtered(blocks), seen.where)
         squared = seen.amplitude.double() ** 2
-        tables = {}
+        tables = {"squared": padded(squared, -1, -2)[None]}
+        rows, columns = (count * self.recovery.binning for count in sizes(blocks)[1:])
+        tables["where_pixel"] = torch.tensor([2 / columns, 2 / rows])
         for camera in (0, 1):
-            weight = squared * seen.lit / seen.reference[camera]
-            tables[f"weight_{camera}"] = padded(weight / self.unit, -1, -2)[None]
-            tables[f"offset_{camera}"] = padded(squared - weight * plain[camera], -1, -2)[None]
+            beam = blocks[camera : camera + 1] * self.unit
+            tables[f"beam_{camera}"] = self._channels(beam) if self.recovery.binning == 1 else beam
+            tables[f"weight_{camera}"] = padded(squared * seen.lit / seen.reference[camera] / self.unit, -1, -2)[None]
             where = seen.where[camera]
             missing = -where.shape[1] % 8, -where.shape[0] % 8
             tables[f"where_{camera}"] = functional.pad(where, (0, 0, 0, missing[0], 0, missing[1]))[None]
         return tables
 
-    def forward(self, frames: Tensor, tables: Tables, camera: int) -> Tensor:
-        """Frames [B, H, W] of one camera to brightness times the squared amplitude, [B, ny, nx] of whole multiples."""
-        seen = self._filtered(frames)[None].to(torch.float32)
-        # pages are channels: the places on the frames are the same for all
-        seen = functional.grid_sample(
-            seen, tables[f"where_{camera}"], mode="bilinear", padding_mode="border", align_corners=False
-        )
-        return seen.to(self.dtype).squeeze(0) * tables[f"weight_{camera}"] + tables[f"offset_{camera}"]
+    def forward(self, frames: Tensor, shift: Tensor, tables: Tables, camera: int) -> Tensor:
+        """Frames of one camera to brightness times the squared amplitude.
 
-    def _filtered(self, frames: Tensor) -> Tensor:
+        Args:
+            frames: [B, H, W].
+            shift: of each page's image against the table's registration, (x, y) in pixels, [B, 2] float32.
+            tables: constants.
+            camera: 0 for the in-phase one, 1 for the other.
+
+        Returns:
+            [B, ny, nx] of whole multiples.
+        """
+        # sums of numbers alone: no place goes through a product that may be rounded
+        places = tables[f"where_{camera}"] + (shift * tables["where_pixel"])[:, None, None]
+        seen = self._filtered(frames, tables[f"beam_{camera}"])[:, None].to(torch.float32)
+        seen = functional.grid_sample(seen, places, mode="bilinear", padding_mode="border", align_corners=False)
+        return seen.to(self.dtype).squeeze(1) * tables[f"weight_{camera}"] + tables["squared"]
+
+    def _filtered(self, frames: Tensor, beam: Tensor) -> Tensor:
+        """Frames beyond the reference beam as they are sampled, [B, rows, columns]."""
         if self.unit != 1.0:
             frames = frames.to(torch.float32) * self.unit
         binning = self.recovery.binning
@@ -75,12 +86,18 @@ class BatchedFrames(nn.Module):
             means = functional.avg_pool2d(
                 frames.to(self.dtype)[:, None], binning, ceil_mode=True, count_include_pad=False
             )
-            return means[:, 0]
+            return means[:, 0] - beam
+        height, width = sizes(frames)[1:]
+        beyond = self._channels(frames).to(self.dtype) - beam
+        filtered = functional.conv2d(beyond, self.weights, padding=(self.reach, _NEIGHBOURS // 2))
+        filtered = filtered.permute(0, 2, 3, 1).reshape(-1, height, width + -width % BLOCK)
+        return filtered[..., :width] if width % BLOCK else filtered
+
+    @staticmethod
+    def _channels(frames: Tensor) -> Tensor:
+        """Blocks of a row as channels, zeros behind the last pixels: [B, `BLOCK`, rows, columns over `BLOCK`]."""
         height, width = sizes(frames)[1:]
         missing = -width % BLOCK
         if missing:
             frames = torch.cat([frames, 0 * frames[..., :missing]], -1)
-        split = frames.reshape(-1, height, (width + missing) // BLOCK, BLOCK).permute(0, 3, 1, 2).to(self.dtype)
-        filtered = functional.conv2d(split, self.weights, padding=(self.reach, _NEIGHBOURS // 2))
-        filtered = filtered.permute(0, 2, 3, 1).reshape(-1, height, width + missing)
-        return filtered[..., :width] if missing else filtered
+        return frames.reshape(-1, height, (width + missing) // BLOCK, BLOCK).permute(0, 3, 1, 2)

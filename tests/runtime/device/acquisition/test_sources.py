@@ -1,10 +1,6 @@
 """Pages come from files, uploads, recordings and simulated devices, by number or in turn."""
 
-import re
-import tomllib
-from importlib.metadata import EntryPoint
 from pathlib import Path
-from types import SimpleNamespace
 from unittest.mock import Mock
 
 import numpy as np
@@ -17,9 +13,7 @@ from lightpage.errors import (
     LightpageError,
     LimitError,
     PageError,
-    Reason,
     RecordingError,
-    SourceError,
     StorageError,
 )
 from lightpage.page.symbols import pilot_mask
@@ -31,7 +25,7 @@ from lightpage.runtime.device.acquisition.recording import RecordingSource
 from lightpage.runtime.device.acquisition.simulator import SimulatorSource
 from lightpage.runtime.device.acquisition.source import open_source, own_fault
 from tests.runtime import toy
-from tests.runtime.device.acquisition.lab import pages_of, reason_of
+from tests.runtime.device.acquisition.lab import pages_of
 
 
 @pytest.fixture
@@ -131,64 +125,6 @@ def test_a_simulator_is_opened_by_name_with_settings(tmp_path: Path) -> None:
 def test_what_is_no_source_is_refused_by_name(spec: str, named: str) -> None:
     with pytest.raises(LightpageError, match=named):
         open_source(spec)
-
-
-class VendorSdk:
-    """Cameras that are there once, and lose their second pair."""
-
-    starts = iter((True, False))
-
-    def __init__(self, rest: str) -> None:
-        self.running, self.number, self.blocked = False, 0, False
-
-    def start(self) -> bool:
-        self.running = next(self.starts)
-        return self.running
-
-    def stop(self) -> None:
-        self.running = False
-
-    def block_signal(self, blocked: bool) -> None:
-        self.blocked = blocked
-
-    def show(self, symbols: np.ndarray | None) -> None:
-        assert symbols is None
-
-    def take_pair(self, timeout_s: float) -> tuple[SimpleNamespace, SimpleNamespace] | None:
-        assert self.running
-        self.number += 1
-        if self.number == 2:
-            return None
-        frame = np.full(load_profile("bench").frame_shape, 50 if self.blocked else 100, np.uint8)
-        told = {"number": self.number, "serial": "V1", "clock_s": 1.0, "host_s": 2.0}
-        return SimpleNamespace(pixels=frame, **told), SimpleNamespace(pixels=frame + 1, **told)
-
-
-def test_the_source_of_a_vendor_in_the_documents_works(monkeypatch: pytest.MonkeyPatch) -> None:
-    text = (Path(__file__).parents[4] / "docs" / "cameras.md").read_text("utf-8")
-    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    space: dict[str, object] = {"VendorSdk": VendorSdk}
-    exec(compile(code, "docs/cameras.md", "exec", dont_inherit=True), space)
-    release = tomllib.loads(re.findall(r"```toml\n(\[project.*?)```", text, re.DOTALL)[0])
-    ((name, value),) = release["project"]["entry-points"]["lightpage.sources"].items()
-    vendor = EntryPoint(name, value, "lightpage.sources")
-    monkeypatch.setattr(EntryPoint, "load", lambda self: space[self.attr])
-    monkeypatch.setattr("lightpage.runtime.device.acquisition.source.entry_points", lambda group: [vendor])
-    lost: list[int] = []
-    with open_source("vendor:7") as source:
-        source.on_lost = lambda page, error: lost.append(page)
-        shot = source.shot()
-        assert shot.infos is not None
-        assert [info.frame_id for info in shot.infos] == [1, 1]
-        assert shot.pair.quadrature[0, 0] == 101
-        assert reason_of(source.shot) is Reason.MISSING_FRAME
-        assert lost == [1]
-        assert source.shot().page_index == 2
-        references = source.references()
-        assert references is not None
-        assert references.in_phase[0, 0] == 50
-    with pytest.raises(SourceError, match=r"^vendor"):
-        open_source("vendor:7").arm()
 
 
 def test_uploaded_pages_follow_those_of_the_file(tmp_path: Path) -> None:

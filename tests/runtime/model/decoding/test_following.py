@@ -8,7 +8,7 @@ import pytest
 import lightpage
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device
-from lightpage.errors import UnconfirmedPageError
+from lightpage.errors import BundleError, UnconfirmedPageError
 from lightpage.metrics.measures import measure
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols
@@ -52,8 +52,9 @@ def test_a_name_is_the_shipped_bundle_even_beside_a_folder_of_that_name(
     monkeypatch.chdir(tmp_path)
     assert bundle_path(DEFAULT).name == f"{DEFAULT}.zip"
     assert bundle_path(DEFAULT).is_file()
-    for given in (f"./{DEFAULT}", "nothing-of-that-name"):
-        assert bundle_path(given) == Path(given)
+    assert bundle_path(f"./{DEFAULT}") == Path(f"./{DEFAULT}")
+    with pytest.raises(BundleError):
+        bundle_path("nothing-of-that-name")
 
 
 @pytest.mark.long  # traces full pages of the shipped bundle; the tracker by itself is tested on small ones

@@ -1,5 +1,6 @@
 """The tracker follows the image, finds it again, and gives out no page that its pilots do not confirm."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -7,16 +8,17 @@ import pytest
 
 from lightpage.calibration.image_search import REACH_PX, FoundImage
 from lightpage.calibration.sampling_table import SamplingTable
-from lightpage.errors import Reason, UnconfirmedPageError
+from lightpage.errors import FrameError, Reason, UnconfirmedPageError
 from lightpage.page.pilots import PilotCheck, Pilots
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate
-from lightpage.runtime.model.decoding.image_tracker import CORRECTIONS, RETRACE_RAD, WALK, ImageState, ImageTracker
+from lightpage.runtime.model.decoding.image_tracker import CORRECTIONS, RETRACE_RAD, WALK, ImageTracker
 from lightpage.runtime.model.decoding.page import Inference
 from lightpage.runtime.model.decoding.tracking import TrackerMemory
 from tests.runtime import toy
 from tests.runtime.model.decoding.test_image_drift import SLOPES
+from tests.waiting import eventually
 
 Real = np.ndarray
 
@@ -325,21 +327,28 @@ def test_what_was_learnt_goes_over_as_text_and_decodes_the_next_page_the_same(de
     assert other.memory() == tracker.memory()
 
 
-def test_pages_decoded_at_the_same_time_teach_once(device: FakeDevice, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A page that began before another was learnt from changes nothing: its drift is accounted for."""
+def test_pages_decoded_at_the_same_time_are_taken_in_their_order(device: FakeDevice) -> None:
+    """A page that was decoded beforehand is decoded again where the page before shows that the image has moved."""
     tracker = settled(device)
     device.drift[SHIFT] = (0.5, 0.0)
-    infer, learnt = FakeDecoder.infer, list[ImageState]()
+    first, second = tracker.turn(), tracker.turn()
+    with ThreadPoolExecutor(1) as pool:
+        behind = pool.submit(tracker.decode, device.page(2), 16, None, second)
+        eventually(lambda: len(device.decodes) == 1)
+        image = tracker.decode(device.page(1), 16, None, first).image
+        assert behind.result().image is not None
+    assert image is not None
+    assert image.shift_x_px == pytest.approx(0.5, abs=0.01)
+    assert [round(float(held[0]), 1) for held in device.decodes] == [0.0, 0.0, 0.5, 0.5]
 
-    def meanwhile(self: FakeDecoder, pair: FramePair, table: SamplingTable | None = None) -> Inference:
-        monkeypatch.undo()
-        tracker.decode(device.page(), 16)
-        learnt.append(tracker.state)
-        return infer(self, pair, table)
 
-    monkeypatch.setattr(FakeDecoder, "infer", meanwhile)
-    tracker.decode(device.page(), 16)
-    assert tracker.state is learnt[0]
+def test_a_turn_that_is_never_used_is_closed_and_holds_nobody_up(device: FakeDevice) -> None:
+    tracker = settled(device)
+    tracker.turn().close()
+    dark = FramePair(*(np.zeros_like(frame) for frame in vars(device.page()).values()))
+    with pytest.raises(FrameError):
+        tracker.decode(dark, 16)
+    assert tracker.decode(device.page(), 16).check.confirmed
 
 
 def test_a_page_is_read_by_the_pilots_that_came_with_it(device: FakeDevice) -> None:
@@ -354,7 +363,7 @@ def test_a_page_is_read_by_the_pilots_that_came_with_it(device: FakeDevice) -> N
 def test_the_time_of_a_page_counts_its_search_and_every_attempt(device: FakeDevice) -> None:
     page = device.tracker().decode(device.page(), 16)
     assert page.timings.search_s > 0
-    parts = (page.timings.check_s, page.timings.inference_s, page.timings.decision_s, page.timings.search_s)
+    parts = vars(page.timings).values()
     assert page.timings.total_s == pytest.approx(sum(parts))
 
 

@@ -1,23 +1,32 @@
 """The contract: committed stubs, what earlier clients know; messages with frames, written and read without copies."""
 
+import os
 import random
+import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2
 from google.protobuf.message import DecodeError
+from grpc_tools import protoc
 
 from lightpage.errors import LimitError, MalformedError
 from lightpage.runtime.client.pb.inference import open_inference_pb2 as oip
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import CHUNK_BYTES, chunks_of, parsed_part, serialized_part
 from lightpage.runtime.service.frames.inference_calls import MOST_FIELDS, take_apart
+from tests.runtime.service.stage import Start
 
 MOST = 10_000
 ROOT = Path(__file__).resolve().parents[4]
+UV = Path(sys.executable).with_name("uv")
+SETTINGS: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 
 def stubs(folder: Path) -> dict[str, str]:
@@ -25,11 +34,42 @@ def stubs(folder: Path) -> dict[str, str]:
     return {str(path.relative_to(folder)): path.read_text("utf-8") for path in paths}
 
 
+@pytest.mark.parametrize(("module", "name"), [(pb, "lightpage/v1/lightpage"), (oip, "inference/open_inference")])
+def test_the_committed_stubs_are_of_the_contract(module: ModuleType, name: str, tmp_path: Path) -> None:
+    assert protoc.main(["protoc", f"-I{ROOT / 'proto'}", f"-o{tmp_path / 'out'}", f"{name}.proto"]) == 0
+    (wanted,) = descriptor_pb2.FileDescriptorSet.FromString((tmp_path / "out").read_bytes()).file
+    found = descriptor_pb2.FileDescriptorProto.FromString(module.DESCRIPTOR.serialized_pb)
+    assert str(found) == re.sub(r" *json_name: .*\n", "", str(wanted)), "run make proto"
+
+
+@pytest.mark.long  # uv installs the protoc that made them
 def test_the_committed_stubs_are_what_the_contract_generates(tmp_path: Path) -> None:
-    generate = [sys.executable, ROOT / "proto" / "generate.py", tmp_path]
+    generate = [UV, "run", "--python", sys.executable, ROOT / "proto" / "generate.py", tmp_path]
     subprocess.run(generate, check=True, capture_output=True, timeout=120)
     for home in ("runtime/client/pb", "runtime/model/execution/pb"):
-        assert stubs(tmp_path / home) == stubs(ROOT / home), "run python proto/generate.py"
+        assert stubs(tmp_path / home) == stubs(ROOT / home), "run make proto"
+
+
+@pytest.mark.long  # uv installs tritonclient and all that we need, 300 MB
+@pytest.mark.parametrize(("major", "more"), [("6", ["tritonclient[grpc]"]), ("7", [])])
+def test_client_and_service_live_beside_tritonclient_and_with_the_newest_protobuf(
+    major: str, more: list[str], start: Start, tmp_path: Path
+) -> None:
+    """Tritonclient wants a protobuf below 7. In one process with it runs the client alone."""
+    call = f"""
+import google.protobuf, lightpage{", tritonclient.grpc" if more else ""}
+with lightpage.LightpageClient({start().client.target!r}) as client:
+    print(google.protobuf.__version__.split(".")[0], client.pages.read().symbols.shape)
+"""
+    wanted = [f"protobuf=={major}.*", *more, *SETTINGS["project"]["dependencies"], "onnxruntime"]
+    command = [UV, "run", "--quiet", "--isolated", "--no-project", "--python", sys.executable]
+    command += [word for requirement in wanted for word in ("--with", requirement)]
+    own = {**os.environ, "PYTHONPATH": str(ROOT)}
+    for script in (call, "import lightpage.runtime.service.server.server"):
+        line = [*command, "python", "-c", script]
+        done = subprocess.run(line, cwd=tmp_path, env=own, capture_output=True, text=True, timeout=500)
+        assert done.returncode == 0, done.stderr[-1000:]
+        assert done.stdout.split()[:1] == ([major] if script == call else [])
 
 
 def test_nothing_of_the_contract_of_0_1_was_renumbered_or_renamed() -> None:

@@ -266,7 +266,7 @@ class Model(_message.Message):
     pinned: bool
     loaded: bool
     origin: ModelOrigin
-    def __init__(self, name: _Optional[str] = ..., version: _Optional[str] = ..., created: _Optional[str] = ..., current: _Optional[bool] = ..., metrics: _Optional[_Mapping[str, float]] = ..., pinned: _Optional[bool] = ..., loaded: _Optional[bool] = ..., origin: _Optional[_Union[ModelOrigin, str]] = ...) -> None: ...
+    def __init__(self, name: _Optional[str] = ..., version: _Optional[str] = ..., created: _Optional[str] = ..., current: bool = ..., metrics: _Optional[_Mapping[str, float]] = ..., pinned: bool = ..., loaded: bool = ..., origin: _Optional[_Union[ModelOrigin, str]] = ...) -> None: ...
 
 class Camera(_message.Message):
     __slots__ = ("rows_px", "columns_px", "bit_depth", "pixel_type")
@@ -328,7 +328,7 @@ class DecodeOptions(_message.Message):
     want_user_data: bool
     session: str
     tracking: Tracking
-    def __init__(self, levels: _Optional[int] = ..., confidence_format: _Optional[_Union[ConfidenceFormat, str]] = ..., want_concentration: _Optional[bool] = ..., want_phase: _Optional[bool] = ..., want_user_data: _Optional[bool] = ..., session: _Optional[str] = ..., tracking: _Optional[_Union[Tracking, str]] = ...) -> None: ...
+    def __init__(self, levels: _Optional[int] = ..., confidence_format: _Optional[_Union[ConfidenceFormat, str]] = ..., want_concentration: bool = ..., want_phase: bool = ..., want_user_data: bool = ..., session: _Optional[str] = ..., tracking: _Optional[_Union[Tracking, str]] = ...) -> None: ...
 
 class Pilots(_message.Message):
     __slots__ = ("mask", "values", "levels")
@@ -430,7 +430,7 @@ class DecodeReply(_message.Message):
     correlation_id: str
     recalibration_reasons: _containers.RepeatedScalarFieldContainer[RecalibrationReason]
     level_phases: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, rows: _Optional[int] = ..., columns: _Optional[int] = ..., levels: _Optional[int] = ..., symbols: _Optional[bytes] = ..., confidence: _Optional[bytes] = ..., confidence_format: _Optional[_Union[ConfidenceFormat, str]] = ..., concentration: _Optional[bytes] = ..., phase: _Optional[bytes] = ..., piston_rad: _Optional[float] = ..., pilot_coherence: _Optional[float] = ..., model_version: _Optional[str] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., pilot_trust: _Optional[float] = ..., claimed_bits: _Optional[float] = ..., confirmed_bits: _Optional[float] = ..., recalibration_due: _Optional[bool] = ..., image: _Optional[_Union[ImagePosition, _Mapping]] = ..., user_data: _Optional[_Union[UserData, _Mapping]] = ..., frame_id: _Optional[int] = ..., captured_s: _Optional[float] = ..., correlation_id: _Optional[str] = ..., recalibration_reasons: _Optional[_Iterable[_Union[RecalibrationReason, str]]] = ..., level_phases: _Optional[_Iterable[float]] = ...) -> None: ...
+    def __init__(self, rows: _Optional[int] = ..., columns: _Optional[int] = ..., levels: _Optional[int] = ..., symbols: _Optional[bytes] = ..., confidence: _Optional[bytes] = ..., confidence_format: _Optional[_Union[ConfidenceFormat, str]] = ..., concentration: _Optional[bytes] = ..., phase: _Optional[bytes] = ..., piston_rad: _Optional[float] = ..., pilot_coherence: _Optional[float] = ..., model_version: _Optional[str] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., pilot_trust: _Optional[float] = ..., claimed_bits: _Optional[float] = ..., confirmed_bits: _Optional[float] = ..., recalibration_due: bool = ..., image: _Optional[_Union[ImagePosition, _Mapping]] = ..., user_data: _Optional[_Union[UserData, _Mapping]] = ..., frame_id: _Optional[int] = ..., captured_s: _Optional[float] = ..., correlation_id: _Optional[str] = ..., recalibration_reasons: _Optional[_Iterable[_Union[RecalibrationReason, str]]] = ..., level_phases: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class DecodePagesReply(_message.Message):
     __slots__ = ("decoded", "refused")
@@ -514,7 +514,7 @@ class ReadDataReply(_message.Message):
     restored: bool
     error: ErrorDetail
     model_version: str
-    def __init__(self, page: _Optional[int] = ..., user_data: _Optional[_Union[UserData, _Mapping]] = ..., restored: _Optional[bool] = ..., error: _Optional[_Union[ErrorDetail, _Mapping]] = ..., model_version: _Optional[str] = ...) -> None: ...
+    def __init__(self, page: _Optional[int] = ..., user_data: _Optional[_Union[UserData, _Mapping]] = ..., restored: bool = ..., error: _Optional[_Union[ErrorDetail, _Mapping]] = ..., model_version: _Optional[str] = ...) -> None: ...
 
 class ImagePosition(_message.Message):
     __slots__ = ("shift_x_px", "shift_y_px", "tilt_x_rad", "tilt_y_rad", "searched", "found")
@@ -530,7 +530,7 @@ class ImagePosition(_message.Message):
     tilt_y_rad: float
     searched: bool
     found: bool
-    def __init__(self, shift_x_px: _Optional[float] = ..., shift_y_px: _Optional[float] = ..., tilt_x_rad: _Optional[float] = ..., tilt_y_rad: _Optional[float] = ..., searched: _Optional[bool] = ..., found: _Optional[bool] = ...) -> None: ...
+    def __init__(self, shift_x_px: _Optional[float] = ..., shift_y_px: _Optional[float] = ..., tilt_x_rad: _Optional[float] = ..., tilt_y_rad: _Optional[float] = ..., searched: bool = ..., found: bool = ...) -> None: ...
 
 class Timings(_message.Message):
     __slots__ = ("receive_s", "decode_s", "inference_s", "total_s")
@@ -556,7 +556,7 @@ class ReadPageRequest(_message.Message):
     want_written: bool
     request_id: str
     correlation_id: str
-    def __init__(self, page: _Optional[int] = ..., options: _Optional[_Union[DecodeOptions, _Mapping]] = ..., want_written: _Optional[bool] = ..., request_id: _Optional[str] = ..., correlation_id: _Optional[str] = ...) -> None: ...
+    def __init__(self, page: _Optional[int] = ..., options: _Optional[_Union[DecodeOptions, _Mapping]] = ..., want_written: bool = ..., request_id: _Optional[str] = ..., correlation_id: _Optional[str] = ...) -> None: ...
 
 class ReadPagesRequest(_message.Message):
     __slots__ = ("pages", "count", "options", "want_written", "correlation_id")
@@ -570,7 +570,7 @@ class ReadPagesRequest(_message.Message):
     options: DecodeOptions
     want_written: bool
     correlation_id: str
-    def __init__(self, pages: _Optional[_Iterable[int]] = ..., count: _Optional[int] = ..., options: _Optional[_Union[DecodeOptions, _Mapping]] = ..., want_written: _Optional[bool] = ..., correlation_id: _Optional[str] = ...) -> None: ...
+    def __init__(self, pages: _Optional[_Iterable[int]] = ..., count: _Optional[int] = ..., options: _Optional[_Union[DecodeOptions, _Mapping]] = ..., want_written: bool = ..., correlation_id: _Optional[str] = ...) -> None: ...
 
 class ReadPagesReply(_message.Message):
     __slots__ = ("read", "refused")
@@ -594,7 +594,7 @@ class ReadPageReply(_message.Message):
     pilot_mask: bytes
     frames: _containers.RepeatedCompositeFieldContainer[CameraFrame]
     replayed: bool
-    def __init__(self, decoded: _Optional[_Union[DecodeReply, _Mapping]] = ..., page: _Optional[int] = ..., written: _Optional[bytes] = ..., pilot_mask: _Optional[bytes] = ..., frames: _Optional[_Iterable[_Union[CameraFrame, _Mapping]]] = ..., replayed: _Optional[bool] = ...) -> None: ...
+    def __init__(self, decoded: _Optional[_Union[DecodeReply, _Mapping]] = ..., page: _Optional[int] = ..., written: _Optional[bytes] = ..., pilot_mask: _Optional[bytes] = ..., frames: _Optional[_Iterable[_Union[CameraFrame, _Mapping]]] = ..., replayed: bool = ...) -> None: ...
 
 class CameraFrame(_message.Message):
     __slots__ = ("serial", "frame_id", "device_time_s", "host_time_s")
@@ -642,7 +642,7 @@ class Beams(_message.Message):
     REFERENCE_FIELD_NUMBER: _ClassVar[int]
     signal: bool
     reference: bool
-    def __init__(self, signal: _Optional[bool] = ..., reference: _Optional[bool] = ...) -> None: ...
+    def __init__(self, signal: bool = ..., reference: bool = ...) -> None: ...
 
 class ReportDisplayRequest(_message.Message):
     __slots__ = ("page", "withdrawn", "beams")
@@ -652,7 +652,7 @@ class ReportDisplayRequest(_message.Message):
     page: int
     withdrawn: bool
     beams: Beams
-    def __init__(self, page: _Optional[int] = ..., withdrawn: _Optional[bool] = ..., beams: _Optional[_Union[Beams, _Mapping]] = ...) -> None: ...
+    def __init__(self, page: _Optional[int] = ..., withdrawn: bool = ..., beams: _Optional[_Union[Beams, _Mapping]] = ...) -> None: ...
 
 class ReportDisplayReply(_message.Message):
     __slots__ = ()
@@ -862,7 +862,7 @@ class ListModelsRequest(_message.Message):
     __slots__ = ("stored",)
     STORED_FIELD_NUMBER: _ClassVar[int]
     stored: bool
-    def __init__(self, stored: _Optional[bool] = ...) -> None: ...
+    def __init__(self, stored: bool = ...) -> None: ...
 
 class UploadModelRequest(_message.Message):
     __slots__ = ("header", "chunk")
@@ -916,7 +916,7 @@ class PinModelRequest(_message.Message):
     version: str
     pinned: bool
     correlation_id: str
-    def __init__(self, version: _Optional[str] = ..., pinned: _Optional[bool] = ..., correlation_id: _Optional[str] = ...) -> None: ...
+    def __init__(self, version: _Optional[str] = ..., pinned: bool = ..., correlation_id: _Optional[str] = ...) -> None: ...
 
 class PinModelReply(_message.Message):
     __slots__ = ("model",)
@@ -944,4 +944,4 @@ class ErrorDetail(_message.Message):
     wanted: str
     reason: LossReason
     recalibration_due: bool
-    def __init__(self, kind: _Optional[str] = ..., thing: _Optional[str] = ..., got: _Optional[str] = ..., wanted: _Optional[str] = ..., reason: _Optional[_Union[LossReason, str]] = ..., recalibration_due: _Optional[bool] = ...) -> None: ...
+    def __init__(self, kind: _Optional[str] = ..., thing: _Optional[str] = ..., got: _Optional[str] = ..., wanted: _Optional[str] = ..., reason: _Optional[_Union[LossReason, str]] = ..., recalibration_due: bool = ...) -> None: ...

@@ -6,7 +6,7 @@ import warnings
 
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as lightpage_dot_v1_dot_lightpage__pb2
 
-GRPC_GENERATED_VERSION = '1.85.1'
+GRPC_GENERATED_VERSION = '1.72.1'
 GRPC_VERSION = grpc.__version__
 _version_not_supported = False
 
@@ -19,14 +19,14 @@ except ImportError:
 if _version_not_supported:
     raise RuntimeError(
         f'The grpc package installed is at version {GRPC_VERSION},'
-        + ' but the generated code in lightpage/v1/lightpage_pb2_grpc.py depends on'
+        + f' but the generated code in lightpage/v1/lightpage_pb2_grpc.py depends on'
         + f' grpcio>={GRPC_GENERATED_VERSION}.'
         + f' Please upgrade your grpc module to grpcio>={GRPC_GENERATED_VERSION}'
         + f' or downgrade your generated code using grpcio-tools<={GRPC_VERSION}.'
     )
 
 
-class LightpageStub:
+class LightpageStub(object):
     """INVALID_ARGUMENT: what the caller sent is wrong. RESOURCE_EXHAUSTED: it is too large (no RetryInfo), or the service has too
     much to do to answer before the caller's deadline (RetryInfo says when to try again). ABORTED: the model in service is not
     the one that was expected, or another recalibration runs. FAILED_PRECONDITION: the service's own source or models do not allow it. DATA_LOSS: the page is lost,
@@ -151,7 +151,7 @@ class LightpageStub:
                 _registered_method=True)
 
 
-class LightpageServicer:
+class LightpageServicer(object):
     """INVALID_ARGUMENT: what the caller sent is wrong. RESOURCE_EXHAUSTED: it is too large (no RetryInfo), or the service has too
     much to do to answer before the caller's deadline (RetryInfo says when to try again). ABORTED: the model in service is not
     the one that was expected, or another recalibration runs. FAILED_PRECONDITION: the service's own source or models do not allow it. DATA_LOSS: the page is lost,
@@ -445,7 +445,7 @@ def add_LightpageServicer_to_server(servicer, server):
 
 
  # This class is part of an EXPERIMENTAL API.
-class Lightpage:
+class Lightpage(object):
     """INVALID_ARGUMENT: what the caller sent is wrong. RESOURCE_EXHAUSTED: it is too large (no RetryInfo), or the service has too
     much to do to answer before the caller's deadline (RetryInfo says when to try again). ABORTED: the model in service is not
     the one that was expected, or another recalibration runs. FAILED_PRECONDITION: the service's own source or models do not allow it. DATA_LOSS: the page is lost,

@@ -1,0 +1,173 @@
+"""A bundle's graph for batches, opened; the constants of a table that it runs with, and the memory of its frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.errors import BundleError
+from lightpage.progress import warn
+from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.bundle.manifest import BATCH, CONSTANTS, FLOAT16
+from lightpage.runtime.model.decoding.golden import check_golden
+from lightpage.runtime.model.decoding.page import OUTPUTS, Inference
+from lightpage.runtime.model.execution.session import BoundSession, open_session, running
+from lightpage.runtime.model.execution.table_graph import TableGraph
+
+_FILES = {CONSTANTS, BATCH}
+REGISTRATION = "registration"
+SHIFT = "shift"
+"""Input of the images' shifts against the registration of the constants, (x, y) of either camera, pixels [B, 2, 2]."""
+REACH = 0.003
+"""Largest shift by which constants serve, as a share of the frame's width: the beam is taken to be where they have it,
+and changes the light by so little."""
+
+
+@dataclass(frozen=True)
+class Constants:
+    """Tensors that follow from a table alone, where the graph computes.
+
+    Attributes:
+        registration: in the table, [2, 2, 10].
+        bound: the graph, run with them.
+        reach_px: see `REACH`.
+    """
+
+    registration: NDArray[np.float32]
+    bound: BoundSession
+    reach_px: float
+
+    def shift_of(self, registration: NDArray[np.float32]) -> NDArray[np.float32] | None:
+        """The shift of an image against it, [2, 2] pixels; None where there is none like it, or it is beyond reach."""
+        apart = registration - self.registration
+        shift = apart[..., 0].astype(np.float32)
+        reached = not apart[..., 1:].any() and np.abs(shift).max() <= self.reach_px
+        return shift if reached else None
+
+
+class FrameBuffer:
+    """Memory for the frames of a batch: pages are written in from many threads, each to its own place.
+
+    Args:
+        pages: at most.
+        frame_shape, dtype: of a frame.
+    """
+
+    def __init__(self, pages: int, frame_shape: tuple[int, int], dtype: str) -> None:
+        self.frames = {name: np.zeros((pages, *frame_shape), dtype) for name in ("in_phase", "quadrature")}
+        self.shift = np.zeros((pages, 2, 2), np.float32)
+
+    def put(self, place: int, pair: FramePair, shift: NDArray[np.float32]) -> None:
+        """Write a page."""
+        self.frames["in_phase"][place], self.frames["quadrature"][place] = pair.in_phase, pair.quadrature
+        self.shift[place] = shift
+
+    def feeds(self, pages: slice) -> dict[str, NDArray[np.generic]]:
+        """Inputs of some pages, by name; what was written before stands where nothing was since."""
+        return {name: array[pages] for name, array in {**self.frames, SHIFT: self.shift}.items()}
+
+
+class BatchGraph:
+    """The graph for batches of a bundle. It never changes; its methods may be called from many threads at once.
+
+    The golden page is decoded alone, and among the most pages, in the first and in the last place.
+
+    Args:
+        bundle: that has such a graph.
+        graph: of its decoder, with its provider and its table.
+        pages: of a run, at most.
+        threads: of a run on the CPU.
+
+    Attributes:
+        subject: what it is, for errors.
+        constants_of_bundle: those of the graph's table.
+
+    Raises:
+        BundleError: the bundle has no such graph, or the golden page comes out differently.
+        ProviderError: there is no such provider here.
+    """
+
+    def __init__(self, bundle: Bundle, graph: TableGraph, pages: int, threads: int | None = None) -> None:
+        self.subject, self.pages = f"{bundle.subject}: {BATCH}", pages
+        if missing := _FILES - bundle.files.keys():
+            raise BundleError(f"{bundle.subject}: files", f"no {', '.join(sorted(missing))}", "a graph for batches")
+        self._bundle, self._provider = bundle, graph.provider
+        self._session = open_session(bundle.files[BATCH], self.subject, threads, provider=graph.provider, rounded=True)
+        if SHIFT not in {node.name for node in self._session.get_inputs()}:
+            raise BundleError(self.subject, f"no input {SHIFT}", "an export by this version of Lightpage")
+        # stays open, since opening it takes longer than running it; `once` has it keep no memory
+        self._first = open_session(bundle.files[CONSTANTS], f"{bundle.subject}: {CONSTANTS}", threads, once=True)
+        self.constants_of_bundle = self.constants(graph)
+        buffer = self.buffer()
+        for place, count in {0: 1, pages - 1: pages}.items():
+            check_golden(bundle, partial(self._golden, buffer, place, count), FLOAT16)
+
+    def buffer(self) -> FrameBuffer:
+        """Memory for the frames of a run."""
+        return FrameBuffer(self.pages, self._bundle.profile.frame_shape, self._bundle.manifest.frame_dtype)
+
+    def constants(self, graph: TableGraph, registration: NDArray[np.float32] | None = None) -> Constants:
+        """Constants of a table, computed on the CPU.
+
+        Args:
+            graph: with that table.
+            registration: in place of the table's.
+        """
+        names = [node.name for node in self._first.get_outputs()]
+        table = {node.name: graph.value(node.name) for node in self._first.get_inputs()}
+        if registration is not None:
+            table[REGISTRATION] = registration
+        with running(self.subject):
+            made = dict(zip(names, self._first.run(names, table), strict=True))
+        bound = BoundSession(self._session, self._provider, made, self.subject)
+        return Constants(table[REGISTRATION], bound, REACH * self._bundle.profile.frame_shape[1])
+
+    def run(self, constants: Constants, buffer: FrameBuffer, pages: slice) -> list[Inference]:
+        """The answers of the graph to some pages in a buffer; of their residuals no one has judged.
+
+        Raises:
+            BundleError: other answers than one a page.
+            ProviderError: a GPU failed, or has no room.
+            SurroundingsError: memory or threads are short.
+        """
+        count = pages.stop - pages.start
+        # of few sizes, since a GPU looks for kernels at each: others are computed beside them, whatever they are
+        size = min(self.pages - pages.start, 1 << (count - 1).bit_length())
+        feeds = buffer.feeds(slice(pages.start, pages.start + size))
+        answers = list(zip(*constants.bound.run([*OUTPUTS, "residual"], feeds), strict=True))
+        if len(answers) != size:
+            raise BundleError(f"{self.subject}, pages of an answer", len(answers), f"{size}, as many as were asked for")
+        return [Inference(p, phase, length, float(left)) for p, phase, length, left in answers[:count]]
+
+    def _golden(self, buffer: FrameBuffer, place: int, pages: int, pair: FramePair) -> NDArray[np.float32]:
+        """The answer to a page at a place among others that are no pages, p."""
+        for number in range(pages):
+            frames = pair if number == place else FramePair(pair.quadrature, pair.in_phase)
+            buffer.put(number, frames, np.zeros((2, 2), np.float32))
+        return self.run(self.constants_of_bundle, buffer, slice(0, pages))[place].p
+
+
+def with_proven_batches(bundle: Bundle, graph: TableGraph) -> Bundle:
+    """The bundle, without its graph for batches and a warning where that does not decode the golden page as it should.
+
+    Args:
+        bundle: in memory.
+        graph: of its decoder, with its table.
+    """
+    if not holds_batches(bundle):
+        return bundle
+    try:
+        BatchGraph(bundle, graph, pages=2)
+    except BundleError as differing:
+        warn(f"no decoder for many pages: {differing}")
+        return replace(bundle, files={name: data for name, data in bundle.files.items() if name not in _FILES})
+    return bundle
+
+
+def holds_batches(bundle: Bundle) -> bool:
+    """Return whether a bundle has a graph for batches."""
+    return bundle.files.keys() >= _FILES

@@ -1,0 +1,336 @@
+"""Dynamic batching: pages that are inferred at the same time are computed in one run of a graph for batches."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from copy import copy
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.clock import SYSTEM, Clock
+from lightpage.failures import lacks_memory
+from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.bundle.manifest import BATCH
+from lightpage.runtime.model.decoding.batch_graph import (
+    REGISTRATION,
+    BatchGraph,
+    Constants,
+    FrameBuffer,
+    holds_batches,
+)
+from lightpage.runtime.model.decoding.page import Inference
+from lightpage.runtime.model.decoding.under_way import Phase, UnderWay
+from lightpage.runtime.model.execution.table_graph import TableGraph
+
+_log = logging.getLogger(__name__)
+
+KEPT = 4
+"""Tables whose constants are held: 640 MB each, of a full-size page by waves."""
+_STALE = 64
+"""Constants that were not asked for by so many pages make room for those of another table."""
+_ALONE = 2
+"""Pages that are computed alone at a time, where batches were wanted: many more are on their way then."""
+_BUFFERS = 2
+"""One is filled while the graph runs from the other."""
+
+
+@dataclass(frozen=True)
+class Batching:
+    """Choices of how pages are gathered.
+
+    Attributes:
+        largest: pages of a run, at most; 1 for none together.
+        longest_wait_s: for which a run waits while others are known to come.
+        pages: that are under way, of all models that gather them so.
+    """
+
+    largest: int = 1
+    longest_wait_s: float = 0.005
+    pages: UnderWay = field(default_factory=UnderWay)
+
+
+NO_BATCHES = Batching()
+
+
+@dataclass(eq=False)
+class _Run:
+    """Pages that are computed together."""
+
+    constants: Constants
+    buffer: FrameBuffer
+    since: float
+    begun: float = 0.0
+    threads: list[int] = field(default_factory=list)
+    written: int = 0
+    is_patient: bool = True
+    inferences: list[Inference] | None = None
+    error: BaseException | None = None
+
+    @property
+    def is_done(self) -> bool:
+        return self.inferences is not None or self.error is not None
+
+
+@dataclass(eq=False)
+class _Ticket:
+    """A page in the queue for a place in a run with these constants."""
+
+    constants: Constants
+
+
+@dataclass(eq=False)
+class _Held:
+    """Constants with the table that they follow from, and when they were last asked for."""
+
+    graph: TableGraph
+    own: NDArray[np.float32]
+    constants: Constants
+    asked: int = 0
+
+
+class HeldConstants:
+    """Constants of the tables in use, a few of them.
+
+    Args:
+        graph: that runs with them.
+        table: whose constants it has already.
+    """
+
+    def __init__(self, graph: BatchGraph, table: TableGraph) -> None:
+        self._graph, self._lock, self._asked = graph, threading.Lock(), 0
+        first = graph.constants_of_bundle
+        self._held = [_Held(table, first.registration, first)]
+        self._making: set[TableGraph] = set()
+
+    def of(
+        self, table: TableGraph, registration: NDArray[np.float32] | None
+    ) -> tuple[Constants, NDArray[np.float32]] | None:
+        """Constants of a table, and by how much an image lies elsewhere than they have it, [2, 2] pixels.
+
+        None where there is no room for them, or they are being made for another page.
+
+        Args:
+            table: which.
+            registration: of the page; None for the table's.
+        """
+        with self._lock:
+            self._asked += 1
+            for held in self._held:
+                shift = held.constants.shift_of(held.own if registration is None else registration)
+                if held.graph is table and shift is not None:
+                    held.asked = self._asked
+                    return held.constants, shift
+            if table in self._making or not self._has_room():
+                return None
+            self._making.add(table)
+        try:
+            own = table.value(REGISTRATION)
+            made = _Held(table, own, self._graph.constants(table, registration), self._asked)
+        finally:
+            with self._lock:
+                self._making.discard(table)
+        with self._lock:
+            self._held = [*sorted(self._held, key=lambda held: held.asked)[1 - KEPT :], made]
+        return made.constants, np.zeros((2, 2), np.float32)
+
+    def _has_room(self) -> bool:
+        oldest = min(held.asked for held in self._held)
+        return len(self._held) < KEPT or self._asked - oldest >= _STALE
+
+
+class OneByOne:
+    """Gathers nothing: each page is computed alone.
+
+    Args:
+        at_once: pages that are computed at a time, at most; None for as many as come.
+    """
+
+    largest = 1
+
+    def __init__(self, at_once: int | None = None) -> None:
+        self.alone: AbstractContextManager[Any] = nullcontext() if at_once is None else threading.Semaphore(at_once)
+        """Held while a page is computed alone."""
+
+    def under_way(self) -> AbstractContextManager[None]:
+        """A page is decoded within the `with` statement; until it is inferred, a batch may wait for it."""
+        return nullcontext()
+
+    def infer(
+        self, table: TableGraph, pair: FramePair, registration: NDArray[np.float32] | None = None
+    ) -> Inference | None:
+        """The graph's answer to a page that is computed with others; None where it must be computed alone.
+
+        Args:
+            table: that it is decoded with.
+            pair: its frames, checked.
+            registration: of the page; None for the table's.
+
+        Raises:
+            BundleError, ProviderError, SurroundingsError: see `BatchGraph.run`; each page of the run hears of it.
+        """
+        return None
+
+
+class Batches(OneByOne):
+    """Gathers pages of one bundle's graph for batches, and runs it. For many threads; the callers' own compute.
+
+    A page that comes while nothing runs is computed at once, alone, unless frames of others are being checked. Pages
+    that come while a run is on wait for its end, and are computed together then.
+
+    Args:
+        graph: that is run.
+        table: of the bundle.
+        batching: how pages are gathered.
+        clock: by which runs wait.
+    """
+
+    def __init__(self, graph: BatchGraph, table: TableGraph, batching: Batching, clock: Clock = SYSTEM) -> None:
+        super().__init__(_ALONE)
+        self._clock = clock
+        self._graph, self._batching, self._constants = graph, batching, HeldConstants(graph, table)
+        self.largest = min(batching.largest, graph.pages)
+        """Pages of a run, at most; fewer once memory was short."""
+        self._pages = batching.pages
+        self._changed = threading.Condition()
+        """Held while runs are looked at or changed, and never while anything is copied or computed."""
+        self._free = [graph.buffer() for _ in range(_BUFFERS)]
+        self._gathering: list[_Run] = []
+        self._queue: deque[_Ticket] = deque()
+        self._is_running = False
+
+    @classmethod
+    def opened(cls, bundle: Bundle, table: TableGraph, batching: Batching, threads: int | None) -> OneByOne:
+        """Open a bundle's graph for batches; pages go one by one where it has none, which is logged, or none is wanted.
+
+        Raises:
+            BundleError, ProviderError: see `BatchGraph`.
+        """
+        if batching.largest == 1:
+            return OneByOne()
+        if not holds_batches(bundle):
+            _log.warning(
+                "%s: no %s, so pages are computed one by one (lightpage export --batches)", bundle.subject, BATCH
+            )
+            return OneByOne(_ALONE)
+        return cls(BatchGraph(bundle, table, batching.largest, threads), table, batching)
+
+    @contextmanager
+    def under_way(self) -> Iterator[None]:
+        """See `OneByOne`."""
+        self._pages.move(Phase.COMING, thread := threading.get_ident())
+        try:
+            yield
+        finally:
+            self._pages.move(None, thread)
+            with self._changed:
+                self._changed.notify_all()
+
+    def infer(
+        self, table: TableGraph, pair: FramePair, registration: NDArray[np.float32] | None = None
+    ) -> Inference | None:
+        """See `OneByOne`."""
+        came, thread = self._clock.now(), threading.get_ident()
+        behind = Phase.BEHIND if self._pages.knows(thread) else None
+        if (found := self._constants.of(table, registration)) is None:
+            self._pages.move(behind, thread)
+            return None
+        self._pages.move(Phase.WAITING, thread)
+        try:
+            run, place = self._joined(found[0], thread)
+            try:
+                run.buffer.put(place, pair, found[1])
+            finally:  # if that is cut short, the others are computed all the same
+                self._see_to(run)
+        finally:
+            self._pages.move(behind, thread)
+        if run.inferences is None:
+            assert run.error is not None
+            raise copy(run.error) from run.error  # each caller's own: callers add to errors
+        return replace(run.inferences[place], waited_s=run.begun - came)
+
+    def _joined(self, constants: Constants, thread: int) -> tuple[_Run, int]:
+        """A run that is gathered with these constants, and the page's place in it."""
+        ticket = _Ticket(constants)
+        with self._changed:
+            self._queue.append(ticket)
+            try:
+                self._changed.wait_for(lambda: self._open(constants) or (self._free and self._queue[0] is ticket))
+                if (run := self._open(constants)) is None:
+                    run = _Run(constants, self._free.pop(), self._clock.now())
+                    self._gathering.append(run)
+                run.threads.append(thread)
+                return run, len(run.threads) - 1
+            finally:
+                self._queue.remove(ticket)
+                self._changed.notify_all()
+
+    def _open(self, constants: Constants) -> _Run | None:
+        """A run that takes one more page with these constants."""
+        same = (run for run in self._gathering if run.constants is constants and len(run.threads) < self.largest)
+        return next(same, None)
+
+    def _see_to(self, run: _Run) -> None:
+        """Wait until a run is done, in which one more page is there; run it if nobody else does once it may begin."""
+        with self._changed:
+            run.written += 1
+            self._changed.notify_all()
+            self._wait(run)
+            if run.is_done:
+                return
+            self._gathering.remove(run)
+            self._is_running, run.begun = True, self._clock.now()
+        self._pages.move(Phase.RUNNING, *run.threads)
+        try:
+            run.inferences = self._computed(run)
+        except BaseException as error:  # an interrupt too: others wait
+            run.error = error
+        finally:
+            self._pages.ran(*run.threads)
+            with self._changed:
+                self._is_running = False
+                self._free.append(run.buffer)
+                self._changed.notify_all()
+
+    def _wait(self, run: _Run) -> None:
+        """Wait until a run is done, or may begin."""
+
+        def over() -> bool:
+            return run.is_done or self._may_begin(run)
+
+        left_s = run.since + self._batching.longest_wait_s - self._clock.now()
+        if not self._clock.wait_for(self._changed, over, left_s):
+            run.is_patient = False
+            self._changed.wait_for(over)
+
+    def _may_begin(self, run: _Run) -> bool:
+        """Return whether it is a run's turn, and nothing is to be waited for."""
+        if self._is_running or [run] != self._gathering[:1] or run.written < len(run.threads):
+            return False
+        if len(run.threads) >= self.largest:
+            return True
+        if any(ticket.constants is run.constants for ticket in self._queue):  # which has been told that there is room
+            return False
+        return not run.is_patient or not self._pages.count(Phase.COMING)
+
+    def _computed(self, run: _Run) -> list[Inference]:
+        """The graph's answers to a run's pages; in smaller runs from now on where there was no memory for so many."""
+        pages = len(run.threads)
+        try:
+            return self._graph.run(run.constants, run.buffer, slice(0, pages))
+        except Exception as error:
+            if pages == 1 or not lacks_memory(error):
+                raise
+            self.largest = half = (pages + 1) // 2
+            _log.warning(
+                "%s: batches of %d pages from now on, since memory was short: %s", self._graph.subject, half, error
+            )
+        parts = [slice(first, min(first + half, pages)) for first in range(0, pages, half)]
+        return [page for part in parts for page in self._graph.run(run.constants, run.buffer, part)]
