@@ -1,6 +1,7 @@
 """A symbol whose image lies off a camera is claimed with nothing, whatever the network says of it."""
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -52,6 +53,9 @@ def test_no_decode_and_no_tracker_counts_pilots_that_a_camera_does_not_show(deco
     blind.__dict__["view"] = CameraView(WIDE, moved, places)  # where a graph with places has it
     device, page = FakeDevice(blind), FakeDevice(blind).page()
     off = blind.infer(page).concentration == 0
+    gathered = blind.with_table({})
+    gathered.__dict__["view"], gathered.batches = blind.view, Mock(infer=Mock(return_value=decoder.infer(page)))
+    np.testing.assert_array_equal(gathered.infer(page).concentration == 0, off)
     right = decoder.pilots(16)
     assert 0 < np.count_nonzero(off[right.mask]) < len(right.phases) / 2
     wrong = replace(right, phases=right.phases + np.pi * off[right.mask])
