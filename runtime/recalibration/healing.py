@@ -126,16 +126,17 @@ def heal(
                 raise RecalibrationRefusedError("healing", work.unread(model), _WANTED)
             rounds += 1
             model = work.fitted(model, partial(_within, progress, rounds))
+        told = partial(_within, progress, MOST_ROUNDS + 1)
         try:
-            result = fit(decoder.bundle, known.part(slice(1)), partial(_within, progress, MOST_ROUNDS + 1), decoder)
+            result = fit(decoder.bundle, known.part(slice(1)), told, decoder)
         except CalibrationError:
             if not rounds:
                 raise
-            model = work.judged(model, known)
+            model = work.judged(model, known, told)
         else:
             by_known = model.by(known.pairs[0], decoder.of_bundle(refitted_bundle(decoder.bundle, result)), result)
             # one more page is worth more than a little more of each
-            if work.count(by_known) >= work.count(model) or (model := work.judged(model, known)).is_wrong:
+            if work.count(by_known) >= work.count(model) or (model := work.judged(model, known, told)).is_wrong:
                 model = by_known
         result = replace(model.result, report=replace(model.result.report, image=work.image))
         return Healed(model.decoder, result, work.known(model) or known, rounds, time.perf_counter() - start)
@@ -289,7 +290,7 @@ class _Healing:
         found = earlier.followed_by(Calibration.from_registered(registered, profile, [*hashes]))
         return model.by(self.pairs[page], *self._with(found))
 
-    def judged(self, model: _Model, known: KnownPages) -> _Model:
+    def judged(self, model: _Model, known: KnownPages, progress: Progress) -> _Model:
         """The model with the verdict on its geometry, by the light of the first known page.
 
         A fit to decisions gives none: those that are wrong would count as light that the geometry does not explain.
@@ -297,7 +298,8 @@ class _Healing:
         if not model.fitted:
             return model
         bundle, symbols = model.decoder.bundle, np.exp(1j * symbol_phases(known.symbols[0], self._levels))
-        goodness = goodness_of(self._twin, self._near(model), KnownPage(known.pairs[0], symbols))
+        page = KnownPage(known.pairs[0], symbols)
+        goodness = goodness_of(self._twin, self._near(model), page, lambda _: progress("unexplained light", 1.0))
         return _Model(*self._with(bundle.calibration.model_copy(update={"goodness": goodness})), model.fitted)
 
 
