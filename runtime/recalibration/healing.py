@@ -136,8 +136,7 @@ def heal(
         else:
             by_known = model.by(known.pairs[0], decoder.of_bundle(refitted_bundle(decoder.bundle, result)), result)
             # one more page is worth more than a little more of each
-            if work.count(by_known) >= work.count(model) or (model := work.judged(model, known, told)).is_wrong:
-                model = by_known
+            model = by_known if work.count(by_known) >= work.count(model) else work.judged(model, known, told)
         result = replace(model.result, report=replace(model.result.report, image=work.image))
         return Healed(model.decoder, result, work.known(model) or known, rounds, time.perf_counter() - start)
 
@@ -156,11 +155,6 @@ class _Model(NamedTuple):
     def last(self) -> FramePair | None:
         """The page of the last fit."""
         return self.fitted[0] if self.fitted else None
-
-    @property
-    def is_wrong(self) -> bool:
-        """Whether its geometry leaves so much light unexplained that it is wrong."""
-        return self.decoder.bundle.calibration.is_wrong
 
     def by(self, pair: FramePair, decoder: Decoder, result: RefitResult) -> _Model:
         """The model of another fit, by `pair`, that began with this one."""
