@@ -9,7 +9,6 @@ from lightpage.errors import BundleError, FrameError
 from lightpage.page.levels import Levels
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import symbol_phases
-from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate, drift_slopes
 from lightpage.runtime.model.decoding.page import Inference
 from tests.lightpage.uneven import overlapping, uneven
@@ -108,8 +107,7 @@ def test_frames_that_are_refused_a_little_off_their_place_are_told_as_frames() -
     refused = Mock()
     refused.graph.value.return_value = np.ones((2, 2, 10), np.float32)
     refused.infer.side_effect = FrameError("frame pair", "no light", "light")
-    frames = FramePair(*np.zeros((2, 4, 4), np.uint8))
-    for pair, kind in ((frames, FrameError), (None, BundleError)):
+    for pair, kind in ((Mock(), FrameError), (None, BundleError)):
         with pytest.raises(kind):
             drift_slopes(refused, Mock(), np.zeros(1), pair)
 
