@@ -47,7 +47,7 @@ def test_columns_that_leave_one_camera_are_not_claimed(camera: int) -> None:
 
 def test_no_decode_and_no_tracker_counts_pilots_that_a_camera_does_not_show(decoder: Decoder) -> None:
     blind, (registration, places) = decoder.with_table({}), nominal(WIDE)
-    moved = shifted(registration, np.array([BENCH.frame_shape[1] / 2 - 84, 0.0]))
+    moved = shifted(registration, np.array([BENCH.frame_shape[1] / 2 - 100, 0.0]))
     blind.__dict__["view"] = CameraView(WIDE, moved, places)  # where a graph with places has it
     device, page = FakeDevice(blind), FakeDevice(blind).page()
     off = blind.infer(page).concentration == 0
