@@ -315,14 +315,11 @@ def test_a_re_fit_starts_where_the_image_is_found(refined: Refined, bench: Decod
     assert np.array_equal(found.table["reference_quadrature"], moved.references.quadrature)
 
 
-def test_a_re_fit_near_a_device_tells_no_search_and_all_pages_of_the_fits_before_it(
-    refined: Refined, bench: Decoder, moved: KnownPages
-) -> None:
-    bundle = bench.bundle
-    near = bundle.calibration.device(bundle.profile, bench.references)
+def test_a_re_fit_near_a_device_tells_no_search(refined: Refined, bench: Decoder, moved: KnownPages) -> None:
+    near = bench.bundle.calibration.device(bench.bundle.profile, bench.references)
     found = refined(replace(moved, near=near, fitted=("a" * 64,)))
     assert found.report.image is None
-    fitted = with_calibration(bundle, found.calibration_toml).calibration
+    fitted = with_calibration(bench.bundle, found.calibration_toml).calibration
     assert fitted.calibrated_pages[-2:] == (hash_frames(moved.pairs[0]), "a" * 64)
 
 
