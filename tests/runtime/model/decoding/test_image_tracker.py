@@ -8,12 +8,13 @@ import pytest
 
 from lightpage.calibration.image_search import REACH_PX, FoundImage
 from lightpage.calibration.sampling_table import SamplingTable
-from lightpage.errors import FrameError, Reason, UnconfirmedPageError
+from lightpage.errors import CallerLeft, FrameError, Reason, UnconfirmedPageError
 from lightpage.page.pilots import PilotCheck, Pilots
 from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.model.decoding.batches import OneByOne
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate
-from lightpage.runtime.model.decoding.image_tracker import CORRECTIONS, RETRACE_RAD, WALK, ImageTracker
+from lightpage.runtime.model.decoding.image_tracker import CORRECTIONS, RETRACE_RAD, WALK, ImageState, ImageTracker
 from lightpage.runtime.model.decoding.page import Inference
 from lightpage.runtime.model.decoding.tracking import TrackerMemory
 from tests.runtime import toy
@@ -41,6 +42,7 @@ class FakeDevice:
     traces: list[Real] = field(default_factory=list)
     pilots: list[Pilots] = field(default_factory=list)
     held: Real = field(default_factory=lambda: np.zeros(4))
+    together: int = 1
 
     def tracker(self, search: bool = True, memory: TrackerMemory | None = None) -> ImageTracker:
         return ImageTracker(
@@ -60,6 +62,8 @@ class FakeDecoder:
 
     def __init__(self, device: FakeDevice, tilt: Real) -> None:
         self._device, self._tilt, self._decoder = device, tilt, device.decoder
+        self.batches = OneByOne()
+        self.batches.largest = device.together
 
     def __getattr__(self, name: str) -> object:
         return getattr(self._decoder, name)
@@ -328,7 +332,8 @@ def test_what_was_learnt_goes_over_as_text_and_decodes_the_next_page_the_same(de
 
 
 def test_pages_decoded_at_the_same_time_are_taken_in_their_order(device: FakeDevice) -> None:
-    """A page that was decoded beforehand is decoded again where the page before shows that the image has moved."""
+    """In batches, a page that was decoded ahead is decoded again where the page before shows that the image moved."""
+    device.together = 2
     tracker = settled(device)
     device.drift[SHIFT] = (0.5, 0.0)
     first, second = tracker.turn(), tracker.turn()
@@ -340,6 +345,38 @@ def test_pages_decoded_at_the_same_time_are_taken_in_their_order(device: FakeDev
     assert image is not None
     assert image.shift_x_px == pytest.approx(0.5, abs=0.01)
     assert [round(float(held[0]), 1) for held in device.decodes] == [0.0, 0.0, 0.5, 0.5]
+
+
+def test_without_batches_pages_wait_for_none_and_teach_once(
+    device: FakeDevice, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A page that began before another was learnt from changes nothing: its drift is accounted for."""
+    tracker = settled(device)
+    device.drift[SHIFT] = (0.5, 0.0)
+    infer, learnt = FakeDecoder.infer, list[ImageState]()
+
+    def meanwhile(self: FakeDecoder, pair: FramePair, table: SamplingTable | None = None) -> Inference:
+        monkeypatch.undo()
+        tracker.decode(device.page(), 16)
+        learnt.append(tracker.state)
+        return infer(self, pair, table)
+
+    monkeypatch.setattr(FakeDecoder, "infer", meanwhile)
+    tracker.decode(device.page(), 16)
+    assert tracker.state is learnt[0]
+
+
+def test_whoever_waits_for_a_page_that_hangs_may_leave(device: FakeDevice) -> None:
+    def leave() -> None:
+        raise CallerLeft
+
+    device.together = 2
+    tracker = settled(device)
+    hanging, turn = tracker.turn(), tracker.turn(leave)
+    with pytest.raises(CallerLeft):
+        tracker.decode(device.page(), 16, None, turn)
+    hanging.close()
+    assert tracker.decode(device.page(), 16).check.confirmed
 
 
 def test_a_turn_that_is_never_used_is_closed_and_holds_nobody_up(device: FakeDevice) -> None:
