@@ -72,11 +72,10 @@ class UnderWay:
         with self._lock:
             return thread in self._phases
 
-    def ran(self, *threads: int) -> None:
-        """A batch of the pages of some threads was run."""
-        self.move(Phase.BEHIND, *threads)
+    def ran(self, pages: int) -> None:
+        """Count a batch that was run."""
         with self._lock:
-            self.runs[len(threads)] += 1
+            self.runs[pages] += 1
 
     def seconds(self) -> dict[Device, float]:
         """Seconds that the device spent in each state until now."""

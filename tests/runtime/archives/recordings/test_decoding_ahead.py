@@ -1,6 +1,6 @@
 """Pages of a recording that are decoded ahead: the same in the end as one by one, and by the model in use."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Thread
 from typing import cast
@@ -26,26 +26,32 @@ class Named:
     """A tracker that is asked for turns alone, and a recording of pages without frames."""
 
     name: str
+    turns: Turns = field(default_factory=Turns)
+    seen: list[int] = field(default_factory=list)
 
     def turn(self) -> Turn:
-        return Turns().take()
+        return self.turns.take()
 
     def shown(self, page: int) -> tuple[FramePair, Symbols]:
         return FramePair(np.full(1, page), np.zeros(1)), None
 
 
-def test_pages_that_the_model_before_has_decoded_are_decoded_again() -> None:
+def test_pages_that_the_model_before_has_decoded_are_decoded_again_in_their_order() -> None:
     def decode(page: Shown, frames: FramePair, symbols: Symbols) -> tuple[str, int]:
-        return cast(Named, page.tracker).name, int(frames.in_phase[0])
+        with page.turn:
+            named, number = cast(Named, page.tracker), int(frames.in_phase[0])
+            named.seen.append(number)
+            return named.name, number
 
     def in_use() -> Tracker:
         return cast(Tracker, models[len(found) >= 3])
 
     models = Named("first"), Named("second")
     found: list[tuple[str, int]] = []
-    for _, result in decoded_ahead(cast(Recording, Named("recording")), range(6), in_use, 2, decode):
+    for _, result in decoded_ahead(cast(Recording, Named("recording")), range(16), in_use, 2, decode):
         found.append(result()[0])
-    assert found == [*(("first", page) for page in range(3)), *(("second", page) for page in range(3, 6))]
+    assert found == [*(("first", page) for page in range(3)), *(("second", page) for page in range(3, 16))]
+    assert models[1].seen == list(range(3, 16))
 
 
 def test_a_file_is_recovered_in_batches_as_page_by_page(tmp_path: Path) -> None:
