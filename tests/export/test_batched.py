@@ -11,7 +11,7 @@ from torch import nn
 
 from lightpage.calibration.sampling_table import sampling_table, shifted
 from lightpage.device.state import Device
-from lightpage.errors import BundleError, UnconfirmedPageError
+from lightpage.errors import BundleError, ProviderError, UnconfirmedPageError
 from lightpage.export.batched import batched_onnx, traced
 from lightpage.export.graph import DecoderGraph, table_tensors
 from lightpage.export.half import deviation
@@ -25,7 +25,13 @@ from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.evaluation import evaluate
 from lightpage.runtime.model.bundle.bundle import npz
 from lightpage.runtime.model.bundle.manifest import BATCH, CONSTANTS, GOLDEN
-from lightpage.runtime.model.decoding.batch_graph import REGISTRATION, BatchGraph, Constants, with_proven_batches
+from lightpage.runtime.model.decoding.batch_graph import (
+    REGISTRATION,
+    BatchGraph,
+    Constants,
+    FrameBuffer,
+    with_proven_batches,
+)
 from lightpage.runtime.model.decoding.batches import Batches, Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
@@ -124,6 +130,20 @@ def test_a_bundle_without_the_graph_is_refused(decoder: Decoder) -> None:
     files = {name: data for name, data in decoder.bundle.files.items() if name not in (BATCH, CONSTANTS)}
     with pytest.raises(BundleError):
         BatchGraph(replace(decoder.bundle, files=files), decoder.graph, PAGES)
+
+
+def test_where_memory_is_short_batches_are_smaller_from_the_start(
+    decoder: Decoder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = BatchGraph.run
+
+    def with_room_for_two(self: BatchGraph, constants: Constants, buffer: FrameBuffer, pages: slice) -> list[Inference]:
+        if pages.stop > 2:
+            raise ProviderError("provider cuda", "Failed to allocate memory", "one with room")
+        return run(self, constants, buffer, pages)
+
+    monkeypatch.setattr(BatchGraph, "run", with_room_for_two)
+    assert BatchGraph(decoder.bundle, decoder.graph, PAGES).pages == 2
 
 
 def test_a_graph_that_says_something_else_to_the_golden_page_is_left_out(decoder: Decoder) -> None:
