@@ -8,12 +8,14 @@ import os
 import sys
 import sysconfig
 import tempfile
-from distutils.ccompiler import new_compiler
-from distutils.sysconfig import customize_compiler
 from pathlib import Path
 
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
+
+# isort: split
+from distutils.ccompiler import new_compiler  # setuptools brings it, once imported
+from distutils.sysconfig import customize_compiler
 
 FOLDER = "lightpage/codec/compiled"
 LIMITED_API = "0x030B0000"

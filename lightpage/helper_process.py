@@ -110,6 +110,11 @@ class HelperProcess:
         """Number of the process."""
         return self._process.pid
 
+    @property
+    def status(self) -> int | None:
+        """Exit status of the process, that of a signal negative; None while it runs."""
+        return self._process.poll()
+
     def ask(self, method: str, *arguments: Any, timeout_s: float, progress: Callable[..., None] | None = None) -> Any:
         """Call a method of the helper, and return what it returns; see `send`.
 

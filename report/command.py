@@ -11,8 +11,9 @@ from lightpage.errors import InvalidInputError
 from lightpage.files import replace_text
 from lightpage.report import recovery_figures
 from lightpage.report.contents.from_recovery import report_of_recovery
-from lightpage.report.json_file import EVALUATE, EXPECTED, RECOVER, JsonFile
+from lightpage.report.json_file import EXPECTED, JsonFile
 from lightpage.report.page import render
+from lightpage.run_files import EVALUATE, RECOVER
 from lightpage.runtime.archives.run.job import FILE as JOB
 
 

@@ -13,8 +13,8 @@ from pydantic_core import from_json
 from lightpage.errors import InvalidInputError
 from lightpage.files import read_text
 from lightpage.page.levels import MAX_LEVELS
+from lightpage.run_files import EVALUATE, RECOVER, REPORT_MARKS
 
-EVALUATE, RECOVER = "evaluate", "recover"
 EXPECTED = (
     f"a finished training run, a bulk run, or the JSON that this version's `lightpage {EVALUATE}` or `{RECOVER}` writes"
 )
@@ -24,12 +24,6 @@ Bits = Annotated[float, Field(le=math.log2(MAX_LEVELS) + 1e-6)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Seconds = Annotated[float, Field(ge=0)]
 
-_MARKS = {
-    EVALUATE: {"bundle_version", "pages"},
-    RECOVER: {"page_results", "user_bytes_per_page"},
-    "decode": {"target", "refused_pages"},
-}
-"""Keys that together stand in the JSON of one command only."""
 _NAMED_KEYS, _LONGEST_KEY = 5, 30
 _NAMED_PROBLEMS = 3
 
@@ -73,7 +67,7 @@ class JsonFile:
             raise InvalidInputError(f"{path}", f"text that is no JSON ({error})", EXPECTED) from None
         if not isinstance(content, dict):
             return cls(path, text, None, "JSON that is no object")
-        command = next((name for name, marks in _MARKS.items() if marks <= content.keys()), None)
+        command = next((name for name, marks in REPORT_MARKS.items() if marks <= content.keys()), None)
         return cls(path, text, command, _keys(content) if command is None else f"the JSON of `lightpage {command}`")
 
     def checked(self, model: type[Model]) -> Model:

@@ -85,14 +85,14 @@ def main(
         "symbols": symbols,
         "seed": seed,
     }
-    found = earlier(json_path, asked)[:pages]
+    found = earlier(json_path, asked)
     for page in track(range(len(found), pages), "bound", unit="page"):
         rng = np.random.default_rng([seed, page])
         bound = LightBound(profile, device, random_symbols(profile, levels, 1, rng)[0], levels)
         places = rng.integers(profile.page_shape, size=(symbols, 2))
         found.append([bound.concentration(row, column) for row, column in places.tolist()])
         write_json(json_path, {"asked": asked, "concentrations": found})
-    each = bits([one for page in found for one in page], levels, np.random.default_rng(seed))
+    each = bits([one for page in found[:pages] for one in page], levels, np.random.default_rng(seed))
     figures = {"bits": float(each.mean()), "standard_error": float(each.std(ddof=1) / np.sqrt(each.size))}
     write_json(json_path, {"asked": asked, **figures, "concentrations": found})
     click.echo(f"bound {figures['bits']:.3f} +- {figures['standard_error']:.3f} bits a symbol, {each.size} symbols")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -160,6 +160,9 @@ _DRIFT_SCALE: Real = np.array([_DRIFT_SHARES.get(parameter.group, 0.05) for para
 """Drift of a device, as a share of the prior about nominal. What a fit cannot tell well stays as it was: a decoder
 has learned the earlier calibration's errors, and loses 0.1 bit a symbol where a re-fit draws others."""
 
+_HELD = 1e-6
+"""Share of a prior that leaves a parameter where it is."""
+
 
 def calibrate(
     twin: Twin,
@@ -240,6 +243,29 @@ def refine(
         work.complex_field(replace(stage, groups=known), _DRIFT_SCALE)
     work.waves("waves", known, _DRIFT_SCALE)
     return work.result()
+
+
+def goodness_of(
+    twin: Twin, device: CalibratedDevice, page: KnownPage, progress: Callable[[float], None] = lambda share: None
+) -> Goodness:
+    """Verdict on a device that is held as it is, by the light of a known page.
+
+    Args:
+        twin: of the nominal device.
+        device: that is judged.
+        page: that it shows.
+        progress: told of each of two steps, 0 to 1. It may raise to stop the work.
+
+    Raises:
+        CalibrationError: the cameras see no symbol.
+    """
+    start, group = device.parameters, ("launch",)  # with it the illumination does not bend the page's phases
+    fit = WaveFit(twin, device.profile, page.pair, device.references, page.symbols)
+    turn, levels = device.quadrature_phase_rad, device.modulation
+    found = fit.fit(start, turn, group, start, _HELD, progress, levels, rough=True)
+    if found.illumination is None:
+        raise CalibrationError("calibration, verdict", "no light of a page", "some")
+    return measure_goodness(twin, device, found.illumination, page.pair, page.symbols, progress)
 
 
 def least_coherence(symbols: int) -> float:

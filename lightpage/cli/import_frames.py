@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import os
+import hashlib
+import json
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import click
 import numpy as np
@@ -18,9 +19,10 @@ from lightpage.cli.options import JSON, named_profile
 from lightpage.cli.paths import NewPath
 from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError
-from lightpage.files import write_json
+from lightpage.failures import os_errors
+from lightpage.files import read_text, write_json
 from lightpage.foreign.array import ForeignArray
-from lightpage.foreign.frames import Arrangement, Frames, Upright, both_cameras, one_camera
+from lightpage.foreign.frames import Arrangement, Flip, Frames, Turn, Upright, both_cameras, one_camera
 from lightpage.foreign.frames import Pages as ForeignPages
 from lightpage.foreign.import_job import Material, describe, exposure_of, references_of, tell, write
 from lightpage.foreign.opening import open_array
@@ -31,8 +33,8 @@ from lightpage.recording.pages import Pages
 from lightpage.recording.unfinished import claim, settings_path
 from lightpage.recording.writer import RecordingWriter
 
-FLIPS = ("none", "x", "y", "xy")
-TURNS = ("0", "90", "180", "270")
+FLIPS: dict[str, Flip] = {each or "none": each for each in get_args(Flip)}
+TURNS: dict[str, Turn] = {str(each): each for each in get_args(Turn)}
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 _CAMERAS = ("in-phase", "quadrature")
 
@@ -68,6 +70,7 @@ def _upright(camera: str) -> Decorator:
 @_source("references", "Or those of both in one file, arranged as --frames.")
 @_source("symbols", "What was written; PAGES.h5 of `encode`, or whole numbers [pages, ny, nx]. Unknown if left out.")
 @_source("pilots", "Where the known symbols are, zeros and others [ny, nx]; the profile's places if left out.")
+@_source("code", "What the pages hold, code.json of `unpack`.  [default: that of --symbols PAGES.h5]")
 @click.option("--profile", "profile_name", metavar="P", help="Nominal device.  [default: that of --symbols PAGES.h5]")
 @click.option("--levels", type=click.IntRange(MIN_LEVELS, MAX_LEVELS), help="Of the symbols.  [default: 256]")
 @click.option(
@@ -91,11 +94,14 @@ def import_frames(out: Path, force: bool, keep_unlit: bool, json_path: Path | No
     Interrupted, the same command goes on where it stopped.
     """
     click.get_current_context().meta[RESUME_KEY] = "run the same command again; it goes on where it was"
+    if out.is_dir():
+        raise InvalidInputError(f"--out {out}", "a folder", "a new file")
     if out.exists() and not force:
         raise InvalidInputError(f"--out {out}", "a file that exists", "a new name, or --force")
     with ExitStack() as opened:
         sources = _Sources(given, opened)
         material = sources.material()
+        sources.check_kept(out)
         material.check()
         exposure = exposure_of(material, given["bit_depth"])
         tell(exposure, material.black_level)
@@ -143,10 +149,12 @@ class _Sources:
     Attributes:
         given: the options.
         opened: closes the files.
+        files: that were opened, by option.
     """
 
     given: dict[str, Any]
     opened: ExitStack
+    files: dict[str, Sequence[Path]] = field(default_factory=dict)
 
     def material(self) -> Material:
         """Open all files; sizes are checked, and nothing is read of frames yet."""
@@ -161,7 +169,7 @@ class _Sources:
         assert profile is not None  # or it was refused above
         symbols = None
         if given["symbols"] is not None:
-            symbols = ForeignPages(self._open(given["symbols"]), profile.page_shape, _what("symbols", profile))
+            symbols = ForeignPages(self._open("symbols"), profile.page_shape, _what("symbols", profile))
         return Material(
             profile,
             self._cameras("frames", profile),
@@ -169,18 +177,26 @@ class _Sources:
             symbols,
             given["levels"] or (MAX_LEVELS if pages is None else pages.levels),
             self._pilots(profile),
-            None if pages is None else pages.code,
+            self._code(None if pages is None else pages.code),
             given["black_level"],
         )
 
+    def check_kept(self, out: Path) -> None:
+        """Check that the recording does not take the place of a file that it is made of.
+
+        Raises:
+            InvalidInputError: it does.
+        """
+        for option, files in self.files.items():
+            if out.exists() and any(path.samefile(out) for path in files):
+                named = f"what --{option.replace('_', '-')} names"
+                raise InvalidInputError(f"--out {out}", named, "a file of its own")
+
     def described(self) -> str:
-        """Return what the pages are made of: the options, and size and time of each file."""
+        """Return what the pages are made of: the options, and a digest of name, size and time of the files of each."""
         lines = []
         for name, value in sorted(self.given.items()):
-            stamp = ""
-            if isinstance(value, str) and os.path.exists(path := value.rpartition("::")[0] or value):
-                found = os.stat(path)
-                stamp = f"  # {found.st_size} bytes, {found.st_mtime_ns}"
+            stamp = f"  # {_stamp(self.files[name])}" if name in self.files else ""
             lines.append(f"{name} = {value!r}{stamp}")
         return "\n".join(lines)
 
@@ -195,12 +211,31 @@ class _Sources:
         pages.check()
         return pages
 
-    def _open(self, named: str) -> ForeignArray:
-        return self.opened.enter_context(closing(open_array(named)))
+    def _open(self, option: str) -> ForeignArray:
+        array = self.opened.enter_context(closing(open_array(self.given[option])))
+        self.files[option] = array.files
+        return array
+
+    def _code(self, of_pages: str | None) -> str | None:
+        """Return what the pages hold, JSON text: that of the pages to write, or of --code."""
+        if (named := self.given["code"]) is None:
+            return of_pages
+        subject, expected = f"--code {named}", "a JSON object, as `unpack` writes it"
+        if of_pages is not None:
+            raise InvalidInputError(subject, "a code beside that of --symbols", "one of them")
+        text = read_text(named, subject, expected)
+        self.files["code"] = (Path(named),)
+        try:
+            told = json.loads(text)
+        except ValueError as error:
+            raise InvalidInputError(subject, error, expected) from None
+        if not isinstance(told, dict):
+            raise InvalidInputError(subject, "JSON that is no object", expected)
+        return text
 
     def _uprights(self) -> tuple[Upright, Upright]:
         first, second = (
-            Upright(_flip(self.given[f"flip_{camera}"]), _turn(self.given[f"turn_{camera}"]))
+            Upright(FLIPS[self.given[f"flip_{camera}"]], TURNS[self.given[f"turn_{camera}"]])
             for camera in ("in_phase", "quadrature")
         )
         return first, second
@@ -208,26 +243,31 @@ class _Sources:
     def _cameras(self, kind: Literal["frames", "references"], profile: Profile) -> tuple[Frames, Frames]:
         prefix = "" if kind == "frames" else "reference-"
         names = [f"{prefix}{camera}" for camera in _CAMERAS]
-        single, both = [self.given[name.replace("-", "_")] for name in names], self.given[kind]
-        _check_named(single, both, names, kind)
+        options = [name.replace("-", "_") for name in names]
+        both = self.given[kind]
+        _check_named([self.given[option] for option in options], both, names, kind)
         what, uprights = _what("frames", profile), self._uprights()
         if both is not None:
             way = self.given["arrangement"]
             arrangement = None if way is None else Arrangement(way)
-            return both_cameras(self._open(both), profile.frame_shape, uprights, arrangement, what)
+            return both_cameras(self._open(kind), profile.frame_shape, uprights, arrangement, what)
         first, second = (
-            one_camera(self._open(named), profile.frame_shape, upright, what)
-            for named, upright in zip(single, uprights, strict=True)
+            one_camera(self._open(option), profile.frame_shape, upright, what)
+            for option, upright in zip(options, uprights, strict=True)
         )
         return first, second
 
     def _pilots(self, profile: Profile) -> NDArray[np.bool_] | None:
         if self.given["pilots"] is None:
             return None
-        found = ForeignPages(self._open(self.given["pilots"]), profile.page_shape, _what("pilots", profile))
+        found = ForeignPages(self._open("pilots"), profile.page_shape, _what("pilots", profile))
         if found.count != 1:
             raise InvalidInputError(found.subject, f"{found.count} pages of pilots", "one")
-        return np.asarray(found.page(0) != 0)
+        places = np.asarray(found.page(0) != 0)
+        if places.all() or not places.any():
+            got = f"{np.count_nonzero(places)} pilots of {places.size} symbols"
+            raise InvalidInputError(found.subject, got, "some of them, not all")
+        return places
 
 
 def _check_named(single: Sequence[str | None], both: str | None, names: Sequence[str], kind: str) -> None:
@@ -240,15 +280,15 @@ def _check_named(single: Sequence[str | None], both: str | None, names: Sequence
         raise InvalidInputError("options", " and ".join(named) or f"no {kind}", expected)
 
 
+def _stamp(files: Sequence[Path]) -> str:
+    """Return how many files there are, and a digest of their names, sizes and times of change."""
+    digest = hashlib.sha256()
+    for path in files:
+        with os_errors(f"file {path}", "a file that can be read"):
+            found = path.stat()
+        digest.update(f"{path}\0{found.st_size}\0{found.st_mtime_ns}\0".encode(errors="surrogateescape"))
+    return f"{len(files)} files, {digest.hexdigest()}"
+
+
 def _what(kind: str, profile: Profile) -> str:
     return f"{kind} (profile {profile.name})"
-
-
-def _flip(text: str) -> Literal["", "x", "y", "xy"]:
-    found: dict[str, Literal["", "x", "y", "xy"]] = {"none": "", "x": "x", "y": "y", "xy": "xy"}
-    return found[text]
-
-
-def _turn(text: str) -> Literal[0, 90, 180, 270]:
-    found: dict[str, Literal[0, 90, 180, 270]] = {"0": 0, "90": 90, "180": 180, "270": 270}
-    return found[text]

@@ -244,6 +244,9 @@ def run(command: click.Command, arguments: Sequence[str] | None = None, name: st
             command.invoke(ctx)
     except click.exceptions.Exit as end:
         return end.exit_code
+    except click.exceptions.NoArgsIsHelpError as error:
+        error.show()
+        return error.exit_code
     except click.UsageError as error:
         return _fail(misused(error))
     except click.ClickException as error:

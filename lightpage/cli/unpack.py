@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import click
@@ -32,8 +33,8 @@ def unpack(recording: Path, out: Path, form: str, json_path: Path | None) -> Non
         raise InvalidInputError(f"--out {out}", "something that exists", "a new name")
     with Recording.open(recording) as file:
         options = unpack_recording(file, Form(form), out)
-        told = f" --levels {file.levels} --bit-depth {file.bit_depth}"
-        write_json(json_path, {"pages": file.pages, "options": dict(each.split(" ", 1) for each in options)})
-        click.echo(
-            f"{out}: {file.pages} pages. They come back by:\nlightpage import {' '.join(options)}{told} --out R.h5"
-        )
+        write_json(json_path, {"pages": file.pages, "options": options})
+        told = {"--profile": "P", **options, "--levels": str(file.levels), "--bit-depth": str(file.bit_depth)}
+        words = [word for option in told.items() for word in option]
+        command = shlex.join(["lightpage", "import", *words, "--out", "R.h5"])
+        click.echo(f"{out}: {file.pages} pages. They come back by:\n{command}")

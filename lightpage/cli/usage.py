@@ -33,4 +33,6 @@ def _of_parameter(path: str, told: str, error: click.BadParameter, param: click.
     if isinstance(error, click.MissingParameter):
         return InvalidInputError(path, f"no {name}", f"{name} {metavar}" if name != metavar else "one")
     got, _, wanted = error.message.rstrip(".").partition(" is not ")
+    if isinstance(param.type, click.IntRange | click.FloatRange) and wanted.startswith("a valid "):
+        wanted = "a whole number" if isinstance(param.type, click.IntRange) else "a number"
     return InvalidInputError(f"{path} {name}", got, wanted.removeprefix("in the range ") or told)

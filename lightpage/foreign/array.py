@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,13 +27,17 @@ class ForeignArray(ABC):
         subject: the file, and the array where it has several, for errors.
         shape: of the array as its own program shows it: MATLAB's are not turned round.
         dtype: of an element.
+        files: that hold its data.
         pages_last: whether its program counts axes from the inner one, so that pages lie along the last.
+        of_pictures: whether it is read picture by picture, so that pages lie along the first axis alone.
         in_sequence: whether reading a part means to read all before it, as in a compressed archive.
     """
 
     in_sequence = False
     pages_last = False
+    of_pictures = False
     subject: str
+    files: Sequence[Path] = ()
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
 
@@ -99,3 +104,8 @@ def chosen(subject: str, name: str | None, found: dict[str, tuple[int, ...]]) ->
         got = f"{len(found)} arrays: {told}" if found else "no array of numbers"
         raise InvalidInputError(subject, got, f"one, or FILE{SEPARATOR}NAME")
     return next(iter(found))
+
+
+def spread(count: int, most: int) -> list[int]:
+    """Return some of so many numbers, from first to last."""
+    return [int(number) for number in np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))]

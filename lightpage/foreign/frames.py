@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.errors import FrameError, InvalidInputError
-from lightpage.foreign.array import ForeignArray
+from lightpage.foreign.array import ForeignArray, spread
 
 Counts = NDArray[np.unsignedinteger[Any]]
+Flip = Literal["", "x", "y", "xy"]
+Turn = Literal[0, 90, 180, 270]
 
 _BLOCK_BYTES = 1 << 26
 """Read at once: pages that lie scattered are read many together, and two blocks are kept for each array."""
@@ -45,8 +47,8 @@ class Upright:
         turn_deg: clockwise.
     """
 
-    flip: Literal["", "x", "y", "xy"] = ""
-    turn_deg: Literal[0, 90, 180, 270] = 0
+    flip: Flip = ""
+    turn_deg: Turn = 0
 
     def before(self, shape: tuple[int, int]) -> tuple[int, int]:
         """Return rows and columns of a frame that has the shape afterwards."""
@@ -76,12 +78,9 @@ class Pages:
         whole = array.shape
         if 0 in whole or not 2 <= len(whole) <= 4:
             raise self._other(what)
-        if whole[-2:] == shape:
-            self.outer, self._axis = whole[:-2], 0
-        elif whole[:2] == shape:
-            self.outer, self._axis = whole[2:], 2
-        else:
+        if (axis := _first_axis_of_pages(array, shape)) is None:
             raise self._other(what)
+        self._axis, self.outer = axis, whole[2:] if axis else whole[:-2]
         self.count = math.prod(self.outer)
         self._outermost = self.outer[0] if self.outer else 1
         self._step = self._pages_at_once()
@@ -160,9 +159,15 @@ class Frames:
         return self._upright(data)
 
     def sample(self, most: int) -> Iterator[Counts]:
-        """Yield some frames from first to last."""
-        for page in np.unique(np.linspace(0, len(self) - 1, min(most, len(self))).astype(int)):
-            yield self.frame(int(page))
+        """Return an iterator over some frames from first to last."""
+        return map(self.frame, spread(len(self), most))
+
+
+def _first_axis_of_pages(array: ForeignArray, shape: tuple[int, int]) -> Literal[0, 2] | None:
+    """Return 0 where pages of a shape lie along the first axes of an array, 2 where along the last, else None."""
+    fits: dict[Literal[0, 2], bool] = {0: array.shape[-2:] == shape, 2: array.shape[:2] == shape}
+    order: tuple[Literal[0, 2], ...] = (0,) if array.of_pictures or len(array.shape) == 2 else (0, 2)
+    return next((axis for axis in (order[::-1] if array.pages_last else order) if fits[axis]), None)
 
 
 def _counts(data: NDArray[Any], subject: str) -> Counts:
@@ -225,6 +230,7 @@ def both_cameras(
         numbers = [range(pages.count)] * 2
     else:
         pages = Pages(array, (rows, columns), what)
+        _check_cameras(pages, arrangement)
         if pages.count % 2:
             raise InvalidInputError(array.subject, f"{pages.count} frames", "as many of one camera as of the other")
         cuts, half = [(everything, everything)] * 2, pages.count // 2
@@ -237,15 +243,26 @@ def both_cameras(
     return first, second
 
 
+def _check_cameras(pages: Pages, arrangement: Arrangement) -> None:
+    """Check that one of two axes of pages is that of the cameras, and the one that the arrangement says."""
+    axes = [size for size in pages.outer if size > 1]
+    place = -1 if arrangement is Arrangement.INTERLEAVED else 0
+    if len(axes) > 1 and axes[place] != 2:
+        got = f"axes of {' x '.join(map(str, axes))} frames"
+        expected = f"two cameras along the {'inner' if place else 'outer'} one, as {arrangement} says"
+        raise InvalidInputError(pages.subject, got, expected)
+
+
 def _found(array: ForeignArray, shape: tuple[int, int]) -> Arrangement:
     """Return the one way in which both cameras' frames can lie in an array."""
     rows, columns = shape
     ends = array.shape[-2:], array.shape[:2]
-    if (rows, 2 * columns) in ends:
+    axis = _first_axis_of_pages(array, shape)
+    if axis is None and (rows, 2 * columns) in ends:
         return Arrangement.SIDE_BY_SIDE
-    if (2 * rows, columns) in ends:
+    if axis is None and (2 * rows, columns) in ends:
         return Arrangement.ABOVE
-    outer = array.shape[:-2] if ends[0] == shape else array.shape[2:]
+    outer = array.shape[2:] if axis else array.shape[:-2]
     if outer in ((2,), (2, 1), (1, 2)):
         return Arrangement.HALVES
     if len(outer) == 2 and outer.count(2) == 1:

@@ -133,13 +133,16 @@ class Material:
 def exposure_of(material: Material, bit_depth: int | None) -> Exposure:
     """Find what the counts are, from some frames of either camera and the references; frames are shifted by it.
 
+    Counts are shifted where they do not fit the depth, or lie at the upper end of 16 bits. Lowest bits that no count of
+    a smaller depth uses say nothing: 8 bits scaled to 12 are multiples of 16 too.
+
     Args:
         material: whose frames are looked at.
         bit_depth: of a count, where it is known.
 
     Raises:
         FrameError: values that are no counts.
-        InvalidInputError, StorageError, SurroundingsError: a frame cannot be read.
+        InvalidInputError, StorageError, SurroundingsError: a frame cannot be read, or the black level is no count.
     """
     peak, unused, darkest = 0, MAX_BIT_DEPTH, (1 << MAX_BIT_DEPTH) - 1
     for frames in (*material.frames, *material.references):
@@ -151,14 +154,16 @@ def exposure_of(material: Material, bit_depth: int | None) -> Exposure:
             # too few different counts, as of a dark frame, tell nothing
             if (found := unused_low_bits(frame, 8 * frame.dtype.itemsize)) is not None:
                 unused = min(unused, found)
-    if bit_depth is not None:
-        wanted = MAX_BIT_DEPTH - bit_depth
-        unused = wanted if wanted <= unused < MAX_BIT_DEPTH else 0
-    unused %= MAX_BIT_DEPTH
+    if peak < 1 << (bit_depth or MAX_BIT_DEPTH - 1) or unused == MAX_BIT_DEPTH:
+        unused = 0
+    elif bit_depth is not None:
+        unused = wanted if (wanted := MAX_BIT_DEPTH - bit_depth) <= unused else 0
     for frames in (*material.frames, *material.references):
         frames.shift = unused
     brightest = peak >> unused
     depth = bit_depth or (MAX_BIT_DEPTH - unused if unused else next(bits for bits in _DEPTHS if peak < 1 << bits))
+    if material.black_level >= (most := 2**depth - 1):
+        raise InvalidInputError(f"--black-level {material.black_level}", f"counts of {depth} bits", f"0 to {most - 1}")
     return Exposure(depth, unused, bit_depth is not None, darkest >> unused, brightest)
 
 
@@ -195,7 +200,7 @@ def references_of(material: Material, exposure: Exposure) -> FramePair:
 
 
 def write(material: Material, exposure: Exposure, writer: RecordingWriter, *, keep_unlit: bool) -> list[Unlit]:
-    """Write the pages that a recording lacks, with a progress bar.
+    """Write the pages that a recording lacks, with a progress bar; the light of those that it has is checked too.
 
     Args:
         material: what it is made of.
@@ -212,9 +217,11 @@ def write(material: Material, exposure: Exposure, writer: RecordingWriter, *, ke
         RecordingError: no room for a page.
     """
     unlit: list[Unlit] = []
-    missing = range(writer.pages, material.pages)
-    for page in track(missing, "import", total=material.pages, done=writer.pages):
+    begun = writer.pages
+    for page in track(range(material.pages), "import", total=material.pages):
         first, second = (_lit(frames, page, material, exposure, keep_unlit, unlit) for frames in material.frames)
+        if page < begun:
+            continue
         symbols = None if material.symbols is None else material.page_symbols(page)
         writer.append(symbols, FramePair(first, second))
     return unlit

@@ -39,7 +39,9 @@ def open_array(named: str) -> ForeignArray:
             return _pattern(named)
         if not path.is_file():
             raise InvalidInputError(f"file {path}", "no regular file", _READABLE)
-        return _of_kind(path, name)
+        array = _of_kind(path, name)
+        array.files = (path,)
+        return array
 
 
 def _parted(named: str) -> tuple[Path, str | None]:

@@ -32,8 +32,10 @@ class Pictures(ForeignArray):
         InvalidInputError: no picture, or a first one that is in colour or damaged.
     """
 
+    of_pictures = True
+
     def __init__(self, subject: str, paths: Sequence[Path]) -> None:
-        self.subject, self._paths = subject, paths
+        self.subject, self.files = subject, paths
         if not paths:
             raise InvalidInputError(subject, "no picture", f"pictures ({', '.join(sorted(SUFFIXES))})")
         first = read_picture(paths[0])
@@ -42,12 +44,12 @@ class Pictures(ForeignArray):
     def take(self, axis: int, start: int, stop: int) -> NDArray[Any]:
         """See `ForeignArray`; the axis is that of the pictures."""
         assert axis == 0, "a picture is read whole"
-        return np.stack([self._picture(path) for path in self._paths[start:stop]])
+        return np.stack([self._picture(path) for path in self.files[start:stop]])
 
     def _picture(self, path: Path) -> NDArray[Any]:
         data = read_picture(path, (self.shape[1], self.shape[2]))
         if data.dtype != self.dtype:
-            got, expected = f"a picture of type {data.dtype}", f"{self.dtype}, as {self._paths[0].name} has"
+            got, expected = f"a picture of type {data.dtype}", f"{self.dtype}, as {self.files[0].name} has"
             raise InvalidInputError(f"file {path}", got, expected)
         return data
 

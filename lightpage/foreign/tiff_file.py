@@ -28,6 +28,8 @@ class TiffArray(ForeignArray):
         ModuleNotFoundError: tifffile is not installed.
     """
 
+    of_pictures = True
+
     def __init__(self, path: Path, name: str | None) -> None:
         import tifffile
 

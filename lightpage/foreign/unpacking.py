@@ -41,8 +41,8 @@ class Form(StrEnum):
     HDF5 = "hdf5"
 
 
-def unpack(recording: Recording, form: Form, out: Path) -> list[str]:
-    """Write the frames, the reference frames and, where they are known, the symbols of a recording.
+def unpack(recording: Recording, form: Form, out: Path) -> dict[str, str]:
+    """Write the frames, the reference frames and, where they are known, the symbols of a recording, and its code.
 
     Frames are free of their black level, as they are read everywhere. The folder appears when it is complete.
 
@@ -52,7 +52,7 @@ def unpack(recording: Recording, form: Form, out: Path) -> list[str]:
         out: a folder that is not there.
 
     Returns:
-        The options by which `lightpage import` takes the files back.
+        The options by which `lightpage import` takes the files back, and their values.
 
     Raises:
         InvalidInputError: the folder cannot be written.
@@ -68,7 +68,7 @@ def unpack(recording: Recording, form: Form, out: Path) -> list[str]:
         except BaseException:
             shutil.rmtree(made, ignore_errors=True)
             raise
-    return [f"--{option.replace('_', '-')} {out / name}" for option, name in options]
+    return {f"--{option.replace('_', '-')}": str(out / name) for option, name in options}
 
 
 def _write(recording: Recording, form: Form, folder: Path) -> list[tuple[str, str]]:
@@ -97,9 +97,12 @@ def _write(recording: Recording, form: Form, folder: Path) -> list[tuple[str, st
         with array(folder, "pilots", 1, pilots.astype(np.uint8)) as add:
             add(pilots.astype(np.uint8))
         options.append(("pilots", f"pilots{array_ending}"))
-    if (text := recording.header.profile_text) is not None:
-        (folder / "profile.toml").write_text(text, "utf-8")
-        options.append(("profile", "profile.toml"))
+    header = recording.header
+    texts = {"profile": ("profile.toml", header.profile_text), "code": ("code.json", header.code_text)}
+    for option, (name, text) in texts.items():
+        if text is not None:
+            (folder / name).write_text(text, "utf-8")
+            options.append((option, name))
     return options
 
 

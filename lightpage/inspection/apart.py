@@ -6,11 +6,13 @@ from pathlib import Path
 
 from lightpage.cli.main import missing
 from lightpage.device.profile import Profile
-from lightpage.errors import InvalidInputError, WorkerError
+from lightpage.errors import InvalidInputError, StorageError, SurroundingsError, WorkerError
 from lightpage.helper_process import Helper, HelperProcess, same_packages
 from lightpage.inspection.finding import Finding, Picture
 from lightpage.systems import INHERITS_SOCKETS
 
+_KILLED = -9
+"""Exit status of a process that the system has ended since memory was short; not every system names the signal."""
 LONGEST_S = 60.0
 """Time that looking at a file may take: it reads samples, and a share may be slow."""
 
@@ -47,17 +49,28 @@ def look_apart(
         longest_s: time after which the process is ended.
 
     Raises:
-        InvalidInputError: it is nothing that is known here, or reading it crashes or takes too long.
-        StorageError, SurroundingsError: it cannot be read.
+        InvalidInputError: it is nothing that is known here, or reading it crashes.
+        StorageError: it cannot be read, or not in time.
+        SurroundingsError: a resource is short.
+        WorkerError: the process cannot be started, or fails by itself.
     """
     if not INHERITS_SOCKETS:  # then a damaged file may end this process
         return Inspector().look(path, profile, drawn)
-    process = HelperProcess(f"{__name__}:Inspector", subject=f"file {path}", environment=same_packages(1))
+    subject = f"file {path}"
+    process = HelperProcess(f"{__name__}:Inspector", subject=subject, environment=same_packages(1))
     try:
-        found, pictures = process.ask("look", path, profile, drawn, timeout_s=longest_s)
+        process.send("look", path, profile, drawn)
+        if not process.poll(longest_s):
+            got, expected = f"no end within {longest_s:g} s", "a file that is whole, on quick storage"
+            raise StorageError(subject, got, expected)
+        found, pictures = process.answer()
         return found, pictures
     except WorkerError as error:
-        got = f"data at which reading does not come to its end ({error.got})"
-        raise InvalidInputError(f"file {path}", got, "a file that is whole") from None
+        if process.status == _KILLED:
+            raise SurroundingsError(subject, error.got, "more memory") from None
+        if process.status is not None and process.status < 0:
+            got = f"data at which reading crashes ({error.got})"
+            raise InvalidInputError(subject, got, "a file that is whole") from None
+        raise
     finally:
         process.end()

@@ -15,13 +15,16 @@ from lightpage.errors import InvalidInputError
 from lightpage.files import read_text
 from lightpage.foreign.array import readable
 from lightpage.inspection.finding import Finding
+from lightpage.run_files import EVALUATE, RECOVER, REPORT_MARKS
 from lightpage.waves.consequences import consequences
 
 MOST_BYTES = 16 << 20
 """Most bytes of a text."""
-_TABLES = ("light", "lens", "pipe", "slm", "page", "camera")
-_SERVICE = {"service", "limits", "metrics", "tls", "logs", "audit", "self_calibration", "flight_recorder"}
-_FIGURES = {"air_bits_per_symbol", "share_of_air"}
+SERVICE_TABLES = frozenset(
+    {"service", "batches", "tls", "inference", "metrics", "traces", "self_calibration", "flight_recorder"}
+    | {"limits", "logs", "audit"}
+)
+"""Tables of a service's settings, whose own module needs Linux."""
 
 
 def look_at_toml(path: Path, profile: Profile | None) -> Finding:
@@ -33,13 +36,13 @@ def look_at_toml(path: Path, profile: Profile | None) -> Finding:
     subject = f"file {path}"
     with readable(subject, "a TOML document"):
         told = tomllib.loads(read_text(path, subject, "a TOML document"))
-    if sum(name in told for name in _TABLES) > 1:
+    if sum(isinstance(told[name], dict) for name in told.keys() & Profile.model_fields.keys()) > 1:
         return _profile(path)
     if "calibrated_pages" in told or "turn_rad" in told:
         return _calibration(path, told, profile)
     if "coded_bits" in told:
         return _code(path)
-    if _SERVICE & told.keys():
+    if told.keys() & SERVICE_TABLES:
         found = Finding(path, "settings of a service")
         found.next.append(f"lightpage serve --config {found.quoted} --print-config")
         return found
@@ -69,7 +72,7 @@ def look_at_json(path: Path) -> Finding:
     found = Finding(path, "JSON")
     if isinstance(told, dict):
         found.facts["keys"] = ", ".join(list(told)[:10])
-        if _FIGURES & told.keys():
+        if any(REPORT_MARKS[command] <= told.keys() for command in (EVALUATE, RECOVER)):
             found.kind = "figures of an evaluation or a recovery"
             found.next.append(f"lightpage report {found.quoted} --out F.html")
     return found

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.inspection.finding import Histogram
+from lightpage.recording.exposure import greatest_count, unused_low_bits
+from lightpage.recording.layout import MIN_BIT_DEPTH
 
 _BINS = 16
 _PIXELS = 1 << 18
@@ -30,9 +32,12 @@ def histogram(frames: list[NDArray[Any]], bit_depth: int) -> Histogram:
         frames: whole counts [row, column], at least one frame.
         bit_depth: of a count.
     """
-    full_scale = (1 << bit_depth) - 1
     counted = np.concatenate([sampled(frame) for frame in frames])
-    width = (full_scale + 1) // _BINS
+    unused = 0
+    if counted.max() >= greatest_count(bit_depth, bit_depth - MIN_BIT_DEPTH):
+        unused = unused_low_bits(counted, bit_depth) or 0
+    full_scale = greatest_count(bit_depth, unused)
+    width = (1 << bit_depth) // _BINS
     edges = np.arange(_BINS + 1) * width
     shares = np.bincount(np.minimum(counted // width, _BINS - 1), minlength=_BINS) / counted.size
     saturated = float(np.mean(counted >= full_scale))

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.cli.main import missing
@@ -28,7 +27,7 @@ class Histogram:
     Attributes:
         edges: first count of each bin, and the one after the last.
         shares: of the pixels in each bin.
-        full_scale: greatest count that the bits hold.
+        full_scale: greatest count that the bits in use hold.
         saturated: share of the pixels at full scale.
     """
 
@@ -99,8 +98,3 @@ def printable(text: str) -> str:
 def shape_text(shape: tuple[int, ...]) -> str:
     """Return a shape for people."""
     return " x ".join(map(str, shape))
-
-
-def spread(count: int, most: int) -> list[int]:
-    """Return some of so many numbers, from first to last."""
-    return [int(number) for number in np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))]

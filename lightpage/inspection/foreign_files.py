@@ -12,18 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile
-from lightpage.foreign.array import MOST_BYTES, SEPARATOR, ForeignArray
+from lightpage.foreign.array import MOST_BYTES, SEPARATOR, ForeignArray, spread
 from lightpage.foreign.hdf5_file import arrays_in
 from lightpage.foreign.mat_file import mat_arrays
 from lightpage.foreign.numpy_file import arrays_of
 from lightpage.foreign.opening import open_array
 from lightpage.inspection.exposure import histogram, sampled
-from lightpage.inspection.finding import Finding, Picture, shape_text, spread
+from lightpage.inspection.finding import Finding, Picture, shape_text
 from lightpage.recording.hdf5 import hdf, open_hdf5
 
 _SAMPLED = 4
 _SAMPLE_BYTES = 1 << 26
 _LARGEST_SYMBOL = 256
+_MOST_COUNT = 65_535
+_KINDS = ("neither", "symbols", "frames")
+"""What an array of a profile's shape is, in the order in which arrays of a file are chosen."""
 _NEEDED = "an array of counts"
 _TOLD = 20
 
@@ -74,9 +77,10 @@ def _several(found: Finding, arrays: dict[str, tuple[int, ...]], profile: Profil
         found.facts["further arrays"] = len(arrays) - _TOLD
     if not arrays:
         found.problems.append("no array of numbers with two to four axes")
-    for name in list(arrays)[:1]:
-        with closing(open_array(f"{found.path}{SEPARATOR}{name}")) as array:
-            _one(found, array, shlex.quote(f"{found.path}{SEPARATOR}{name}"), profile)
+        return
+    name = max(arrays, key=lambda each: (_KINDS.index(_kind(arrays[each], profile)), math.prod(arrays[each])))
+    with closing(open_array(f"{found.path}{SEPARATOR}{name}")) as array:
+        _one(found, array, shlex.quote(f"{found.path}{SEPARATOR}{name}"), profile)
 
 
 def _one(found: Finding, array: ForeignArray, named: str, profile: Profile | None) -> None:
@@ -88,10 +92,6 @@ def _one(found: Finding, array: ForeignArray, named: str, profile: Profile | Non
     if not 2 <= len(array.shape) <= 4 or array.dtype.kind not in "uif" or 0 in array.shape:
         found.problems.append(f"type {array.dtype} of shape {array.shape}: neither frames nor symbols")
         return
-    if len(array.shape) == 3 and max(array.shape[-2:]) < _LARGEST_SYMBOL and array.dtype.itemsize == 1:
-        found.facts["may be"] = "symbols"
-        found.next.append(f"lightpage import --symbols {named} --in-phase I --quadrature Q ... --profile P --out R.h5")
-        return
     axis = len(array.shape) - 1 if array.pages_last and len(array.shape) > 2 else 0
     pages = array.shape[axis] if len(array.shape) > 2 else 1
     if (size := math.prod(array.shape) // pages * array.dtype.itemsize) > MOST_BYTES:
@@ -99,17 +99,22 @@ def _one(found: Finding, array: ForeignArray, named: str, profile: Profile | Non
         return
     frames = _frames(array, axis, pages, max(1, _SAMPLE_BYTES // max(1, size)))
     found.pictures = lambda: _pictures(str(named), frames)
-    pixels = [sampled(frame) for frame in frames]
-    if any(not np.isfinite(each).all() for each in pixels):
-        found.problems.append("values that are no numbers")
-    elif any(np.any(each != np.rint(each)) or each.min() < 0 for each in pixels):
-        found.problems.append("values that are no whole counts: multiply by full scale, and round")
-    else:
-        _counts(found, [each.astype(np.int64) for each in pixels])
+    if _may_be_symbols(array, profile):
+        found.facts["may be"] = "symbols"
+        found.next.append(f"lightpage import --symbols {named} --in-phase I --quadrature Q ... --profile P --out R.h5")
+        return
+    _values(found, [sampled(frame) for frame in frames])
     found.next.append(
         f"lightpage import --in-phase {named} --quadrature Q --reference-in-phase RI --reference-quadrature RQ "
         "--symbols S --profile P --out R.h5"
     )
+
+
+def _may_be_symbols(array: ForeignArray, profile: Profile | None) -> bool:
+    """Return whether an array is symbols: by the profile, or else since its values and pages are that small."""
+    if (kind := _kind(array.shape, profile)) != "neither":
+        return kind == "symbols"
+    return len(array.shape) == 3 and max(array.shape[-2:]) < _LARGEST_SYMBOL and array.dtype.itemsize == 1
 
 
 def _frames(array: ForeignArray, axis: int, pages: int, most: int) -> list[NDArray[Any]]:
@@ -122,28 +127,44 @@ def _frames(array: ForeignArray, axis: int, pages: int, most: int) -> list[NDArr
     return [page if page.ndim == 2 else page[0] for page in taken]
 
 
+def _values(found: Finding, pixels: list[NDArray[Any]]) -> None:
+    """Tell of the values of some frames, and of their exposure where they are counts."""
+    if any(not np.isfinite(each).all() for each in pixels):
+        found.problems.append("values that are no numbers")
+    elif any(np.any(each != np.rint(each)) or each.min() < 0 for each in pixels):
+        found.problems.append("values that are no whole counts: multiply by full scale, and round")
+    elif (most := max(each.max() for each in pixels)) > _MOST_COUNT:
+        found.problems.append(f"values up to {most:.6g}, wanted counts up to {_MOST_COUNT}")
+    else:
+        _counts(found, [each.astype(np.int64) for each in pixels])
+
+
 def _counts(found: Finding, frames: list[NDArray[np.int64]]) -> None:
     peak = max(int(frame.max()) for frame in frames)
-    bits = min(16, max(8, peak.bit_length()))
+    bits = max(8, peak.bit_length())
     found.facts["counts"] = f"{min(int(frame.min()) for frame in frames)} to {peak}, so at least {bits} bits"
     if peak == 0:
         found.problems.append("all that was looked at is black")
-    if peak < 1 << 16:
-        found.histograms["frames"] = histogram(list(frames), bits)
+    found.histograms["frames"] = histogram(list(frames), bits)
 
 
 def _fits(found: Finding, array: ForeignArray, profile: Profile) -> None:
     """Tell whether frames or symbols fit a profile."""
-    ends = array.shape[-2:], array.shape[:2]
-    if profile.frame_shape in ends:
-        found.facts["fits"] = f"frames of profile {profile.name}"
-    elif profile.page_shape in ends:
-        found.facts["fits"] = f"symbols of profile {profile.name}"
+    if (kind := _kind(array.shape, profile)) != "neither":
+        found.facts["fits"] = f"{kind} of profile {profile.name}"
     else:
         wanted = f"{shape_text(profile.frame_shape)} pixels or {shape_text(profile.page_shape)} symbols"
-        turned = profile.frame_shape[::-1] in ends
+        turned = profile.frame_shape[::-1] in (array.shape[-2:], array.shape[:2])
         more = "; turned by 90 degrees they fit: --turn-in-phase, --turn-quadrature" if turned else ""
         found.problems.append(f"shape {array.shape}, and profile {profile.name} has {wanted}{more}")
+
+
+def _kind(shape: tuple[int, ...], profile: Profile | None) -> str:
+    """Return which pages of a profile an array holds by its shape, of `_KINDS`."""
+    ends = shape[-2:], shape[:2]
+    if profile is not None and profile.frame_shape in ends:
+        return "frames"
+    return "symbols" if profile is not None and profile.page_shape in ends else "neither"
 
 
 def _pictures(name: str, frames: list[NDArray[Any]]) -> list[Picture]:

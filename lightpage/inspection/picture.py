@@ -29,7 +29,7 @@ def draw(found: Finding, pictures: list[Picture], out: Path) -> None:
         InvalidInputError: there is nothing to draw, or the file cannot be written.
     """
     if not pictures:
-        raise InvalidInputError(f"--picture {out}", f"a {found.kind}", "a file with frames or symbols")
+        raise InvalidInputError(f"--picture {out}", found.kind, "a file with frames or symbols")
     panels = len(pictures) + bool(found.histograms)
     rows = math.ceil(panels / _COLUMNS)
     figure = Figure(figsize=(4.6 * _COLUMNS, 3.4 * rows), layout="constrained")
@@ -37,7 +37,7 @@ def draw(found: Finding, pictures: list[Picture], out: Path) -> None:
     for place, (title, pixels) in enumerate(pictures, 1):
         axis = figure.add_subplot(rows, _COLUMNS, place)
         step = max(1, max(pixels.shape) // _SIDE_PX)
-        shown = pixels[::step, ::step]
+        shown = np.nan_to_num(pixels[::step, ::step], posinf=0.0, neginf=0.0)
         low, high = np.percentile(sampled(shown), _SHADES)
         image = axis.imshow(shown, cmap="gray", vmin=low, vmax=max(high, low + 1e-9))
         axis.set_title(title, fontsize=9)

@@ -10,9 +10,9 @@ import numpy as np
 
 from lightpage.device.profile import Profile
 from lightpage.errors import FrameError, InvalidInputError
-from lightpage.foreign.array import MOST_BYTES
+from lightpage.foreign.array import MOST_BYTES, spread
 from lightpage.inspection.exposure import contrast, histogram, sampled
-from lightpage.inspection.finding import Finding, Picture, shape_text, spread
+from lightpage.inspection.finding import Finding, Picture, shape_text
 from lightpage.inspection.foreign_files import look_at_hdf5
 from lightpage.recording import decoded_file, layout, pages
 from lightpage.recording.exposure import check_pair_light
@@ -125,7 +125,7 @@ def _recording(path: Path, profile: Profile | None) -> Finding:
         }
         coded = _tell_code(found, header.code_text)
         with found.trying("a profile that fits"):
-            found.profile = header.device(profile)
+            found.profile = header.device(profile, found.problems.append)
             check_camera(found.profile)
             found.facts["profile"] = f"{found.profile.name}{' (its own)' if profile is None else ''}"
         _exposure(found, recording)
@@ -164,8 +164,6 @@ def _sampled(pair: FramePair) -> FramePair:
 def _next(found: Finding, recording: Recording, coded: bool) -> None:
     """Tell what can be done with a recording."""
     profile = "" if recording.header.own_profile() is not None else " --profile P"
-    if profile and found.profile is None:
-        found.problems.append("no profile in it: name one with --profile")
     if recording.has_symbols:
         found.next += [
             f"lightpage calibrate{profile} --recording {found.quoted} --out C.toml",

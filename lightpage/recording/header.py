@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from lightpage.device.profile import Profile, parse_profile
 from lightpage.errors import ProfileError, RecordingError
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
+from lightpage.progress import warn
 from lightpage.recording.layout import FORMAT, FRAMES, MAX_BIT_DEPTH, MIN_BIT_DEPTH, REFERENCES, VERSION, frame_type
 from lightpage.recording.stored import ArrayFile, StoredArray
 
@@ -70,13 +72,18 @@ class Header:
         except ProfileError:
             return None
 
-    def device(self, given: Profile | None) -> Profile:
+    def device(self, given: Profile | None, tell: Callable[[str], None] = warn) -> Profile:
         """The nominal profile of the pages: the one that was given, or else the recording's own.
 
-        A recording's own that cannot be read contradicts nothing: another program's notes are no reason to stop.
+        A recording's own that cannot be read contradicts nothing: another program's notes are no reason to stop. A page
+        that is laid out in another way is one; other optics may be a data sheet's that were put right.
+
+        Args:
+            given: profile that was named, if one was.
+            tell: takes what its optics say otherwise than the recording's own.
 
         Raises:
-            RecordingError: there is none, frames or page have another shape, or both profiles say otherwise.
+            RecordingError: there is none, frames or page have another shape, or the page is laid out otherwise.
             ProfileError: the recording's own is needed, and cannot be read.
         """
         subject = f"{self.subject}: attribute 'profile'"
@@ -86,8 +93,10 @@ class Header:
             given = self._parsed(self.profile_text)
         self.check_against(given)
         if (own := self.own_profile()) is not None and (others := _differences(own, given)):
-            expected = f"what profile {given.name} says: leave --profile out, or import the frames anew with it"
-            raise RecordingError(subject, "; ".join(others), expected)
+            if own.page != given.page:
+                expected = f"what profile {given.name} says: leave --profile out, or import the frames anew with it"
+                raise RecordingError(subject, "; ".join(others), expected)
+            tell(f"{subject}: {'; '.join(others)}: profile {given.name} is taken")
         return given
 
     def _parsed(self, text: str) -> Profile:

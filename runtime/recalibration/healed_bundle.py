@@ -10,7 +10,7 @@ from pathlib import Path
 from lightpage.calibration.document import parse_calibration
 from lightpage.calibration.known_pages import first_lit_pages, lit_pages
 from lightpage.codec.code import Code
-from lightpage.errors import RecalibrationRefusedError
+from lightpage.errors import CalibrationError, RecalibrationRefusedError, raised_as
 from lightpage.progress import Progress, warn
 from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording
@@ -21,6 +21,7 @@ from lightpage.runtime.recalibration.healing import TOGETHER, LostPages, heal
 from lightpage.runtime.recalibration.known_pages import MIN_PAGES, KnownPages, read_recorded
 from lightpage.runtime.recalibration.other_device import MOST_PAGES, of_other_device
 from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome, Refit, RefitResult, recalibrate
+from lightpage.runtime.recalibration.refit import check_as_good
 
 _HEALING_SHARE = 0.8
 """Of the time that it takes, judging and writing the rest."""
@@ -46,13 +47,17 @@ def recalibrate_by_lost(
         start: the model that is healed, if not `decoder` itself.
 
     Raises:
-        RecalibrationRefusedError: fewer than two pages came right, or as `heal` and `recalibrate` raise.
+        RecalibrationRefusedError: no page came right beside those that were fitted, the geometry that was found is
+            wrong where the earlier one was not, or as `heal` and `recalibrate` raise.
         BundleError: as they raise.
     """
     healed = heal(start or decoder, pages, lambda what, share: progress(what, _HEALING_SHARE * share), fit)
-    if (count := len(healed.known.pairs)) < MIN_PAGES:
-        got = f"{count} page that came right after {healed.rounds} rounds"
-        raise RecalibrationRefusedError("healing", got, f"at least {MIN_PAGES}: one to fit, one to judge by")
+    if (count := len(healed.known.pairs)) < max(MIN_PAGES, healed.known.fitted_count + 1):
+        got = f"{count} pages that came right after {healed.rounds} rounds, {healed.known.fitted_count} of them fitted"
+        raise RecalibrationRefusedError("healing", got, f"at least {MIN_PAGES}, and one that was not, to judge by")
+    if (found := healed.decoder.bundle.calibration).is_wrong:
+        with raised_as(RecalibrationRefusedError, CalibrationError):
+            check_as_good((start or decoder).bundle.calibration, found)
 
     def judging(what: str, share: float) -> None:
         progress(what, _HEALING_SHARE + (1 - _HEALING_SHARE) * share)

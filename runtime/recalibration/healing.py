@@ -8,13 +8,13 @@ model is re-fitted by it as by any known page.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-from lightpage.calibration.calibrate import KnownPage, refine
+from lightpage.calibration.calibrate import KnownPage, goodness_of, refine
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.document import Calibration
 from lightpage.calibration.interfaces import Twin
@@ -83,8 +83,8 @@ class Healed:
 
     Attributes:
         decoder: of the re-fitted bundle, which lies in memory.
-        result: what was re-fitted.
-        known: pages that come right, with their symbols; where one of them was fitted, it is the first.
+        result: what was re-fitted, with the verdict on it. It may be wrong: pages that come right are right even so.
+        known: pages that come right, with their symbols; those that were fitted are the first.
         rounds: of fits to decisions; 0 where only the image had moved.
         seconds: that it took.
     """
@@ -126,24 +126,39 @@ def heal(
                 raise RecalibrationRefusedError("healing", work.unread(model), _WANTED)
             rounds += 1
             model = work.fitted(model, partial(_within, progress, rounds))
-    try:
-        result = fit(decoder.bundle, known.part(slice(1)), partial(_within, progress, MOST_ROUNDS + 1), decoder)
-    except CalibrationError as error:
-        if not rounds:
-            raise RecalibrationRefusedError(error.subject, error.got, error.expected) from error
-    else:
-        by_known = _Model(decoder.of_bundle(refitted_bundle(decoder.bundle, result)), result, known.pairs[0])
-        # one more page is worth more than a little more of each
-        model = max(by_known, model, key=work.count)
-    return Healed(model.decoder, model.result, work.known(model) or known, rounds, time.perf_counter() - start)
+        told = partial(_within, progress, MOST_ROUNDS + 1)
+        try:
+            result = fit(decoder.bundle, known.part(slice(1)), told, decoder)
+        except CalibrationError:
+            if not rounds:
+                raise
+            model = work.judged(model, known, told)
+        else:
+            by_known = model.by(known.pairs[0], decoder.of_bundle(refitted_bundle(decoder.bundle, result)), result)
+            # one more page is worth more than a little more of each
+            model = by_known if work.count(by_known) >= work.count(model) else work.judged(model, known, told)
+        result = replace(model.result, report=replace(model.result.report, image=work.image))
+        return Healed(model.decoder, result, work.known(model) or known, rounds, time.perf_counter() - start)
 
 
 class _Model(NamedTuple):
-    """A decoder whose bundle lies in memory, what was re-fitted for it, and by which page; None for the first one."""
+    """A decoder whose bundle lies in memory, what was re-fitted for it, and the pages of all fits on its way.
+
+    The page of the last fit comes first; there is none for the first model.
+    """
 
     decoder: Decoder
     result: RefitResult
-    fitted: FramePair | None = None
+    fitted: tuple[FramePair, ...] = ()
+
+    @property
+    def last(self) -> FramePair | None:
+        """The page of the last fit."""
+        return self.fitted[0] if self.fitted else None
+
+    def by(self, pair: FramePair, decoder: Decoder, result: RefitResult) -> _Model:
+        """The model of another fit, by `pair`, that began with this one."""
+        return _Model(decoder, result, (pair, *(other for other in self.fitted if other is not pair)))
 
 
 def _within(progress: Progress, rounds: int, what: str, share: float) -> None:
@@ -160,6 +175,7 @@ class _Healing:
     Attributes:
         pairs: the pages that are taken.
         model: the model with the image where it lies now.
+        image: where that is.
     """
 
     def __init__(self, decoder: Decoder, pages: LostPages, twin: Twin) -> None:
@@ -177,10 +193,10 @@ class _Healing:
         self.pairs = tuple(pages.pairs[number] for number in taken)
         expected = tuple(pages.expected[number] if pages.expected else None for number in taken)
         self._shown = UnknownPages(self.pairs, expected, pages.code, bundle.written_pilots(self._levels), twin)
-        self._image = self._found()
-        moved = moved_cameras(bundle.calibration.vector, np.array([self._image.shift_x_px, self._image.shift_y_px]))
+        self.image = self._found()
+        moved = moved_cameras(bundle.calibration.vector, np.array([self.image.shift_x_px, self.image.shift_y_px]))
         self._start = bundle.calibration.model_copy(update={"parameters": as_dict(moved)})
-        self.model = self._with(self._start)
+        self.model = _Model(*self._with(self._start))
 
     def _found(self) -> ImagePosition:
         """Where the image lies: where one page's pilots are found, or else where it was, if those of all agree there.
@@ -205,14 +221,14 @@ class _Healing:
         )
         raise RecalibrationRefusedError("healing", got, _WANTED)
 
-    def _with(self, calibration: Calibration, fitted: FramePair | None = None) -> _Model:
-        """The model with another geometry, and by which page that was fitted."""
+    def _with(self, calibration: Calibration) -> tuple[Decoder, RefitResult]:
+        """The decoder with another geometry, and what was re-fitted for it."""
         result = traced(self._decoder, self._twin, self._references, calibration)
-        return _Model(self._decoder.of_bundle(refitted_bundle(self._decoder.bundle, result)), result, fitted)
+        return self._decoder.of_bundle(refitted_bundle(self._decoder.bundle, result)), result
 
     def _read(self, model: _Model) -> tuple[PageBytes, ...]:
         """Return what the pages give a model."""
-        return self._shown.look(model.decoder, model.fitted).read
+        return self._shown.look(model.decoder, model.last).read
 
     def count(self, model: _Model) -> int:
         """How many pages a model reads."""
@@ -227,17 +243,19 @@ class _Healing:
         return f"{len(pages)} pages of which none is read after {MOST_ROUNDS} rounds; {told}"
 
     def known(self, model: _Model) -> KnownPages | None:
-        """The pages that come right, the fitted one first, then by what they have to spare; None if none does."""
+        """The pages that come right, the fitted ones first, then by what they have to spare; None if none does."""
         read = [(page, pair) for page, pair in zip(self._read(model), self.pairs, strict=True) if page.loss is None]
         if not read:
             return None
-        read.sort(key=lambda one: (one[1] is not model.fitted, -one[0].margin_bits))
+        order = {id(pair): place for place, pair in enumerate(model.fitted)}
+        read.sort(key=lambda one: (order.get(id(one[1]), len(order)), -one[0].margin_bits))
         codec = self._shown.codec(model.decoder)
         symbols = tuple(codec.encode_again(page, self._shown.pilots) for page, _ in read)
-        image_px = self._image.shift_x_px, self._image.shift_y_px
+        image_px = self.image.shift_x_px, self.image.shift_y_px
         pairs = tuple(pair for _, pair in read)
-        mask, near = model.decoder.bundle.pilot_mask, None if model.fitted is None else self._near(model)
-        return KnownPages(pairs, symbols, self._levels, self._references, mask, image_px, near)
+        mask, near = model.decoder.bundle.pilot_mask, self._near(model) if model.fitted else None
+        fitted = tuple(map(hash_frames, model.fitted))
+        return KnownPages(pairs, symbols, self._levels, self._references, mask, image_px, near, fitted)
 
     def _near(self, model: _Model) -> CalibratedDevice:
         """Return the device as a model has it."""
@@ -247,7 +265,7 @@ class _Healing:
     def fitted(self, model: _Model, progress: Progress) -> _Model:
         """The model of a fit to what `model` decides, its smooth error off."""
         progress("decide", 0.0)
-        page, symbols = self._shown.decided(model.decoder, model.fitted)
+        page, symbols = self._shown.decided(model.decoder, model.last)
         profile, earlier = model.decoder.bundle.profile, self._start
         registered = refine(
             self._twin,
@@ -262,9 +280,21 @@ class _Healing:
             near=self._near(model),
             rough=True,
         )
-        hashes = [hash_frames(self.pairs[page])]
-        found = earlier.followed_by(Calibration.from_registered(registered, profile, hashes))
-        return self._with(found, self.pairs[page])
+        hashes = {hash_frames(pair): None for pair in (self.pairs[page], *model.fitted)}
+        found = earlier.followed_by(Calibration.from_registered(registered, profile, [*hashes]))
+        return model.by(self.pairs[page], *self._with(found))
+
+    def judged(self, model: _Model, known: KnownPages, progress: Progress) -> _Model:
+        """The model with the verdict on its geometry, by the light of the first known page.
+
+        A fit to decisions gives none: those that are wrong would count as light that the geometry does not explain.
+        """
+        if not model.fitted:
+            return model
+        bundle, symbols = model.decoder.bundle, np.exp(1j * symbol_phases(known.symbols[0], self._levels))
+        page = KnownPage(known.pairs[0], symbols)
+        goodness = goodness_of(self._twin, self._near(model), page, lambda _: progress("unexplained light", 1.0))
+        return _Model(*self._with(bundle.calibration.model_copy(update={"goodness": goodness})), model.fitted)
 
 
 def _shows_light(decoder: Decoder, pair: FramePair) -> bool:

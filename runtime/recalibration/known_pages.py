@@ -34,6 +34,7 @@ class KnownPages:
         pilot_mask: where the pilots are, bool [ny, nx], or None for the device's usual positions.
         image_px: where the image was last seen against the model's calibration, (x, y), camera pixels.
         near: a device that is known to be near the one that shows them: a fit begins there, and looks for no image.
+        fitted: SHA-256 (`hash_frames`) of the pages that `near` was fitted to. Those that are among these come first.
     """
 
     pairs: tuple[FramePair, ...]
@@ -43,6 +44,7 @@ class KnownPages:
     pilot_mask: NDArray[np.bool_] | None = None
     image_px: tuple[float, float] = (0.0, 0.0)
     near: CalibratedDevice | None = None
+    fitted: tuple[str, ...] = ()
 
     def check(self, decoder: Decoder) -> None:
         """Check everything against the device of `decoder`.
@@ -91,6 +93,11 @@ class KnownPages:
             raise dark
         pairs, symbols = tuple(self.pairs[n] for n in kept), tuple(self.symbols[n] for n in kept)
         return replace(self, pairs=pairs, symbols=symbols)
+
+    @property
+    def fitted_count(self) -> int:
+        """How many of these pages `near` was fitted to."""
+        return sum(hash_frames(pair) in self.fitted for pair in self.pairs)
 
     def part(self, pages: slice) -> KnownPages:
         """Some of the pages, the rest as it is."""

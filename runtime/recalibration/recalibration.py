@@ -138,7 +138,7 @@ def recalibrate(
     start = time.perf_counter()
     check_version(version, "version of the new bundle")
     pages.check(decoder)
-    fitted_count = min(FIT_PAGES, len(pages.pairs) - 1)
+    fitted_count = min(max(FIT_PAGES, pages.fitted_count), len(pages.pairs) - 1)
     fitted, held_back = pages.part(slice(fitted_count)), pages.part(slice(fitted_count, None))
     tracker = tracker_for(decoder) if tracker is None else tracker.fork()
     judged_count = len(held_back.pairs)

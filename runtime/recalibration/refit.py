@@ -62,13 +62,10 @@ def refit(
     references = pages.references or decoder.references
     twin = OnnxTwin(bundle) if twin is None else twin
     progress("find the image", 0.0)
-    if pages.near is None:
-        image = _find(decoder, twin, pages, references)
-    else:
-        image = ImagePosition(*pages.image_px, searched=True, found=True)
-    start = earlier.vector
-    if image is not None:
-        start = moved_cameras(start, np.array([image.shift_x_px, image.shift_y_px]))
+    image = _find(decoder, twin, pages, references) if pages.near is None else None
+    moved_px = pages.image_px if image is None else (image.shift_x_px, image.shift_y_px)
+    known_place = image is not None or pages.near is not None
+    start = moved_cameras(earlier.vector, np.array(moved_px)) if known_place else earlier.vector
     known = [
         KnownPage(pair, np.exp(1j * symbol_phases(symbols, pages.levels)))
         for pair, symbols in zip(pages.pairs, pages.symbols, strict=True)
@@ -87,7 +84,7 @@ def refit(
             near=pages.near,
         )
     except CalibrationError as error:
-        if image is None:
+        if not known_place:
             near = f"an image within {REACH_PX:g} px of where it was last seen, else calibrate anew"
             expected = f"{error.expected}; {near}"
             raise CalibrationError("re-fit", f"no image of the first page; then {error.got}", expected) from None
@@ -99,10 +96,20 @@ def refit(
             f"at least {LEAST_KEPT:.0%} of the {earlier.reference_coherence:.3f} when it was calibrated: this device, "
             "drifted a little; else calibrate anew",
         )
-    fitted = earlier.followed_by(Calibration.from_registered(registered, profile, [*map(hash_frames, pages.pairs)]))
+    hashes = dict.fromkeys([*map(hash_frames, pages.pairs), *pages.fitted])
+    fitted = earlier.followed_by(Calibration.from_registered(registered, profile, [*hashes]))
+    check_as_good(earlier, fitted)
+    return traced(decoder, twin, references, fitted, image)
+
+
+def check_as_good(earlier: Calibration, fitted: Calibration) -> None:
+    """Check that a re-fit is not wrong, where the calibration that it started from is known not to be.
+
+    Raises:
+        CalibrationError: it is wrong.
+    """
     if earlier.goodness is not None and not earlier.is_wrong:
         fitted.check_good("re-fit, outcome", ": else calibrate anew")
-    return traced(decoder, twin, references, fitted, image)
 
 
 def traced(
@@ -115,7 +122,7 @@ def traced(
         twin: of the bundle's profile.
         references: that the geometry was fitted with.
         fitted: the geometry.
-        image: where its image was found, None where it was not.
+        image: where its image was found, None where it was not, or not looked for.
     """
     profile = decoder.bundle.profile
     table = {

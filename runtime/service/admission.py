@@ -35,7 +35,7 @@ Bytes = np.ndarray[tuple[int], np.dtype[np.uint8]]
 
 _RETRY_S = 1.0
 _UNSEEN = 2
-"""References to spare memory that nobody has a view of: its name here, and the argument of the count itself."""
+"""References to spare memory that nobody has a view of: its place among the spares, and the argument of the count."""
 
 
 @dataclass(eq=False)
@@ -288,10 +288,9 @@ class ReceiveBudget:
         """
         with self._lock:
             for _ in range(len(self._spares)):
-                spare = self._spares.popleft()
-                if spare.size == size and sys.getrefcount(spare) == _UNSEEN:
-                    return spare
-                self._spares.append(spare)
+                if self._spares[0].size == size and sys.getrefcount(self._spares[0]) == _UNSEEN:
+                    return self._spares.popleft()
+                self._spares.rotate(-1)
         return np.empty(size, np.uint8)
 
     def spare(self, memory: Bytes) -> None:

@@ -105,7 +105,7 @@ def calibrate_recording(
         RecordingError: no symbols, no such page, or a recording of another profile.
         CalibrationError: nothing within the capture range explains the frames.
     """
-    recording.header.device(profile)
+    recording.header.check_against(profile)
     known = known_pages(recording, profile, pages)
     registered = register(
         TorchTwin(RayTwin(profile)),

@@ -168,7 +168,8 @@ def drift_slopes(decoder: Decoder, twin: Twin, parameters: Real, pair: FramePair
         pair: a page that it reads; the golden page by default.
 
     Raises:
-        BundleError: the golden page is refused when its image is looked for a little off its place.
+        FrameError: the page is refused when its image is looked for a little off its place.
+        BundleError: the golden page is.
     """
     registration, given = decoder.graph.value("registration"), pair is not None
     profile, pair = decoder.bundle.profile, decoder.bundle.golden.pair if pair is None else pair
@@ -178,8 +179,8 @@ def drift_slopes(decoder: Decoder, twin: Twin, parameters: Real, pair: FramePair
             table = {"registration": shifted(registration, shift_px)}
             return decoder.infer(pair, table, doubtful=given, alone=True).phase
         except FrameError as error:
-            subject = f"{decoder.bundle.subject}: golden page, moved by {PROBE_PX} px"
-            raise BundleError(subject, error.got, error.expected) from None
+            kind, page = (FrameError, "page") if given else (BundleError, f"{decoder.bundle.subject}: golden page")
+            raise kind(f"{page}, moved by {PROBE_PX} px", error.got, error.expected) from None
 
     moved = [[phase(sign * PROBE_PX * axis) for sign in (1, -1)] for axis in np.eye(2)]
     by_table = [np.angle(np.exp(1j * (plus - minus))) / (2 * PROBE_PX) for plus, minus in moved]

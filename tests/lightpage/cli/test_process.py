@@ -192,6 +192,12 @@ def test_a_wrong_line_is_told_in_one_line(
     assert wanted in expected
 
 
+@pytest.mark.parametrize("words", [[], ["profile"]])
+def test_without_a_command_the_help_is_shown_as_it_is(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(lightpage, words) == EXIT_ERROR
+    assert "\nCommands:\n" in capsys.readouterr().err
+
+
 def test_a_name_that_is_too_long_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(lightpage, ["bulk", "decode", "n" * 300, "--recordings", "R.h5"]) == 2
     assert capsys.readouterr().err.startswith("lightpage: error: ")

@@ -1,7 +1,9 @@
 """`lightpage import` and `unpack`: what other programs have written becomes the same recording, whatever its form."""
 
 import json
+import os
 import shlex
+import shutil
 import tracemalloc
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,7 +23,7 @@ from lightpage.cli.import_frames import import_frames
 from lightpage.cli.unpack import unpack
 from lightpage.errors import BlackFrameError, FrameError, InvalidInputError, PageError
 from lightpage.foreign import import_job
-from lightpage.foreign.frames import Pages, Upright
+from lightpage.foreign.frames import Arrangement, Pages, Upright, both_cameras
 from lightpage.foreign.opening import open_array
 from lightpage.foreign.unpacking import Form
 from lightpage.recording.reader import Recording
@@ -29,6 +31,7 @@ from tests.lightpage.refused import refused
 from tests.runtime import coded, toy
 
 LEVELS, PAGES = 16, 4
+COUNTS = ("in_phase", "quadrature", "reference_in_phase", "reference_quadrature")
 TURNS = [Upright("", turn) for turn in (180, 270, 90)]
 WAYS = [Upright("x"), Upright("y"), *TURNS, Upright("x", 270), Upright("x", 90)]
 """Options that docs/your-device.md names, in the order of `ORIENTATIONS`."""
@@ -39,6 +42,8 @@ Arrays = dict[str, np.ndarray]
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("toy") / "R.h5"
     toy.write_toy_recording(path, toy.ToyDevice(), LEVELS, PAGES)
+    with h5py.File(path, "r+") as file:
+        file.attrs["code"] = '{"volume": 9}'
     return path
 
 
@@ -94,7 +99,7 @@ def test_a_recording_comes_back_from_every_form(
 
 
 def left_aligned(a: Arrays) -> None:
-    for name in ("in_phase", "quadrature", "reference_in_phase", "reference_quadrature"):
+    for name in COUNTS:
         np.save(f"{name}.npy", a[name].astype(">u2") << 8)
 
 
@@ -148,6 +153,45 @@ def test_frames_may_lie_in_many_ways(
     write(arrays)
     bring(f"{options} {REFERENCES} {REST}")
     check_same(folder / "new.h5", arrays)
+
+
+@pytest.mark.parametrize(
+    ("factor", "options", "depth"), [(16, "", 12), (16, " --bit-depth 12", 12), (2, "", 10), (1, " --bit-depth 10", 10)]
+)
+def test_counts_that_fit_stay_as_they_are_though_they_are_multiples(
+    factor: int, options: str, depth: int, folder: Path, arrays: Arrays
+) -> None:
+    scaled = arrays | {name: arrays[name].astype(np.uint16) * factor for name in COUNTS}
+    for name, data in scaled.items():
+        np.save(f"{name}.npy", data)
+    bring(f"{FRAMES} {REFERENCES} {REST}{options}")
+    check_same(folder / "new.h5", scaled)
+    assert contents(folder / "new.h5")[1]["camera_bit_depth"] == depth
+
+
+class TestShapesThatAreReadInTwoWays:
+    """Cubes, square frames, and axes of which two are two."""
+
+    def test_pages_of_matlab_lie_along_the_last_axis(self, tmp_path: Path) -> None:
+        cube = np.arange(27, dtype=np.uint8).reshape(3, 3, 3)
+        savemat(tmp_path / "cube.mat", {"cube": cube})
+        np.testing.assert_array_equal(Pages(open_array(str(tmp_path / "cube.mat")), (3, 3), "").page(1), cube[:, :, 1])
+
+    @pytest.mark.parametrize(
+        ("shape", "arrangement", "kind"),
+        [
+            ((2, 3, 4, 5), "interleaved", "two cameras"),
+            ((3, 2, 4, 5), "halves", "two cameras"),
+            ((8, 4, 4), None, "--arrangement"),
+        ],
+    )  # fmt: skip
+    def test_an_arrangement_that_the_axes_contradict_or_leave_open(
+        self, shape: tuple[int, ...], arrangement: str | None, kind: str, tmp_path: Path
+    ) -> None:
+        np.save(tmp_path / "a.npy", np.zeros(shape, np.uint8))
+        way = None if arrangement is None else Arrangement(arrangement)
+        with refused("a.npy", wanted=kind):
+            both_cameras(open_array(str(tmp_path / "a.npy")), shape[-2:], (Upright(), Upright()), way, "")
 
 
 def test_the_pages_that_were_encoded_bring_profile_levels_and_code(folder: Path) -> None:
@@ -204,9 +248,12 @@ class TestRefused:
             (FRAMES, "options", "no references"),
             (f"--frames in_phase.npy {REFERENCES}", "in_phase.npy", "does not tell"),
             (f"{FRAMES.replace('in_phase', 'all')} {REFERENCES}", "all.npy", "no such file"),
+            (f"{FRAMES} {REFERENCES} --black-level 300", "--black-level 300", "8 bits"),
+            (f"{FRAMES} {REFERENCES} --pilots ones.npy", "ones.npy", "pilots of"),
         ],
     )
-    def test_options_that_do_not_go_together(self, options: str, subject: str, got: str) -> None:
+    def test_options_that_do_not_go_together(self, options: str, subject: str, got: str, arrays: Arrays) -> None:
+        np.save("ones.npy", np.ones_like(arrays["symbols"][0]))
         with refused(subject, got):
             bring(f"{options} {REST}")
 
@@ -246,16 +293,35 @@ def test_an_interrupted_import_goes_on_with_the_same_files_alone(
             raise KeyboardInterrupt
         return whole(self, page)
 
+    arrays = {**arrays, "in_phase": arrays["in_phase"] * (np.arange(PAGES) != 0).astype(np.uint8)[:, None, None]}
+    Path("pics").mkdir()
+    for page, frame in enumerate(arrays["in_phase"]):
+        Image.fromarray(frame).save(picture := Path(f"pics/{page}.png"))
+    given = f"{FRAMES.replace('in_phase.npy', 'pics/*.png')} {REFERENCES} {REST} --keep-unlit --json J"
+    stamp = picture.stat()
     with monkeypatch.context() as patched:
         patched.setattr(import_job.Material, "page_symbols", stops)
         with pytest.raises(click.Abort):
-            bring(f"{FRAMES} {REFERENCES} {REST}")
+            bring(given)
     assert contents(folder / "new.h5.partial")[1]["pages_complete"] == 2
     with refused("new.h5", "other settings"):
-        bring(f"{FRAMES} {REFERENCES} {REST} --bit-depth 10")
-    bring(f"{FRAMES} {REFERENCES} {REST}")
+        bring(f"{given} --bit-depth 10")
+    picture.touch()
+    with refused("new.h5", "other settings"):
+        bring(given)
+    os.utime(picture, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
+    bring(given)
     check_same(folder / "new.h5", arrays)
+    assert [each["page"] for each in json.loads((folder / "J").read_text())["unlit"]] == [0]
     assert not list(folder.glob("*.partial*"))
+
+
+def test_a_recording_never_takes_the_place_of_its_source(folder: Path, recording: Path) -> None:
+    shutil.copy(recording, "in.h5")
+    given = f"{FRAMES} {REFERENCES} {REST}".replace("in_phase.npy", "in.h5::in_phase", 1).replace("new.h5", "in.h5")
+    with refused("--out in.h5", "--in-phase"):
+        bring(f"{given} --force")
+    check_same(folder / "in.h5", contents(recording)[0])
 
 
 @pytest.mark.parametrize("name", ["stack.npy", "stack.tif"])

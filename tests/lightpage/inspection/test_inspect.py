@@ -15,11 +15,15 @@ from PIL import Image
 from scipy.io import savemat
 
 from lightpage.cli import main
-from lightpage.errors import InvalidInputError
+from lightpage.errors import InvalidInputError, LightpageError, StorageError, SurroundingsError, WorkerError
+from lightpage.helper_process import Helper, HelperProcess
+from lightpage.inspection import apart
 from lightpage.inspection.apart import look_apart
 from lightpage.inspection.command import inspect, table
+from lightpage.inspection.documents import SERVICE_TABLES
 from lightpage.inspection.look import look
 from lightpage.recording.decoded_file import DecodedWriter
+from lightpage.runtime.service.settings import ServiceSettings
 from tests.lightpage.refused import refused
 from tests.lightpage.small import small_profile
 from tests.runtime import coded, toy
@@ -100,7 +104,11 @@ MADE: dict[str, tuple[str, int, Callable[[Path], object]]] = {
     "five.mat": ("MATLAB file", 0, lambda path: savemat(path, {"stack": FRAMES})),
     "seven.mat": ("MATLAB file", 0, mat73),
     "png": ("folder of pictures", 0, png_folder),
-    "e.json": ("figures of an evaluation", 0, lambda path: path.write_text('{"air_bits_per_symbol": 6}')),
+    "e.json": ("figures of an evaluation", 0, lambda path: path.write_text('{"bundle_version": "v", "pages": 6}')),
+    "s.toml": ("settings of a service", 0, lambda path: path.write_text("[inference]\n")),
+    "left.npy": ("full scale 65520", 0, lambda path: np.save(path, np.minimum(2 * FRAMES, 4095) << 4)),
+    "bright.npy": ("values up to 1e+20", 2, lambda path: np.save(path, np.full((2, 9, 9), 1e20))),
+    "two.npz": ("two.npz::b", 0, lambda path: path.write_bytes(zipped(a=[[1.0]], b=FRAMES))),
     "rgb.tif": ("RGB", 2, lambda path: tifffile.imwrite(path, np.zeros((40, 60, 3), np.uint8), photometric="rgb")),
     "half.npy": ("all of shape", 2, lambda path: path.write_bytes(SAVED.getvalue()[:-9])),
     "half.tif": ("TIFF", 2, lambda path: path.write_bytes(b"II*\0\x08\0\0\0\x01\0\x02\0")),
@@ -111,18 +119,18 @@ MADE: dict[str, tuple[str, int, Callable[[Path], object]]] = {
     "empty": ("an empty file", 2, lambda path: path.touch()),
     "cut.h5": ("complete HDF5 file", 2, lambda path: path.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(200))),
     "pickle.npy": ("pickled", 2, lambda path: np.save(path, np.array([object, {}], object))),
-    "negative.npy": ("negative.npy", 2, lambda path: npy_of(path, "(-5, 9, 9)")),
+    "negative.npy": ("shape (-5", 2, lambda path: npy_of(path, "(-5, 9, 9)")),
     "large.npy": ("all of shape", 2, lambda path: npy_of(path, "(9999999999, 9, 9)")),
     "bomb.zip": ("manifest.json", 2, bomb),
     "huge.h5": ("GB", 2, huge_symbols),
-    "deep.toml": ("deep.toml", 2, lambda path: path.write_text("a = " + "[" * 100_000)),
-    "deep.json": ("deep.json", 2, lambda path: path.write_text("[" * 100_000)),
+    "deep.toml": ("recursion", 2, lambda path: path.write_text("a = " + "[" * 100_000)),
+    "deep.json": ("recursion", 2, lambda path: path.write_text("[" * 100_000)),
     "pipe": ("a pipe", 2, os.mkfifo),
-    "loop": ("loop", 2, lambda path: path.symlink_to(path.name)),
+    "loop": ("Too many levels", 2, lambda path: path.symlink_to(path.name)),
     "folders": ("inner", 2, folder_loop),
     "new\nline": ("new\\nline", 2, lambda path: path.write_bytes(b"\0\1\2")),
     "zero": ("a device", 2, lambda path: path.symlink_to("/dev/zero")),
-    "none": ("none", 2, lambda path: None),
+    "none": ("No such file", 2, lambda path: None),
 }  # fmt: skip
 
 
@@ -142,8 +150,32 @@ def test_it_says_what_a_file_is_or_what_is_wrong(name: str, tmp_path: Path, monk
 
 def test_a_file_that_is_never_read_to_its_end_is_given_up(tmp_path: Path) -> None:
     (tmp_path / "p.toml").write_text(PROFILE)
-    with refused("p.toml", "does not come to its end"):
+    with refused("p.toml", "0 s", StorageError):
         look_apart(tmp_path / "p.toml", None, drawn=False, longest_s=0.0)
+
+
+def test_settings_of_a_service_are_known_by_any_of_their_tables() -> None:
+    assert ServiceSettings.model_fields.keys() == SERVICE_TABLES
+
+
+class Dies(Helper):
+    """The helper that ends as a path says."""
+
+    def look(self, path: Path, *_: object) -> None:
+        """End by a signal, or by an error that nobody foresaw."""
+        os.kill(os.getpid(), int(path.name))
+
+
+@pytest.mark.parametrize(
+    ("signal", "kind"), [("11", InvalidInputError), ("9", SurroundingsError), ("999", WorkerError)]
+)  # fmt: skip
+def test_a_file_is_blamed_only_where_reading_it_crashes(
+    signal: str, kind: type[LightpageError], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(apart, "HelperProcess", lambda _, **told: HelperProcess(f"{__name__}:Dies", **told))
+    with pytest.raises(kind) as caught:
+        look_apart(Path(signal), None, drawn=False)
+    assert type(caught.value) is kind
 
 
 def test_a_recording_is_looked_at_and_drawn(small_device: list[str], tmp_path: Path) -> None:

@@ -155,11 +155,13 @@ class TestReading:
                         recording.header.device(None)
                 else:
                     assert recording.header.device(None) == own
-                if own is other:
-                    with refused("attribute 'profile'", "pipe.length_m = 0.2 (profile bench", RecordingError):
-                        recording.header.device(profile)
-                else:
-                    assert recording.header.device(profile) == profile
+                told: list[str] = []
+                assert recording.header.device(profile, told.append) == profile
+                assert [("pipe.length_m = 0.2 (profile bench" in each) for each in told] == [True] * (own is other)
+                laid_out = profile.model_copy(update={"page": profile.page.model_copy(update={"pilot_seed": 7})})
+                if own is not None:
+                    with refused("attribute 'profile'", "page.pilot_seed = 0", RecordingError):
+                        recording.header.device(laid_out)
 
     def test_left_aligned_counts_are_told_of_once(self, foreign: Path, caplog: pytest.LogCaptureFixture) -> None:
         with h5py.File(foreign, "r+") as file:

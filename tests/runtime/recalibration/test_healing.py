@@ -5,6 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import NoReturn
+from unittest.mock import Mock, patch
 
 import numpy as np
 import pytest
@@ -14,9 +15,10 @@ from lightpage.cli.simulate import simulate
 from lightpage.codec.code import Code
 from lightpage.codec.page_bytes import Loss
 from lightpage.device.state import Device
-from lightpage.errors import LostPageError, Reason, RecalibrationRefusedError, RecordingError
+from lightpage.errors import CalibrationError, LostPageError, Reason, RecalibrationRefusedError, RecordingError
 from lightpage.page.pilots import Pilots
 from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.layout import hash_frames
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings import page_reader
 from lightpage.runtime.archives.recordings.page_reader import PageReader
@@ -27,6 +29,7 @@ from lightpage.runtime.device.acquisition.source import open_source
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.tracking import NoTracker
+from lightpage.runtime.recalibration import healed_bundle
 from lightpage.runtime.recalibration.healed_bundle import recalibrate_by_lost
 from lightpage.runtime.recalibration.healing import LostPages, heal
 from lightpage.runtime.recalibration.judgement import Verdict, judge, judged_pages
@@ -43,6 +46,7 @@ from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.monitoring.observation import Observation
 from lightpage.runtime.service.pages.page_calls import PageCalls
 from lightpage.simulator.simulator import Simulator
+from tests.lightpage.small import UNEXPLAINED
 
 CODE = Code(levels=8, coded_bits=2, rate_per_mille=500, corrections=2)
 CONTENT = bytes(range(250)) * 3
@@ -171,6 +175,25 @@ def test_pages_wait_for_others_and_for_twice_as_many_where_that_brought_none(
     assert tried == [6, 18, 24]
     assert [page.page for page in pages] == [*range(4)] * 6
     assert {page.loss for page in pages} == {Loss.OPTICS}
+
+
+def test_a_healed_model_has_a_verdict_and_is_not_written_where_it_is_wrong(small_bundle: Path, drifted: Path) -> None:
+    decoder = Decoder.load(small_bundle, threads=1)
+    with Recording.open(drifted / "R.h5") as recording:
+        lost = LostPages(tuple(map(recording.frames, range(2))), CODE, references=recording.references())
+    healed = heal(decoder, lost, fit=Mock(side_effect=CalibrationError("re-fit", "nothing", "a geometry")))
+    found, report = healed.decoder.bundle.calibration, healed.result.report
+    assert report.goodness == found.goodness is not None
+    assert report.image is not None
+    assert healed.known.fitted == found.calibrated_pages[-len(healed.known.fitted) :]
+    wrong = found.model_copy(update={"goodness": UNEXPLAINED}).to_toml()
+    manifest = decoder.bundle.manifest.model_copy(update={"calibration": wrong})
+    spoilt = replace(healed, decoder=decoder.of_bundle(replace(decoder.bundle, manifest=manifest)))
+    all_fitted = replace(healed.known, fitted=tuple(map(hash_frames, healed.known.pairs)))
+    for subject, one in (("re-fit", spoilt), ("healing", replace(healed, known=all_fitted))):
+        with patch.object(healed_bundle, "heal", return_value=one), pytest.raises(RecalibrationRefusedError) as refused:
+            recalibrate_by_lost(decoder, lost, drifted / "out", "small-1+r1", refit, untouched)
+        assert refused.value.subject.startswith(subject)
 
 
 def test_a_bundle_without_a_calibration_is_not_healed(small_bundle: Path, drifted: Path) -> None:

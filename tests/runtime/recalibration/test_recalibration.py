@@ -315,6 +315,21 @@ def test_a_re_fit_starts_where_the_image_is_found(refined: Refined, bench: Decod
     assert np.array_equal(found.table["reference_quadrature"], moved.references.quadrature)
 
 
+def test_a_re_fit_near_a_device_tells_no_search(refined: Refined, bench: Decoder, moved: KnownPages) -> None:
+    near = bench.bundle.calibration.device(bench.bundle.profile, bench.references)
+    found = refined(replace(moved, near=near, fitted=("a" * 64,)))
+    assert found.report.image is None
+    fitted = with_calibration(bench.bundle, found.calibration_toml).calibration
+    assert fitted.calibrated_pages[-2:] == (hash_frames(moved.pairs[0]), "a" * 64)
+
+
+def test_pages_that_earlier_fits_saw_do_not_judge(decoder: Decoder, tmp_path: Path) -> None:
+    pages = known()
+    seen = replace(pages, fitted=tuple(map(hash_frames, pages.pairs[:2])))
+    outcome = recalibrate(decoder, seen, tmp_path / "new", "toy-1+r1", toy.fit_references, quiet)
+    assert (outcome.pages_used, outcome.pages_held_back) == (3, 1)
+
+
 def test_small_losses_do_not_add_up_unseen(refined: Refined, bench: Decoder) -> None:
     """A re-fit is measured by the first calibration, and not by the one before."""
     late = bench.bundle.calibration.model_copy(update={"coherence_at_first": 1.0})

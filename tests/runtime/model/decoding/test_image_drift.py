@@ -1,12 +1,15 @@
 """The image's drift shows in the phases of pilots and safe decisions; pages that say nothing are left out."""
 
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 
+from lightpage.errors import BundleError, FrameError
 from lightpage.page.levels import Levels
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import symbol_phases
-from lightpage.runtime.model.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate
+from lightpage.runtime.model.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate, drift_slopes
 from lightpage.runtime.model.decoding.page import Inference
 from tests.lightpage.uneven import overlapping, uneven
 from tests.runtime import toy
@@ -98,6 +101,15 @@ def test_a_pages_own_pilots_take_the_place_of_the_devices() -> None:
     found = DriftModel(SLOPES).estimate(other, 16, Pilots.of_symbols(mask, symbols, 16), ANYTHING)
     assert found is not None
     assert np.all(np.abs(found.drift[SHIFT] - (0.1, -0.05)) < 0.03)
+
+
+def test_frames_that_are_refused_a_little_off_their_place_are_told_as_frames() -> None:
+    refused = Mock()
+    refused.graph.value.return_value = np.ones((2, 2, 10), np.float32)
+    refused.infer.side_effect = FrameError("frame pair", "no light", "light")
+    for pair, kind in ((Mock(), FrameError), (None, BundleError)):
+        with pytest.raises(kind):
+            drift_slopes(refused, Mock(), np.zeros(1), pair)
 
 
 def test_phases_freed_from_a_drift_show_it_no_more() -> None:
