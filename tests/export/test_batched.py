@@ -3,6 +3,7 @@
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from torch import nn
 
 from lightpage.calibration.sampling_table import sampling_table, shifted
 from lightpage.device.state import Device
-from lightpage.errors import BundleError, ProviderError, UnconfirmedPageError
+from lightpage.errors import BundleError, UnconfirmedPageError
 from lightpage.export.batched import batched_onnx, traced
 from lightpage.export.graph import DecoderGraph, table_tensors
 from lightpage.export.half import deviation
@@ -29,7 +30,6 @@ from lightpage.runtime.model.decoding.batch_graph import (
     REGISTRATION,
     BatchGraph,
     Constants,
-    FrameBuffer,
     with_proven_batches,
 )
 from lightpage.runtime.model.decoding.batches import Batches, Batching
@@ -132,16 +132,13 @@ def test_a_bundle_without_the_graph_is_refused(decoder: Decoder) -> None:
         BatchGraph(replace(decoder.bundle, files=files), decoder.graph, PAGES)
 
 
-def test_where_memory_is_short_batches_are_smaller_from_the_start(
-    decoder: Decoder, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_where_memory_is_short_batches_are_smaller_at_once(decoder: Decoder, monkeypatch: pytest.MonkeyPatch) -> None:
+    def with_room_for_two(*asked: Any) -> list[Inference]:
+        if asked[-1].stop > 2:
+            raise MemoryError
+        return run(*asked)
+
     run = BatchGraph.run
-
-    def with_room_for_two(self: BatchGraph, constants: Constants, buffer: FrameBuffer, pages: slice) -> list[Inference]:
-        if pages.stop > 2:
-            raise ProviderError("provider cuda", "Failed to allocate memory", "one with room")
-        return run(self, constants, buffer, pages)
-
     monkeypatch.setattr(BatchGraph, "run", with_room_for_two)
     assert BatchGraph(decoder.bundle, decoder.graph, PAGES).pages == 2
 

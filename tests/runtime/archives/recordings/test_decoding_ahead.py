@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from threading import Thread
 from typing import cast
 
 import numpy as np
@@ -15,17 +14,14 @@ from lightpage.runtime.model.decoding.batches import Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.tracking import NoTracker, Tracker
 from lightpage.runtime.model.decoding.turns import Turn, Turns
-from lightpage.runtime.model.decoding.under_way import Phase
 from tests.runtime import coded
 from tests.runtime.held_graph import LARGEST, HeldGraph
-from tests.waiting import eventually
 
 
 @dataclass
-class Named:
+class Follower:
     """A tracker that is asked for turns alone, and a recording of pages without frames."""
 
-    name: str
     turns: Turns = field(default_factory=Turns)
     seen: list[int] = field(default_factory=list)
 
@@ -37,21 +33,19 @@ class Named:
 
 
 def test_pages_that_the_model_before_has_decoded_are_decoded_again_in_their_order() -> None:
-    def decode(page: Shown, frames: FramePair, symbols: Symbols) -> tuple[str, int]:
+    def decode(page: Shown, frames: FramePair, symbols: Symbols) -> int:
         with page.turn:
-            named, number = cast(Named, page.tracker), int(frames.in_phase[0])
-            named.seen.append(number)
-            return named.name, number
+            cast(Follower, page.tracker).seen.append(number := int(frames.in_phase[0]))
+            return number
 
     def in_use() -> Tracker:
         return cast(Tracker, models[len(found) >= 3])
 
-    models = Named("first"), Named("second")
-    found: list[tuple[str, int]] = []
-    for _, result in decoded_ahead(cast(Recording, Named("recording")), range(16), in_use, 2, decode):
+    models, found = (Follower(), Follower()), list[int]()
+    for _, result in decoded_ahead(cast(Recording, Follower()), range(16), in_use, 2, decode):
         found.append(result()[0])
-    assert found == [*(("first", page) for page in range(3)), *(("second", page) for page in range(3, 16))]
-    assert models[1].seen == list(range(3, 16))
+    assert found == list(range(16))
+    assert models[1].seen == found[3:]
 
 
 def test_a_file_is_recovered_in_batches_as_page_by_page(tmp_path: Path) -> None:
@@ -60,12 +54,7 @@ def test_a_file_is_recovered_in_batches_as_page_by_page(tmp_path: Path) -> None:
     path = coded.recording(tmp_path / "R.h5", symbols, {1: coded.half_lost, 4: coded.dark})
     decoder = Decoder.load(bundle, threads=1)
     graph, batching = HeldGraph(decoder), Batching(LARGEST)
-
-    def let_run() -> None:
-        eventually(lambda: batching.pages.count(Phase.WAITING) > 1)
-        graph.may_run.set()
-
-    Thread(target=let_run).start()
+    graph.run_together(batching)
     results = []
     for each in (decoder, graph.gathering(batching)):
         with Recording.open(path) as recording:

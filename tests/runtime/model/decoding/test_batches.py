@@ -119,17 +119,6 @@ def test_a_run_waits_for_a_page_whose_frames_are_being_checked(stage: Stage) -> 
     assert [sorted(run) for run in stage.graph.runs] == [[1, 2]]
 
 
-def test_a_run_does_not_wait_for_a_page_that_is_computed_alone(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
-    with stage.batches.under_way():
-        other = stage.pool.submit(stage.infer, 1)
-        eventually(lambda: stage.pages.count(Phase.WAITING) == 1)
-        monkeypatch.setattr(HeldConstants, "of", lambda *_: None)
-        stage.clock.until_somebody_waits()
-        frame = np.zeros((1, 1), np.uint8)
-        assert stage.batches.infer(cast(TableGraph, stage.table), FramePair(frame, frame)) is None
-        assert other.result(PATIENT) == 1
-
-
 def test_a_run_waits_no_longer_than_is_set(stage: Stage) -> None:
     with stage.batches.under_way():
         page = stage.pool.submit(stage.infer, 1)
@@ -154,9 +143,7 @@ def test_an_error_is_that_of_every_page_of_its_run_and_of_no_other(stage: Stage)
 
 
 @pytest.mark.parametrize("room", [1, 2])
-def test_where_memory_is_short_runs_are_smaller_from_then_on(
-    stage: Stage, caplog: pytest.LogCaptureFixture, room: int
-) -> None:
+def test_where_memory_is_short_runs_are_smaller_from_then_on(stage: Stage, caplog: Any, room: int) -> None:
     def fail(numbers: list[int]) -> None:
         if len(numbers) > room:
             raise RuntimeError("Failed to allocate memory for requested buffer of size 9")
@@ -192,21 +179,17 @@ def test_few_constants_are_held_and_those_in_use_stay() -> None:
 
 
 def test_constants_that_are_being_made_take_room() -> None:
-    tables: Any = [Table(9.0 * number) for number in range(KEPT + 2)]
-    graph, making = Graph(tables[0]), threading.Barrier(KEPT)
+    tables: Any = [Table(9.0 * number) for number in range(KEPT + 1)]
+    graph, refused = Graph(tables[0]), list[bool]()
     held = HeldConstants(cast(BatchGraph, graph), tables[0])
 
     def constants(table: Table, registration: np.ndarray | None = None) -> Constants:
-        making.wait(PATIENT)
-        return Graph.constants(graph, table, registration)
+        refused.append(held.of(tables[tables.index(table) + 1], None) is None)
+        return Graph.constants(graph, table)
 
     graph.constants = constants  # type: ignore[method-assign]
-    with ThreadPoolExecutor(KEPT - 1) as pool:
-        others = [pool.submit(held.of, table, None) for table in tables[1:KEPT]]
-        eventually(lambda: making.n_waiting == KEPT - 1)
-        assert held.of(tables[-1], None) is None
-        making.wait(PATIENT)
-        assert all(other.result(PATIENT) for other in others)
+    assert held.of(tables[1], None) is not None
+    assert refused == [True, *[False] * (KEPT - 2)]
 
 
 def test_constants_follow_an_image_that_leaves_their_reach() -> None:

@@ -2,6 +2,8 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -347,41 +349,28 @@ def test_pages_decoded_at_the_same_time_are_taken_in_their_order(device: FakeDev
     assert [round(float(held[0]), 1) for held in device.decodes] == [0.0, 0.0, 0.5, 0.5]
 
 
-def test_without_batches_pages_wait_for_none_and_teach_once(
-    device: FakeDevice, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_batches_pages_wait_for_none_and_teach_once(device: FakeDevice, monkeypatch: Any) -> None:
     """A page that began before another was learnt from changes nothing: its drift is accounted for."""
-    tracker = settled(device)
+    tracker, learnt = settled(device), list[ImageState]()
     device.drift[SHIFT] = (0.5, 0.0)
-    infer, learnt = FakeDecoder.infer, list[ImageState]()
 
-    def meanwhile(self: FakeDecoder, pair: FramePair, table: SamplingTable | None = None) -> Inference:
+    def meanwhile(_: FramePair) -> None:
         monkeypatch.undo()
         tracker.decode(device.page(), 16)
         learnt.append(tracker.state)
-        return infer(self, pair, table)
 
-    monkeypatch.setattr(FakeDecoder, "infer", meanwhile)
+    monkeypatch.setattr(device.decoder, "check", meanwhile)
     tracker.decode(device.page(), 16)
     assert tracker.state is learnt[0]
 
 
-def test_whoever_waits_for_a_page_that_hangs_may_leave(device: FakeDevice) -> None:
-    def leave() -> None:
-        raise CallerLeft
-
+def test_a_turn_that_is_never_used_holds_nobody_up_who_leaves_or_once_it_is_closed(device: FakeDevice) -> None:
     device.together = 2
     tracker = settled(device)
-    hanging, turn = tracker.turn(), tracker.turn(leave)
+    hanging = tracker.turn()
     with pytest.raises(CallerLeft):
-        tracker.decode(device.page(), 16, None, turn)
+        tracker.decode(device.page(), 16, None, tracker.turn(Mock(side_effect=CallerLeft)))
     hanging.close()
-    assert tracker.decode(device.page(), 16).check.confirmed
-
-
-def test_a_turn_that_is_never_used_is_closed_and_holds_nobody_up(device: FakeDevice) -> None:
-    tracker = settled(device)
-    tracker.turn().close()
     dark = FramePair(*(np.zeros_like(frame) for frame in vars(device.page()).values()))
     with pytest.raises(FrameError):
         tracker.decode(dark, 16)

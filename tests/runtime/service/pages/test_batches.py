@@ -1,11 +1,9 @@
 """A range of pages that are computed together gives what its pages give one by one."""
 
 from pathlib import Path
-from threading import Thread
 
 from lightpage.runtime.model.decoding.batches import Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.model.decoding.under_way import Phase
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.models.models import Models
@@ -13,7 +11,6 @@ from lightpage.runtime.service.pages.reading import read_data
 from lightpage.runtime.service.stages import CallTimes
 from tests.runtime import coded
 from tests.runtime.held_graph import LARGEST, HeldGraph
-from tests.waiting import eventually
 
 
 def test_user_bytes_of_a_range_are_read_in_batches_as_page_by_page(tmp_path: Path) -> None:
@@ -21,12 +18,7 @@ def test_user_bytes_of_a_range_are_read_in_batches_as_page_by_page(tmp_path: Pat
     symbols = coded.pages(bundle, tmp_path)
     decoder = Decoder.load(bundle, threads=1)
     graph, batching, found = HeldGraph(decoder), Batching(LARGEST), []
-
-    def let_run() -> None:
-        eventually(lambda: batching.pages.count(Phase.WAITING) > 1)
-        graph.may_run.set()
-
-    Thread(target=let_run).start()
+    graph.run_together(batching)
     for each in (decoder, graph.gathering(batching)):
         times = CallTimes()
         plane = DataPlane(Models(each), coded.ShownPages(symbols, {1: coded.half_lost, 4: coded.dark}))
