@@ -38,11 +38,10 @@ def test_pages_that_the_model_before_has_decoded_are_decoded_again_in_their_orde
             cast(Follower, page.tracker).seen.append(number := int(frames.in_phase[0]))
             return number
 
-    def in_use() -> Tracker:
-        return cast(Tracker, models[len(found) >= 3])
-
     models, found = (Follower(), Follower()), list[int]()
-    for _, result in decoded_ahead(cast(Recording, Follower()), range(16), in_use, 2, decode):
+    for _, result in decoded_ahead(
+        cast(Recording, Follower()), range(16), lambda: cast(Tracker, models[len(found) >= 3]), 2, decode
+    ):
         found.append(result()[0])
     assert found == list(range(16))
     assert models[1].seen == found[3:]

@@ -350,7 +350,6 @@ def test_pages_decoded_at_the_same_time_are_taken_in_their_order(device: FakeDev
 
 
 def test_without_batches_pages_wait_for_none_and_teach_once(device: FakeDevice, monkeypatch: Any) -> None:
-    """A page that began before another was learnt from changes nothing: its drift is accounted for."""
     tracker, learnt = settled(device), list[ImageState]()
     device.drift[SHIFT] = (0.5, 0.0)
 
