@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from lightpage.runtime.archives.recordings.decoding_ahead import Shown, Symbols,
 from lightpage.runtime.archives.recordings.recovery import recover
 from lightpage.runtime.model.decoding.batches import Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.model.decoding.tracking import NoTracker, Tracker
+from lightpage.runtime.model.decoding.tracking import NoTracker
 from lightpage.runtime.model.decoding.turns import Turn, Turns
 from tests.runtime import coded
 from tests.runtime.held_graph import LARGEST, HeldGraph
@@ -38,10 +38,8 @@ def test_pages_that_the_model_before_has_decoded_are_decoded_again_in_their_orde
             cast(Follower, page.tracker).seen.append(number := int(frames.in_phase[0]))
             return number
 
-    models, found = (Follower(), Follower()), list[int]()
-    for _, result in decoded_ahead(
-        cast(Recording, Follower()), range(16), lambda: cast(Tracker, models[len(found) >= 3]), 2, decode
-    ):
+    models, found = cast(Any, [Follower() for _ in range(3)]), list[int]()
+    for _, result in decoded_ahead(models[2], range(16), lambda: models[len(found) >= 3], 2, decode):
         found.append(result()[0])
     assert found == list(range(16))
     assert models[1].seen == found[3:]
