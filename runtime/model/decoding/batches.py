@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -38,6 +38,8 @@ _STALE = 64
 """Constants that were not asked for by so many pages make room for those of another table."""
 _ALONE = 2
 """Pages that are computed alone at a time, where batches were wanted: many more are on their way then."""
+_LOOK_S = 1.0
+"""How often a page that waits for others says so."""
 _BUFFERS = 2
 """One is filled while the graph runs from the other."""
 
@@ -266,7 +268,7 @@ class Batches(OneByOne):
         with self._changed:
             self._queue.append(ticket)
             try:
-                self._changed.wait_for(lambda: self._open(constants) or (self._free and self._queue[0] is ticket))
+                self._wait_for(lambda: bool(self._open(constants) or (self._free and self._queue[0] is ticket)))
                 if (run := self._open(constants)) is None:
                     run = _Run(constants, self._free.pop(), self._clock.now())
                     self._gathering.append(run)
@@ -314,7 +316,11 @@ class Batches(OneByOne):
         left_s = run.since + self._batching.longest_wait_s - self._clock.now()
         if not self._clock.wait_for(self._changed, over, left_s):
             run.is_patient = False
-            self._changed.wait_for(over)
+            self._wait_for(over)
+
+    def _wait_for(self, over: Callable[[], bool]) -> None:
+        while not self._changed.wait_for(over, _LOOK_S):
+            self._pages.waits()
 
     def _may_begin(self, run: _Run) -> bool:
         """Return whether it is a run's turn, and nothing is to be waited for."""
