@@ -179,5 +179,5 @@ def short_resource(subject: str, error: BaseException) -> SurroundingsError | No
 
 def lacks_memory(error: BaseException) -> bool:
     """Return whether a failure says that memory is short, this machine's or a device's."""
-    short = short_resource("", error)
+    short = error if isinstance(error, SurroundingsError) else short_resource("", error)
     return short is not None and short.expected == "more memory"

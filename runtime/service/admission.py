@@ -214,12 +214,13 @@ class Heart:
     def __init__(self, longest_s: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._longest_s, self._clock = longest_s, clock
         self._lock = threading.Lock()
-        self._begun: dict[object, float] = {}
+        self._begun: dict[tuple[int, object], float] = {}
+        """When decodes began, by their threads."""
 
     @contextmanager
     def at_work(self) -> Iterator[None]:
         """A decode runs within the `with` statement."""
-        key = object()
+        key = threading.get_ident(), object()
         with self._lock:
             self._begun[key] = self._clock()
         try:
@@ -227,6 +228,12 @@ class Heart:
         finally:
             with self._lock:
                 del self._begun[key]
+
+    def waits(self) -> None:
+        """Begin anew to count the time of this thread's decodes, which wait for others."""
+        thread, now = threading.get_ident(), self._clock()
+        with self._lock:
+            self._begun.update((key, now) for key in self._begun if key[0] == thread)
 
     def trouble(self) -> str:
         """Why the service cannot be said to serve; empty where it can."""

@@ -99,6 +99,7 @@ def assembled(settings: ServiceSettings, observer: Observer) -> Iterator[Assembl
             monitor=monitor,
             device_sessions=settings.device_sessions,
         )
+        together.pages.waits = plane.heart.waits
         recalibrator = Recalibrator(plane, recordings=service.recordings)
         try:
             recalibrator.check_start()

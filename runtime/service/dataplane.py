@@ -6,7 +6,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,6 +21,7 @@ from lightpage.errors import (
     LostPageError,
     NoSourceError,
     Reason,
+    SlotsTakenError,
     SourceError,
     UnconfirmedPageError,
 )
@@ -30,7 +31,8 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.device.acquisition.source import FrameSource
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.page import DecodedPage
-from lightpage.runtime.model.decoding.tracking import unconfirmed_page
+from lightpage.runtime.model.decoding.tracking import Tracker, unconfirmed_page
+from lightpage.runtime.model.decoding.turns import Turn
 from lightpage.runtime.service.admission import Heart, ReceiveBudget, Slots
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.limits import Limits
@@ -129,6 +131,19 @@ class Answer:
     def recalibration_due(self) -> bool:
         """Whether the device has changed since it was calibrated, as this page or many together show."""
         return self.page.check.recalibration_due or bool(self.monitor_signs)
+
+
+@dataclass(frozen=True)
+class Place:
+    """A page's place among those of its device or session.
+
+    Attributes:
+        tracker: follows them.
+        turn: of the page.
+    """
+
+    tracker: Tracker
+    turn: Turn
 
 
 class DataPlane:
@@ -261,10 +276,32 @@ class DataPlane:
         self.metrics.in_service(model.version)
         self.monitors.begin(model.version)
 
+    def waiting(self, caller: Caller) -> Callable[[], None]:
+        """What to call again and again while a caller's page waits for others: no decode hangs for that.
+
+        It raises `CallerLeft` once the caller has gone, and `SlotsTakenError` once its time is up.
+        """
+
+        def still() -> None:
+            self.heart.waits()
+            caller.check()
+            if caller.seconds_left() <= 0:
+                expected = "its turn within the deadline; try again later"
+                raise SlotsTakenError("page", "others before it still decoded", expected, retry_s=1.0)
+
+        return still
+
+    @contextmanager
+    def place(self, model: Model, caller: Caller) -> Iterator[Place]:
+        """The place of a caller's page behind all that have one; it is left at the end of the `with` statement."""
+        tracker = model.tracker_for(caller)
+        with closing(tracker.turn(self.waiting(caller))) as turn:
+            yield Place(tracker, turn)
+
     def decode(
         self,
         model: Model,
-        caller: Caller,
+        place: Place,
         pair: FramePair,
         levels: int,
         pilots: Pilots | None,
@@ -282,7 +319,7 @@ class DataPlane:
         stages.begin(Stage.INFERENCE)
         try:
             with self.heart.at_work():
-                page = model.tracker_for(caller).decode(pair, levels, pilots)
+                page = place.tracker.decode(pair, levels, pilots, place.turn)
         except LostPageError as error:
             if isinstance(error, UnconfirmedPageError):
                 _inferred(unconfirmed_page(error), stages)

@@ -51,6 +51,7 @@ class Stages:
 
     Attributes:
         laps: the stages that have ended, in their order.
+        is_dropped: whether there was no such page, so that nothing is to be told of it.
     """
 
     def __init__(self, start: float | None = None, clock: Callable[[], float] = time.perf_counter) -> None:
@@ -58,6 +59,7 @@ class Stages:
         self.start = self._since = clock() if start is None else start
         self._lock = threading.Lock()
         self.laps: list[Lap] = []
+        self.is_dropped = False
         self._running: Stage | None = None
         self._end: float | None = None
 
@@ -150,6 +152,9 @@ class CallTimes:
             if stages not in self._open:
                 return
             self._open.remove(stages)
+            if stages.is_dropped:
+                self.count -= 1
+                return
             if len(self.pages) < self._keep:
                 self.pages.append(stages)
             self._next = ended

@@ -3,6 +3,7 @@
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +26,12 @@ from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.evaluation import evaluate
 from lightpage.runtime.model.bundle.bundle import npz
 from lightpage.runtime.model.bundle.manifest import BATCH, CONSTANTS, GOLDEN
-from lightpage.runtime.model.decoding.batch_graph import REGISTRATION, BatchGraph, Constants, with_proven_batches
+from lightpage.runtime.model.decoding.batch_graph import (
+    REGISTRATION,
+    BatchGraph,
+    Constants,
+    with_proven_batches,
+)
 from lightpage.runtime.model.decoding.batches import Batches, Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
@@ -124,6 +130,17 @@ def test_a_bundle_without_the_graph_is_refused(decoder: Decoder) -> None:
     files = {name: data for name, data in decoder.bundle.files.items() if name not in (BATCH, CONSTANTS)}
     with pytest.raises(BundleError):
         BatchGraph(replace(decoder.bundle, files=files), decoder.graph, PAGES)
+
+
+def test_where_memory_is_short_batches_are_smaller_at_once(decoder: Decoder, monkeypatch: pytest.MonkeyPatch) -> None:
+    def with_room_for_two(*asked: Any) -> list[Inference]:
+        if asked[-1].stop > 2:
+            raise MemoryError
+        return run(*asked)
+
+    run = BatchGraph.run
+    monkeypatch.setattr(BatchGraph, "run", with_room_for_two)
+    assert BatchGraph(decoder.bundle, decoder.graph, PAGES).pages == 2
 
 
 def test_a_graph_that_says_something_else_to_the_golden_page_is_left_out(decoder: Decoder) -> None:

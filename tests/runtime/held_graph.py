@@ -1,6 +1,7 @@
 """A graph for batches of the toy device, that is held until it may run."""
 
-from threading import Event
+from functools import partial
+from threading import Event, Thread
 from typing import cast
 
 import numpy as np
@@ -10,9 +11,10 @@ from lightpage.runtime.model.decoding.batch_graph import BatchGraph, Constants, 
 from lightpage.runtime.model.decoding.batches import Batches, Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.page import Inference
+from lightpage.runtime.model.decoding.under_way import Phase
 from lightpage.runtime.model.execution.session import BoundSession
 from tests.runtime import toy
-from tests.waiting import LIMIT_S
+from tests.waiting import LIMIT_S, eventually
 
 LARGEST = 4
 
@@ -34,6 +36,11 @@ class HeldGraph:
         assert self.may_run.wait(LIMIT_S)
         shown = zip(*(buffer.frames[name][pages] for name in ("in_phase", "quadrature")), strict=True)
         return [self._decoder.infer(FramePair(*frames), doubtful=True, alone=True) for frames in shown]
+
+    def run_together(self, batching: Batching) -> None:
+        """Have it run once several pages wait for it."""
+        several = partial(eventually, lambda: batching.pages.count(Phase.WAITING) > 1)
+        Thread(target=lambda: several() and self.may_run.set()).start()
 
     def gathering(self, batching: Batching) -> Decoder:
         """The toy's decoder, whose pages are gathered for it."""

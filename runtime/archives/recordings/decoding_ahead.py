@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -41,29 +40,42 @@ class Shown:
 
 def decoded_ahead(
     recording: Recording,
-    pages: Iterable[int],
+    pages: Sequence[int],
     tracker: Callable[[], Tracker],
     together: int,
     decode: Callable[[Shown, FramePair, Symbols], T],
 ) -> Iterator[tuple[int, Callable[[], tuple[T, Symbols]]]]:
     """Every page's number, and what gives its decoded form and its symbols, in order.
 
+    What was decoded ahead is dropped once another model is in use, which then sees the pages from there on in order.
+
     Args:
         recording: of the pages.
         pages: their numbers.
-        tracker: gives that of the model in use. Pages that another one decoded ahead are decoded again.
+        tracker: gives that of the model in use.
         together: pages that are computed together at most.
         decode: decodes a page with its tracker, in its turn.
     """
 
     def decoded(page: Shown) -> tuple[T, Symbols]:
-        with closing(page.turn):
-            frames, symbols = page.read.result()
-            return decode(page, frames, symbols), symbols
+        frames, symbols = page.read.result()
+        return decode(page, frames, symbols), symbols
 
-    def shown(index: int, read: Future[tuple[FramePair, Symbols]]) -> Shown:
-        return Shown(index, read, now := tracker(), now.turn())
+    def begun(now: Tracker) -> Iterator[Shown]:
+        with closing(read_ahead(recording.shown, pages[done:])) as shown:
+            for index, read in shown:
+                if tracker() is not now:
+                    return
+                yield Shown(index, read, now, now.turn())
 
-    ahead = (shown(*each) for each in read_ahead(recording.shown, pages))
-    for page, result in beside(decoded, ahead, 2 * together if together > 1 else 1):
-        yield page.index, result if page.tracker is tracker() else partial(decoded, shown(page.index, page.read))
+    def over(page: Shown) -> None:
+        page.turn.close()
+
+    done, threads = 0, 2 * together if together > 1 else 1
+    while done < len(pages):
+        with closing(beside(decoded, begun(now := tracker()), threads, over)) as ahead:
+            for page, result in ahead:
+                if tracker() is not now:
+                    break
+                done += 1
+                yield page.index, result

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from functools import partial
 from typing import TypeVar
 
@@ -13,7 +14,7 @@ Key = TypeVar("Key")
 
 
 def read_ahead(
-    read: Callable[[Key], T], pages: Iterable[Key], ahead: int = 1
+    read: Callable[[Key], T], pages: Iterable[Key], ahead: int = 1, over: Callable[[Key], None] = lambda page: None
 ) -> Generator[tuple[Key, Future[T]], None, None]:
     """Every page and what is read of it, in order; the next ones are read while the caller works on one.
 
@@ -24,12 +25,14 @@ def read_ahead(
         read: what is wanted of a page; `result()` raises what it raises.
         pages: their numbers, or whatever names them.
         ahead: threads that read, each one page at a time.
+        over: is told of each page that was begun, once it was read or is dropped.
     """
     reader = ThreadPoolExecutor(ahead, "read-ahead")
     begun: deque[tuple[Key, Future[T]]] = deque()
     try:
         for page in pages:
-            begun.append((page, reader.submit(read, page)))
+            begun.append((page, future := reader.submit(read, page)))
+            future.add_done_callback(partial(_told, over, page))
             if len(begun) > ahead:
                 yield begun.popleft()
         while begun:
@@ -40,15 +43,28 @@ def read_ahead(
     reader.shutdown()
 
 
-def beside(work: Callable[[Key], T], pages: Iterable[Key], threads: int) -> Iterator[tuple[Key, Callable[[], T]]]:
+def beside(
+    work: Callable[[Key], T], pages: Iterable[Key], threads: int, over: Callable[[Key], None] = lambda page: None
+) -> Generator[tuple[Key, Callable[[], T]], None, None]:
     """Every page, in order, and what does its work: now, or, with several threads, that waits for what is done ahead.
 
     Args:
         work: what is done with a page.
         pages: their numbers, or whatever names them.
         threads: that work.
+        over: is told of each page once its work is done or dropped; with one thread, when the next one is asked for.
     """
     if threads == 1:
-        yield from ((page, partial(work, page)) for page in pages)
-    else:
-        yield from ((page, begun.result) for page, begun in read_ahead(work, pages, threads))
+        for page in pages:
+            try:
+                yield page, partial(work, page)
+            finally:
+                over(page)
+        return
+    with closing(read_ahead(work, pages, threads, over)) as ahead:
+        for page, begun in ahead:
+            yield page, begun.result
+
+
+def _told(over: Callable[[Key], None], page: Key, _: Future[T]) -> None:
+    over(page)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.errors import BundleError
+from lightpage.errors import BundleError, ProviderError, SurroundingsError
+from lightpage.failures import lacks_memory
 from lightpage.progress import warn
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.bundle import Bundle
@@ -17,6 +19,8 @@ from lightpage.runtime.model.decoding.golden import check_golden
 from lightpage.runtime.model.decoding.page import OUTPUTS, Inference
 from lightpage.runtime.model.execution.session import BoundSession, open_session, running
 from lightpage.runtime.model.execution.table_graph import TableGraph
+
+_log = logging.getLogger(__name__)
 
 _FILES = {CONSTANTS, BATCH}
 REGISTRATION = "registration"
@@ -84,6 +88,7 @@ class BatchGraph:
 
     Attributes:
         subject: what it is, for errors.
+        pages: of a run, at most; fewer than were wanted where there is no memory for so many.
         constants_of_bundle: those of the graph's table.
 
     Raises:
@@ -102,9 +107,21 @@ class BatchGraph:
         # stays open, since opening it takes longer than running it; `once` has it keep no memory
         self._first = open_session(bundle.files[CONSTANTS], f"{bundle.subject}: {CONSTANTS}", threads, once=True)
         self.constants_of_bundle = self.constants(graph)
+        while not self._has_room():
+            self.pages = (self.pages + 1) // 2
+            _log.warning("%s: batches of %d pages, since memory is short", self.subject, self.pages)
+
+    def _has_room(self) -> bool:
+        """Check the golden page alone and among the most pages, and return whether there is memory for so many."""
         buffer = self.buffer()
-        for place, count in {0: 1, pages - 1: pages}.items():
-            check_golden(bundle, partial(self._golden, buffer, place, count), FLOAT16)
+        try:
+            for place, count in {0: 1, self.pages - 1: self.pages}.items():
+                check_golden(self._bundle, partial(self._golden, buffer, place, count), FLOAT16)
+        except (ProviderError, SurroundingsError) as error:
+            if self.pages == 1 or not lacks_memory(error):
+                raise
+            return False
+        return True
 
     def buffer(self) -> FrameBuffer:
         """Memory for the frames of a run."""

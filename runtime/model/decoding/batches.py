@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -38,6 +38,8 @@ _STALE = 64
 """Constants that were not asked for by so many pages make room for those of another table."""
 _ALONE = 2
 """Pages that are computed alone at a time, where batches were wanted: many more are on their way then."""
+_LOOK_S = 1.0
+"""How often a page that waits for others says so."""
 _BUFFERS = 2
 """One is filled while the graph runs from the other."""
 
@@ -142,8 +144,9 @@ class HeldConstants:
         return made.constants, np.zeros((2, 2), np.float32)
 
     def _has_room(self) -> bool:
-        oldest = min(held.asked for held in self._held)
-        return len(self._held) < KEPT or self._asked - oldest >= _STALE
+        """Return whether there is room for one more, beside those that are being made."""
+        stale = sum(self._asked - held.asked >= _STALE for held in self._held)
+        return len(self._held) - stale + len(self._making) < KEPT
 
 
 class OneByOne:
@@ -237,11 +240,14 @@ class Batches(OneByOne):
         self, table: TableGraph, pair: FramePair, registration: NDArray[np.float32] | None = None
     ) -> Inference | None:
         """See `OneByOne`."""
-        came, thread = self._clock.now(), threading.get_ident()
+        thread = threading.get_ident()
         behind = Phase.BEHIND if self._pages.knows(thread) else None
         if (found := self._constants.of(table, registration)) is None:
             self._pages.move(behind, thread)
+            with self._changed:  # a run may have waited for it
+                self._changed.notify_all()
             return None
+        came = self._clock.now()
         self._pages.move(Phase.WAITING, thread)
         try:
             run, place = self._joined(found[0], thread)
@@ -262,7 +268,7 @@ class Batches(OneByOne):
         with self._changed:
             self._queue.append(ticket)
             try:
-                self._changed.wait_for(lambda: self._open(constants) or (self._free and self._queue[0] is ticket))
+                self._wait_for(lambda: bool(self._open(constants) or (self._free and self._queue[0] is ticket)))
                 if (run := self._open(constants)) is None:
                     run = _Run(constants, self._free.pop(), self._clock.now())
                     self._gathering.append(run)
@@ -287,14 +293,16 @@ class Batches(OneByOne):
                 return
             self._gathering.remove(run)
             self._is_running, run.begun = True, self._clock.now()
-        self._pages.move(Phase.RUNNING, *run.threads)
+        inferences, failure = None, None
         try:
-            run.inferences = self._computed(run)
+            self._pages.move(Phase.RUNNING, *run.threads)
+            inferences = self._computed(run)
         except BaseException as error:  # an interrupt too: others wait
-            run.error = error
+            failure = error
         finally:
-            self._pages.ran(*run.threads)
+            self._pages.move(Phase.BEHIND, *run.threads)  # before their callers go on
             with self._changed:
+                run.inferences, run.error = inferences, failure
                 self._is_running = False
                 self._free.append(run.buffer)
                 self._changed.notify_all()
@@ -308,7 +316,11 @@ class Batches(OneByOne):
         left_s = run.since + self._batching.longest_wait_s - self._clock.now()
         if not self._clock.wait_for(self._changed, over, left_s):
             run.is_patient = False
-            self._changed.wait_for(over)
+            self._wait_for(over)
+
+    def _wait_for(self, over: Callable[[], bool]) -> None:
+        while not self._changed.wait_for(over, _LOOK_S):
+            self._pages.waits()
 
     def _may_begin(self, run: _Run) -> bool:
         """Return whether it is a run's turn, and nothing is to be waited for."""
@@ -322,15 +334,18 @@ class Batches(OneByOne):
 
     def _computed(self, run: _Run) -> list[Inference]:
         """The graph's answers to a run's pages; in smaller runs from now on where there was no memory for so many."""
-        pages = len(run.threads)
-        try:
-            return self._graph.run(run.constants, run.buffer, slice(0, pages))
-        except Exception as error:
-            if pages == 1 or not lacks_memory(error):
-                raise
-            self.largest = half = (pages + 1) // 2
-            _log.warning(
-                "%s: batches of %d pages from now on, since memory was short: %s", self._graph.subject, half, error
-            )
-        parts = [slice(first, min(first + half, pages)) for first in range(0, pages, half)]
-        return [page for part in parts for page in self._graph.run(run.constants, run.buffer, part)]
+        pages, found = len(run.threads), list[Inference]()
+        size = pages
+        while (first := len(found)) < pages:
+            part = slice(first, min(first + size, pages))
+            try:
+                found += self._graph.run(run.constants, run.buffer, part)
+            except Exception as error:
+                if size == 1 or not lacks_memory(error):
+                    raise
+                self.largest = size = (size + 1) // 2
+                told = "%s: batches of %d pages from now on, since memory was short: %s"
+                _log.warning(told, self._graph.subject, size, error)
+            else:
+                self._pages.ran(part.stop - first)
+        return found

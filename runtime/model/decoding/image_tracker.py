@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -21,7 +22,7 @@ from lightpage.runtime.model.decoding.image_drift import SHIFT, TILT, BundleSear
 from lightpage.runtime.model.decoding.image_position import ImagePosition
 from lightpage.runtime.model.decoding.page import DecodedPage, Inference, Timings
 from lightpage.runtime.model.decoding.tracking import NoTracker, Tracker, TrackerMemory, confirmed
-from lightpage.runtime.model.decoding.turns import Turn, Turns
+from lightpage.runtime.model.decoding.turns import Turn, Turns, patiently
 from lightpage.runtime.model.execution.twin import OnnxTwin
 
 Real = NDArray[np.float64]
@@ -233,9 +234,9 @@ class ImageTracker:
         search = None if self._search is None else BundleSearch(decoder, twin)
         return ImageTracker(decoder, self._model, BundleTables(decoder, twin), search)
 
-    def turn(self) -> Turn:
+    def turn(self, waiting: Callable[[], None] = patiently) -> Turn:
         """See `Tracker`."""
-        return self._turns.take()
+        return self._turns.take(waiting)
 
     def decode(
         self, pair: FramePair, levels: int, pilots: Pilots | None = None, turn: Turn | None = None
@@ -244,22 +245,30 @@ class ImageTracker:
 
         The image is looked for before anything is decoded at the start, and later where the pilots confirm too little.
         What is learnt counts for the next page only where this one's pilots confirm it: a page that is not this
-        device's moves nothing. Pages that are decoded at the same time are taken in their order, whatever they wait
-        for: each begins with what the one before it has taught.
+        device's moves nothing. Pages that are decoded at the same time wait for none; where they are computed together,
+        they are taken in their order: each begins with what the one before it has taught.
         """
         with self._turns.taken(turn) as turn:
-            clock, shown = _Clock(), self._decoder.bundle.levels(levels)
             _ = self._model.slopes  # may still be measured; two inferences at once may not fit the memory
-            turn.wait(lambda before: before < self._ahead)
-            clock.add("waiting_s")
+            begun, clock, inference = self.state, _Clock(), None
+            shown = self._decoder.bundle.levels(levels)
+            if self._in_batches:
+                turn.wait(lambda before: before < self._ahead)
+                clock.add("waiting_s")
             with self._decoder.batches.under_way():
                 self._decoder.check(pair)
                 pilots = pilots or self._decoder.pilots(levels)
                 clock.add("check_s")
-                begun, inference = self._in_turn(turn, pair, clock)
-                best, found = self._followed(pair, begun, inference, shown, pilots, clock)
-                turn.close()
+                if self._in_batches:
+                    begun, inference = self._in_turn(turn, pair, clock)
+                best, found, step = self._followed(pair, begun, inference, shown, pilots, clock)
+                learn = partial(self._learn, begun, best, step, searched=found is not None)
+                if self._in_batches:  # the page behind waits for it
+                    learn()
+                    turn.close()
                 page = self._decoder.post_process(best.inference, levels, pilots)
+                if not self._in_batches:
+                    learn()
                 clock.add("decision_s")
         page = replace(page, check=best.check, image=_position(best.after, found), timings=clock.timings)
         return confirmed(page, found)
@@ -283,9 +292,9 @@ class ImageTracker:
         """Return whether a page with so many before it, that was decoded with a state, is now to be decoded anew."""
         if before >= self._ahead:
             return False
-        now, moved = self.state, np.abs(self.state.looked_px - state.looked_px).max()
-        at_most = 0.0 if self._in_batches else STALE_PX
-        return now.settled != state.settled or now.decoder is not state.decoder or bool(moved > at_most)
+        now = self.state
+        moved = np.any(now.looked_px != state.looked_px)
+        return now.settled != state.settled or now.decoder is not state.decoder or bool(moved)
 
     def _followed(
         self,
@@ -295,8 +304,8 @@ class ImageTracker:
         levels: Levels,
         pilots: Pilots,
         clock: _Clock,
-    ) -> tuple[_Attempt, FoundImage | None]:
-        """The attempt at a page that counts, which is learnt from, and the outcome of a search for its image."""
+    ) -> tuple[_Attempt, FoundImage | None, Estimate | None]:
+        """The attempt at a page that counts, the outcome of a search for its image, and what it tells of the walk."""
         state, found = begun, None
         if not begun.settled and self._search is not None and len(pilots.phases) >= FEWEST_SEARCHED:
             found = self._search.find(pair, pilots, self._around(begun))
@@ -312,8 +321,7 @@ class ImageTracker:
                 there = self._attempts(pair, moved, levels, pilots, found, clock)
                 if not _worse(there, best):
                     best, step = there, None
-        self._learn(begun, best, step, searched=found is not None)
-        return best, found
+        return best, found, step
 
     def _attempts(
         self,
@@ -344,7 +352,9 @@ class ImageTracker:
             if not attempt.again and attempt.correction_px <= enough:
                 break
             # the same page once more: what it has taught already is no knowledge from before it
-            state = replace(self._looking_there(attempt.after), covariance=attempt.prior)
+            after = attempt.after
+            looking = after if np.array_equal(after.drift[SHIFT], after.looked_px) else self._looking_there(after)
+            state = replace(looking, covariance=attempt.prior)
             inference, enough = None, np.inf
         assert best is not None  # at least one attempt
         return best
@@ -369,7 +379,8 @@ class ImageTracker:
         read = [self._freed(known, tilt, levels, pilots, prior) for tilt in tilts]
         freed, drift, covariance, check = max(read, key=lambda each: each[3].confirmed_bits)
         after = self._state_at(state.drift + drift, covariance, replace(state, jump_px=np.zeros(2)))
-        again = after.decoder is not state.decoder or (jumped and after.table is not state.table)
+        elsewhere = not self._in_batches or after.table is not state.table
+        again = after.decoder is not state.decoder or (jumped and elsewhere)
         return _Attempt(state, after, freed, check, prior, again, step)
 
     def _freed(
@@ -399,11 +410,7 @@ class ImageTracker:
     def _looking_there(self, state: ImageState) -> ImageState:
         """The state with the shift that it knows in its table."""
         shift = state.drift[SHIFT].copy()
-        return (
-            state
-            if np.array_equal(shift, state.looked_px)
-            else replace(state, table=self._tables.shifted(shift), looked_px=shift)
-        )
+        return replace(state, table=self._tables.shifted(shift), looked_px=shift)
 
     def _moved_to(self, found: FoundImage, state: ImageState) -> ImageState:
         """The state where the image was found; the same one where that is nothing new."""
@@ -416,7 +423,7 @@ class ImageTracker:
         return self._state_at(np.concatenate([found.shift_px, state.drift[TILT]]), covariance, moved)
 
     def _learn(self, begun: ImageState, best: _Attempt, step: Estimate | None, *, searched: bool) -> None:
-        """Keep what a page showed for the next one.
+        """Keep what a page showed for the next one; of pages that waited for none, the first of those that began alike.
 
         Args:
             begun: what the page began with.
@@ -431,10 +438,13 @@ class ImageTracker:
             lately = share if searched else begun.share + SHARE_MEMORY * (share - begun.share)
             after = replace(best.after, settled=True, walk=walk, share=lately)
         stays = after.decoder is begun.decoder and after.table is begun.table
+        after = replace(after, covariance=after.covariance + np.diag(after.walk))
         with self._turns.changed:
             if self._in_batches:
                 self._ahead = min(self._ahead + 1, MOST_AHEAD) if stays else max(self._ahead // 2, FEWEST_AHEAD)
-            self.state = replace(after, covariance=after.covariance + np.diag(after.walk))
+            elif self.state is not begun:
+                return
+            self.state = after
             self._turns.changed.notify_all()
 
     @staticmethod

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 from pydantic import BaseModel, ConfigDict
@@ -12,7 +13,7 @@ from lightpage.page.pilots import LEAST_CONFIRMED_SHARE, Pilots
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.page import DecodedPage
-from lightpage.runtime.model.decoding.turns import Turn, Turns
+from lightpage.runtime.model.decoding.turns import Turn, Turns, patiently
 
 
 class TrackerMemory(BaseModel):
@@ -42,8 +43,12 @@ class TrackerMemory(BaseModel):
 class Tracker(Protocol):
     """Decodes the pages of one device in their order; calls come from many threads."""
 
-    def turn(self) -> Turn:
-        """The page's turn that comes next, for whoever has pages decoded at the same time and says in which order."""
+    def turn(self, waiting: Callable[[], None] = patiently) -> Turn:
+        """The page's turn that comes next, for whoever has pages decoded at the same time and says in which order.
+
+        Args:
+            waiting: see `Turns.take`.
+        """
 
     def decode(
         self, pair: FramePair, levels: int, pilots: Pilots | None = None, turn: Turn | None = None
@@ -90,9 +95,9 @@ class NoTracker:
     def __init__(self, decoder: Decoder) -> None:
         self._decoder = decoder
 
-    def turn(self) -> Turn:
+    def turn(self, waiting: Callable[[], None] = patiently) -> Turn:
         """See `Tracker`: one that waits for nothing."""
-        return Turns().take()
+        return Turns().take(waiting)
 
     def decode(
         self, pair: FramePair, levels: int, pilots: Pilots | None = None, turn: Turn | None = None

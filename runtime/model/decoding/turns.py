@@ -6,6 +6,13 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+_LOOK_S = 0.1
+"""How often whoever waits looks whether it still should."""
+
+
+def patiently() -> None:
+    """Wait on, whatever happens."""
+
 
 class Turn:
     """A page's place among others; closed once the next one may go on. In a `with` statement, it is its turn.
@@ -13,25 +20,32 @@ class Turn:
     Args:
         turns: that it is one of.
         number: of it.
+        waiting: see `Turns.take`.
     """
 
-    def __init__(self, turns: Turns, number: int) -> None:
-        self._turns, self._number = turns, number
+    def __init__(self, turns: Turns, number: int, waiting: Callable[[], None]) -> None:
+        self._turns, self._number, self._waiting = turns, number, waiting
 
     def wait(self, interrupts: Callable[[int], bool] = lambda before: False) -> bool:
         """Wait until all pages before are closed, and return whether they are.
 
         Args:
             interrupts: whether to go on with so many pages before; it is asked again behind each change.
+
+        Raises what is raised of `waiting`, see `Turns.take`.
         """
-        return self._turns.wait(self._number, interrupts)
+        return self._turns.wait(self._number, interrupts, self._waiting)
 
     def close(self) -> None:
         """Let the page behind have its turn."""
         self._turns.close(self._number)
 
     def __enter__(self) -> Turn:
-        self.wait()
+        try:
+            self.wait()
+        except BaseException:
+            self.close()
+            raise
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -47,12 +61,16 @@ class Turns:
         self._next = 0
         self._open: set[int] = set()
 
-    def take(self) -> Turn:
-        """The turn behind all that were taken."""
+    def take(self, waiting: Callable[[], None] = patiently) -> Turn:
+        """The turn behind all that were taken.
+
+        Args:
+            waiting: is called again and again while its page waits for others; what it raises ends that.
+        """
         with self.changed:
             self._next += 1
             self._open.add(self._next)
-            return Turn(self, self._next)
+            return Turn(self, self._next, waiting)
 
     @contextmanager
     def taken(self, turn: Turn | None) -> Iterator[Turn]:
@@ -63,14 +81,15 @@ class Turns:
         finally:
             turn.close()
 
-    def wait(self, number: int, interrupts: Callable[[int], bool]) -> bool:
+    def wait(self, number: int, interrupts: Callable[[int], bool], waiting: Callable[[], None]) -> bool:
         """See `Turn.wait`."""
 
         def before() -> int:
             return sum(one < number for one in self._open)
 
         with self.changed:
-            self.changed.wait_for(lambda: not before() or interrupts(before()))
+            while not self.changed.wait_for(lambda: not before() or interrupts(before()), _LOOK_S):
+                waiting()
             return not before()
 
     def close(self, number: int) -> None:

@@ -43,6 +43,7 @@ class UnderWay:
 
     Attributes:
         runs: how many batches there were of each number of pages.
+        waits: is called again and again by each thread that waits for others' batches.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -51,6 +52,7 @@ class UnderWay:
         self._phases: dict[int, Phase] = {}
         self._spent = dict.fromkeys(Device, 0.0)
         self.runs: Counter[int] = Counter()
+        self.waits: Callable[[], None] = lambda: None
 
     def move(self, phase: Phase | None, *threads: int) -> None:
         """Have the pages of some threads in another phase; None ends their way."""
@@ -72,11 +74,10 @@ class UnderWay:
         with self._lock:
             return thread in self._phases
 
-    def ran(self, *threads: int) -> None:
-        """A batch of the pages of some threads was run."""
-        self.move(Phase.BEHIND, *threads)
+    def ran(self, pages: int) -> None:
+        """Count a batch that was run."""
         with self._lock:
-            self.runs[len(threads)] += 1
+            self.runs[pages] += 1
 
     def seconds(self) -> dict[Device, float]:
         """Seconds that the device spent in each state until now."""

@@ -18,6 +18,7 @@ from lightpage.recording.layout import frame_type
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import FramePart
 from lightpage.runtime.client.wire.status import reason_told, refusal_of
+from lightpage.runtime.model.decoding.turns import Turn, Turns
 from lightpage.runtime.service.caller import Call, Caller, Role
 from lightpage.runtime.service.dataplane import DataPlane, levels_for
 from lightpage.runtime.service.frames.frames import (
@@ -82,7 +83,7 @@ class FrameCalls:
     async def DecodePages(self, requests: AsyncIterator[FramePart], call: Call) -> AsyncIterator[pb.DecodePagesReply]:
         """Receive frame pairs, one after another, and decode each while the next one comes."""
         pending: asyncio.Queue[tuple[asyncio.Future[pb.DecodePagesReply], Stages] | None] = asyncio.Queue()
-        room = asyncio.Semaphore(self._plane.ahead(_ON_THEIR_WAY))
+        room, turns = asyncio.Semaphore(self._plane.ahead(_ON_THEIR_WAY)), Turns()
 
         async def receive() -> None:
             try:
@@ -91,7 +92,7 @@ class FrameCalls:
                     stages.begin(Stage.QUEUE)
                     await room.acquire()
                     stages.begin(Stage.RECEIVE)
-                    outcome = await self._begin(_header(message, call), requests, call, stages)
+                    outcome = await self._begin(_header(message, call), requests, call, stages, turns)
                     pending.put_nowait((asyncio.ensure_future(outcome), stages))
             finally:
                 pending.put_nowait(None)
@@ -108,7 +109,7 @@ class FrameCalls:
             receiving.cancel()
 
     async def _begin(
-        self, header: pb.DecodeHeader, requests: AsyncIterator[FramePart], call: Call, stages: Stages
+        self, header: pb.DecodeHeader, requests: AsyncIterator[FramePart], call: Call, stages: Stages, turns: Turns
     ) -> Awaitable[pb.DecodePagesReply]:
         """Receive a pair of many, and begin to decode it. One that is refused is read to its end: others follow."""
         counted = _Counted(requests)
@@ -119,7 +120,14 @@ class FrameCalls:
         except LightpageError as error:
             await self._skip(header, counted, error)
             return self._refused(error, header, stages)
-        return call.in_thread(partial(self._outcome, receiver, header, call, stages), receiver.close)
+        order = turns.take(self._plane.waiting(_caller(header, call))) if self._plane.together > 1 else None
+
+        def never() -> None:
+            receiver.close()
+            if order is not None:
+                order.close()
+
+        return call.in_thread(partial(self._outcome, receiver, header, call, stages, order), never)
 
     async def _skip(self, header: pb.DecodeHeader, requests: _Counted, error: LightpageError) -> None:
         """Drop what is left of a pair."""
@@ -181,12 +189,15 @@ class FrameCalls:
         return part
 
     def _outcome(
-        self, receiver: PairReceiver, header: pb.DecodeHeader, call: Call, stages: Stages
+        self, receiver: PairReceiver, header: pb.DecodeHeader, call: Call, stages: Stages, order: Turn | None
     ) -> pb.DecodePagesReply:
         try:
-            return pb.DecodePagesReply(decoded=self._decode(receiver, header, call, stages))
+            return pb.DecodePagesReply(decoded=self._decode(receiver, header, call, stages, order))
         except Exception as error:
             return self._refusal(error, header, stages)
+        finally:
+            if order is not None:
+                order.close()
 
     def check(self, header: pb.DecodeHeader) -> None:
         """Check what a header says of its frames, and what it asks for.
@@ -202,7 +213,13 @@ class FrameCalls:
         self._pilots(header)
 
     def decode(
-        self, pair: FramePair, header: pb.DecodeHeader, call: Call, stages: Stages, version: str = ""
+        self,
+        pair: FramePair,
+        header: pb.DecodeHeader,
+        call: Call,
+        stages: Stages,
+        version: str = "",
+        order: Turn | None = None,
     ) -> pb.DecodeReply:
         """Decode a pair that has come, whose header was checked; raises as `DataPlane.decode`.
 
@@ -212,6 +229,7 @@ class FrameCalls:
             call: that it came with.
             stages: times it.
             version: of the model that must be in service; empty for any.
+            order: of the pairs of its call; by default it is alone.
         """
         options = header.options
         answer = decode(
@@ -223,6 +241,7 @@ class FrameCalls:
             user_data=options.want_user_data,
             stages=stages,
             version=version,
+            order=order,
         )
         return decode_reply(answer, options, header.correlation_id, header.frame_id, header.captured_s)
 
@@ -234,10 +253,12 @@ class FrameCalls:
             return None
         return pilots_of(header.pilots, decoder.bundle, levels)
 
-    def _decode(self, receiver: PairReceiver, header: pb.DecodeHeader, call: Call, stages: Stages) -> pb.DecodeReply:
+    def _decode(
+        self, receiver: PairReceiver, header: pb.DecodeHeader, call: Call, stages: Stages, order: Turn | None = None
+    ) -> pb.DecodeReply:
         """Decode a pair that was received, and let go of it."""
         try:
-            return self.decode(receiver.pair(), header, call, stages)
+            return self.decode(receiver.pair(), header, call, stages, order=order)
         finally:
             receiver.close()
 

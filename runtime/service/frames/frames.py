@@ -15,6 +15,7 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import PIXEL_TYPES, message_of
 from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.decoding.turns import Turn, Turns
 from lightpage.runtime.service.admission import Bytes, ReceiveBudget
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import Answer, DataPlane, Seen, levels_for, observed
@@ -179,6 +180,7 @@ def decode(
     user_data: bool = False,
     version: str = "",
     stages: Stages | None = None,
+    order: Turn | None = None,
 ) -> Answer:
     """Decode a pair with the model in service.
 
@@ -191,6 +193,7 @@ def decode(
         user_data: whether to read the page's bytes too.
         version: of the model that must be in service; empty for any.
         stages: times the page.
+        order: of the pages of its call, in which they are followed; by default it is alone.
 
     Raises:
         BundleError: user bytes are asked for, and the model has no code.
@@ -202,7 +205,7 @@ def decode(
     """
     stages = stages or Stages()
     stages.begin(Stage.QUEUE)
-    with plane.decodes.held(caller):
+    with order or Turns().take() as order, plane.decodes.held(caller):
         began = time.perf_counter()
         # Taken once: a swap in the meantime changes the next request, not this one.
         model = plane.models.expect(version)
@@ -214,8 +217,9 @@ def decode(
         seen = Seen(subject, None, model.version)
         seen.note(tells=sure, pair=pair, of_device=monitor is not None and monitor is plane.monitors.device)
         with observed(plane.monitors.told_by(monitor), seen):
-            with plane.optics(user_data):
-                page = plane.decode(model, caller, pair, levels, pilots, subject, stages, monitor, sure=sure)
+            with plane.optics(user_data), plane.place(model, caller) as place:
+                order.close()
+                page = plane.decode(model, place, pair, levels, pilots, subject, stages, monitor, sure=sure)
             found = plane.user_data(model, page, stages, monitor) if user_data else None
             seen.note(page=page, user_data=found)
         plane.decodes.took(time.perf_counter() - began)

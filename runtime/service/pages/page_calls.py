@@ -75,7 +75,11 @@ class PageCalls:
         caller = _caller(request.options, call)
         numbers: list[int | None] = list(request.pages) or [None] * request.count
         turns, read = Turns(), partial(self._of_range, request, caller, call)
-        pages = beside(read, ((number, turns.take()) for number in numbers), self._plane.ahead())
+        waiting = self._plane.waiting(caller)
+        # of pages that come next, none is taken off the source that is not answered
+        threads = self._plane.ahead() if request.pages else 1
+        ordered = ((number, turns.take(waiting)) for number in numbers)
+        pages = beside(read, ordered, threads, lambda at: at[1].close())
         for _ in numbers:
             with self._plane.ranges.held(caller):  # not while the caller takes its time to read the reply
                 _, result = next(pages)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ from lightpage.runtime.device.acquisition.source import FrameSource, Shot, own_f
 from lightpage.runtime.model.decoding.turns import Turn, Turns
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import Answer, DataPlane, Seen, levels_for, observed
+from lightpage.runtime.service.models.loader import Model
 from lightpage.runtime.service.monitoring.monitor import SHOWS_DEVICE
 from lightpage.runtime.service.stages import Stage, Stages
 
@@ -36,11 +38,12 @@ GROUPS = 4
 
 @dataclass(frozen=True)
 class ReadAnswer:
-    """An answer for a page of the source, with what the source knows of it."""
+    """An answer for a page of the source, with what the source knows of it, and the model that has decoded it."""
 
     answer: Answer
     shot: Shot
     pilot_mask: NDArray[np.bool_]
+    model: Model
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,7 @@ class DataPage:
         error: why not.
         model_version: what decoded it, or the last page of its group; empty where nothing did.
         stages: times it; None where its bytes were restored.
+        again: reads its bytes as those of the page that should be there; None where nothing was decoded.
     """
 
     source_page: int | None
@@ -60,6 +64,7 @@ class DataPage:
     error: LightpageError | None = None
     model_version: str = ""
     stages: Stages | None = None
+    again: Callable[[Header], PageBytes] | None = None
 
 
 @dataclass
@@ -127,26 +132,27 @@ def read_page(
         with observed(plane.monitors.told_by(monitor), seen):
             stages.begin(Stage.RECEIVE)
             found = _shot(plane, source, page, caller, user_data)
-            order.close()
-            subject = f"page {found.page_index} of {source.name}"
-            seen.note(subject=subject, page_index=found.page_index, levels=source.levels)
-            seen.note(pair=found.pair, infos=found.infos, symbols=found.symbols, pilot_mask=found.pilot_mask)
-            mask = model.decoder.bundle.pilot_mask if found.pilot_mask is None else found.pilot_mask
-            levels = levels_for(model.decoder, levels, source.levels, user_data)
-            if user_data and not np.array_equal(mask, model.decoder.bundle.pilot_mask):
-                raise SourceError(f"{source.name}: pilots", "other places", "those of the model in service")
-            # Pilots are what was written, whatever level count the caller wants to see.
-            if found.symbols is not None:
-                pilots = Pilots.of_symbols(mask, found.symbols, model.decoder.bundle.levels(source.levels))
-            else:
-                own = model.decoder
-                pilots = own.written_pilots(levels) if user_data else own.pilots(source.levels, mask)
-            with own_fault(f"{subject}: "), plane.optics(user_data):
-                decoded = plane.decode(model, caller, found.pair, levels, pilots, subject, stages, monitor)
+            with plane.place(model, caller) as place:
+                order.close()
+                subject = f"page {found.page_index} of {source.name}"
+                seen.note(subject=subject, page_index=found.page_index, levels=source.levels)
+                seen.note(pair=found.pair, infos=found.infos, symbols=found.symbols, pilot_mask=found.pilot_mask)
+                mask = model.decoder.bundle.pilot_mask if found.pilot_mask is None else found.pilot_mask
+                levels = levels_for(model.decoder, levels, source.levels, user_data)
+                if user_data and not np.array_equal(mask, model.decoder.bundle.pilot_mask):
+                    raise SourceError(f"{source.name}: pilots", "other places", "those of the model in service")
+                # Pilots are what was written, whatever level count the caller wants to see.
+                if found.symbols is not None:
+                    pilots = Pilots.of_symbols(mask, found.symbols, model.decoder.bundle.levels(source.levels))
+                else:
+                    own = model.decoder
+                    pilots = own.written_pilots(levels) if user_data else own.pilots(source.levels, mask)
+                with own_fault(f"{subject}: "), plane.optics(user_data):
+                    decoded = plane.decode(model, place, found.pair, levels, pilots, subject, stages, monitor)
             data = plane.user_data(model, decoded, stages, monitor, expected) if user_data else None
             seen.note(page=decoded, user_data=data)
         plane.decodes.took(time.perf_counter() - begun)
-    return ReadAnswer(plane.answer(decoded, model, stages, data, monitor), found, mask)
+    return ReadAnswer(plane.answer(decoded, model, stages, data, monitor), found, mask, model)
 
 
 def _shot(plane: DataPlane, source: FrameSource, page: int | None, caller: Caller, user_data: bool) -> Shot:
@@ -232,24 +238,30 @@ def read_data(
     """
     _ = plane.source, plane.models.current.decoder.page_codec  # they are there
     successor, unread, turns = Successor(), unread or Unread(), Turns()
-    known = first, successor
+    known, waiting = (first, successor), plane.waiting(caller)
 
     def read(at: tuple[int, Turn]) -> tuple[DataPage, Header | None]:
         (index, order), (since, expected) = at, known
         for _ in range(since, index):
             expected = expected.after()
-        return _data_page(plane, index, expected.header, caller, timed(), order), expected.header
+        stages = timed()
+        try:
+            return _data_page(plane, index, expected.header, caller, stages, order), expected.header
+        except PageError:
+            stages.is_dropped = index > known[0]  # nobody has asked for it yet
+            raise
 
-    numbers = ((index, turns.take()) for index in range(first, first + count))
-    for (index, _), result in beside(read, numbers, plane.ahead()):
+    numbers = ((index, turns.take(waiting)) for index in range(first, first + count))
+    for (index, _), result in beside(read, numbers, plane.ahead(), lambda at: at[1].close()):
         try:
             page, expected = result()
-            if _lacks_header(page) and successor.header not in (None, expected):  # it was not known yet
-                page = _data_page(plane, index, successor.header, caller, timed())
         except PageError:
             if index == first:
                 raise
             break
+        if _lacks_header(page) and page.again and successor.header not in (None, expected):  # it was not known yet
+            page = replace(page, found=page.again(successor.header))
+        page = replace(page, again=None)
         oldest = next(iter(unread.groups.values()), None)
         group = unread.group_of(page)
         if group is not None and group.last.header is not None:
@@ -307,7 +319,8 @@ def _data_page(
         stages.begin(Stage.RESPOND)
         return DataPage(index, None, error, stages=stages)
     assert answer.user_data is not None  # it was asked for
-    return DataPage(index, answer.user_data, model_version=answer.model_version, stages=stages)
+    again = partial(read.model.decoder.page_codec.decode, answer.page.phase, answer.page.concentration)
+    return DataPage(index, answer.user_data, model_version=answer.model_version, stages=stages, again=again)
 
 
 def _lacks_header(page: DataPage) -> bool:

@@ -168,4 +168,6 @@ def test_a_decode_that_does_not_end_is_trouble() -> None:
         with heart.at_work():
             now = 12.0
             assert "12 s" in heart.trouble()
+            heart.waits()
+            assert heart.trouble() == ""
     assert heart.trouble() == ""

@@ -1,9 +1,8 @@
 """Pages of a recording that are decoded ahead: the same in the end as one by one, and by the model in use."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from threading import Thread
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -13,39 +12,37 @@ from lightpage.runtime.archives.recordings.decoding_ahead import Shown, Symbols,
 from lightpage.runtime.archives.recordings.recovery import recover
 from lightpage.runtime.model.decoding.batches import Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.model.decoding.tracking import NoTracker, Tracker
+from lightpage.runtime.model.decoding.tracking import NoTracker
 from lightpage.runtime.model.decoding.turns import Turn, Turns
-from lightpage.runtime.model.decoding.under_way import Phase
 from tests.runtime import coded
 from tests.runtime.held_graph import LARGEST, HeldGraph
-from tests.waiting import eventually
 
 
 @dataclass
-class Named:
+class Follower:
     """A tracker that is asked for turns alone, and a recording of pages without frames."""
 
-    name: str
+    turns: Turns = field(default_factory=Turns)
+    seen: list[int] = field(default_factory=list)
 
     def turn(self) -> Turn:
-        return Turns().take()
+        return self.turns.take()
 
     def shown(self, page: int) -> tuple[FramePair, Symbols]:
         return FramePair(np.full(1, page), np.zeros(1)), None
 
 
-def test_pages_that_the_model_before_has_decoded_are_decoded_again() -> None:
-    def decode(page: Shown, frames: FramePair, symbols: Symbols) -> tuple[str, int]:
-        return cast(Named, page.tracker).name, int(frames.in_phase[0])
+def test_pages_that_the_model_before_has_decoded_are_decoded_again_in_their_order() -> None:
+    def decode(page: Shown, frames: FramePair, symbols: Symbols) -> int:
+        with page.turn:
+            cast(Follower, page.tracker).seen.append(number := int(frames.in_phase[0]))
+            return number
 
-    def in_use() -> Tracker:
-        return cast(Tracker, models[len(found) >= 3])
-
-    models = Named("first"), Named("second")
-    found: list[tuple[str, int]] = []
-    for _, result in decoded_ahead(cast(Recording, Named("recording")), range(6), in_use, 2, decode):
+    models, found = cast(Any, [Follower() for _ in range(3)]), list[int]()
+    for _, result in decoded_ahead(models[2], range(16), lambda: models[len(found) >= 3], 2, decode):
         found.append(result()[0])
-    assert found == [*(("first", page) for page in range(3)), *(("second", page) for page in range(3, 6))]
+    assert found == list(range(16))
+    assert models[1].seen == found[3:]
 
 
 def test_a_file_is_recovered_in_batches_as_page_by_page(tmp_path: Path) -> None:
@@ -54,12 +51,7 @@ def test_a_file_is_recovered_in_batches_as_page_by_page(tmp_path: Path) -> None:
     path = coded.recording(tmp_path / "R.h5", symbols, {1: coded.half_lost, 4: coded.dark})
     decoder = Decoder.load(bundle, threads=1)
     graph, batching = HeldGraph(decoder), Batching(LARGEST)
-
-    def let_run() -> None:
-        eventually(lambda: batching.pages.count(Phase.WAITING) > 1)
-        graph.may_run.set()
-
-    Thread(target=let_run).start()
+    graph.run_together(batching)
     results = []
     for each in (decoder, graph.gathering(batching)):
         with Recording.open(path) as recording:

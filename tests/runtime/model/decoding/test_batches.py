@@ -144,14 +144,15 @@ def test_an_error_is_that_of_every_page_of_its_run_and_of_no_other(stage: Stage)
 
 def test_where_memory_is_short_runs_are_smaller_from_then_on(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
     def fail(numbers: list[int]) -> None:
-        if len(numbers) > 2:
+        if len(numbers) > 1:
             raise RuntimeError("Failed to allocate memory for requested buffer of size 9")
 
     stage.graph.fails = fail
     with stage.held(1, 2, 3, 4) as others:
         pass
     assert sorted(page.result(PATIENT) for page in others) == [1, 2, 3, 4]
-    assert stage.batches.largest == 2
+    assert stage.batches.largest == 1
+    assert stage.pages.runs == {1: 5}
     assert "memory" in caplog.text
 
 
@@ -174,6 +175,19 @@ def test_few_constants_are_held_and_those_in_use_stay() -> None:
         assert held.of(tables[0], None) is not None
     assert held.of(tables[-1], None) is not None
     assert held.of(tables[1], None) is not None  # made again
+
+
+def test_constants_that_are_being_made_take_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    tables: Any = [Table(9.0 * number) for number in range(KEPT + 1)]
+    held, make, found = HeldConstants(cast(BatchGraph, Graph(tables[0])), tables[0]), Graph.constants, list[Any]()
+
+    def constants(graph: Graph, table: Table, _: None) -> Constants:
+        found.append(held.of(tables[tables.index(table) + 1], None))
+        return make(graph, table)
+
+    monkeypatch.setattr(Graph, "constants", constants)
+    found.append(held.of(tables[1], None))
+    assert [each is None for each in found] == [True, *[False] * (KEPT - 1)]
 
 
 def test_constants_follow_an_image_that_leaves_their_reach() -> None:

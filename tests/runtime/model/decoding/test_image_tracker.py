@@ -2,18 +2,21 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from lightpage.calibration.image_search import REACH_PX, FoundImage
 from lightpage.calibration.sampling_table import SamplingTable
-from lightpage.errors import FrameError, Reason, UnconfirmedPageError
+from lightpage.errors import CallerLeft, FrameError, Reason, UnconfirmedPageError
 from lightpage.page.pilots import PilotCheck, Pilots
 from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.model.decoding.batches import OneByOne
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate
-from lightpage.runtime.model.decoding.image_tracker import CORRECTIONS, RETRACE_RAD, WALK, ImageTracker
+from lightpage.runtime.model.decoding.image_tracker import CORRECTIONS, RETRACE_RAD, WALK, ImageState, ImageTracker
 from lightpage.runtime.model.decoding.page import Inference
 from lightpage.runtime.model.decoding.tracking import TrackerMemory
 from tests.runtime import toy
@@ -41,6 +44,7 @@ class FakeDevice:
     traces: list[Real] = field(default_factory=list)
     pilots: list[Pilots] = field(default_factory=list)
     held: Real = field(default_factory=lambda: np.zeros(4))
+    together: int = 1
 
     def tracker(self, search: bool = True, memory: TrackerMemory | None = None) -> ImageTracker:
         return ImageTracker(
@@ -60,6 +64,8 @@ class FakeDecoder:
 
     def __init__(self, device: FakeDevice, tilt: Real) -> None:
         self._device, self._tilt, self._decoder = device, tilt, device.decoder
+        self.batches = OneByOne()
+        self.batches.largest = device.together
 
     def __getattr__(self, name: str) -> object:
         return getattr(self._decoder, name)
@@ -328,7 +334,8 @@ def test_what_was_learnt_goes_over_as_text_and_decodes_the_next_page_the_same(de
 
 
 def test_pages_decoded_at_the_same_time_are_taken_in_their_order(device: FakeDevice) -> None:
-    """A page that was decoded beforehand is decoded again where the page before shows that the image has moved."""
+    """In batches, a page that was decoded ahead is decoded again where the page before shows that the image moved."""
+    device.together = 2
     tracker = settled(device)
     device.drift[SHIFT] = (0.5, 0.0)
     first, second = tracker.turn(), tracker.turn()
@@ -342,9 +349,27 @@ def test_pages_decoded_at_the_same_time_are_taken_in_their_order(device: FakeDev
     assert [round(float(held[0]), 1) for held in device.decodes] == [0.0, 0.0, 0.5, 0.5]
 
 
-def test_a_turn_that_is_never_used_is_closed_and_holds_nobody_up(device: FakeDevice) -> None:
+def test_without_batches_pages_wait_for_none_and_teach_once(device: FakeDevice, monkeypatch: Any) -> None:
+    tracker, learnt = settled(device), list[ImageState]()
+    device.drift[SHIFT] = (0.5, 0.0)
+
+    def meanwhile(_: FramePair) -> None:
+        monkeypatch.undo()
+        tracker.decode(device.page(), 16)
+        learnt.append(tracker.state)
+
+    monkeypatch.setattr(device.decoder, "check", meanwhile)
+    tracker.decode(device.page(), 16)
+    assert tracker.state is learnt[0]
+
+
+def test_a_turn_that_is_never_used_holds_nobody_up_who_leaves_or_once_it_is_closed(device: FakeDevice) -> None:
+    device.together = 2
     tracker = settled(device)
-    tracker.turn().close()
+    hanging = tracker.turn()
+    with pytest.raises(CallerLeft):
+        tracker.decode(device.page(), 16, None, tracker.turn(Mock(side_effect=CallerLeft)))
+    hanging.close()
     dark = FramePair(*(np.zeros_like(frame) for frame in vars(device.page()).values()))
     with pytest.raises(FrameError):
         tracker.decode(dark, 16)

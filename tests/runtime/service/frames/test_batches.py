@@ -79,7 +79,7 @@ def test_pages_of_one_call_are_computed_together_and_answered_in_their_order(sta
     client, numbers = stage.service.client, range(6)
     written = [toy.symbols_of(16, number)[0] for number in numbers]
     shown = [toy.ToyDevice(seed=number).page(symbols, 16) for number, symbols in enumerate(written)]
-    made = client.frames.decode_many(shown, 16) if call == "a stream" else client.pages.read_many(count=len(shown))
+    made = client.frames.decode_many(shown, 16) if call == "a stream" else client.pages.read_many(numbers)
     answers = stage.pool.submit(list, made)
     eventually(lambda: stage.count(Phase.RUNNING) + stage.count(Phase.WAITING) == len(shown))
     stage.graph.may_run.set()
