@@ -108,7 +108,8 @@ def test_the_field_is_that_of_one_page(recovery: FieldRecovery, dtype: torch.dty
         seen = recovery.references(blocks, table["registration"])
         frames, field = BatchedFrames(recovery, bits, dtype), BatchedField(recovery)
         tables = _typed({**frames.tables(blocks, seen), **field.tables(seen, table["homodyne"])}, dtype)
-        both = Seen(*(frames(torch.stack([each, each]), tables, camera) for camera, each in enumerate(page)))
+        still, cameras = torch.zeros(2, 2), enumerate(page)
+        both = Seen(*(frames(torch.stack([each, each]), still, tables, camera) for camera, each in cameras))
         found = field(both, tables)
         residual = field.residual(both, found, field.power(found), tables)
     ny, nx = recovery.grid.shape
