@@ -40,9 +40,16 @@ def yield_to_reads() -> None:
     """Take what processor time reads leave, as far as the system lets a process ask for that."""
     with suppress(OSError):
         os.nice(NICENESS)
+    lower_session(NICENESS)
     if hasattr(os, "SCHED_BATCH"):
         with suppress(OSError):
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+
+
+def lower_session(niceness: int) -> None:
+    """Lower this process's session too: Linux may share cores among sessions first, where the service has its own."""
+    with suppress(OSError):
+        Path("/proc/self/autogroup").write_text(f"{niceness}\n")
 
 
 def yield_more(clock: Clock = SYSTEM, worked: Callable[[], float] = time.process_time) -> threading.Thread:
@@ -64,6 +71,7 @@ def yield_more(clock: Clock = SYSTEM, worked: Callable[[], float] = time.process
             share = (worked() - before) / (clock.now() - begun)
         with suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, os.getpid(), LOWEST)  # of the thread that works, which is the first one
+        lower_session(LOWEST)
 
     thread = threading.Thread(target=watch, name="lightpage-priority", daemon=True)
     thread.start()

@@ -13,6 +13,7 @@ import pytest
 from lightpage.errors import CallerLeft, RecalibrationRefusedError, WorkerError
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.tracking import NoTracker
+from lightpage.runtime.recalibration import worker
 from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome, recalibrate
 from lightpage.runtime.recalibration.separate_process import recalibrate_apart
 from lightpage.runtime.recalibration.worker import LOWEST, NICENESS, ROOM, yield_more
@@ -113,8 +114,11 @@ def test_it_yields_all_once_reads_leave_it_room(
     shares: list[float], looks: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock, begun, asked = HandClock(0.0), 0.0, list[tuple[int, int, int]]()
+    sessions = list[int]()
     monkeypatch.setattr(os, "setpriority", lambda *how: asked.append(how))
+    monkeypatch.setattr(worker, "lower_session", sessions.append)  # not that of the tests
     worked = iter([each for share in accumulate(shares, initial=begun) for each in (share, share)][1:])
     yield_more(clock=clock, worked=lambda: next(worked, 0.0)).join()
     assert asked == [(os.PRIO_PROCESS, os.getpid(), LOWEST)]
+    assert sessions == [LOWEST]
     assert clock.now() == looks
