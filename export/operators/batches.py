@@ -1,4 +1,4 @@
-"""What a graph for batches costs on a GPU, and what in it would be slow there; counted without one."""
+"""Cost of a graph for batches on a GPU, and the nodes that would be slow there, counted without one."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _PLANE = 24
 
 @dataclass(frozen=True)
 class Cost:
-    """What a batch takes.
+    """Cost of a batch.
 
     Attributes:
         kernels: that are launched for it.
@@ -68,7 +68,7 @@ class BatchFile:
         self._users = Counter(name for node in graph.node for name in node.input)
 
     def cost(self) -> Cost:
-        """What a batch takes."""
+        """Return the cost of a batch."""
         kernels, flops, moved = 0, 0.0, dict[str, float]()
         for node in self._running():
             kernels += 1

@@ -85,7 +85,7 @@ class OutputFolder(_PathType):
 
 
 def writes_to_stdout(context: click.Context) -> bool:
-    """Whether an option of a command names `STDOUT` for writing."""
+    """Return whether an option of a command names `STDOUT` for writing."""
     outputs = (param.name or "" for param in context.command.params if isinstance(param.type, OutputFile))
     return any(context.params.get(name) == STDOUT for name in outputs)
 

@@ -193,7 +193,7 @@ class PageCodec:
         """Levels of a page whose bytes may be out of reach.
 
         A block that converges is a word of the code, and so the cosets of its symbols are known. About the limit of the
-        bench code, one in a thousand at most is another word than was sent (`analysis.codec.safety`).
+        bench code, 0.11% at most are another word than was sent (`analysis.codec.safety`).
 
         Args:
             phase, concentration: as for `decode`.
@@ -246,7 +246,7 @@ class PageCodec:
 
     @property
     def _upper_weights(self) -> NDArray[np.int64]:
-        """Of the bits of a number within its coset, the highest first."""
+        """Bits of a number within its coset, the highest first."""
         return 1 << np.arange(self._upper_bits)[::-1]
 
     def _labels(self, information: Bits) -> Bits:

@@ -1,4 +1,4 @@
-"""What is wrong with a TOML table, in the words of whoever wrote it and not in those of the library that checks it."""
+"""Mistakes in a TOML table, told by the names in the file and not by those of the library that checks it."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _SIDES = {"gt": "more than", "ge": "at least", "lt": "less than", "le": "at most
 
 @dataclass(frozen=True)
 class Problem:
-    """One mistake.
+    """A mistake in a table.
 
     Attributes:
         place: the key, or the table, with dots; empty for the whole document.
@@ -55,7 +55,7 @@ class Problem:
     kind: str = "wrong"
 
     def __str__(self) -> str:
-        """In a word or two, for a list."""
+        """The mistake in a word or two, for a list."""
         if self.kind == "missing":
             return f"no {self.place}"
         if self.kind == "unknown":
@@ -91,13 +91,13 @@ def tables_in(annotation: Any) -> list[type[BaseModel]]:
 
 
 def tag_of(model: type[BaseModel]) -> str:
-    """What the key `kind` of a table says that is one of several."""
+    """Return the value of the key `kind` of a table that is one of several."""
     field = model.model_fields.get("kind")
     return "" if field is None else str(get_args(field.annotation)[0])
 
 
 def problem_of(model: type[BaseModel], error: ErrorDetails) -> Problem:
-    """One mistake of a `ValidationError`."""
+    """Return the mistake that an entry of a `ValidationError` tells."""
     place, owners, within = _walk(model, error["loc"])
     kind, context = error["type"], error.get("ctx", {})
     key = place.rpartition(".")[2]
@@ -121,7 +121,7 @@ def problem_of(model: type[BaseModel], error: ErrorDetails) -> Problem:
 
 
 def expected_of(error: ErrorDetails) -> str:
-    """What would have been right in place of a single value."""
+    """Return a few words on what would have been right in place of a single value."""
     kind, context = error["type"], error.get("ctx", {})
     if kind in _BOUNDS:
         bound = _BOUNDS[kind]

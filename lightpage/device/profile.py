@@ -38,7 +38,7 @@ class TomlTable(BaseModel):
 
 
 class StrictTable(TomlTable):
-    """One whose values are of the right type to begin with: no text that stands for a number."""
+    """A table whose values are of the right type to begin with: no text stands for a number."""
 
     model_config = ConfigDict(strict=True)
 
@@ -86,7 +86,7 @@ class LensPath(TomlTable):
         )
 
     def times(self, factor: float) -> LensPath:
-        """Of lenses so many times as large.
+        """Return the path of lenses so many times as large.
 
         Raises:
             ProfileError: a term that is more than a profile may state.
@@ -113,7 +113,7 @@ class Slm(TomlTable):
 
 
 class PageLayout(TomlTable):
-    """How symbols lie on the SLM, and which of them are pilots."""
+    """Layout of symbols on the SLM, and which of them are pilots."""
 
     columns: Count = Field(description="symbols side by side")
     rows: Count = Field(description="symbols above one another")
@@ -131,7 +131,7 @@ class Camera(TomlTable):
 
 
 class Profile(TomlTable):
-    """What the data sheet of a device says. Lengths in metres, angles in degrees, pixels where the key says so."""
+    """Data sheet of a device. Lengths in metres, angles in degrees, pixels where the key says so."""
 
     schema_version: Literal[1] = Field(description="of this layout")
     name: Annotated[str, Field(min_length=1)] = Field(description="of the device, for messages")
@@ -221,7 +221,7 @@ class Profile(TomlTable):
 
     @property
     def ideal_lenses(self) -> bool:
-        """Whether the lenses have no path beyond the ideal one."""
+        """Return whether the lenses have no path beyond the ideal one."""
         return self.lens_path == LensPath()
 
     def seidel_terms(self, share: Any = 1.0) -> SeidelTerms:

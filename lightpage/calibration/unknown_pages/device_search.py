@@ -146,7 +146,7 @@ class _Search:
         return tell
 
     def direct(self) -> _Geometry:
-        """Where the direct image lies on either camera, and how its phase slopes."""
+        """Find the place of the direct image on either camera, and the slope of its phase."""
         tell = self._begin("find the direct image")
         axis = np.arange(-_LARGEST_SLOPE_RAD, _LARGEST_SLOPE_RAD + _SLOPE_STEP_RAD, _SLOPE_STEP_RAD)
         slopes = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
@@ -186,7 +186,7 @@ class _Search:
         return found
 
     def with_turn(self, geometry: _Geometry) -> _Geometry:
-        """On which side the quadrature arm is: the cameras' phases of the same light tell."""
+        """Find the side of the quadrature arm, by the cameras' phases of the same light."""
         light = self._light.seen(geometry.parameters, _BRANCHES[:2])
         pages = np.sum(light * self._light.shares(geometry.parameters, _BRANCHES[:2]), axis=(-2, -1))
         return geometry._replace(side=float(np.sign(np.sum(pages[0] * pages[1].conj()).imag)))
@@ -250,13 +250,13 @@ class _Search:
         return self._light.seen(geometry.parameters, _BRANCHES), self._light.shares(geometry.parameters, _BRANCHES)
 
     def told(self, geometry: _Geometry) -> float:
-        """What the pages together tell of a geometry, nats."""
+        """Return the evidence of all pages together for a geometry, nats."""
         light, expected = self._seen(geometry)
         return float(told_nats(light[0] + np.exp(1j * geometry.turn_rad) * light[1], expected).sum())
 
 
 def _worth_of(light: Complex, expected: Real, geometry: _Geometry) -> tuple[float, Complex]:
-    """What light [cameras, pages, B, N] is worth, and its slope by a change of it, the same shape."""
+    """Return the worth of light [cameras, pages, B, N], and its slope by a change of it, the same shape."""
     if not geometry.side:
         worth = _WORTH * _ONE_CAMERA
         return worth * float(told_nats(light, expected).sum()), worth * told_slope(light, expected)

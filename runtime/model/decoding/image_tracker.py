@@ -51,8 +51,8 @@ WIDEST = np.array([3.0, 3.0, 0.03, 0.03])
 
 STALE_PX = 0.04
 """Distance from where an image was looked at, up to which pages behind are read from there, computed before
-this one was read. On 30 pages of a bench device that walks by 0.02 px a page, in bright light, 0.03, 0.04, 0.05 and
-0.08 px cost 0.003, 0.005, 0.009 and 0.019 bit on average; the place changed with every 3rd, 4th, 7th and 15th page."""
+this one was read. Twice as far costs some hundredths of a bit in bright light; half as far, every other page of a
+device that walks is computed again."""
 
 MOST_AHEAD, FEWEST_AHEAD = 64, 4
 """Pages that are computed ahead of the one that is read: one more after each page that leaves the place where they are
