@@ -162,14 +162,15 @@ class Week:
                     source.knock(KNOCK_PX)
                 row = self._read(number, plane, monitor, source, true_table)
                 row |= {"restarted": number == begun > 0, "during": watched.running, "ended": watched.ended()}
-                row["again"] = [] if self.shown or (number + 1) % RANGE_PAGES else self._again([*self.rows, row], plane)
+                ends = (number + 1) % RANGE_PAGES == 0 or number + 1 == self.pages
+                row["again"] = self._again([*self.rows, row], plane) if ends and not self.shown else []
                 self.rows.append(row)
                 append_row(path, row)
                 watched.settle(monitor, self.pages_during)
 
     def _again(self, rows: Rows, plane: DataPlane) -> list[int]:
         """Read lost pages of the last range once more, as ReadData does; returns those that are read now."""
-        lost = [row for row in rows[-RANGE_PAGES:] if row["lost"]]
+        lost = [row for row in rows[-1 - rows[-1]["page"] % RANGE_PAGES :] if row["lost"]]
         if not lost or plane.heal is None or not plane.heal(Caller(), lost[-1]["version"], len(lost)):
             return []
         read = list[int]()

@@ -56,10 +56,18 @@ class KeptPages:
         with self._lock:
             self._pages.clear()
 
-    def lost(self, decoder: Decoder) -> int:
-        """How many of the pages that the model in service has decoded gave no bytes, whoever knows what they hold."""
-        found = (_found(one, decoder) for one in self._of(decoder))
-        return sum(page is None or page.loss not in (None, Loss.CODE) for page in found)
+    def enough_for_lost(self, decoder: Decoder) -> bool:
+        """Return whether pages are lost, and enough kept to fit by and to judge by: a single lost page shows neither.
+
+        Pages count that the model in service has decoded, at the levels of its code. Those whose symbols the source
+        knows are lost, too, where they gave no bytes.
+        """
+        kept = self._of(decoder)
+        found = [_found(one, decoder) for one in kept]
+        lost = sum(page is None or page.loss not in (None, Loss.CODE) for page in found)
+        read = sum(page is not None and page.loss is None for page in found)
+        known = sum(one.symbols is not None for one in kept)
+        return lost > 0 and max(lost, read, known) >= MIN_PAGES
 
     def pages(self, decoder: Decoder, image_px: tuple[float, float]) -> KnownPages | LostPages | None:
         """What to recalibrate by: the last pages that were read, or else those that were lost; None if there are none.

@@ -158,8 +158,8 @@ class SelfCalibration:
         """Recalibrate for a caller whose pages are lost, as soon as that may be, and wait for the end.
 
         Where the last recalibration is not long enough ago, none begins and nobody waits; as many callers wait as
-        ranges are read at once. One lost page is not enough: what was read before may show the device before it was
-        knocked.
+        ranges are read at once. One lost page that nothing else is kept with is not enough: a model fitted by it could
+        not be judged.
 
         Args:
             caller: waits for as long as it has time. Where it leaves, the work goes on.
@@ -175,9 +175,12 @@ class SelfCalibration:
         model, done = self._plane.models.current, threading.Event()
         if model.version != version:
             return True
-        enough = lost if self._settings.pages else self._kept.lost(model.decoder) if self._kept else 0
+        if self._settings.pages:
+            enough = lost >= MIN_PAGES
+        else:
+            enough = self._kept is not None and self._kept.enough_for_lost(model.decoder)
         with self._lock:
-            if enough < MIN_PAGES or self._stopping.is_set() or len(self._asked) >= self._plane.ranges.count:
+            if not enough or self._stopping.is_set() or len(self._asked) >= self._plane.ranges.count:
                 return False
             self._asked.append(done)
         self._wake.set()

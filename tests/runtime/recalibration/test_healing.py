@@ -93,6 +93,7 @@ def test_a_service_recalibrates_by_the_pages_that_it_keeps(small_bundle: Path, d
         shown = Observation("page", 0, "small-1", 0.0, 0.1, Reason.PILOTS_DISAGREE, pair=pair)
         kept.observe(replace(shown, of_device=False))
         kept.observe(shown)
+        assert kept.enough_for_lost(decoder) == (pair is not pairs[0])  # the first could not be judged by
     lost = kept.pages(decoder, (0.0, 0.0))
     assert isinstance(lost, LostPages)
     assert len(lost.pairs) == len(pairs)
@@ -109,9 +110,10 @@ def test_a_service_recalibrates_by_the_pages_that_it_keeps(small_bundle: Path, d
     assert isinstance(known, KnownPages)
     np.testing.assert_array_equal(known.symbols[0], symbols[-1])
     kinds = []
-    for number, pair in enumerate(pairs[:2], start=1):  # the device is knocked: what was read before shows another one
+    assert not kept.enough_for_lost(healed)
+    for pair in pairs[:2]:  # the device is knocked: what was read before shows another one
         kept.observe(Observation("page", 0, "small-1+r1", 0.0, 0.1, Reason.PILOTS_DISAGREE, pair=pair))
-        assert kept.lost(healed) == number
+        assert kept.enough_for_lost(healed)
         kinds.append(type(kept.pages(healed, (0.0, 0.0))))
     assert kinds == [KnownPages, LostPages]
 
