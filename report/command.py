@@ -6,9 +6,10 @@ from pathlib import Path
 
 import click
 
+from lightpage.cli.options import JSON
 from lightpage.cli.paths import OutputFile
 from lightpage.errors import InvalidInputError
-from lightpage.files import replace_text
+from lightpage.files import replace_text, write_json
 from lightpage.report import recovery_figures
 from lightpage.report.contents.from_recovery import report_of_recovery
 from lightpage.report.json_file import EXPECTED, JsonFile
@@ -25,7 +26,8 @@ from lightpage.runtime.archives.run.job import FILE as JOB
     type=click.Path(path_type=Path),
     help="Recording of the run; needed for the published decoders none, mode and ray.",
 )
-def report(source: Path, out: Path, recording: Path | None) -> None:
+@JSON
+def report(source: Path, out: Path, recording: Path | None, json_path: Path | None) -> None:
     """Show a training run, a bulk run or figures as one self-contained HTML page.
 
     RUN_OR_JSON is the folder of a finished training run, that of a bulk run, finished or not, or what `lightpage
@@ -36,6 +38,7 @@ def report(source: Path, out: Path, recording: Path | None) -> None:
     else:
         title, summary, text = _of_json(JsonFile.read(source), recording)
     replace_text(out, text, "report")
+    write_json(json_path, {"report": str(out), "title": title, "summary": summary, "bytes": len(text.encode())})
     click.echo(f"{out}: {title}, {summary}, {len(text) / 1e6:.1f} MB")
 
 

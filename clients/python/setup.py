@@ -10,7 +10,10 @@ from pathlib import Path
 from setuptools import setup
 from setuptools.command.build_py import build_py
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parent / "repository"
+"""Links to what is needed of the repository: a copy of this folder that follows them is whole."""
+if not (ROOT / "pyproject.toml").is_file():
+    raise SystemExit(f"{ROOT}: got links that lead nowhere, wanted a copy that follows them: cp -rL clients/python")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 DEPENDENCIES = ("googleapis-common-protos", "grpcio", "numpy", "protobuf")
 PACKAGE = "lightpage_client"

@@ -13,6 +13,7 @@ from lightpage.cli.options import JSON
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import Profile, load_profile
 from lightpage.device.profile_keys import commented_toml, key_table
+from lightpage.device.profile_keys import keys as all_keys
 from lightpage.errors import InvalidInputError, ProfileError, raised_as
 from lightpage.files import replace_text, write_json
 from lightpage.progress import warn
@@ -41,8 +42,10 @@ def new(out: Path, like: str, force: bool) -> None:
 
 
 @profile.command()
-def keys() -> None:
+@JSON
+def keys(json_path: Path | None) -> None:
     """Print all keys as a table."""
+    write_json(json_path, {"keys": list(map(asdict, all_keys()))})
     click.echo(key_table(), nl=False)
 
 

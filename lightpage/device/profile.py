@@ -16,6 +16,7 @@ from lightpage.device.lens_path import SeidelTerms
 from lightpage.device.problems import problems_of
 from lightpage.errors import ProfileError
 from lightpage.files import read_text
+from lightpage.words import brief, sides
 
 Length = Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)]
 """Of a part of the device, metres."""
@@ -143,6 +144,13 @@ class Profile(TomlTable):
     camera: Camera
     relay: Relay = Relay()
     lens_path: LensPath = LensPath()
+
+    def __repr__(self) -> str:
+        lens = f"{1e9 * self.light.wavelength_m:g} nm, f {1e3 * self.lens.focal_length_m:g} mm"
+        pipe = f"pipe {1e3 * self.pipe.length_m:g} mm by {1e3 * self.pipe.width_m:.4g} mm"
+        return brief(self, self.name, lens, pipe, f"page of {sides(self.page_shape)} symbols")
+
+    __str__ = __repr__  # pydantic's own tells every number
 
     @model_validator(mode="after")
     def _page_fits_the_optics(self) -> Self:

@@ -97,6 +97,12 @@ def test_the_lock_for_ray_is_what_a_worker_needs_and_rays_dashboard() -> None:
     assert all(locked[requirement.name].version in requirement.specifier for requirement in asked("ray"))
 
 
+def test_the_sizes_of_all_installations_of_the_readme_can_be_printed() -> None:
+    assert {"./clients/python", ".[cpu]", *(f".[cpu,{name}]" for name in ("import", "report", "train"))} == set(
+        script("install_sizes").stated()
+    )
+
+
 def test_every_stage_that_installs_does_it_by_its_lock() -> None:
     text = (ROOT / "Dockerfile").read_text()
     assert sorted(re.findall(r"release/locks/(\w+)\.txt", text)) == sorted(path.stem for path in LOCKS.glob("*.txt"))

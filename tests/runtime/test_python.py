@@ -40,7 +40,7 @@ def test_what_users_hold_says_in_a_line_what_it_is_and_can_be_drawn(
         assert len(recording) == len(list(recording)) == 2
         assert (next(iter(recording)).in_phase == pair.in_phase).all()
         held = (recording, pair, page, remote, decoder, decoder.bundle, service.client, service.client.describe())
-        more = (decoder.pilots(16), load_calibration(small_device[-1]), decoder.bundle.golden)
+        more = (decoder.pilots(16), load_calibration(small_device[-1]), decoder.bundle.golden, decoder.bundle.profile)
         for thing in (*held, *more):
             told = repr(thing)
             assert type(thing).__name__ in told

@@ -14,6 +14,8 @@ from tests.runtime import coded, toy
 ELSEWHERE = """
 import asyncio, multiprocessing.connection, os, select, signal, socket, socketserver, subprocess, sys
 import grpc, h5py, matplotlib.figure, onnxruntime, scipy.optimize, scipy.signal, tqdm.rich  # they look after themselves
+import torch, lightning.pytorch.trainer.connectors.signal_connector as signals  # so do they, by the system's name
+signals._SignalConnector.register_signal_handlers = signals._SignalConnector.teardown = lambda self: None
 GONE = {"fcntl", "grp", "pwd", "resource", "termios"}
 LACKING = {
     os: "fork sched_getaffinity memfd_create MFD_CLOEXEC pread pwrite posix_fallocate O_CLOEXEC O_NOFOLLOW O_NONBLOCK "
@@ -42,7 +44,7 @@ print(json.dumps([run(commands, line.split()) for line in json.loads(sys.argv[1]
 """
 
 
-def test_what_needs_no_linux_runs_without_its_calls(toy_zip: Path, tmp_path: Path) -> None:
+def test_what_needs_no_linux_runs_without_its_calls(toy_zip: Path, small_device: list[str], tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(small_profile().to_toml())
     toy.write_toy_recording(tmp_path / "toy.h5", toy.ToyDevice(), 16, 2)
     bundle = coded.bundle(tmp_path / "coded.zip")
@@ -52,7 +54,8 @@ def test_what_needs_no_linux_runs_without_its_calls(toy_zip: Path, tmp_path: Pat
         "inspect R.h5 --json I.json",
         f"evaluate --bundle {toy_zip} --recording toy.h5 --json E.json",
         f"recover --bundle {bundle} --recording pages.h5 --out read.bin --no-tracking",
-        "train --help",
+        f"train {' '.join(small_device)} --out run --steps 10 --channels 4 --blocks 1 --refinements 0 "
+        "--synthetic-pages 0 --validation-share 0.25 --test-share 0.5",
         "serve --help",
         "serve --print-config",
     ]
@@ -64,4 +67,5 @@ def test_what_needs_no_linux_runs_without_its_calls(toy_zip: Path, tmp_path: Pat
     with Recording.open(tmp_path / "R.h5") as recording:
         assert np.ptp(recording.frames(1).in_phase) > 0
     assert json.loads((tmp_path / "E.json").read_text())["pages"] == 2
+    assert (tmp_path / "run" / "run.json").is_file()
     assert (tmp_path / "read.bin").read_bytes() == coded.CONTENT

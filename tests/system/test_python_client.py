@@ -90,11 +90,10 @@ print(json.dumps({{
 
 def test_it_decodes_a_page_as_the_services_own_client_does(decoder: Decoder, tmp_path: Path) -> None:
     source, installed = tmp_path / "source", tmp_path / "installed"
-    for name in ("lightpage", "clients/python"):  # a copy: a build leaves its traces
-        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__", "build", "*.egg-info"))
-    shutil.copy(ROOT / "pyproject.toml", source)
+    traces = shutil.ignore_patterns("__pycache__", "build", "*.egg-info")
+    shutil.copytree(ROOT / "clients" / "python", source, ignore=traces)  # by itself, and builds leave traces
     pip = (sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index")
-    run(*pip, "--target", installed, "./clients/python", cwd=source)
+    run(*pip, "--target", installed, ".", cwd=source)
     (about,) = installed.glob("*.dist-info")
     assert {re.split(r"[<>=!~;\[ ]", one)[0] for one in Distribution.at(about).requires or []} == NEEDED
 
