@@ -16,7 +16,7 @@ export PYTHONDONTWRITEBYTECODE =
 export ORT_DISABLE_TELEMETRY = 1
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMEXPR_NUM_THREADS=1
 
-.PHONY: help setup demo demo-hardware test pytest test-busy test-long planted test-lowest messages bench bench-gpu bench-speed bench-service bench-other-servers bench-scaling dashboard soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image sbom check-image check-camera-image lock licences audit proto lint format clean
+.PHONY: help setup demo demo-hardware test pytest test-busy test-long planted test-lowest messages notebooks bench bench-gpu bench-speed bench-service bench-other-servers bench-scaling dashboard soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image sbom check-image check-camera-image lock licences audit proto lint format clean
 .DELETE_ON_ERROR:
 
 help:  ## list the targets
@@ -62,6 +62,9 @@ test-long: $(STAMP)  ## tests that take minutes and prove little more
 PLANTED_ARGS ?=
 planted: $(STAMP)  ## plant 60 faults, one at a time, and print which of them the tests find; PLANTED_ARGS="--out FOLDER" resumes
 	$(ONE_THREAD) $(BIN)/python -m tests.planted.plant $(PLANTED_ARGS)
+
+notebooks: $(STAMP)  ## run docs/notebooks anew, and keep what they print and draw: half an hour
+	$(BIN)/python -m tests.system.notebooks
 
 messages: $(STAMP)  ## write anew what the command line says in the failures that people meet most: tests/messages
 	$(PYTEST) tests/messages --snapshot-update

@@ -7,9 +7,11 @@ import os
 import select
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from datetime import timedelta
+from pathlib import Path
 
 import click
 from rich.console import Console, Group, RenderableType
@@ -18,11 +20,13 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from lightpage.cli.options import JSON
 from lightpage.errors import LightpageError
+from lightpage.files import write_json
 from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.commands.client.connection import with_tls
-from lightpage.runtime.console.scrapes import WINDOW_S, Change, Scrapes, scrape
-from lightpage.runtime.service.stages import Stage
+from lightpage.runtime.console.figures import DeviceSigns, Load, Process, ServiceFigures, StageTimes, service_figures
+from lightpage.runtime.console.scrapes import WINDOW_S, Scrapes, scrape
 
 try:
     import termios
@@ -40,55 +44,59 @@ _WIDTH = 100
     "--interval", default=2.0, show_default=True, type=click.FloatRange(0.1, 60), help="Seconds between two scrapes."
 )
 @click.option("--once", is_flag=True, help="Print what two scrapes say, and end; also where nobody has a terminal.")
+@JSON
 @with_tls
-def top(address: str, interval: float, once: bool, tls: TlsFiles | None) -> None:
-    """Show how a service fares that runs with --metrics-port. The key q ends it."""
+def top(address: str, interval: float, once: bool, json_path: Path | None, tls: TlsFiles | None) -> None:
+    """Show how a service fares that runs with --metrics-port. The key q ends it, as --once and --json do."""
     scrapes = Scrapes()
     scrapes.add(scrape(address, tls))
     terminal = sys.stdout.isatty()
-    if once or not terminal:
+    if once or json_path is not None or not terminal:
         time.sleep(interval)
         scrapes.add(scrape(address, tls))
-        Console(width=None if terminal else _WIDTH, highlight=False).print(view(scrapes, address))
+        write_json(json_path, {"address": address, **asdict(_figures(scrapes))})
+        Console(width=None if terminal else _WIDTH, highlight=False).print(view(_figures(scrapes), address))
         return
     silent = ""
-    with _keys() as pressed, Live(view(scrapes, address), screen=True, auto_refresh=False) as live:
+    with _keys() as pressed, Live(view(_figures(scrapes), address), screen=True, auto_refresh=False) as live:
         while "q" not in pressed(interval):
             try:
                 scrapes.add(scrape(address, tls))
                 silent = ""
             except LightpageError as error:
                 silent = silent or f"no answer since {time.strftime('%H:%M:%S')}: {error.got}"
-            live.update(view(scrapes, address, silent), refresh=True)
+            live.update(view(_figures(scrapes), address, silent), refresh=True)
 
 
-def view(scrapes: Scrapes, address: str, silent: str = "") -> RenderableType:
-    """What the scrapes say, for a terminal; `silent` says since when nobody answers, empty where somebody does."""
+def _figures(scrapes: Scrapes) -> ServiceFigures:
     change = scrapes.change
     assert change is not None  # there is a scrape
-    parts: list[RenderableType] = [_header(change, scrapes.restarts, address)]
+    return service_figures(change, scrapes.restarts)
+
+
+def view(found: ServiceFigures, address: str, silent: str = "") -> RenderableType:
+    """What a service says, for a terminal; `silent` says since when nobody answers, empty where somebody does."""
+    parts: list[RenderableType] = [_header(found, address)]
     if silent:
         parts.append(Text(silent, style="bold white on red"))
     upper = Table.grid(padding=(0, 1))
-    right = Group(_panel("device", _device(change)), _panel("process", _process(change)))
-    upper.add_row(_panel("load", _load(change)), right)
-    return Group(*parts, upper, _panel("stages", _stages(change)))
+    right = Group(_panel("device", _device(found.device)), _panel("process", _process(found.process)))
+    upper.add_row(_panel("load", _load(found.load)), right)
+    return Group(*parts, upper, _panel("stages", _stages(found.stages)))
 
 
 def _panel(title: str, table: Table) -> Panel:
     return Panel(table, title=title, expand=False)
 
 
-def _header(change: Change, restarts: int, address: str) -> Text:
-    now = change.now
-    model = next((dict(own)["version"] for own in now.values("lightpage_model_info")), "none")
-    up_s = time.time() - now.value("process_start_time_seconds")
-    text = Text.assemble(("lightpage top", "bold"), f"  {address}  model ", (model, "bold"))
-    if math.isfinite(up_s):
-        text.append(f"  up {timedelta(seconds=round(max(0.0, up_s)))}")
-    text.append(f"  figures of {change.seconds:.0f} s" if change.seconds < WINDOW_S else f"  of {WINDOW_S:.0f} s")
-    if restarts:
-        text.append(f"  restarted {restarts} times meanwhile" if restarts > 1 else "  restarted meanwhile", "yellow")
+def _header(found: ServiceFigures, address: str) -> Text:
+    text = Text.assemble(("lightpage top", "bold"), f"  {address}  model ", (found.model_version, "bold"))
+    if math.isfinite(found.up_s):
+        text.append(f"  up {timedelta(seconds=round(found.up_s))}")
+    text.append(f"  figures of {found.seconds:.0f} s" if found.seconds < WINDOW_S else f"  of {WINDOW_S:.0f} s")
+    if found.restarts:
+        times = f" {found.restarts} times" if found.restarts > 1 else ""
+        text.append(f"  restarted{times} meanwhile", "yellow")
     return text
 
 
@@ -99,75 +107,59 @@ def _table() -> Table:
     return table
 
 
-def _load(change: Change) -> Table:
-    now, table = change.now, _table()
-    table.add_row("pages", f"{_number(change.rate('lightpage_pages_total'))}/s")
-    lost = change.rises("lightpage_pages_lost_total", "reason")
-    for reason, count in lost.items():
+def _load(load: Load) -> Table:
+    table = _table()
+    table.add_row("pages", f"{_number(load.pages_per_s)}/s")
+    for reason, count in load.pages_lost.items():
         table.add_row(f"lost, {reason}", Text(f"{count:.0f}", "red"))
-    for code, count in change.rises("lightpage_calls_total", "code").items():
-        rate = count / change.seconds if change.seconds > 0 else math.nan
+    for code, rate in load.calls_per_s.items():
         table.add_row(f"calls, {code}", Text(f"{_number(rate)}/s", "" if code == "OK" else "yellow"))
-    for reason, count in change.rises("lightpage_rejects_total", "reason").items():
+    for reason, count in load.rejects.items():
         table.add_row(f"rejects, {reason}", f"{count:.0f}")
-    waiting, busy = now.value("lightpage_decodes_waiting"), now.value("lightpage_decodes_busy")
-    table.add_row("waiting", _number(waiting))
-    table.add_row("decoded now", f"{_number(busy)} of {_number(now.value('lightpage_decodes_slots'))}")
-    used, limit = now.value("lightpage_receive_buffer_bytes"), now.value("lightpage_receive_buffer_limit_bytes")
-    table.add_row("frames in memory", f"{_bytes(used)} of {_bytes(limit)}")
-    table.add_row("frames received", f"{_bytes(change.rate('lightpage_received_bytes_total'))}/s")
+    table.add_row("waiting", _number(load.decodes_waiting))
+    table.add_row("decoded now", f"{_number(load.decodes_busy)} of {_number(load.decodes_slots)}")
+    table.add_row("frames in memory", f"{_bytes(load.frames_bytes)} of {_bytes(load.frames_limit_bytes)}")
+    table.add_row("frames received", f"{_bytes(load.received_bytes_per_s)}/s")
     return table
 
 
-def _device(change: Change) -> Table:
-    now, table = change.now, _table()
-    read = change.now.value("lightpage_data_pages_total", loss="none") > 0
-    margin = now.value("lightpage_margin_bits")
-    table.add_row("margin", f"{_number(margin)} bit" if read else "-")
-    table.add_row("trust", _number(now.value("lightpage_pilot_trust")))
-    table.add_row("AIR share", _number(now.value("lightpage_pilot_share")))
-    table.add_row("AIR", f"{_number(now.value('lightpage_monitor_sign', sign='air_bits'))} bit")
-    shift = [now.value("lightpage_image_shift_px", axis=axis) for axis in ("x", "y")]
-    table.add_row("image shift", f"{', '.join(map(_number, shift))} px")
-    due = now.value("lightpage_monitor_due") == 1
+def _device(device: DeviceSigns) -> Table:
+    table, margin = _table(), device.margin_bits
+    table.add_row("margin", "-" if math.isnan(margin) else f"{_number(margin)} bit")
+    table.add_row("trust", _number(device.pilot_trust))
+    table.add_row("AIR share", _number(device.air_share))
+    table.add_row("AIR", f"{_number(device.air_bits)} bit")
+    table.add_row("image shift", f"{_number(device.image_shift_x_px)}, {_number(device.image_shift_y_px)} px")
+    due = device.recalibration_due
     table.add_row("recalibration", Text("due" if due else "not due", "red" if due else "green"))
-    raised = [dict(own)["sign"] for own, value in now.values("lightpage_monitor_sign_raised").items() if value == 1]
-    for sign in raised:
+    for sign in device.signs_raised:
         table.add_row("sign raised", Text(sign, "red"))
-    for own, count in now.values("lightpage_recalibrations_total").items():
-        if count:
-            table.add_row(f"recalibrations {dict(own)['result']}", f"{count:.0f}")
-    if now.value("lightpage_source_ok") == 0:
+    for result, count in device.recalibrations.items():
+        table.add_row(f"recalibrations {result}", f"{count:.0f}")
+    if not device.source_ok:
         table.add_row("source", Text("a beam may be blocked", "red"))
-    if now.value("lightpage_store_ok") == 0:
-        trouble = [dict(own)["reason"] for own, value in now.values("lightpage_store_trouble").items() if value == 1]
-        table.add_row("store", Text(", ".join(trouble) or "in trouble", "red"))
+    if not device.store_ok:
+        table.add_row("store", Text(", ".join(device.store_trouble) or "in trouble", "red"))
     return table
 
 
-def _process(change: Change) -> Table:
-    now, table = change.now, _table()
-    table.add_row("CPU", f"{_number(change.rate('process_cpu_seconds_total'))} cores")
-    table.add_row("memory", _bytes(now.value("process_resident_memory_bytes")))
-    descriptors = _number(now.value("process_open_fds")), _number(now.value("process_max_fds"))
-    table.add_row("descriptors", f"{descriptors[0]} of {descriptors[1]}")
-    table.add_row("calls in flight", _number(now.value("lightpage_calls_in_flight")))
+def _process(process: Process) -> Table:
+    table = _table()
+    table.add_row("CPU", f"{_number(process.cpu_cores)} cores")
+    table.add_row("memory", _bytes(process.memory_bytes))
+    table.add_row("descriptors", f"{_number(process.descriptors)} of {_number(process.descriptors_limit)}")
+    table.add_row("calls in flight", _number(process.calls_in_flight))
     return table
 
 
-def _stages(change: Change) -> Table:
+def _stages(stages: Iterable[StageTimes]) -> Table:
     table = Table(box=None, padding=(0, 2))
     for name in ("", "pages", "share", "mean", "p50", "p99"):
         table.add_column(name, justify="right" if name else "left")
-    name = "lightpage_stage_seconds"
-    whole = change.rise(f"{name}_sum")
-    for stage in Stage:
-        count = change.rise(f"{name}_count", stage=stage.value)
-        share = change.rise(f"{name}_sum", stage=stage.value) / whole if whole > 0 else math.nan
-        quantiles = (change.quantile(q, name, stage=stage.value) for q in (0.5, 0.99))
-        times = map(_seconds, (change.mean(name, stage=stage.value), *quantiles))
-        percent = f"{100 * share:.0f}%" if math.isfinite(share) else "-"
-        table.add_row(stage.value.replace("_", " "), f"{count:.0f}", percent, *times)
+    for each in stages:
+        percent = f"{100 * each.share:.0f}%" if math.isfinite(each.share) else "-"
+        times = map(_seconds, (each.mean_s, each.p50_s, each.p99_s))
+        table.add_row(each.stage.replace("_", " "), f"{each.pages:.0f}", percent, *times)
     return table
 
 

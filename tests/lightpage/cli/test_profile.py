@@ -16,6 +16,8 @@ def test_a_new_profile_is_checked_and_shown(tmp_path: Path, capsys: pytest.Captu
     assert main.run(profile, ["new", "--out", str(mine)]) == 2
     assert main.run(profile, ["show", str(mine), "--json", str(figures)]) == 0
     assert json.loads(figures.read_text())["symbols"] == 87 * 56
+    assert main.run(profile, ["keys", "--json", str(figures)]) == 0
+    assert {"table": "pipe", "name": "width_m"}.items() <= json.loads(figures.read_text())["keys"][6].items()
     mine.write_text(load_profile("bench").to_toml().replace("columns_px = 1368", "columns_px = 1300"))
     capsys.readouterr()
     assert main.run(profile, ["check", str(mine)]) == 2

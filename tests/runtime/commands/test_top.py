@@ -1,5 +1,6 @@
 """`lightpage top`: what it says of a real service, of one that was restarted, and of one that is gone."""
 
+import json
 import math
 import os
 import pty
@@ -28,16 +29,24 @@ def address(running: Stage) -> str:
     return running.url.removeprefix("http://").replace("localhost", "127.0.0.1")
 
 
-def test_one_text_says_what_the_service_does(decoder: Decoder, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_text_says_what_the_service_does(
+    decoder: Decoder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with stage(decoder) as running:
         running.plane.metrics.call_ended("ReadPage", "OK", "", 0.5)
         before = scrape(address(running))
         running.read(10)  # two of them are lost
-        assert cli_main.run(top, ["--address", address(running), "--interval", "0.1", "--once"]) == 0
+        asked = ["--address", address(running), "--interval", "0.1", "--once", "--json", str(tmp_path / "J")]
+        assert cli_main.run(top, asked) == 0
         told = capsys.readouterr().out
         for text in ("model toy-1", "not due", "cores", "iB", "inference", "post processing", "0 of 2"):
             assert text in told, text
         assert "\x1b" not in told
+        figures = json.loads((tmp_path / "J").read_text())
+        assert (figures["model_version"], figures["load"]["decodes_slots"]) == ("toy-1", 2)
+        assert (figures["device"]["recalibration_due"], figures["device"]["margin_bits"]) == (False, None)
+        assert figures["process"]["memory_bytes"] > 1e6
+        assert "inference" in {each["stage"] for each in figures["stages"]}
         change = Change(before, scrape(address(running)))
         assert change.rise("lightpage_pages_total") == 8
         assert change.rises("lightpage_pages_lost_total", "reason") == {"MISSING_FRAME": 2}

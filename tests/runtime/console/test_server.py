@@ -169,8 +169,10 @@ def test_pictures_are_thinned_and_show_saturation() -> None:
 def test_the_command_finds_a_console_or_says_what_it_lacks(
     decoder: Decoder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    shown = tmp_path / "J"
+
     def found(running: Stage) -> str:
-        command = ["console", "--address", running.url.partition("://")[2], "--no-browser"]
+        command = ["console", "--address", running.url.partition("://")[2], "--no-browser", "--json", str(shown)]
         status = cli_main.run(lightpage, command)
         out, err = capsys.readouterr()
         assert status == (0 if out else EXIT_ERROR)
@@ -178,6 +180,7 @@ def test_the_command_finds_a_console_or_says_what_it_lacks(
 
     with stage(decoder) as running:
         assert found(running) == f"{running.url}/"
+        assert json.loads(shown.read_text())["state"]["condition"] == "no page yet"
     assert running.url.removeprefix("http://") in found(running)
     with stage(decoder, Authority(tmp_path).service()) as running:
         assert "--certificate" in found(running)
