@@ -134,7 +134,7 @@ def told_nats(light: Complex, expected: Real) -> Real:
 
 
 def told_slope(light: Complex, expected: Real) -> Complex:
-    """Return the slope of `told_nats`: the real part of its product with a change of light [..., branches, N], summed."""
+    """Return the slope of `told_nats`: the real part of its product with a change of light [..., branches, N]."""
     _, share, along, power = _coherent(light, expected)
     by_share = (expected.size - 1) / (1 - share)
     norm = np.sum(expected**2)

@@ -84,7 +84,7 @@ class Estimate:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     def gained_nats(self, prior: Real) -> float:
-        """Return the nats that a fit gains by chance: the log volume of drifts in `prior` [4, 4] over that which is left."""
+        """Return the nats that a fit gains by chance: the log volume of drifts in `prior` [4, 4] over that left."""
         return max(0.0, float(np.linalg.slogdet(prior)[1] - np.linalg.slogdet(self.covariance)[1]) / 2)
 
 
