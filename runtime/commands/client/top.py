@@ -75,7 +75,7 @@ def _figures(scrapes: Scrapes) -> ServiceFigures:
 
 
 def view(found: ServiceFigures, address: str, silent: str = "") -> RenderableType:
-    """Return what a service says, for a terminal; `silent` says since when nobody answers, empty where somebody does."""
+    """Return what a service says, for a terminal; `silent` says since when nobody answers, empty if somebody does."""
     parts: list[RenderableType] = [_header(found, address)]
     if silent:
         parts.append(Text(silent, style="bold white on red"))
