@@ -10,9 +10,9 @@ from tests.system.notebooks import FOLDER, NAMES, executed, notebook
 MOST_BYTES = 300_000
 SMALLER = {
     "calibrate-and-train": """
-os.environ["PAGES"] = "4"
+os.environ["PAGES"] = "6"
 os.environ["TRAINING"] = (
-    "--steps 10 --channels 8 --blocks 1 --synthetic-pages 0 --validation-share 0.25 --test-share 0.25"
+    "--steps 10 --channels 8 --blocks 1 --synthetic-pages 0 --test-share 0.25"
 )""",
     "decode-a-recording": 'os.environ.update(PROFILE="{profile}", BUNDLE="{bundle}", PAGES="2")',
     "store-a-photograph": """
