@@ -40,7 +40,11 @@ def test_they_are_kept_as_a_run_from_end_to_end_left_them() -> None:
         assert (FOLDER / f"{name}.ipynb").stat().st_size <= MOST_BYTES
 
 
-@pytest.mark.parametrize("name", NAMES)
+# Half a minute for healing, which `test_healing.py` tests by the same commands.
+_LONG = pytest.param("store-a-photograph", marks=pytest.mark.long)
+
+
+@pytest.mark.parametrize("name", ["calibrate-and-train", "decode-a-recording", _LONG])
 def test_it_runs_on_a_small_device_and_shows_what_is_kept(
     name: str, small_device: list[str], small_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
