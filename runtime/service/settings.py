@@ -306,7 +306,7 @@ def service_settings(
         origin, got, wanted = problems[0]
         raise InvalidInputError(origin or subject, got, wanted)
     told = "; ".join(f"{got}{f' ({origin})' * bool(origin)}, wanted {wanted}" for origin, got, wanted in problems)
-    raise InvalidInputError(subject, told, "settings as docs/service-settings.md explains them")
+    raise InvalidInputError(subject, told, "settings as docs/guides/serving.md explains them")
 
 
 def _of_environment(environment: Mapping[str, str]) -> Iterator[Given]:
