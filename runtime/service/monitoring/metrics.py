@@ -61,9 +61,8 @@ class ServiceMetrics:
         self._versions: list[str] = []
         self._naming = threading.Lock()
         """Held while `_versions` and the labels of `pages` are read or changed."""
-        counter, gauge = partial(Counter, registry=own), partial(Gauge, registry=own)
-        self.calls = counter("lightpage_calls", "Finished calls, by their gRPC status.", ["method", "code"])
-        self.in_flight = gauge("lightpage_calls_in_flight", "Calls being served.")
+        self.calls = Counter("lightpage_calls", "Finished calls, by gRPC status.", ["method", "code"], registry=own)
+        self.in_flight = Gauge("lightpage_calls_in_flight", "Calls being served.", registry=own)
         self.call_seconds = Histogram(
             "lightpage_call_seconds",
             "Time of whole calls, except those that only watch.",
@@ -78,49 +77,69 @@ class ServiceMetrics:
             buckets=_FINE_SECONDS,
             registry=own,
         )
-        about = "Calls, and pages of streams, that ended with an error, by its reason."
-        self.rejects = counter("lightpage_rejects", about, ["reason"])
-        about = f"Pages that were decoded and confirmed, of the newest {VERSIONS} models."
-        self.pages = counter("lightpage_pages", about, ["model_version"])
-        about = "Time of the decode of a confirmed page, without waiting."
-        self.decode = Histogram("lightpage_decode_seconds", about, buckets=_SECONDS, registry=own)
-        self.confidence = gauge("lightpage_confidence_mean", "Mean confidence of the last confirmed page.")
-        about = "Mean concentration, von Mises kappa, of the last confirmed page."
-        self.concentration = gauge("lightpage_concentration_mean", about)
-        self.piston = gauge("lightpage_piston_radians", "Piston of the last confirmed page.")
-        self.pilots = gauge("lightpage_pilot_coherence", "Agreement of the last page's pilots on the piston, 0 to 1.")
-        about = "Share of the last page's claimed concentration that its pilots confirm, 0 to 1."
-        self.trust = gauge("lightpage_pilot_trust", about)
-        about = "Share of the last page's claimed information that its pilots confirm."
-        self.share = gauge("lightpage_pilot_share", about)
-        about = "1 if the last page shows that a recalibration is due, else 0."
-        self.due = gauge("lightpage_recalibration_due", about)
-        about = "Lost pages. Frames that came with pilots of their caller count here, and show nothing of the device."
-        self.lost_pages = counter("lightpage_pages_lost", about, ["reason"])
-        about = "Information of the last page's symbols beyond what its code needs, bits a symbol."
-        self.margin = gauge("lightpage_margin_bits", about)
-        about = "Pages read for their user bytes, by loss; none if the bytes came."
-        self.data_pages = counter("lightpage_data_pages", about, ["loss"])
-        about = "Symbols of user bytes that Reed-Solomon corrected."
-        self.corrected = counter("lightpage_corrected_symbols", about)
-        about = "Iterations of the last page's code, mean of its blocks."
-        self.code_iterations = gauge("lightpage_code_iterations", about)
-        about = "Pages whose image was searched for, by whether it was found."
-        self.searches = counter("lightpage_image_searches", about, ["found"])
-        about = "Shift of the last page's image since calibration, camera pixels."
-        self.image = gauge("lightpage_image_shift_px", about, ["axis"])
-        about = "Recalibrations by result; dropped ones were ended by their caller or a stop."
-        self.recalibrations = counter("lightpage_recalibrations", about, ["result"])
-        about = "1 if many pages together show that a recalibration is due, else 0."
-        self.monitor_due = gauge("lightpage_monitor_due", about)
-        about = "Signs that the monitor follows, each smoothed over pages."
-        self.monitor_signs = gauge("lightpage_monitor_sign", about, ["sign"])
-        self.monitor_raised = gauge("lightpage_monitor_sign_raised", "1 if the sign is raised, else 0.", ["sign"])
-        about = "Sessions of callers whose pages together show that a recalibration is due."
-        self.sessions_due = gauge("lightpage_sessions_due", about)
-        about = "Pages of the flight recorder: kept, dropped or failed."
-        self.flight_pages = counter("lightpage_flight_pages", about, ["result"])
-        self.model = gauge("lightpage_model_info", "1 for the model in service.", ["version"])
+        self.rejects = Counter(
+            "lightpage_rejects", "Calls and pages that ended with an error.", ["reason"], registry=own
+        )
+        self.pages = Counter(
+            "lightpage_pages",
+            "Pages that were decoded and confirmed, of the newest models.",
+            ["model_version"],
+            registry=own,
+        )
+        self.decode = Histogram(
+            "lightpage_decode_seconds", "Decode of a confirmed page, without waiting.", buckets=_SECONDS, registry=own
+        )
+        self.confidence = Gauge(
+            "lightpage_confidence_mean", "Mean confidence of the last confirmed page.", registry=own
+        )
+        self.concentration = Gauge(
+            "lightpage_concentration_mean", "Mean von Mises kappa of the last confirmed page.", registry=own
+        )
+        self.piston = Gauge("lightpage_piston_radians", "Piston of the last page.", registry=own)
+        self.pilots = Gauge(
+            "lightpage_pilot_coherence", "Agreement of the last page's pilots on the piston, 0 to 1.", registry=own
+        )
+        self.trust = Gauge(
+            "lightpage_pilot_trust", "Claimed concentration that the last page's pilots confirm, 0 to 1.", registry=own
+        )
+        self.share = Gauge(
+            "lightpage_pilot_share", "Share of claimed information that the last page's pilots confirm.", registry=own
+        )
+        self.due = Gauge("lightpage_recalibration_due", "1 if the last page asks for a recalibration.", registry=own)
+        self.lost_pages = Counter("lightpage_pages_lost", "Lost pages, by reason.", ["reason"], registry=own)
+        self.margin = Gauge(
+            "lightpage_margin_bits", "Bits a symbol of the last page beyond what its code needs.", registry=own
+        )
+        self.data_pages = Counter(
+            "lightpage_data_pages", "Pages read for user bytes, by their loss, or none.", ["loss"], registry=own
+        )
+        self.corrected = Counter("lightpage_corrected_symbols", "Symbols that Reed-Solomon corrected.", registry=own)
+        self.code_iterations = Gauge(
+            "lightpage_code_iterations", "Iterations of the last page's code, mean.", registry=own
+        )
+        self.searches = Counter(
+            "lightpage_image_searches", "Searches for the image of a page, by result.", ["found"], registry=own
+        )
+        self.image = Gauge(
+            "lightpage_image_shift_px", "Shift of the last page's image since calibration.", ["axis"], registry=own
+        )
+        self.recalibrations = Counter(
+            "lightpage_recalibrations", "Recalibrations; dropped: ended by caller or stop.", ["result"], registry=own
+        )
+        self.monitor_due = Gauge(
+            "lightpage_monitor_due", "1 if many pages together ask for a recalibration.", registry=own
+        )
+        self.monitor_signs = Gauge(
+            "lightpage_monitor_sign", "Signs of the monitor, smoothed over pages.", ["sign"], registry=own
+        )
+        self.monitor_raised = Gauge("lightpage_monitor_sign_raised", "1 if the sign is raised.", ["sign"], registry=own)
+        self.sessions_due = Gauge(
+            "lightpage_sessions_due", "Sessions of callers that ask for a recalibration.", registry=own
+        )
+        self.flight_pages = Counter(
+            "lightpage_flight_pages", "Pages of the flight recorder, by result.", ["result"], registry=own
+        )
+        self.model = Gauge("lightpage_model_info", "1 for the model in service.", ["version"], registry=own)
         self._begin_at_zero()
 
     def _begin_at_zero(self) -> None:
@@ -213,8 +232,11 @@ class ServiceMetrics:
 
     def watch_certificates(self, ends_s: Callable[[], float]) -> None:
         """Show when the first certificate ends, whenever somebody looks."""
-        about = "First end of the service's and its authorities' certificates, seconds since 1970."
-        Gauge("lightpage_certificate_ends_seconds", about, registry=self.registry).set_function(ends_s)
+        Gauge(
+            "lightpage_certificate_ends_seconds",
+            "First end of a certificate, seconds since 1970.",
+            registry=self.registry,
+        ).set_function(ends_s)
 
     def in_service(self, version: str) -> None:
         """Say which model decodes now."""
@@ -245,9 +267,10 @@ def _load(decodes: Slots, received: ReceiveBudget) -> Iterator[Metric]:
     yield GaugeMetricFamily("lightpage_decodes_busy", "Slots in which a page is decoded.", value=decodes.busy)
     yield GaugeMetricFamily("lightpage_decodes_slots", "Pages decoded at once, at most.", value=decodes.count)
     yield CounterMetricFamily("lightpage_received_bytes", "Frames that callers sent.", value=received.taken)
-    about = "Received frames that are not yet decoded."
-    yield GaugeMetricFamily("lightpage_receive_buffer_bytes", about, value=received.used)
-    yield GaugeMetricFamily("lightpage_receive_buffer_limit_bytes", f"Limit: {about.lower()}", value=received.size)
+    yield GaugeMetricFamily("lightpage_receive_buffer_bytes", "Frames that are not yet decoded.", value=received.used)
+    yield GaugeMetricFamily(
+        "lightpage_receive_buffer_limit_bytes", "Limit of them, all callers together.", value=received.size
+    )
 
 
 def _batches(pages: UnderWay) -> Iterator[Metric]:
@@ -255,10 +278,13 @@ def _batches(pages: UnderWay) -> Iterator[Metric]:
     runs = pages.runs.copy()
     bounds = {**{str(bound): bound for bound in _BATCH_PAGES}, "+Inf": math.inf}
     buckets = [(told, sum(runs[size] for size in runs if size <= bound)) for told, bound in bounds.items()]
-    about, total = "Pages that were computed together.", sum(size * count for size, count in runs.items())
-    yield HistogramMetricFamily("lightpage_batch_pages", about, buckets=buckets, sum_value=total)
-    about = "Time of the device that computes batches: running, waiting for frames or post_processing, or idle."
-    spent = CounterMetricFamily("lightpage_device_seconds", about, labels=["state"])
+    total = sum(size * count for size, count in runs.items())
+    yield HistogramMetricFamily("lightpage_batch_pages", "Pages of a batch.", buckets=buckets, sum_value=total)
+    spent = CounterMetricFamily(
+        "lightpage_device_seconds",
+        "Time of the device that computes batches: running, waiting for frames or post_processing, or idle.",
+        labels=["state"],
+    )
     for state, seconds in pages.seconds().items():
         spent.add_metric([state.value], seconds)
     yield spent
@@ -266,18 +292,23 @@ def _batches(pages: UnderWay) -> Iterator[Metric]:
 
 def _source(source: FrameSource) -> Iterator[Metric]:
     """What a source counts by itself."""
-    about = "Shots of the cameras: TAKEN, or why they were lost."
-    shots = CounterMetricFamily("lightpage_shots", about, labels=["outcome"])
+    shots = CounterMetricFamily(
+        "lightpage_shots", "Shots of the cameras: TAKEN, or why they were lost.", labels=["outcome"]
+    )
     for outcome, count in source.shots_by_outcome().items():
         shots.add_metric([outcome], count)
     yield shots
-    about = "Share of pixels at full scale in the last frame."
-    share = GaugeMetricFamily("lightpage_saturated_share", about, labels=["camera"])
+    share = GaugeMetricFamily(
+        "lightpage_saturated_share", "Share of pixels at full scale in the last frame.", labels=["camera"]
+    )
     for camera, value in source.saturated_shares().items():
         share.add_metric([camera], value)
     yield share
-    about = "1 if pages of the source can be read, 0 if a beam may be blocked."
-    yield GaugeMetricFamily("lightpage_source_ok", about, value=float(not source.trouble()))
+    yield GaugeMetricFamily(
+        "lightpage_source_ok",
+        "1 if pages of the source can be read, 0 if a beam may be blocked.",
+        value=float(not source.trouble()),
+    )
 
 
 def _store(health: StoreHealth, trouble: Callable[[], Trouble | None]) -> Iterator[Metric]:
@@ -288,8 +319,9 @@ def _store(health: StoreHealth, trouble: Callable[[], Trouble | None]) -> Iterat
     elif not is_well and (known := trouble()) is not None:
         found = known.reason
     yield GaugeMetricFamily("lightpage_store_ok", "1 if the model store is well, else 0.", value=float(is_well))
-    about = "1 for what is wrong with the model store, else 0."
-    reasons = GaugeMetricFamily("lightpage_store_trouble", about, labels=["reason"])
+    reasons = GaugeMetricFamily(
+        "lightpage_store_trouble", "1 for what is wrong with the model store, else 0.", labels=["reason"]
+    )
     for reason in Reason:
         reasons.add_metric([reason.value], float(reason is found))
     yield reasons
