@@ -36,10 +36,13 @@ class Limits(SettingsTable):
     """
 
     message_bytes: _Bytes = MESSAGE_BYTES
+    """One message to the service, except of `ModelInfer`, which takes a pair in one."""
     chunk_bytes: _Bytes = CHUNK_BYTES
+    """One chunk of frames. The Python client sends chunks of 1 MiB, which a smaller limit refuses."""
     pair_bytes: _MemoryBytes = 256 << 20
     """Both frames of a pair: three times a full-scale 20-megapixel pair of 16 bits."""
     reply_bytes: _Bytes = REPLY_BYTES
+    """One reply. The Python client takes none of more than 64 MiB."""
     receive_bytes: _MemoryBytes = 1 << 30
     """Bytes of pairs that were received and are not yet decoded, of all callers together: bounds the memory."""
     concurrent_decodes: Annotated[int, Field(ge=1, le=256)] = 2
@@ -65,6 +68,7 @@ class Limits(SettingsTable):
     model_s: _Seconds = 600.0
     """A bundle that has not come by then is dropped: a full-size one comes over a slow line in that time."""
     jobs_kept: Annotated[int, Field(ge=1, le=1_000_000)] = JOBS_KEPT
+    """Results of jobs; the oldest are forgotten."""
     decode_s: _Seconds = 120.0
     """A decode that takes longer has hung, and health checks fail: three times a full-size page by waves on two
     cores."""
@@ -75,10 +79,11 @@ class Limits(SettingsTable):
     kept_bytes: _MemoryBytes = 512 << 20
     """Frames of the last pages that a service keeps to recalibrate itself by: eight full-size pairs of 16 bits."""
     recalibration_s: _Seconds = 300.0
-    """One recalibration in its own process. On two cores a bench device's takes 8 s beside an idle service, and 90 s
+    """One recalibration in its own process. On two cores a bench device's takes 16 s beside an idle service, and 95 s
     beside reads without a pause on both cores, since its priority leaves it what they do not use and a tenth of a
     core."""
     uploaded_bytes: _MemoryBytes = UPLOADED_BYTES
+    """Uploaded pages, which lie in memory until the service ends."""
     concurrent_ranges: _Count = 4
     """Ranges of pages of which a page is being read. A range whose caller takes its time to read a reply does not
     count."""
@@ -92,8 +97,12 @@ class Limits(SettingsTable):
     concurrent_watches: _Count = 2
     """Controllers that watch what is to be shown: one, and one whose connection has been lost."""
     grace_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] = GRACE_S
+    """Time for calls in progress when the service is told to stop; then they are ended."""
     connection_age_s: Annotated[float | None, _DAY] = None
+    """Age at which a connection is closed, give or take a tenth, so that callers behind a balancer connect anew. Calls
+    on it end first, and its session ends with it."""
     connection_grace_s: Annotated[float | None, _DAY] = None
+    """Time for the calls that are then still on it."""
 
     def rules(self) -> Iterator[Rule]:
         """Yield the rules among limits."""

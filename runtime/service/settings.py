@@ -63,15 +63,21 @@ class ServiceTable(SettingsTable):
         None,
         description="simulator:PROFILE, recording:FILE, camera:CONFIG.toml; without it only sent frames decode.",
     )
-    pages: File | None = Field(None, description="Pages that the source is to show, PAGES.h5.")
-    address: _Address = Field(ADDRESS, description="HOST:PORT to listen on; port 0 takes a free one.")
+    pages: File | None = Field(
+        None,
+        description="Pages that the source is to show, PAGES.h5; ReadPage.page is the row. By default random ones.",
+    )
+    address: _Address = Field(
+        ADDRESS,
+        description="HOST:PORT or unix:PATH to listen on; port 0 takes a free one, a path has at most 107 bytes.",
+    )
     insecure: bool = False
     """Whether addresses that others reach may do without TLS, as in a container whose ports are published on its own
     machine alone."""
     health_address: _HealthAddress | None = Field(
         None,
-        description="HOST:PORT of health checks, answered by a process of their own; by default the next port. "
-        "off: none.",
+        description="HOST:PORT of health checks, answered by a process of their own; by default the next port of this "
+        "machine, or unix:PATH.health. off: none.",
     )
     shared_memory: bool = Field(False, description="Share memory with clients at the service's Unix socket.")
     store: Folder | None = Field(
@@ -83,11 +89,14 @@ class ServiceTable(SettingsTable):
         None, description="Folder whose recordings a caller may name to recalibrate with."
     )
     threads: int | None = Field(None, ge=1, le=4096)
+    """Threads of one inference; by default all cores."""
     code_threads: int = Field(
         1, ge=1, le=64, description="Threads that share the code of a page, where it is compiled."
     )
     provider: Annotated[str, checked(Provider.parse)] = CPU
+    """What computes pages: cpu, cuda or tensorrt, with :N behind it for another GPU than the first."""
     engine_cache: Folder | None = None
+    """Folder where TensorRT keeps its engines; without, it builds them at each start, for minutes."""
     tracking: bool = Field(True, description="Follow the image, and find it again.")
 
     def rules(self) -> Iterator[Rule]:
@@ -157,6 +166,7 @@ class InferenceTable(SettingsTable):
     """The Open Inference Protocol, beside the service's own contract; it takes a whole frame pair in one message."""
 
     enabled: bool = True
+    """Whether it is served; without it, messages are at most `limits.message_bytes`."""
 
 
 class AuditTable(SettingsTable):

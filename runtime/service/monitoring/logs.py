@@ -30,6 +30,7 @@ class LogSettings(SettingsTable):
     """What goes to stderr: the table [logs] of the service's settings."""
 
     format: Literal["text", "json"] = "text"
+    """Lines for people, or one object of JSON a line."""
     level: Literal["debug", "info", "warning", "error"] = "info"
     """Lesser lines are left out."""
     lines_per_second: int = Field(5, ge=1, le=100_000)
