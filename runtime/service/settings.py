@@ -55,7 +55,7 @@ _HealthAddress = Annotated[str, checked(_check_health_address)]
 
 
 class ServiceTable(SettingsTable):
-    """What is served, and where. Each description is the help of an option of `serve`."""
+    """The served bundle and source, and their addresses."""
 
     bundle: Text = Field(DEFAULT, description="A bundle's path, or the name of a shipped one.")
     bundle_key: File | None = Field(None, description="Public key, PEM, that bundles must be signed with.")
@@ -63,14 +63,8 @@ class ServiceTable(SettingsTable):
         None,
         description="simulator:PROFILE, recording:FILE, camera:CONFIG.toml; without it only sent frames decode.",
     )
-    pages: File | None = Field(
-        None,
-        description="Pages that the source is to show, PAGES.h5; ReadPage.page is the row. By default random ones.",
-    )
-    address: _Address = Field(
-        ADDRESS,
-        description="HOST:PORT or unix:PATH to listen on; port 0 takes a free one, a path has at most 107 bytes.",
-    )
+    pages: File | None = Field(None, description="Pages for the source to show, PAGES.h5; ReadPage.page is the row.")
+    address: _Address = Field(ADDRESS, description="HOST:PORT or unix:PATH to listen on; port 0 takes a free one.")
     insecure: bool = False
     """Whether addresses that others reach may do without TLS, as in a container whose ports are published on its own
     machine alone."""
@@ -145,7 +139,7 @@ class TlsTable(SettingsTable):
 
 
 class MetricsTable(SettingsTable):
-    """Where metrics and the console are shown; without a port, nowhere."""
+    """The address of metrics and console; without a port they are not shown."""
 
     host: Text = Field("127.0.0.1", description="Where the figures are shown.")
     port: int | None = Field(None, ge=0, le=65535, description="Show metrics and console on this port.")
@@ -154,7 +148,7 @@ class MetricsTable(SettingsTable):
 
 
 class TracesTable(SettingsTable):
-    """Where spans of calls are sent; without an endpoint, nowhere."""
+    """The collector of spans of calls; without an endpoint none are sent."""
 
     endpoint: Annotated[str, checked(check_endpoint)] | None = None
     """Of a collector that takes OTLP over gRPC, http://HOST:PORT or https://HOST:PORT."""

@@ -1,4 +1,4 @@
-"""What a bulk run shows to Prometheus: while it works to whoever scrapes, and after its end as a file."""
+"""Prometheus metrics of a bulk run: served while it works, written to a file after its end."""
 
 from __future__ import annotations
 
@@ -43,52 +43,30 @@ class BulkMetrics(Watch):
         self._own = values = run, str(part)
         one = ["run", "part"]
 
+        def counter(name: str, what: str) -> Counter:
+            return Counter(name, what, one, registry=own).labels(*values)
+
+        def gauge(name: str, what: str) -> Gauge:
+            return Gauge(name, what, one, registry=own).labels(*values)
+
         # What has its labels is shown at once: Prometheus sees no rise from nothing to the first one.
-        self._pages = Counter(
-            "lightpage_bulk_pages",
-            "Pages: read, lost or left out. Devices: read, or lost if refused. Later rounds count again.",
-            [*one, "state"],
-            registry=own,
-        )
+        self._pages = Counter("lightpage_bulk_pages", "Pages or devices, by outcome.", [*one, "state"], registry=own)
         self._lost = Counter("lightpage_bulk_pages_lost", "Lost pages, by cause.", [*one, "reason"], registry=own)
         for state in PageState:
             self._pages.labels(*values, state)
         for reason in _CAUSES.get(operation, ()):
             self._lost.labels(*values, reason)
-        self._failed = Counter(
-            "lightpage_bulk_ranges_failed", "Ranges without a result; files that cannot be opened.", one, registry=own
-        ).labels(*values)
-        self._died = Counter("lightpage_bulk_workers_died", "Workers that died.", one, registry=own).labels(*values)
-        self._read_bytes = Counter(
-            "lightpage_bulk_read_bytes", "Frames, as they lie in recordings.", one, registry=own
-        ).labels(*values)
-        self._job_pages = Gauge(
-            "lightpage_bulk_job_pages", "Pages of the job, or of this part of it; or devices.", one, registry=own
-        ).labels(*values)
-        self._left = Gauge(
-            "lightpage_bulk_job_pages_left", "Pages or devices yet to be read, or read again.", one, registry=own
-        ).labels(*values)
-        self._in_flight = Gauge(
-            "lightpage_bulk_ranges_in_flight", "Page ranges that workers are reading.", one, registry=own
-        ).labels(*values)
-        self._workers = Gauge(
-            "lightpage_bulk_workers", "Workers alive; with Ray, as many as its CPUs suffice for.", one, registry=own
-        ).labels(*values)
-        self._ended = Gauge(
-            "lightpage_bulk_end_timestamp_seconds",
-            "End of the run, seconds since 1970; absent before.",
-            one,
-            registry=own,
-        )
+        self._failed = counter("lightpage_bulk_ranges_failed", "Ranges without a result; files that cannot be opened.")
+        self._died = counter("lightpage_bulk_workers_died", "Workers that died.")
+        self._read_bytes = counter("lightpage_bulk_read_bytes", "Frames, as they lie in recordings.")
+        self._job_pages = gauge("lightpage_bulk_job_pages", "Pages or devices of the job, or of this part of it.")
+        self._left = gauge("lightpage_bulk_job_pages_left", "Pages or devices yet to be read, or read again.")
+        self._in_flight = gauge("lightpage_bulk_ranges_in_flight", "Page ranges that workers are reading.")
+        self._workers = gauge("lightpage_bulk_workers", "Workers alive; with Ray, as many as its CPUs suffice for.")
+        self._ended = Gauge("lightpage_bulk_end_timestamp_seconds", "End of the run, in Unix time.", one, registry=own)
         info = Gauge("lightpage_bulk_info", "1 for what the run does.", [*one, "operation"], registry=own)
         info.labels(*values, operation).set(1)
-        seconds = Histogram(
-            "lightpage_bulk_page_seconds",
-            "A worker's time for a page, mean of its range.",
-            one,
-            buckets=_SECONDS,
-            registry=own,
-        )
+        seconds = Histogram("lightpage_bulk_page_seconds", "Mean time for a page.", one, buckets=_SECONDS, registry=own)
         self._page_seconds = seconds.labels(*values)
 
     def wanted(self, total: int, left: int) -> None:

@@ -1,4 +1,4 @@
-"""What the operator watches: counters and gauges in the Prometheus format, one registry per service."""
+"""Metrics of the service: counters and gauges in the Prometheus format, one registry per service."""
 
 from __future__ import annotations
 
@@ -61,8 +61,9 @@ class ServiceMetrics:
         self._versions: list[str] = []
         self._naming = threading.Lock()
         """Held while `_versions` and the labels of `pages` are read or changed."""
-        self.calls = Counter("lightpage_calls", "Finished calls, by gRPC status.", ["method", "code"], registry=own)
-        self.in_flight = Gauge("lightpage_calls_in_flight", "Calls being served.", registry=own)
+        counter, gauge = partial(Counter, registry=own), partial(Gauge, registry=own)
+        self.calls = counter("lightpage_calls", "Finished calls, by their gRPC status.", ["method", "code"])
+        self.in_flight = gauge("lightpage_calls_in_flight", "Calls being served.")
         self.call_seconds = Histogram(
             "lightpage_call_seconds",
             "Time of whole calls, except those that only watch.",
@@ -77,69 +78,30 @@ class ServiceMetrics:
             buckets=_FINE_SECONDS,
             registry=own,
         )
-        self.rejects = Counter(
-            "lightpage_rejects", "Calls and pages that ended with an error.", ["reason"], registry=own
-        )
-        self.pages = Counter(
-            "lightpage_pages",
-            "Pages that were decoded and confirmed, of the newest models.",
-            ["model_version"],
-            registry=own,
-        )
-        self.decode = Histogram(
-            "lightpage_decode_seconds", "Decode of a confirmed page, without waiting.", buckets=_SECONDS, registry=own
-        )
-        self.confidence = Gauge(
-            "lightpage_confidence_mean", "Mean confidence of the last confirmed page.", registry=own
-        )
-        self.concentration = Gauge(
-            "lightpage_concentration_mean", "Mean von Mises kappa of the last confirmed page.", registry=own
-        )
-        self.piston = Gauge("lightpage_piston_radians", "Piston of the last page.", registry=own)
-        self.pilots = Gauge(
-            "lightpage_pilot_coherence", "Agreement of the last page's pilots on the piston, 0 to 1.", registry=own
-        )
-        self.trust = Gauge(
-            "lightpage_pilot_trust", "Claimed concentration that the last page's pilots confirm, 0 to 1.", registry=own
-        )
-        self.share = Gauge(
-            "lightpage_pilot_share", "Share of claimed information that the last page's pilots confirm.", registry=own
-        )
-        self.due = Gauge("lightpage_recalibration_due", "1 if the last page asks for a recalibration.", registry=own)
-        self.lost_pages = Counter("lightpage_pages_lost", "Lost pages, by reason.", ["reason"], registry=own)
-        self.margin = Gauge(
-            "lightpage_margin_bits", "Bits a symbol of the last page beyond what its code needs.", registry=own
-        )
-        self.data_pages = Counter(
-            "lightpage_data_pages", "Pages read for user bytes, by their loss, or none.", ["loss"], registry=own
-        )
-        self.corrected = Counter("lightpage_corrected_symbols", "Symbols that Reed-Solomon corrected.", registry=own)
-        self.code_iterations = Gauge(
-            "lightpage_code_iterations", "Iterations of the last page's code, mean.", registry=own
-        )
-        self.searches = Counter(
-            "lightpage_image_searches", "Searches for the image of a page, by result.", ["found"], registry=own
-        )
-        self.image = Gauge(
-            "lightpage_image_shift_px", "Shift of the last page's image since calibration.", ["axis"], registry=own
-        )
-        self.recalibrations = Counter(
-            "lightpage_recalibrations", "Recalibrations; dropped: ended by caller or stop.", ["result"], registry=own
-        )
-        self.monitor_due = Gauge(
-            "lightpage_monitor_due", "1 if many pages together ask for a recalibration.", registry=own
-        )
-        self.monitor_signs = Gauge(
-            "lightpage_monitor_sign", "Signs of the monitor, smoothed over pages.", ["sign"], registry=own
-        )
-        self.monitor_raised = Gauge("lightpage_monitor_sign_raised", "1 if the sign is raised.", ["sign"], registry=own)
-        self.sessions_due = Gauge(
-            "lightpage_sessions_due", "Sessions of callers that ask for a recalibration.", registry=own
-        )
-        self.flight_pages = Counter(
-            "lightpage_flight_pages", "Pages of the flight recorder, by result.", ["result"], registry=own
-        )
-        self.model = Gauge("lightpage_model_info", "1 for the model in service.", ["version"], registry=own)
+        self.rejects = counter("lightpage_rejects", "Calls and pages that ended with an error.", ["reason"])
+        self.pages = counter("lightpage_pages", "Decoded and confirmed pages of the newest models.", ["model_version"])
+        self.decode = Histogram("lightpage_decode_seconds", "Decode of a page.", buckets=_SECONDS, registry=own)
+        self.confidence = gauge("lightpage_confidence_mean", "Mean confidence of the last confirmed page.")
+        self.concentration = gauge("lightpage_concentration_mean", "Mean von Mises kappa of the last confirmed page.")
+        self.piston = gauge("lightpage_piston_radians", "Piston of the last confirmed page.")
+        self.pilots = gauge("lightpage_pilot_coherence", "Agreement of the last page's pilots on the piston, 0 to 1.")
+        self.trust = gauge("lightpage_pilot_trust", "Claimed concentration that the last page's pilots confirm.")
+        self.share = gauge("lightpage_pilot_share", "Claimed information that the last page's pilots confirm.")
+        self.due = gauge("lightpage_recalibration_due", "1 if the last page asks for a recalibration, else 0.")
+        self.lost_pages = counter("lightpage_pages_lost", "Lost pages, by reason.", ["reason"])
+        self.margin = gauge("lightpage_margin_bits", "Information of a symbol beyond what the page's code needs, bits.")
+        self.data_pages = counter("lightpage_data_pages", "Pages read for user bytes, by their loss or none.", ["loss"])
+        self.corrected = counter("lightpage_corrected_symbols", "Symbols of user bytes that Reed-Solomon corrected.")
+        self.code_iterations = gauge("lightpage_code_iterations", "Iterations of the last page's code, mean of blocks.")
+        self.searches = counter("lightpage_image_searches", "Searches for the image of a page, by result.", ["found"])
+        self.image = gauge("lightpage_image_shift_px", "Shift of the last page's image since calibration.", ["axis"])
+        self.recalibrations = counter("lightpage_recalibrations", "Recalibrations, by how they ended.", ["result"])
+        self.monitor_due = gauge("lightpage_monitor_due", "1 if many pages together ask for a recalibration, else 0.")
+        self.monitor_signs = gauge("lightpage_monitor_sign", "Signs of the monitor, smoothed over pages.", ["sign"])
+        self.monitor_raised = gauge("lightpage_monitor_sign_raised", "1 if the sign is raised, else 0.", ["sign"])
+        self.sessions_due = gauge("lightpage_sessions_due", "Sessions of callers that ask for a recalibration.")
+        self.flight_pages = counter("lightpage_flight_pages", "Pages of the flight recorder, by result.", ["result"])
+        self.model = gauge("lightpage_model_info", "1 for the model in service.", ["version"])
         self._begin_at_zero()
 
     def _begin_at_zero(self) -> None:
@@ -232,11 +194,9 @@ class ServiceMetrics:
 
     def watch_certificates(self, ends_s: Callable[[], float]) -> None:
         """Show when the first certificate ends, whenever somebody looks."""
-        Gauge(
-            "lightpage_certificate_ends_seconds",
-            "First end of a certificate, seconds since 1970.",
-            registry=self.registry,
-        ).set_function(ends_s)
+        own = self.registry
+        ends = Gauge("lightpage_certificate_ends_seconds", "First end of a certificate, Unix time.", registry=own)
+        ends.set_function(ends_s)
 
     def in_service(self, version: str) -> None:
         """Say which model decodes now."""
@@ -251,7 +211,7 @@ class ServiceMetrics:
 
 
 class _Figures(Collector):
-    """What is counted elsewhere, as it is whenever somebody looks."""
+    """Figures that are counted elsewhere and read at each scrape."""
 
     def __init__(self, look: Callable[[], Iterator[Metric]]) -> None:
         self._look = look
@@ -262,15 +222,13 @@ class _Figures(Collector):
 
 
 def _load(decodes: Slots, received: ReceiveBudget) -> Iterator[Metric]:
-    """How busy the service is."""
+    """Return how busy the service is."""
     yield GaugeMetricFamily("lightpage_decodes_waiting", "Pages that wait for a slot.", value=decodes.queued)
     yield GaugeMetricFamily("lightpage_decodes_busy", "Slots in which a page is decoded.", value=decodes.busy)
     yield GaugeMetricFamily("lightpage_decodes_slots", "Pages decoded at once, at most.", value=decodes.count)
     yield CounterMetricFamily("lightpage_received_bytes", "Frames that callers sent.", value=received.taken)
     yield GaugeMetricFamily("lightpage_receive_buffer_bytes", "Frames that are not yet decoded.", value=received.used)
-    yield GaugeMetricFamily(
-        "lightpage_receive_buffer_limit_bytes", "Limit of them, all callers together.", value=received.size
-    )
+    yield GaugeMetricFamily("lightpage_receive_buffer_limit_bytes", "Limit of these.", value=received.size)
 
 
 def _batches(pages: UnderWay) -> Iterator[Metric]:
@@ -280,48 +238,35 @@ def _batches(pages: UnderWay) -> Iterator[Metric]:
     buckets = [(told, sum(runs[size] for size in runs if size <= bound)) for told, bound in bounds.items()]
     total = sum(size * count for size, count in runs.items())
     yield HistogramMetricFamily("lightpage_batch_pages", "Pages of a batch.", buckets=buckets, sum_value=total)
-    spent = CounterMetricFamily(
-        "lightpage_device_seconds",
-        "Time of the device that computes batches: running, waiting for frames or post_processing, or idle.",
-        labels=["state"],
-    )
+    spent = CounterMetricFamily("lightpage_device_seconds", "What computes batches, by state.", labels=["state"])
     for state, seconds in pages.seconds().items():
         spent.add_metric([state.value], seconds)
     yield spent
 
 
 def _source(source: FrameSource) -> Iterator[Metric]:
-    """What a source counts by itself."""
-    shots = CounterMetricFamily(
-        "lightpage_shots", "Shots of the cameras: TAKEN, or why they were lost.", labels=["outcome"]
-    )
+    """Return what a source counts by itself."""
+    shots = CounterMetricFamily("lightpage_shots", "Shots, TAKEN or by why they were lost.", labels=["outcome"])
     for outcome, count in source.shots_by_outcome().items():
         shots.add_metric([outcome], count)
     yield shots
-    share = GaugeMetricFamily(
-        "lightpage_saturated_share", "Share of pixels at full scale in the last frame.", labels=["camera"]
-    )
+    share = GaugeMetricFamily("lightpage_saturated_share", "Pixels at full scale, last frame.", labels=["camera"])
     for camera, value in source.saturated_shares().items():
         share.add_metric([camera], value)
     yield share
-    yield GaugeMetricFamily(
-        "lightpage_source_ok",
-        "1 if pages of the source can be read, 0 if a beam may be blocked.",
-        value=float(not source.trouble()),
-    )
+    is_well = float(not source.trouble())
+    yield GaugeMetricFamily("lightpage_source_ok", "1 if pages of the source can be read, else 0.", value=is_well)
 
 
 def _store(health: StoreHealth, trouble: Callable[[], Trouble | None]) -> Iterator[Metric]:
-    """How the store is; a disk that hangs is waited for no longer than `_LOOK_S`."""
+    """Return how the store is; a disk that hangs is waited for no longer than `_LOOK_S`."""
     is_well, found = health.is_well(_LOOK_S), None
     if not is_well and health.hangs:
         found = Reason.HUNG
     elif not is_well and (known := trouble()) is not None:
         found = known.reason
     yield GaugeMetricFamily("lightpage_store_ok", "1 if the model store is well, else 0.", value=float(is_well))
-    reasons = GaugeMetricFamily(
-        "lightpage_store_trouble", "1 for what is wrong with the model store, else 0.", labels=["reason"]
-    )
+    reasons = GaugeMetricFamily("lightpage_store_trouble", "1 for what is wrong with the store.", labels=["reason"])
     for reason in Reason:
         reasons.add_metric([reason.value], float(reason is found))
     yield reasons
