@@ -227,10 +227,8 @@ def _load(decodes: Slots, received: ReceiveBudget) -> Iterator[Metric]:
     yield GaugeMetricFamily("lightpage_decodes_busy", "Slots in which a page is decoded.", value=decodes.busy)
     yield GaugeMetricFamily("lightpage_decodes_slots", "Pages decoded at once, at most.", value=decodes.count)
     yield CounterMetricFamily("lightpage_received_bytes", "Frames that callers sent.", value=received.taken)
-    yield GaugeMetricFamily("lightpage_receive_buffer_bytes", "Frames that are not yet decoded.", value=received.used)
-    yield GaugeMetricFamily(
-        "lightpage_receive_buffer_limit_bytes", "Limit of frames not yet decoded.", value=received.size
-    )
+    yield GaugeMetricFamily("lightpage_receive_buffer_bytes", "Undecoded frames of callers.", value=received.used)
+    yield GaugeMetricFamily("lightpage_receive_buffer_limit_bytes", "Limit of undecoded frames.", value=received.size)
 
 
 def _batches(pages: UnderWay) -> Iterator[Metric]:
