@@ -38,9 +38,12 @@ class TomlTable(BaseModel):
 
 
 class StrictTable(TomlTable):
-    """A table whose values are of the right type to begin with: no text stands for a number."""
+    """A table whose values are of the right type to begin with: no text stands for a number.
 
-    model_config = ConfigDict(strict=True)
+    The text below a key is its description.
+    """
+
+    model_config = ConfigDict(strict=True, use_attribute_docstrings=True)
 
 
 T = TypeVar("T", bound=TomlTable)
