@@ -25,7 +25,7 @@ KEYS = "reference/camera-keys.md of the documentation"
 
 
 class CameraTable(View, CameraSettings):
-    """One camera, and how it sees the image."""
+    """A camera, and its view of the image."""
 
     kind: Literal["genicam"] = "genicam"
     """A camera that Lightpage drives."""
@@ -87,7 +87,7 @@ class ExternalModulatorTable(StrictTable):
 
 
 class SimulatedTable(StrictTable):
-    """Part of a simulated device."""
+    """The modulator, or the shutters, of a simulated device."""
 
     kind: Literal["simulated"]
     """Part of a simulated device."""

@@ -1,4 +1,4 @@
-"""What becomes of one camera's frames before they are read."""
+"""Processing of one camera's frames before they are read."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Counts = NDArray[np.unsignedinteger[Any]]
 
 
 class View(StrictTable):
-    """How a camera sees the image: mirrored or not, as behind one more mirror."""
+    """A camera's view of the image: mirrored or not, as behind one more mirror."""
 
     flip_x: bool = False
     """The camera sees left and right exchanged."""

@@ -1,4 +1,4 @@
-"""How one camera is found and set up."""
+"""Address and settings of one camera."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lightpage.runtime.device.cameras.pixel_formats import pixel_format
 
 
 class CameraSettings(StrictTable):
-    """One camera, and every setting that a frame depends on."""
+    """Identity of one camera, and every setting that a frame depends on."""
 
     driver: Literal["aravis", "gentl"] = "aravis"
     """`aravis`: GigE Vision and USB3 Vision. `gentl`: any camera with a GenTL producer."""

@@ -27,7 +27,7 @@ class Shutter(StrictTable):
     """Time that the shutter takes to move."""
 
     def level(self, is_open: bool) -> bool:
-        """Whether its channel is on while it is open, or closed."""
+        """Return whether its channel is on while it is open, or closed."""
         return is_open == (self.open_when == "high")
 
 

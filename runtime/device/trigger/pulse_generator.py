@@ -35,7 +35,7 @@ Channel = Annotated[int, Field(ge=1, le=CHANNELS)]
 
 
 class PulseGeneratorSettings(LineTimes):
-    """Line and outputs of the pulse generator."""
+    """Address and settings of the pulse generator."""
 
     port: Annotated[str, Field(min_length=1)]
     """Device of the serial line, e.g. `/dev/serial/by-id/...`, or `socket://HOST:PORT`."""
@@ -86,7 +86,7 @@ class PulseGenerator:
 
     @property
     def reached(self) -> bool:
-        """Whether it has ever answered: before, nothing but a question for its identity was sent."""
+        """Return whether it has ever answered: before, nothing but a question for its identity was sent."""
         return self._line.session > 0
 
     def arm(self) -> None:
