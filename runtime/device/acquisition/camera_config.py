@@ -108,7 +108,9 @@ class ShuttersTable(StrictTable):
     kind: Literal["shutters"]
     """Shutters on channels of the pulse generator."""
     signal: Shutter
+    """Shutter of the signal beam."""
     reference: Shutter
+    """Shutter of the reference beam, with the keys of `signal`."""
 
 
 class ExternalBeamsTable(StrictTable):
@@ -137,17 +139,24 @@ class DeviceTable(StrictTable):
     pages: str | None = None
     """File of pages to show. `--symbols` and `--pages` override it."""
     in_phase: AnyCameraTable
+    """The in-phase camera."""
     quadrature: AnyCameraTable
+    """The quadrature camera, with the keys of `in_phase`."""
     trigger: Annotated[PulseGeneratorTable | SoftwareTriggerTable | PluginTable, Field(discriminator="kind")]
+    """Trigger of both cameras."""
     modulator: Annotated[
         ScreenTable | ExternalModulatorTable | SimulatedTable | NoModulatorTable | PluginTable,
         Field(discriminator="kind"),
     ] = NoModulatorTable()
+    """Display of the pages."""
     beams: Annotated[
         ShuttersTable | ExternalBeamsTable | SimulatedTable | OperatorTable, Field(discriminator="kind")
     ] = OperatorTable()
+    """Shutters of both beams, for dark and reference frames."""
     pairing: PairingSettings = PairingSettings()
+    """How frames of one shot are told from others."""
     exposures: Exposures = Exposures()
+    """How many frames are taken."""
 
     @model_validator(mode="after")
     def _two_cameras(self) -> Self:
