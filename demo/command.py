@@ -14,6 +14,7 @@ from lightpage.demo.demo import run_demo
 from lightpage.demo.result import DemoResult
 from lightpage.errors import InvalidInputError
 from lightpage.files import write_json
+from lightpage.metrics.provenance import with_provenance
 from lightpage.runtime.archives.recordings.coded_pages import AIR_LEVELS
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 
@@ -39,7 +40,8 @@ def demo(bundle: str, out: Path, seed: int, spec: str | None, json_path: Path | 
         raise InvalidInputError(f"--out {out}", error, "a folder that can be written") from None
     with percent_bar() as progress:
         result = run_demo(bundle_path(bundle), out, seed, progress, spec)
-    figures = result.to_json() | {"seconds": time.perf_counter() - start}
+    figures = with_provenance(result.to_json(), bundle=bundle_path(bundle), options={"seed": seed, "source": spec})
+    figures["seconds"] = time.perf_counter() - start
     write_json(out / "demo.json", figures)
     if json_path is not None:
         write_json(json_path, figures)

@@ -31,6 +31,7 @@ from lightpage.codec.volume import DATA_PAGES, PARITY_PAGES, Volume, encode_volu
 from lightpage.device.profile import Profile, load_profile
 from lightpage.errors import InvalidInputError
 from lightpage.files import write_json
+from lightpage.metrics.provenance import with_provenance
 from lightpage.page.levels import Levels
 from lightpage.page.modulation import NOMINAL, Modulation
 from lightpage.page.symbols import pilot_mask, pilot_symbols, symbol_phases
@@ -132,7 +133,11 @@ def main(blocks: int, rounds: int, json_path: Path | None) -> None:
         click.echo(f"{name}: a file to pages {encoding[name]:.1f} MB/s")
     if json_path is not None:
         found = {"page_code": in_use(), "decoders": found, "pages": pages, "encode_MB_per_second": encoding}
-        write_json(json_path, found)
+        codes = {
+            name: (load_profile(profile).to_toml(), size, code.model_dump())
+            for name, (profile, size, code) in PAGES.items()
+        }
+        write_json(json_path, with_provenance(found, codes=codes))
 
 
 if __name__ == "__main__":

@@ -169,7 +169,6 @@ def copy_picture(path: Path, to: Path) -> None:
     multiple=True,
     help="Collect a JSON of `analysis.speed.speed`.",
 )
-@click.option("--commit", help="That was measured; the one checked out where the JSON lies if left out.")
 @click.option(
     "--kept",
     type=click.Path(exists=True, file_okay=False, path_type=Path),
@@ -185,7 +184,6 @@ def main(
     image_search: Path | None,
     ledger: Path | None,
     speeds: tuple[Path, ...],
-    commit: str | None,
     kept: Path,
     out: Path,
 ) -> None:
@@ -200,13 +198,13 @@ def main(
             click.echo(f"not collected, no {below[name]}")
     before = kept_measurements(kept)
     for name, path in found.items():
-        measurement = collected(name, path, commit)
+        measurement = collected(name, path)
         lacking = methods(before[name]) - methods(measurement) if name in before else set()
         if lacking:  # a comparison writes its figures method by method
             click.echo(f"not collected, unfinished: {path} lacks {', '.join(sorted(lacking))}")
             continue
         measurement.write(kept / f"{name}.json")
-        click.echo(f"{name}: {measurement.source}")
+        click.echo(f"{name}: {measurement.provenance.time}, commit {measurement.provenance.commit[:7]}")
         if name == PICTURED and (drawn := path.with_name("figure.png")).exists():
             copy_picture(drawn, out.parent / PICTURE)
     results = Results(kept_measurements(kept))

@@ -26,6 +26,7 @@ from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import load_profile
 from lightpage.export.onnx_files import decoder_onnx
 from lightpage.files import write_json
+from lightpage.metrics.provenance import with_provenance
 from lightpage.runtime.model.execution.cpus import available_cpus
 
 _PROFILED = 3
@@ -99,7 +100,7 @@ def main(
             click.echo("\n".join([f"\n{name}", *lines(found)]))
             figures["parts"][name] = [asdict(part) for part in found]
     if json_path is not None:
-        write_json(json_path, figures)
+        write_json(json_path, with_provenance(figures, profile=profile.to_toml()))
 
 
 if __name__ == "__main__":

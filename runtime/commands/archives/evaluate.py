@@ -8,6 +8,7 @@ import click
 
 from lightpage.cli.options import JSON
 from lightpage.files import write_json
+from lightpage.metrics.provenance import with_provenance
 from lightpage.progress import warn
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.evaluation import Evaluation, NothingReadError
@@ -37,7 +38,8 @@ def evaluate(load: Load, recording: str, json_path: Path | None, tracking: bool)
         except NothingReadError as error:
             write_json(json_path, error.figures)
             raise error.refusal from None
-    write_json(json_path, result.to_json())
+    if json_path is not None:
+        write_json(json_path, with_provenance(result.to_json(), bundle=decoder.bundle.path, recording=Path(recording)))
     click.echo(describe(result))
     if result.figures.air_bits_per_symbol <= 0:
         warn(WORTH_NOTHING)
