@@ -108,7 +108,7 @@ def _files(folder: Path) -> Iterator[Path]:
 def command() -> str:
     """Return the command that is running, with its arguments."""
     spec = getattr(sys.modules["__main__"], "__spec__", None)
-    program = f"python -m {spec.name}" if spec is not None else Path(sys.argv[0]).name
+    program = Path(sys.argv[0]).name if spec is None else f"python -m {spec.name.removesuffix('.__main__')}"
     return f"{program} {shlex.join(sys.argv[1:])}".strip()
 
 
