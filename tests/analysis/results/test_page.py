@@ -87,10 +87,7 @@ def test_the_readme_says_what_the_kept_figures_say() -> None:
 
 def test_kept_figures_say_where_they_are_from() -> None:
     configurations = {BEGUN, "mlserver-model.json", "mlserver-settings.json"}
-    listed = subprocess.run(
-        ["git", "ls-files", "analysis/*.json"], cwd=ROOT, check=True, capture_output=True, text=True
-    )
-    paths = [ROOT / name for name in listed.stdout.split() if Path(name).name not in configurations]
+    paths = [path for path in (ROOT / "analysis").rglob("*.json") if path.name not in configurations]
     assert paths
     for path in paths:
         found = Provenance.model_validate(json.loads(path.read_text("utf-8")).get(PROVENANCE, {}))
