@@ -9,6 +9,7 @@ that is kept is not collected: it is not finished.
 from __future__ import annotations
 
 import sys
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -132,6 +133,15 @@ class Results:
         asked = [profile, *data_set]
         return next((of for of in self.bounds() if [of[key] for key in ("profile", *_DATA_SET)] == asked), None)
 
+    def origins(self) -> list[tuple[tuple[str, str], list[str]]]:
+        """Return the names of measurements by their commit, shortened, and their source."""
+        found = defaultdict[tuple[str, str], list[str]](list)
+        for name, measurement in self.measurements.items():
+            of = measurement.provenance
+            source = "notebook" if "notebook" in of.source else "output" if of.source else "complete"
+            found[of.commit[:7], source].append(name)
+        return list(found.items())
+
     def _miss(self, what: str) -> None:
         if what not in self.missing:
             self.missing.append(what)
@@ -142,7 +152,7 @@ def render(results: Results) -> str:
     environment = Environment(
         autoescape=False, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
     )
-    environment.filters |= {"digits": digits, "kilobytes": kilobytes, "thousands": thousands, "degrees": "{:g}".format}
+    environment.filters |= {"digits": digits, "kilobytes": kilobytes, "thousands": thousands}
     source = Path(__file__).with_name(TEMPLATE).read_text("utf-8")
     return environment.from_string(source).render(
         results=results,
