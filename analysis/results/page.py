@@ -50,8 +50,8 @@ PICTURED = "sheared"
 """The comparison whose picture the page shows."""
 TEMPLATE = "results.md.j2"
 LEDGER_LABELS = {
-    "bright": "quarter scale, 4x4, 15,000 electrons, shipped",
-    "32e": "quarter scale, 4x4, 32 electrons, two passes",
+    "bright": "bench, 4x4, 15,000 electrons, shipped",
+    "32e": "bench, 4x4, 32 electrons, two passes",
     "full-size 4x4 fast": "full size, 4x4, 32 electrons, `fast`",
     "full-size 4x4 standard": "full size, 4x4, 32 electrons, `standard`",
     "full-size 4x4": "full size, 4x4, 32 electrons, two passes",
