@@ -13,8 +13,7 @@ from lightpage.cli.progress_bar import percent_bar
 from lightpage.demo.demo import run_demo
 from lightpage.demo.result import DemoResult
 from lightpage.errors import InvalidInputError
-from lightpage.files import write_json
-from lightpage.metrics.provenance import with_provenance
+from lightpage.metrics.provenance import write_figures
 from lightpage.runtime.archives.recordings.coded_pages import AIR_LEVELS
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 
@@ -40,11 +39,9 @@ def demo(bundle: str, out: Path, seed: int, spec: str | None, json_path: Path | 
         raise InvalidInputError(f"--out {out}", error, "a folder that can be written") from None
     with percent_bar() as progress:
         result = run_demo(bundle_path(bundle), out, seed, progress, spec)
-    figures = with_provenance(result.to_json(), bundle=bundle_path(bundle), options={"seed": seed, "source": spec})
-    figures["seconds"] = time.perf_counter() - start
-    write_json(out / "demo.json", figures)
-    if json_path is not None:
-        write_json(json_path, figures)
+    figures = result.to_json() | {"seconds": time.perf_counter() - start}
+    for path in (out / "demo.json", json_path):
+        write_figures(path, figures, bundle=bundle_path(bundle), options={"seed": seed, "source": spec})
     write_figure(result, out / "demo.png")
     click.echo(describe(result))
     click.echo(f"\nwritten to {out}: demo.json, demo.png, pages.h5, pictures ({figures['seconds']:.0f} s)")

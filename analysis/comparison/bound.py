@@ -24,9 +24,8 @@ from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, load_device
 from lightpage.errors import InvalidInputError
-from lightpage.files import write_json
 from lightpage.metrics.information import own_information
-from lightpage.metrics.provenance import with_provenance
+from lightpage.metrics.provenance import write_figures
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 from lightpage.page.symbols import random_symbols
 from lightpage.progress import track
@@ -95,10 +94,10 @@ def main(
         bound = LightBound(profile, device, random_symbols(profile, levels, 1, rng)[0], levels)
         places = rng.integers(profile.page_shape, size=(symbols, 2))
         found.append([bound.concentration(row, column) for row, column in places.tolist()])
-        write_json(json_path, with_provenance({"asked": asked, "concentrations": found}, asked=asked))
+        write_figures(json_path, {"asked": asked, "concentrations": found}, asked=asked)
     each = bits([one for page in found[:pages] for one in page], levels, np.random.default_rng(seed))
     figures = {"bits": float(each.mean()), "standard_error": float(each.std(ddof=1) / np.sqrt(each.size))}
-    write_json(json_path, with_provenance({"asked": asked, **figures, "concentrations": found}, asked=asked))
+    write_figures(json_path, {"asked": asked, **figures, "concentrations": found}, asked=asked)
     click.echo(f"bound {figures['bits']:.3f} +- {figures['standard_error']:.3f} bits a symbol, {each.size} symbols")
 
 

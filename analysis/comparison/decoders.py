@@ -37,8 +37,7 @@ from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFolder
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, Sensor, ideal_device
-from lightpage.files import write_json
-from lightpage.metrics.provenance import with_provenance
+from lightpage.metrics.provenance import write_figures
 from lightpage.train.fitting.memory import keep_freed_memory
 from lightpage.train.models.hyperparameters import Hyperparameters
 from lightpage.train.models.presets import FAST
@@ -190,7 +189,7 @@ def main(
                 }
                 figures = {"pages": pages, "seed": seed, "data_sets": [*measured, data_set]}
                 inputs = {"profile": nominal.to_toml(), "weights": trained / Path(profile_name).stem}
-                write_json(out / "figures.json", with_provenance(figures, **inputs))
+                write_figures(out / "figures.json", figures, **inputs)
                 draw([*measured, data_set], out)
         measured.append(data_set)
         click.echo(f"\n{title(data_set)}")

@@ -30,7 +30,7 @@ from analysis.gpu.kept_form import Form, Scene, form_of, scene_of
 from lightpage.errors import InvalidInputError
 from lightpage.export.operators.batches import BatchFile
 from lightpage.files import write_json
-from lightpage.metrics.provenance import PROVENANCE, commit, with_provenance
+from lightpage.metrics.provenance import PROVENANCE, commit, provenance
 from lightpage.runtime.model.decoding.batch_graph import SHIFT
 from lightpage.runtime.model.execution.providers import Provider
 from lightpage.runtime.model.execution.session import BoundSession, open_session
@@ -365,7 +365,7 @@ def main(
     machine = Machine.of(provider)
     torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
     card = torch.cuda.get_device_name(0) if provider == CUDA else "cpu"
-    kept = Kept(out / "gpu.json", with_provenance({"card": card}, weights=folder))
+    kept = Kept(out / "gpu.json", {"card": card, PROVENANCE: provenance(weights=folder).to_json()})
     kept.part("ceilings", lambda: ceilings(machine))
     scene = scene_of(folder, simulated or out)
     for preset in presets:

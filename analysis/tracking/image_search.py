@@ -38,8 +38,7 @@ from analysis.tracking.wrong_pages import false_acquisitions
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFolder
 from lightpage.errors import InvalidInputError
-from lightpage.files import write_json
-from lightpage.metrics.provenance import with_provenance
+from lightpage.metrics.provenance import write_figures
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 
 WANTED_SHARE = 0.98
@@ -66,7 +65,7 @@ class FigureStore:
         if name not in self.figures:
             self.figures[name] = make()
             inputs = {"bundle": bundle_path(DEFAULT), "weights": TRAINED / "bench" / NOISY}
-            write_json(self.path, self.figures | with_provenance({}, **inputs))
+            write_figures(self.path, self.figures, **inputs)
         part: Figures = self.figures[name]
         return part
 

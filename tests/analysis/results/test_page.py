@@ -30,14 +30,8 @@ def outcome(method: str, air: float, gained: float = 0.001) -> dict[str, Any]:
 
 
 def toy(*outcomes: dict[str, Any], angle_deg: float = -0.6) -> dict[str, Any]:
-    data_set = {
-        "angle_deg": angle_deg,
-        "full_well_e": 32.0,
-        "exposure": 0.5,
-        "symbol_size_px": 4,
-        "outcomes": list(outcomes),
-    }
-    return {"pages": 60, "seed": 1, "data_sets": [data_set]}
+    light = {"angle_deg": angle_deg, "full_well_e": 32.0, "exposure": 0.5, "symbol_size_px": 4}
+    return {"pages": 60, "seed": 1, "data_sets": [light | {"outcomes": list(outcomes)}]}
 
 
 def written(path: Path, figures: object) -> Path:
@@ -109,9 +103,8 @@ def test_figures_are_collected_without_their_curves_and_what_lacks_is_left_out(t
     path = written(tmp_path / "runs" / "sheared" / "figures.json", {PROVENANCE: ORIGIN, **figures})
     (path.parent / "figure.png").write_bytes(b"picture")
     (tmp_path / "kept").mkdir()
-    Measurement(toy(outcome("ray", 1.0)), Provenance(source="a document"), "a caveat").write(
-        tmp_path / "kept" / "sheared.json"
-    )
+    earlier = Measurement(toy(outcome("ray", 1.0)), Provenance(), "a caveat")
+    earlier.write(tmp_path / "kept" / "sheared.json")
     done = command(tmp_path, "--from", tmp_path / "runs")
     assert done.exit_code == 0
     kept = kept_measurements(tmp_path / "kept")
@@ -121,7 +114,7 @@ def test_figures_are_collected_without_their_curves_and_what_lacks_is_left_out(t
         del one["training_curve"], one["validation_curve"]
     assert kept["sheared"].figures == figures
     assert (tmp_path / "images" / "decoders.png").read_bytes() == b"picture"
-    assert "| published, ray localizer | 2.34 |  | 1.17 |" in (tmp_path / "results" / "index.md").read_text()
+    assert "| published, ray localizer | 2.34 | open | 1.17 |" in (tmp_path / "results" / "index.md").read_text()
     # a comparison that is not finished replaces nothing
     written(path, {PROVENANCE: ORIGIN, **toy(outcome("ray", 3.0))})
     command(tmp_path, "--from", tmp_path / "runs")
