@@ -188,7 +188,7 @@ def symbols(profile: str, size_px: int) -> str:
 def bound_name(figures: Figures) -> str:
     """Return the name under which a bound is kept."""
     angle, well, exposure, size = (f"{figures[key]:g}" for key in _DATA_SET)
-    return f"{BOUND}{figures['profile']}-{angle}deg-{well}e-{exposure}x-{size}px"
+    return f"{BOUND}{figures['profile']}_{angle}deg_{well}e_{exposure}x_{size}px"
 
 
 def copy_picture(path: Path, to: Path) -> None:
