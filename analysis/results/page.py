@@ -139,8 +139,8 @@ class Results:
         for name, measurement in self.measurements.items():
             of = measurement.provenance
             source = "notebook" if "notebook" in of.source else "output" if of.source else "complete"
-            found[of.commit[:7], source].append(name)
-        return list(found.items())
+            found[of.commit[:7], source].append("bounds" if name.startswith(BOUND) else name)
+        return [(origin, list(dict.fromkeys(names))) for origin, names in found.items()]
 
     def _miss(self, what: str) -> None:
         if what not in self.missing:
