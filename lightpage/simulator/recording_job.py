@@ -19,7 +19,7 @@ from lightpage.recording.writer import RecordingWriter
 from lightpage.simulator.engine import CPU, NUMPY, engine_on
 from lightpage.simulator.simulator import LIGHT, Simulator
 
-_SYMBOLS = 3
+SYMBOLS = 3
 """Random stream of the pages' symbols, beside those of the simulator."""
 
 
@@ -104,7 +104,7 @@ class RecordingJob:
 
     def _append(self, writer: RecordingWriter, simulator: Simulator, page: int) -> None:
         if self._written is None:
-            rng = np.random.default_rng([self.seed, _SYMBOLS, page])
+            rng = np.random.default_rng([self.seed, SYMBOLS, page])
             symbols = random_symbols(self.profile, self.levels, 1, rng)[0]
         else:
             symbols = self._written[page]

@@ -180,7 +180,7 @@ class TrueOptics:
         """Light that the SLM makes of nominal phases, [ny, nx]."""
         xp = self.engine.xp
         noise = np.exp(1j * noise_rad) if isinstance(noise_rad, float) else xp.exp(1j * noise_rad)
-        shown = modulated(slm, with_crosstalk(page_phase, slm.crosstalk_relative, xp), xp) * noise
+        shown: Complex = modulated(slm, with_crosstalk(page_phase, slm.crosstalk_relative, xp), xp) * noise
         if self._dead_pixels is not None:
             dead, light = self._dead_pixels
             shown[dead] = light

@@ -166,8 +166,9 @@ class RayLocalizer(Localizer):
         half = torch.tensor(self._half, dtype=torch.float64, device=self.places.device)
         at = torch.tensor(angle, dtype=torch.float64, device=self.places.device)
         with forward_ad.dual_level():
-            traced = self.tracer((self.places * half).reshape(-1, 2), forward_ad.make_dual(at, torch.ones_like(at)))
-            places, slopes = forward_ad.unpack_dual(traced.places)
+            moving: Tensor = forward_ad.make_dual(at, torch.ones_like(at))  # type: ignore[no-untyped-call]
+            traced = self.tracer((self.places * half).reshape(-1, 2), moving)
+            places, slopes = forward_ad.unpack_dual(traced.places)  # type: ignore[no-untyped-call]
         slopes = torch.zeros_like(places) if slopes is None else slopes  # of a pipe that no ray meets
         valid, shape = traced.valid[:, None], self.places.shape
         landed = torch.where(valid, places / half, _FAR).reshape(shape).float()
