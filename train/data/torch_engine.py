@@ -111,7 +111,8 @@ class TorchEngine:
     def spline(self, image: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
         """See `Engine`: a prefilter of two convolutions, then four samples along either axis."""
         padded = functional.pad(image.float()[None, None], (2 * _REACH,) * 4, mode="replicate")
-        coefficients = functional.conv2d(functional.conv2d(padded, self._prefilter.mT), self._prefilter)[0, 0]
+        with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # 10 bits would be seen
+            coefficients = functional.conv2d(functional.conv2d(padded, self._prefilter.mT), self._prefilter)[0, 0]
         height, width = coefficients.shape
         (top, down), (left, across) = (
             _nearest(places.clip(-1, count), limit - 4, _REACH)
