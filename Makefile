@@ -16,7 +16,7 @@ export PYTHONDONTWRITEBYTECODE =
 export ORT_DISABLE_TELEMETRY = 1
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMEXPR_NUM_THREADS=1
 
-.PHONY: help setup demo demo-hardware test pytest test-busy test-long planted test-lowest messages bench bench-gpu bench-speed bench-service bench-other-servers bench-scaling dashboard soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image sbom check-image check-camera-image lock licences audit proto lint format clean
+.PHONY: help setup demo demo-hardware test pytest test-busy test-long planted test-lowest messages bench bench-gpu bench-speed bench-service bench-other-servers bench-scaling dashboard soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results site image sbom check-image check-camera-image lock licences audit release-check proto lint format clean
 .DELETE_ON_ERROR:
 
 help:  ## list the targets
@@ -193,6 +193,9 @@ results: $(STAMP)  ## write docs/results.md from analysis/results: RESULTS_ARGS=
 proto: $(STAMP)  ## regenerate the gRPC stubs from proto/
 	$(BIN)/uv run --quiet --python $(BIN)/python proto/generate.py
 
+site: $(STAMP)  ## build the site of docs/ and of the reference made of the code, into build/site; a broken link is an error
+	$(ONE_THREAD) $(BIN)/python release/build_site.py
+
 image:  ## build the container image (IMAGE_TARGET=runtime, camera, deep, gpu or ray; RELEASE=1 BASE=NAME@sha256:DIGEST; IMAGE_PLATFORM)
 	LIGHTPAGE_RELEASE=$(RELEASE) LIGHTPAGE_BASE=$(BASE) LIGHTPAGE_PLATFORM=$(IMAGE_PLATFORM) \
 	    release/build_image.sh $(IMAGE_TARGET) $(IMAGE_TAG)
@@ -216,6 +219,10 @@ licences: $(STAMP)  ## list the licences of all that is in the image, by its SBO
 
 audit: $(STAMP)  ## ask for known vulnerabilities of the locked packages; ends with 3 where nobody could tell of all
 	$(BIN)/python release/audit.py
+
+RELEASE_STEPS ?=
+release-check: $(STAMP)  ## the checklist of a release: versions, wheels in empty environments, site, notebooks, image, planted faults
+	$(BIN)/python release/check_release.py $(RELEASE_STEPS)
 
 clean:  ## remove what was built and measured, and leave the environment
 	rm -rf build out .pytest_cache .mypy_cache .ruff_cache

@@ -70,7 +70,7 @@ def in_half(model: bytes, fed: Collection[str]) -> bytes:
 
 
 def rounded(model: bytes, fed: Collection[str]) -> bytes:
-    """What `in_half` makes, in float32 with every number rounded to float16: to see on a CPU what a GPU would do.
+    """Return `in_half` in float32 with every number rounded to float16: a CPU shows so what a GPU would do.
 
     A CPU has few kernels of float16. Its runtime casts around each node, and leaves out two casts that meet, and with
     them most of the rounding. Arguments as for `in_half`. To be opened without optimisations.
@@ -140,7 +140,7 @@ class _Graph:
 
 
 def deviation(expected: NDArray[np.float32], got: NDArray[np.float32]) -> float:
-    """How far p [2, ny, nx] is off, over its length: the 99th percentile of a page's symbols."""
+    """Return how far p [2, ny, nx] is off, over its length: the 99th percentile of a page's symbols."""
     length = np.maximum(np.linalg.norm(expected, axis=0), np.finfo(np.float32).tiny)
     return float(np.percentile(np.linalg.norm(got - expected, axis=0) / length, _PERCENTILE))
 

@@ -35,7 +35,7 @@ LEVELS = 256
 
 @dataclass(frozen=True)
 class Outcome:
-    """One device. Angles in degrees; what could not be measured is None."""
+    """Outcome of one device. Angles in degrees; None where a figure could not be measured."""
 
     seed: int
     angle_deg: float
@@ -142,7 +142,7 @@ class Bench:
         return self.profile.pipe.angle_deg + float(np.rad2deg(found.parameters[NAMES.index("pipe_angle_rad")]))
 
     def _relation_error_px(self, found: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
-        """What of the cameras' displacements from the truth is not common to both, root mean square over the page."""
+        """Return the difference of the cameras' displacements from the truth, root mean square over the page."""
         grid = field_grid(self.profile)
         places = np.stack(np.meshgrid(grid.x_m[::16], grid.y_m[::16]), axis=-1).reshape(-1, 2)
         in_phase, quadrature = self.twin.pixels(found, places) - self.twin.pixels(truth, places)

@@ -1,1 +1,1 @@
-"""What execution providers can run: their operators by version and type, and which nodes of a graph they lack."""
+"""Operators of execution providers by version and type, and the nodes of a graph that they lack."""

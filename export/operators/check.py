@@ -165,7 +165,7 @@ class _Graph:
         return (node for node in self.nodes if not self.constants.issuperset(node.output))
 
     def tensor(self, name: str) -> _Tensor:
-        """What is known of a tensor."""
+        """Return what is known of a tensor."""
         return self._tensors.get(name, _Tensor(None, None))
 
     def schema(self, node: onnx.NodeProto) -> OpSchema | None:
@@ -178,7 +178,7 @@ class _Graph:
 
 
 def _tensors(model: onnx.ModelProto, foreign: Collection[str]) -> dict[str, _Tensor]:
-    """What is known of every tensor: inferred from the inputs on, and what the model itself says where that ends.
+    """Return the known types of every tensor: inferred from the inputs on, and by the model itself where that ends.
 
     Args:
         foreign: tensors whose types ONNX cannot infer and the model's word is taken for.
@@ -235,7 +235,7 @@ def _range(kernel: Kernel) -> str:
 
 
 def _wrong_types(kernel: Kernel, variables: Mapping[str, str], graph: _Graph) -> list[tuple[str, str]]:
-    """What is there and what a kernel takes, of tensors whose type it does not take.
+    """Return what is there and what a kernel takes, of tensors whose type it does not take.
 
     Args:
         variables: type variable of every tensor, by its name.

@@ -27,7 +27,7 @@ def dtype_name(name: str) -> str:
 
 @dataclass(frozen=True)
 class Kernel:
-    """One implementation of an operator.
+    """An implementation of an operator.
 
     Attributes:
         since, until: versions of the operator that it implements; without `until` it implements `since` alone.
@@ -39,7 +39,7 @@ class Kernel:
     types: Mapping[str, frozenset[str]]
 
     def implements(self, version: int) -> bool:
-        """Whether onnxruntime takes it for this version of the operator.
+        """Return whether onnxruntime takes it for this version of the operator.
 
         A kernel that is registered for "20 and later" is taken for version 20 alone: whether it does what a later
         version wants is not known. Source: `VerifyVersion` in onnxruntime/core/framework/kernel_registry.cc.
@@ -49,7 +49,7 @@ class Kernel:
 
 @dataclass(frozen=True)
 class Operator:
-    """What a provider has of one operator.
+    """A provider's implementations of one operator.
 
     Attributes:
         kernels: implementations.
@@ -67,7 +67,7 @@ class Operator:
 
 @dataclass(frozen=True)
 class OperatorList:
-    """What a provider can run.
+    """The operators that a provider can run.
 
     Attributes:
         provider: its name in onnxruntime.

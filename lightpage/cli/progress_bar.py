@@ -1,4 +1,4 @@
-"""What commands say on stderr on their way: bars on a terminal, elsewhere a line now and then; and warnings."""
+"""Progress and warnings of commands on stderr: bars on a terminal, elsewhere a line now and then."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class _Lines(tqdm):  # type: ignore[type-arg]
 
     @property
     def format_dict(self) -> dict[str, Any]:
-        """What a line is made of; tqdm itself ends some descriptions with a colon and some without."""
+        """Return what a line is made of; tqdm itself ends some descriptions with a colon and some without."""
         parts = dict(super().format_dict)
         parts["prefix"] = f"{str(parts['prefix']).rstrip(': ')}:"
         return parts

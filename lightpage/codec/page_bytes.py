@@ -1,4 +1,4 @@
-"""What a page of user bytes says of itself, and what it gave: plain facts that need no code."""
+"""Facts of a page of user bytes: its header and the outcome of decoding it. They need no code."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ LOSSES = {
 
 @dataclass(frozen=True)
 class FileFacts:
-    """What every page says of the file that it belongs to.
+    """The file that a page belongs to, as each of its pages states it.
 
     Attributes:
         data_pages, parity_pages: k and m of a group, 0 to 255.
@@ -87,18 +87,18 @@ class FileFacts:
     checksum: int
 
     def to_bytes(self) -> bytes:
-        """As they stand on the page."""
+        """Return the bytes of the header as they stand on the page."""
         return bytes([self.data_pages, self.parity_pages]) + self.checksum.to_bytes(CRC32C_BYTES, "big")
 
     @classmethod
     def parse(cls, data: bytes) -> FileFacts:
-        """What `to_bytes` has made."""
+        """Return what `to_bytes` has made."""
         return cls(data[0], data[1], int.from_bytes(data[2:FILE_BYTES], "big"))
 
 
 @dataclass(frozen=True)
 class PageBytes:
-    """What a page gave.
+    """The outcome of decoding a page.
 
     Attributes:
         header: as it stands on the page; to be believed only where there is data. None where it could not be read.

@@ -1,1 +1,1 @@
-"""What a device should be (profile) and what it is (state)."""
+"""The nominal device (profile) and the true one (state)."""

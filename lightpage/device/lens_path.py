@@ -35,7 +35,7 @@ class SeidelTerms(NamedTuple):
     """Of y R^2."""
 
     def mirrored(self) -> SeidelTerms:
-        """Of the same lens met from the facet, as a lens from camera plane to facet whose adjoint is used.
+        """Return the path of the same lens met from the facet: a lens from camera plane to facet whose adjoint is used.
 
         The second lens is the first one's mirror image, so light takes the same path the other way. Camera coordinates
         are turned by half a turn, which changes the sign of the odd terms; the adjoint's conjugate changes all.
@@ -50,7 +50,7 @@ class SeidelTerms(NamedTuple):
 
     @property
     def couples(self) -> bool:
-        """Whether any term depends on the field; defocus does not."""
+        """Return whether any term depends on the field; defocus does not."""
         return not all(isinstance(term, float) and term == 0.0 for term in self._replace(defocus=0.0))
 
     def defocus_at(self, x: Any, y: Any) -> Any:

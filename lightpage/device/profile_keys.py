@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, get_args
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -14,6 +16,7 @@ from lightpage.device.problems import tables_in
 from lightpage.device.profile import Profile, toml_value
 
 _BOUNDS = {"gt": "above", "ge": "from", "lt": "below", "le": "up to"}
+_KINDS = {bool: "true or false", int: "whole number", float: "number", Path: "path", dict: "a table"}
 _WIDTH = 44
 
 
@@ -72,31 +75,52 @@ def commented_toml(profile: Profile) -> str:
 
 
 def _key(table: str, name: str, field: FieldInfo) -> Key:
-    default = field.default
     return Key(
         table,
         name,
-        _wanted(field.annotation, list(field.metadata)),
-        "" if default is None or default is PydanticUndefined else toml_value(default),
+        wanted(field.annotation, list(field.metadata)),
+        default_of(field),
         field.is_required(),
         field.description or "",
     )
 
 
-def _wanted(annotation: Any, metadata: list[Any]) -> str:
-    """Return type and bounds in words; what a union or an annotated type holds counts too."""
-    kind = "text"
-    for part in (annotation, *(inner for one in get_args(annotation) for inner in (one, *get_args(one)))):
-        if part in (int, float):
-            kind = "whole number" if part is int else "number"
-        elif isinstance(part, FieldInfo):
-            metadata = [*metadata, *part.metadata]
-        elif type(part) is int:  # of a literal
-            return toml_value(part)
+def default_of(field: FieldInfo) -> str:
+    """Return the value of a key that is left out, as TOML writes it; empty where it must be given, or means none."""
+    default = field.default
+    if isinstance(default, BaseModel):
+        return "its defaults"
+    return "" if default is None or default is PydanticUndefined else toml_value(default)
+
+
+def wanted(annotation: Any, metadata: list[Any]) -> str:
+    """Return type and bounds of a key in words.
+
+    Args:
+        annotation: type of the key's field.
+        metadata: what pydantic knows of it beside the type.
+    """
+    origin, parts = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        inner = [one for more in parts[1:] for one in (more.metadata if isinstance(more, FieldInfo) else [more])]
+        return wanted(parts[0], [*metadata, *inner])
+    if origin is Literal:
+        return " or ".join(toml_value(part) for part in parts)
+    if origin in (Union, UnionType):
+        return " or ".join(dict.fromkeys(wanted(part, metadata) for part in parts if part is not NoneType))
+    if origin is tuple:
+        return f"list of {wanted(parts[0], metadata)}"
     bounds = [
-        f"{word} {getattr(one, name):g}" for name, word in _BOUNDS.items() for one in metadata if hasattr(one, name)
+        f"{word} {_number(getattr(one, name))}"
+        for name, word in _BOUNDS.items()
+        for one in metadata
+        if hasattr(one, name)
     ]
-    return ", ".join((kind, *bounds))
+    return ", ".join((_KINDS.get(annotation, "text"), *bounds))
+
+
+def _number(value: float) -> str:
+    return str(value) if isinstance(value, int) else f"{value:g}"
 
 
 def _first_line(model: type[BaseModel]) -> str:

@@ -1,4 +1,4 @@
-"""What one device truly is: its deviations from the nominal profile, known only to a simulator."""
+"""The true state of one device: its deviations from the nominal profile, known only to a simulator."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Geometry(TomlTable):
 
 
 class CameraPose(TomlTable):
-    """Where one camera truly sits: similarity transform about its centre, shift in camera pixels."""
+    """The true pose of one camera: similarity transform about its centre, shift in camera pixels."""
 
     scale_relative_error: Annotated[float, Field(gt=-0.5, lt=0.5)] = 0.0
     rotation_deg: Angle = 0.0
@@ -281,7 +281,7 @@ def load_device(name_or_path: str | Path) -> Device:
 
 
 class Spread(NamedTuple):
-    """From where to where calibration must find a number, and how it scatters among rough devices.
+    """The range in which calibration must find a number, and the scatter of that number among rough devices.
 
     Attributes:
         low, high: ends of the range.

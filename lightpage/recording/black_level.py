@@ -1,4 +1,4 @@
-"""What a camera counts without light, and pixels that always see some: taken off, or mended, before anything else."""
+"""Black level and hot pixels of a camera: taken off, or mended, before anything else reads the counts."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def without_black(frame: Counts, black_level: int, bit_depth: int) -> Counts:
 
 @dataclass(frozen=True)
 class DarkFrame:
-    """What one camera sees without light.
+    """One camera's counts without light.
 
     Attributes:
         mean: counts [row, column], rounded mean of some exposures.
@@ -53,7 +53,7 @@ class DarkFrame:
 
     @classmethod
     def of(cls, frames: NDArray[np.unsignedinteger[Any]], bit_depth: int, subject: str = "dark frames") -> DarkFrame:
-        """From exposures without light.
+        """Return the black level and the hot pixels that exposures without light show.
 
         Args:
             frames: counts [exposure, row, column].

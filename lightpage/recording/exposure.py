@@ -1,4 +1,4 @@
-"""Whether a camera frame shows light that can be used: counts within the bit depth, neither black nor saturated.
+"""Checks of a camera frame's exposure: counts within the bit depth, neither black nor saturated.
 
 Counts may lie at the upper end of their bits, as 12 bits do in `Mono16` of many cameras. Such counts are multiples, of
 16 for 12 bits in 16. They are as good as others, but their greatest one, 4095 * 16, is not full scale, so that
@@ -68,7 +68,7 @@ def check_light(name: str, frame: Counts, bit_depth: int) -> None:
 
 
 def unused_low_bits(frame: Counts, bit_depth: int) -> int | None:
-    """How many of the lowest bits no count of a frame uses.
+    """Return how many of the lowest bits no count of a frame uses.
 
     Args:
         frame: counts [row, column].
@@ -95,5 +95,5 @@ def greatest_count(bit_depth: int, unused: int) -> int:
 
 
 def describe(bit_depth: int, unused: int) -> str:
-    """For people, what counts are whose lowest bits are not used."""
+    """Describe counts whose lowest bits are not used."""
     return f"counts that are multiples of {2**unused}: {bit_depth - unused} bits left-aligned in {bit_depth}"

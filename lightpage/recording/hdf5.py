@@ -35,7 +35,7 @@ _UNFINISHED = ("unable to lock file", "already open for", "truncated file")
 
 
 def retried(call: Callable[[], T], renew: Callable[[], object] = lambda: None) -> T:
-    """What `call` returns, tried up to three times where storage fails for a moment.
+    """Return what `call` returns, tried up to three times where storage fails for a moment.
 
     Args:
         call: reads or writes, by HDF5 or the system.
@@ -120,7 +120,7 @@ def open_once(path: Path, subject: str) -> h5py.File:
 
 
 def _lacks_locks(error: OSError) -> bool:
-    """Whether a file could not be opened because its file system has no locks, or it is open without one already."""
+    """Return whether opening failed since the file system has no locks, or the file is open without one already."""
     text = str(error)
     return "locking flag" in text or ("unable to lock file" in text and error_number(error) != errno.EAGAIN)
 
@@ -134,7 +134,7 @@ def open_named(path: Path, subject: str, variable: str) -> h5py.File:
 
 
 def find(file: h5py.File, name: str, subject: str) -> Any:
-    """What lies under a path in a file, or None where nothing is there, or HDF5's null.
+    """Return what lies under a path in a file, or None where nothing is there, or HDF5's null.
 
     Raises:
         RecordingError: a link that leads to nothing.
@@ -189,7 +189,7 @@ def resolved(name: str, file: Path, prefixes: str) -> Path:
 
 
 def _may_be(path: Path) -> bool:
-    """Whether a file is there; where the system does not say, opening it will tell why."""
+    """Return whether a file is there; where the system does not say, opening it will tell why."""
     try:
         path.stat()
     except OSError as error:

@@ -21,7 +21,7 @@ _SYMBOL_PAGES_AT_ONCE = 64
 
 @dataclass(frozen=True)
 class Header:
-    """What holds for all pages of a recording.
+    """Facts that hold for all pages of a recording.
 
     Attributes:
         subject: the recording, for error messages.

@@ -51,7 +51,7 @@ def join(paths: Sequence[Path], out: Path) -> None:
 
 
 def _kind(path: Path) -> dict[str, Any]:
-    """What recordings must have in common, in words."""
+    """Return what recordings must have in common, in words."""
     with Recording.open(path) as recording:
         pilots = recording.pilots()
         return {

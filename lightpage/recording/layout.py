@@ -36,7 +36,7 @@ LOSSES = "cameras/losses"
 
 @dataclass(frozen=True)
 class FrameInfo:
-    """What a camera and its driver say of a frame.
+    """Facts of a frame that a camera and its driver state.
 
     Attributes:
         serial: of the camera.

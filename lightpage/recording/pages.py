@@ -165,7 +165,7 @@ class Pages:
 
     @property
     def code(self) -> str | None:
-        """What the pages hold, JSON text, or None."""
+        """Return what the pages hold, JSON text, or None."""
         text = self._file.attribute("code")
         return text if isinstance(text, str) else None
 

@@ -176,7 +176,7 @@ class Recording(AbstractContextManager["Recording"]):
 
 @dataclass(frozen=True)
 class CameraNotes:
-    """What a recording has of its cameras beside the frames; each is None, or empty, where it was not noted.
+    """A recording's notes of its cameras beside the frames; each is None, or empty, where it was not noted.
 
     Attributes:
         file: the recording.
@@ -196,7 +196,7 @@ class CameraNotes:
             self.file.array(name)
 
     def frame_infos(self, page: int) -> tuple[FrameInfo, FrameInfo] | None:
-        """What the cameras said of a page's in-phase and quadrature frame.
+        """Return what the cameras said of a page's in-phase and quadrature frame.
 
         Raises:
             RecordingError: no such page, or the data cannot be read, or do not fit the frames.
@@ -220,7 +220,7 @@ class CameraNotes:
         return first, second
 
     def dark_frames(self) -> FramePair | None:
-        """What the cameras saw without light, as it was."""
+        """Return what the cameras saw without light, as it was."""
         found = self._both(DARK)
         return None if found is None else FramePair(*found)
 

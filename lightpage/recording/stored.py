@@ -212,7 +212,7 @@ class ArrayFile:
 
 @dataclass(frozen=True)
 class _Part:
-    """What a virtual dataset shows of one source: element by element, along each axis, in order.
+    """The part of a virtual dataset that comes from one source: element by element, along each axis, in order.
 
     Attributes:
         path, name: of the source.
@@ -479,7 +479,7 @@ class StoredArray:
                 raise StorageError(self.subject, f"no data of {end.path}", "storage that answers")
 
     def _selected(self, space: Any) -> list[Slab | NDArray[np.intp]]:
-        """What a mapping selects along each axis; nothing where it is the whole array."""
+        """Return what a mapping selects along each axis; nothing where it is the whole array."""
         kind = space.get_select_type()
         if kind == hdf.h5s.SEL_ALL:
             return []
@@ -536,7 +536,7 @@ def _moved(indices: Indices, by: int) -> Indices:
 
 
 def _at(axes: Sequence[Indices]) -> Any:
-    """What selects these indices of an array."""
+    """Return what selects these indices of an array."""
     if all(isinstance(axis, range) for axis in axes):
         return tuple(slice(axis.start, axis.stop, axis.step) for axis in axes if isinstance(axis, range))
     return np.ix_(*axes)

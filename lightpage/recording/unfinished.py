@@ -29,7 +29,7 @@ CUT_OFF = (OSError, KeyError, RuntimeError, TypeError, ValueError)
 
 @dataclass(frozen=True)
 class Identity:
-    """What a recording's pages are of, by which an unfinished one is known again.
+    """The origin of a recording's pages, by which an unfinished recording is known again.
 
     Attributes:
         profile: nominal profile.
@@ -54,7 +54,7 @@ class Identity:
         return told | ({"black_level": self.black_level} if self.black_level else {})
 
     def difference(self, file: h5py.File, pages: int) -> str:
-        """Of what else the pages of a file are; empty if they are the same."""
+        """Return the first difference between two origins in words; empty if they are the same."""
         own = self.attributes()
         for names, what in (
             (("profile",), "another profile"),
@@ -77,7 +77,7 @@ class Identity:
 
 
 def partial_path(path: Path) -> Path:
-    """Where a recording lies until it is complete and gets its name `path`."""
+    """Return where a recording lies until it is complete and gets its name `path`."""
     return path.with_name(path.name + ".partial")
 
 
@@ -144,7 +144,7 @@ def discard_partial(path: Path) -> None:
 
 
 def taken(partial: Path, *, remove: bool) -> bool:
-    """Whether `partial` is there, writable and written by nobody else; `remove` unlinks it while that is certain.
+    """Return whether `partial` is there, writable and written by nobody else; `remove` unlinks it while that holds.
 
     HDF5 holds this same lock on a file as long as it is open for writing.
 

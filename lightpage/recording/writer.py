@@ -337,7 +337,7 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
 
 
 def _is_same(dataset: h5py.Dataset, value: NDArray[Any], exactly: bool) -> bool:
-    """Whether a dataset holds a value, or at least one of its kind."""
+    """Return whether a dataset holds a value, or at least one of its kind."""
     if exactly:
         return np.array_equal(dataset[()], value)
     return dataset.shape == value.shape and dataset.dtype == value.dtype

@@ -1,4 +1,4 @@
-"""What a service answers, as a caller of it sees it."""
+"""Answers of a service, as its callers see them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class RemoteTimings:
 
 @dataclass(frozen=True)
 class RemoteFrame:
-    """What a camera says of a frame.
+    """A camera's facts of a frame.
 
     Attributes:
         serial: of the camera.
@@ -124,7 +124,7 @@ def remote_page(reply: pb.DecodeReply, read: pb.ReadPageReply | None = None) -> 
 
 
 class ModelOrigin(StrEnum):
-    """Where a model came from."""
+    """Origin of a model."""
 
     GIVEN = "given"
     RECALIBRATED = "recalibrated"
@@ -156,7 +156,7 @@ class ModelInfo:
 
 @dataclass(frozen=True)
 class ServiceLimits:
-    """How much a service takes.
+    """Limits of a service.
 
     Attributes:
         message_bytes, chunk_bytes, pair_bytes: largest message, chunk of frames, and pair of frames.
@@ -182,7 +182,7 @@ class ServiceLimits:
 
 @dataclass(frozen=True, repr=False)
 class Description:
-    """What a service is."""
+    """Description of a service."""
 
     service_version: str
     model: ModelInfo
@@ -271,7 +271,7 @@ class Recalibrated:
 
 
 class JobState(StrEnum):
-    """How a job stands."""
+    """State of a job."""
 
     RUNNING = "RUNNING"
     DONE = "DONE"
@@ -321,7 +321,7 @@ def job_info(job: pb.Job) -> JobInfo:
 
 @dataclass(frozen=True)
 class DisplayOrder:
-    """What a controller is to show.
+    """Order to a controller: the page to show, or the beams to set.
 
     Attributes:
         page: number of the page that the service waits for, None where it waits for none.

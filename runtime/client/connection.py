@@ -86,7 +86,7 @@ class Connection:
 
     @property
     def description(self) -> Description:
-        """What the service was when it was last asked; raises as `ask` where it is asked for the first time."""
+        """Return what the service was when it was last asked; raises as `ask` where it is asked for the first time."""
         return self._description or self.describe()
 
     def close(self) -> None:
@@ -102,7 +102,7 @@ class Connection:
 
 
 class SubClient:
-    """What a client has of one kind of calls.
+    """A client's part for one kind of calls.
 
     Args:
         connection: to the service.

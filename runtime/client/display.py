@@ -1,4 +1,4 @@
-"""What a controller does that shows pages, or moves shutters, for the service's source."""
+"""Calls of a controller that shows pages, or moves shutters, for the service's source."""
 
 from __future__ import annotations
 

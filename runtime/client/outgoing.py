@@ -1,4 +1,4 @@
-"""What a caller asks of a page, and how its frames and symbols are sent."""
+"""Requests of a caller: options of a page, and the messages of its frames and symbols."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lightpage.runtime.client.wire.messages import PIXEL_TYPES, message_of
 
 
 class PageOptions(TypedDict, total=False):
-    """What a caller wants to have of a page, and whose pages it is followed with. All may be left out.
+    """Options of a page: the parts that the caller wants, and the session that it belongs to. All may be left out.
 
     Attributes:
         want_concentration: also get kappa.
@@ -51,7 +51,7 @@ class KnownPilots:
 
 
 class FrameOptions(PageOptions, total=False):
-    """What a caller says of frames, beside what it wants to have of their page. All may be left out.
+    """Facts of frames, beside the options of their page. All may be left out.
 
     Attributes:
         bit_depth: bits of a camera count; by default those of the service's camera.

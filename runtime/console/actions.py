@@ -1,4 +1,4 @@
-"""What a person may do with the console: recalibrate, and go back to the model before."""
+"""Actions of a person on the console: recalibrate, and go back to the model before."""
 
 from __future__ import annotations
 

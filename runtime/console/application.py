@@ -1,4 +1,4 @@
-"""What the HTTP server of a service answers: the console, its actions, and metrics for Prometheus."""
+"""The HTTP application of a service: console, actions, and metrics for Prometheus."""
 
 from __future__ import annotations
 

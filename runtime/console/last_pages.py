@@ -1,4 +1,4 @@
-"""What the console shows of the last pages: their figures, the losses, and the last frames."""
+"""The last pages on the console: their figures, the losses, and the last frames."""
 
 from __future__ import annotations
 

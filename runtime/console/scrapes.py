@@ -1,4 +1,4 @@
-"""What a running service says over HTTP: its pages, its metrics, and what has happened between two scrapes of these."""
+"""Scrapes of a running service over HTTP: its pages, its metrics, and the changes between two scrapes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Labels = frozenset[tuple[str, str]]
 
 
 def url_of(address: str, path: str = "", tls: TlsFiles | None = None) -> str:
-    """Where a page is of the service whose `--metrics-port` is at HOST:PORT; `tls` as in `fetch`."""
+    """Return where a page is of the service whose `--metrics-port` is at HOST:PORT; `tls` as in `fetch`."""
     return f"http{'s' if tls else ''}://{address}/{path}"
 
 
@@ -67,7 +67,7 @@ def fetch(subject: str, address: str, path: str, tls: TlsFiles | None = None) ->
 
 
 def _wanted(tls: TlsFiles | None) -> str:
-    """What an address is to be of, for people."""
+    """Return what an address is to be of, for people."""
     expected = "a service that runs with --metrics-port: `lightpage serve --metrics-port 9100`"
     return expected if tls else f"{expected}; if it has TLS, --ca, --certificate and --key too"
 
@@ -89,7 +89,7 @@ class Scrape:
         return self.samples.get((name, frozenset(labels.items())), math.nan)
 
     def values(self, name: str, **labels: str) -> dict[Labels, float]:
-        """Those of a name that have at least these labels."""
+        """Return the values of a name that have at least these labels."""
         asked = frozenset(labels.items())
         return {own: value for (known, own), value in self.samples.items() if known == name and asked <= own}
 
@@ -143,12 +143,12 @@ class Scrapes:
 
     @property
     def change(self) -> Change | None:
-        """From the first one kept to the last; None where there is no scrape yet."""
+        """Return the change from the first scrape kept to the last; None where there is no scrape yet."""
         return Change(self._kept[0], self._kept[-1]) if self._kept else None
 
 
 class Change:
-    """What has happened between two scrapes.
+    """The change between two scrapes.
 
     Args:
         before, now: scrapes of the same process.
@@ -168,7 +168,7 @@ class Change:
         return [(dict(own), value - self.before.samples.get((name, own), 0.0)) for own, value in found.items()]
 
     def rise(self, name: str, **labels: str) -> float:
-        """By how much counters with at least these labels rose, all together."""
+        """Return the rise of counters with at least these labels, all together."""
         return sum(rise for _, rise in self._risen(name, **labels))
 
     def rate(self, name: str, **labels: str) -> float:
@@ -176,7 +176,7 @@ class Change:
         return self.rise(name, **labels) / self.seconds if self.seconds > 0 else math.nan
 
     def rises(self, name: str, label: str) -> dict[str, float]:
-        """By how much counters rose, by one of their labels, those left out that did not; the largest first."""
+        """Return the rises of counters that rose, by one of their labels, the largest first."""
         sums = defaultdict[str, float](float)
         for own, rise in self._risen(name):
             sums[own.get(label, "")] += rise
@@ -205,7 +205,7 @@ class Change:
 
 
 def _restarted(before: Scrape, now: Scrape) -> bool:
-    """Whether another process answers: its start is another one, or a counter fell."""
+    """Return whether another process answers: its start is another one, or a counter fell."""
     started = "process_start_time_seconds"
     if not math.isnan(now.value(started)) and not math.isnan(before.value(started)):
         return now.value(started) != before.value(started)

@@ -1,4 +1,4 @@
-"""What the console says of a service."""
+"""The state of a service as the console shows it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _SERIES = [figure.name for figure in fields(PageRow) if figure.type == "float | 
 
 
 class ConsoleState:
-    """What the console says.
+    """The state that the console shows.
 
     Args:
         last_pages: what is known of them.
@@ -87,7 +87,7 @@ class ConsoleState:
 
 
 def _condition(rows: list[PageRow], due: bool, now: float) -> str:
-    """How the service fares, in a word."""
+    """Return how the service fares, in a word."""
     if not rows:
         return "no page yet"
     if any(row.lost or row.unread for row in rows[-5:]):

@@ -199,7 +199,7 @@ class _Healing:
         self.model = _Model(*self._with(self._start))
 
     def _found(self) -> ImagePosition:
-        """Where the image lies: where one page's pilots are found, or else where it was, if those of all agree there.
+        """Return the image position: by one page's pilots, or else where it was, if those of all pages agree there.
 
         Raises:
             RecalibrationRefusedError: no page shows it.
@@ -231,7 +231,7 @@ class _Healing:
         return self._shown.look(model.decoder, model.last).read
 
     def count(self, model: _Model) -> int:
-        """How many pages a model reads."""
+        """Return how many pages a model reads."""
         return sum(page.loss is None for page in self._read(model))
 
     def unread(self, model: _Model) -> str:
@@ -298,7 +298,7 @@ class _Healing:
 
 
 def _shows_light(decoder: Decoder, pair: FramePair) -> bool:
-    """Whether a decoder takes the frames, and finds the light of a page on them."""
+    """Return whether a decoder takes the frames, and finds the light of a page on them."""
     try:
         decoder.check(pair)
         decoder.infer(pair, doubtful=True)

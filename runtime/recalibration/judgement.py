@@ -1,4 +1,4 @@
-"""Whether a re-fitted model is as good as the one in service."""
+"""Judgement of a re-fitted model against the one in service."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class JudgedPage:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What two decoders read of the same held-back pages, bits per symbol.
+    """Figures of two decoders on the same held-back pages, bits per symbol.
 
     Attributes:
         before: AIR of the one in service; pages that it would not give out count with no bits.

@@ -96,7 +96,7 @@ class KnownPages:
 
     @property
     def fitted_count(self) -> int:
-        """How many of these pages `near` was fitted to."""
+        """Return how many of these pages `near` was fitted to."""
         return sum(hash_frames(pair) in self.fitted for pair in self.pairs)
 
     def part(self, pages: slice) -> KnownPages:

@@ -42,7 +42,7 @@ FIT_PAGES = 1
 
 @dataclass(frozen=True)
 class RefitReport:
-    """What a fit says of itself; None where it does not know.
+    """Figures of a fit; None where the fit does not know them.
 
     Attributes:
         angle_deg: fitted pipe angle.

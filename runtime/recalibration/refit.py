@@ -144,7 +144,7 @@ def traced(
 
 
 def _find(decoder: Decoder, twin: Twin, pages: KnownPages, references: FramePair) -> ImagePosition | None:
-    """Where the image of the first page lies against the earlier calibration; None where the search does not find it.
+    """Return the image position of the first page against the earlier calibration; None where no search finds it.
 
     It is looked for there and where the service saw it last.
 

@@ -1,4 +1,4 @@
-"""What the process of a recalibration does, which `separate_process` starts."""
+"""The work of a recalibration's process, which `separate_process` starts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What may be at work at once: slots, first come, first served, bytes of frames that were received, what has hung."""
+"""Limits on work under way: slots, first come, first served; bytes of received frames; decodes that hang."""
 
 from __future__ import annotations
 
@@ -84,12 +84,12 @@ class Slots:
 
     @property
     def usual_s(self) -> float:
-        """What a slot was lately held for, the median in seconds; 0 where nothing was done lately."""
+        """Return what a slot was lately held for, the median in seconds; 0 where nothing was done lately."""
         taken = self._taken()
         return median(taken) if taken else 0.0
 
     def expected_wait_s(self) -> float:
-        """How long whoever comes now will wait for a slot, seconds."""
+        """Return how long whoever comes now will wait for a slot, seconds."""
         with self._lock:
             ahead = len(self._queue) + (0 if self._free else 1)
         return self.usual_s * ahead / self.count
@@ -174,7 +174,7 @@ class Slots:
         return max(MARGIN * median(taken), taken[ceil(SLOW * len(taken)) - 1]) if taken else 0.0
 
     def _taken(self) -> list[float]:
-        """What was lately taken, the shortest first."""
+        """Return what was lately taken, the shortest first."""
         since = self._clock.now() - FORGET_S
         with self._lock:
             return sorted(seconds for ended, seconds in self._lately if ended >= since)

@@ -1,4 +1,4 @@
-"""Whoever calls the service, and the call: who they are, what they may do, how long they wait, whether they left."""
+"""Callers of the service and their calls: identity, rights, patience, and whether they have left."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 
 class Role(StrEnum):
-    """What a caller may do. Every role may look; none but `ADMIN` includes another."""
+    """The rights of a caller. Every role may look; none but `ADMIN` includes another."""
 
     READ = "read"
     """See what the service is and does."""
@@ -53,7 +53,7 @@ class Identity:
     until: float = math.inf
 
     def may(self, role: Role) -> bool:
-        """Whether it has a role, or one that includes it."""
+        """Return whether it has a role, or one that includes it."""
         return role in self.roles or Role.ADMIN in self.roles or (role is Role.READ and bool(self.roles))
 
     def check(self, role: Role, what: str, now: float) -> None:
@@ -101,7 +101,7 @@ MOST_SESSIONS = 256
 
 
 class Sessions(Generic[T]):
-    """What belongs to each session: what the pages of different callers show is kept apart.
+    """State of each session: the pages of different callers are kept apart.
 
     Args:
         make: makes what belongs to a new one.
@@ -113,7 +113,7 @@ class Sessions(Generic[T]):
         self._known: OrderedDict[str, T] = OrderedDict()
 
     def of(self, session: str) -> T:
-        """What belongs to a session."""
+        """Return what belongs to a session."""
         with self._lock:
             if (found := self._known.pop(session, None)) is None:
                 found = self._make(session)
@@ -123,14 +123,14 @@ class Sessions(Generic[T]):
             return found
 
     def all(self) -> list[T]:
-        """What belongs to those that are remembered."""
+        """Return what belongs to those that are remembered."""
         with self._lock:
             return list(self._known.values())
 
 
 @dataclass(frozen=True)
 class Actor:
-    """Who does something to the service, for its records.
+    """The author of a change to the service, for its records.
 
     Attributes:
         name: address of a caller, or what in the service acts by itself.
@@ -146,7 +146,7 @@ NOBODY = Actor("the service")
 
 
 class Caller:
-    """Whoever waits for an answer. The default waits for ever and never leaves.
+    """A caller that waits for an answer. The default waits for ever and never leaves.
 
     Args:
         seconds_left: how long the caller still waits, infinite without a deadline.
@@ -208,7 +208,7 @@ class Caller:
 
 @dataclass
 class Call:
-    """What a handler knows of its call beside the request.
+    """Facts of a call beside its request, for its handler.
 
     Attributes:
         method: name of the RPC.
@@ -232,7 +232,7 @@ class Call:
 
     @property
     def actor(self) -> Actor:
-        """Who calls, for records."""
+        """Return the caller's name, for records."""
         return Actor(f"{self.identity.name} at {self.peer}" if self.identity.name else self.peer, self.correlation_id)
 
     def own(self, name: str) -> str:
@@ -240,12 +240,12 @@ class Call:
         return name and own_name(name, self.identity.name)
 
     def session(self, name: str) -> str:
-        """Where the pages of a session that the caller named are followed; empty for none."""
+        """Return where the pages of a session that the caller named are followed; empty for none."""
         return name and named_session(name, self.identity.name)
 
     @property
     def connection_session(self) -> str:
-        """Where the pages of its connection are followed; empty where gRPC has one name for all connections."""
+        """Return where the pages of its connection are followed; empty where gRPC has one name for all connections."""
         return "" if self.peer.startswith("unix:") else f"connection {self.own(self.peer)}"
 
     async def in_thread(self, work: Callable[[], T], otherwise: Callable[[], None] | None = None) -> T:

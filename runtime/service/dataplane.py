@@ -1,4 +1,4 @@
-"""What all calls share, without a word of gRPC: the models, the source, and how a page is decoded and told of."""
+"""The data plane that all calls share, without a word of gRPC: models, source, decoding, and observers of pages."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _LEAST_WAIT_S = 1e-3
 
 
 class Seen:
-    """What becomes known of a page while it is read and decoded.
+    """Facts of a page that become known while it is read and decoded.
 
     Args:
         subject, page_index, model_version: see `Observation`.
@@ -129,7 +129,7 @@ class Answer:
 
     @property
     def recalibration_due(self) -> bool:
-        """Whether the device has changed since it was calibrated, as this page or many together show."""
+        """Return whether the device has changed since it was calibrated, as this page or many together show."""
         return self.page.check.recalibration_due or bool(self.monitor_signs)
 
 
@@ -219,7 +219,7 @@ class DataPlane:
 
     @property
     def has_source(self) -> bool:
-        """Whether `read_page` can work."""
+        """Return whether `read_page` can work."""
         return self._source is not None
 
     def ahead(self, alone: int = 1) -> int:
@@ -277,7 +277,7 @@ class DataPlane:
         self.monitors.begin(model.version)
 
     def waiting(self, caller: Caller) -> Callable[[], None]:
-        """What to call again and again while a caller's page waits for others: no decode hangs for that.
+        """Return what to call again and again while a caller's page waits for others: no decode hangs for that.
 
         It raises `CallerLeft` once the caller has gone, and `SlotsTakenError` once its time is up.
         """

@@ -1,4 +1,4 @@
-"""What the server has to know of an RPC before its handler runs, written at the handler."""
+"""Facts of an RPC that the server needs before its handler runs, written at the handler."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 @dataclass(frozen=True)
 class Rpc:
-    """How an RPC is served.
+    """Way in which an RPC is served.
 
     Attributes:
         role: that its callers need.

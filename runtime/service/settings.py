@@ -55,7 +55,7 @@ _HealthAddress = Annotated[str, checked(_check_health_address)]
 
 
 class ServiceTable(SettingsTable):
-    """What is served, and where. Each description is the help of an option of `serve`."""
+    """The served bundle and source, and their addresses."""
 
     bundle: Text = Field(DEFAULT, description="A bundle's path, or the name of a shipped one.")
     bundle_key: File | None = Field(None, description="Public key, PEM, that bundles must be signed with.")
@@ -136,7 +136,7 @@ class TlsTable(SettingsTable):
 
 
 class MetricsTable(SettingsTable):
-    """Where metrics and the console are shown; without a port, nowhere."""
+    """The address of metrics and console; without a port they are not shown."""
 
     host: Text = Field("127.0.0.1", description="Where the figures are shown.")
     port: int | None = Field(None, ge=0, le=65535, description="Show metrics and console on this port.")
@@ -145,7 +145,7 @@ class MetricsTable(SettingsTable):
 
 
 class TracesTable(SettingsTable):
-    """Where spans of calls are sent; without an endpoint, nowhere."""
+    """The collector of spans of calls; without an endpoint none are sent."""
 
     endpoint: Annotated[str, checked(check_endpoint)] | None = None
     """Of a collector that takes OTLP over gRPC, http://HOST:PORT or https://HOST:PORT."""

@@ -1,4 +1,4 @@
-"""Where a page's time goes: at every moment of its way exactly one stage runs, so that all of them are the whole."""
+"""Stages of a page's way: exactly one runs at every moment, so that their times add up to the whole."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Lap:
 
     @property
     def seconds(self) -> float:
-        """How long it was."""
+        """Return how long it was."""
         return self.end - self.start
 
 
@@ -90,11 +90,11 @@ class Stages:
 
     @property
     def elapsed_s(self) -> float:
-        """From its start to its end, or to now."""
+        """Return the seconds from its start to its end, or to now."""
         return (self._clock() if self._end is None else self._end) - self.start
 
     def seconds(self) -> dict[Stage, float]:
-        """How long each stage took until now, those left out that never ran."""
+        """Return how long each stage took until now, those left out that never ran."""
         with self._lock:
             laps = list(self.laps)
             if self._end is None and self._running is not None:

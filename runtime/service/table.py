@@ -1,4 +1,4 @@
-"""What a table of the service's settings is: checked TOML, with rules among its keys."""
+"""Base class of the service's settings tables: checked TOML, with rules among its keys."""
 
 from __future__ import annotations
 

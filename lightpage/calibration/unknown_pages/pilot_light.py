@@ -105,7 +105,7 @@ class PilotLight:
     def _look(
         self, parameters: Real, branches: Sequence[str], shift_m: tuple[float, float] = (0.0, 0.0)
     ) -> tuple[Real, Complex]:
-        """Where both cameras see the pilots' points [cameras, B, N, S, 2], and what takes their phase off [B, N, S]."""
+        """Return the pilots' points on both cameras [cameras, B, N, S, 2], and the phasor of their phase [B, N, S]."""
         rays = self._twin.trace(parameters, self._points, self._anchors)
         chosen, shape = [BRANCHES.index(name) for name in branches], (len(branches), len(self.centres), _SAMPLES**2)
         phases = rays.phases[chosen].reshape(shape) + self._phases[:, None]
@@ -134,7 +134,7 @@ def told_nats(light: Complex, expected: Real) -> Real:
 
 
 def told_slope(light: Complex, expected: Real) -> Complex:
-    """What the real part of its product with a change of light [..., branches, N], summed, adds to `told_nats`."""
+    """Return the slope of `told_nats`: the real part of its product with a change of light [..., branches, N]."""
     _, share, along, power = _coherent(light, expected)
     by_share = (expected.size - 1) / (1 - share)
     norm = np.sum(expected**2)

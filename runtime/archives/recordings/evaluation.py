@@ -78,7 +78,7 @@ class Evaluation:
 
     @property
     def page_kb(self) -> float:
-        """What a page carries, by its AIR."""
+        """Return what a page carries, by its AIR."""
         return page_kilobytes(self.figures.air_bits_per_symbol, self.symbols_per_page)
 
     def to_json(self) -> dict[str, Any]:
@@ -110,7 +110,7 @@ class NothingReadError(LightpageError):
 
 
 def was_seen(decoder: Decoder, frames: FramePair) -> bool:
-    """Whether the bundle was calibrated or trained on a page, whichever type its counts were stored in then."""
+    """Return whether the bundle was calibrated or trained on a page, whichever type its counts were stored in then."""
     manifest = decoder.bundle.manifest
     seen = {*manifest.calibrated_pages, *manifest.trained_pages}
     return bool(seen) and not seen.isdisjoint(page_hashes(frames))
@@ -139,7 +139,7 @@ def check_symbols(recording: Recording, purpose: str = "measure against") -> Non
 
 
 def pilots_of(decoder: Decoder, recording: Recording) -> NDArray[np.bool_]:
-    """Where the pilots of a recording's pages are, [ny, nx]: as it says itself, or else the bundle's."""
+    """Return where the pilots of a recording's pages are, [ny, nx]: as it says itself, or else the bundle's."""
     own = recording.pilots()
     return decoder.bundle.pilot_mask if own is None else own
 

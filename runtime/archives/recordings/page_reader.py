@@ -42,7 +42,7 @@ _CURABLE = frozenset({Loss.OPTICS, Loss.HEADER, Loss.BODY, Loss.CHECKSUM})
 
 @dataclass(frozen=True)
 class RecoveredPage:
-    """What became of one recorded page.
+    """Outcome of one recorded page.
 
     Attributes:
         page: its number in the recording.

@@ -47,7 +47,7 @@ class RefusedPage:
 
 
 def unconfirmed(refused: Sequence[RefusedPage]) -> int:
-    """How many of the pages were decoded and not confirmed."""
+    """Return how many of the pages were decoded and not confirmed."""
     return sum(page.unconfirmed for page in refused)
 
 

@@ -1,4 +1,4 @@
-"""How far a device may drift until pages of a code are lost, by pages that were recorded before it did.
+"""Drift that pages of a code survive, judged by pages that were recorded before the device drifted.
 
 A decoder whose table is traced for a geometry that is off reads them as a right one reads a device that has drifted as
 far the other way.

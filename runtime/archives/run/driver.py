@@ -24,7 +24,7 @@ TOLD = 5
 
 @dataclass
 class Progressed:
-    """What one run has done.
+    """Progress of one run.
 
     Attributes:
         pages: that were read, or are lost.
@@ -50,7 +50,7 @@ class Progressed:
 
     @property
     def pages_per_s(self) -> float | None:
-        """Of all workers together; None where nothing was to do, or it took no time."""
+        """Return the pages a second of all workers together; None where nothing was to do, or it took no time."""
         return self.pages / self.seconds if self.pages and self.seconds else None
 
     def count(self, outcome: Outcome) -> int:
@@ -73,7 +73,7 @@ class Progressed:
         warn(str(problem))
 
     def state(self) -> str:
-        """For a bar."""
+        """Return the state in words, for a progress bar."""
         parts = {"lost": self.lost, "failed": self.failed, "workers died": self.restarts}
         return ", ".join(f"{name} {count}" for name, count in parts.items() if count)
 

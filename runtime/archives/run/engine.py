@@ -1,4 +1,4 @@
-"""How ranges are spread over workers: one small interface, of which there are several engines."""
+"""The interface of engines, which spread ranges over workers."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Engine(Protocol):
     """Workers that are at work or wait for it; of a cluster, for how many its CPUs suffice."""
 
     def run(self, tasks: Iterable[Task]) -> Generator[Outcome, None, None]:
-        """What became of each task, in whatever order they end; each exactly once.
+        """Return what became of each task, in whatever order they end; each exactly once.
 
         Tasks are taken from the iterable as workers become free, so that few are held at once. A worker that dies costs
         the range that it was at; that is given to another one, `ATTEMPTS` times in all. Workers end with

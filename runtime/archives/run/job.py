@@ -1,4 +1,4 @@
-"""What a bulk run was asked: written into its folder once, so that the next run goes on with the same question."""
+"""The question of a bulk run, written into its folder once, so that the next run goes on with the same question."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Source(Plain):
 
 
 class Job(Plain):
-    """What a run was asked.
+    """The question of a run.
 
     Attributes:
         format, version: of this file.
@@ -74,7 +74,7 @@ class Job(Plain):
 
     @classmethod
     def read(cls, folder: Path) -> Job | None:
-        """That of a folder; None where no run has begun there.
+        """Read the question of a folder; None where no run has begun there.
 
         Raises:
             InvalidInputError: it cannot be read.
@@ -122,7 +122,7 @@ class Job(Plain):
         return self.model_copy(update={"bundles": tuple(bundles), "sources": tuple(again)})
 
     def passing(self) -> bool:
-        """Whether a recording or bundle could not be opened for a reason that may pass."""
+        """Return whether a recording or bundle could not be opened for a reason that may pass."""
         tried = (source.problem for source in self.sources if not source.given_up)
         return any(problem is not None and problem.passes for problem in tried)
 

@@ -58,7 +58,7 @@ class Part(Plain):
         return cls(index=int(match[1]), count=int(match[2]))
 
     def sources(self, job: Job) -> Iterator[tuple[int, Source]]:
-        """Its recordings, each with its place among the run's."""
+        """Return its recordings, each with its place among the run's."""
         for place, own in self.devices(job):
             yield from enumerate(own, place)
 
@@ -208,7 +208,7 @@ class Ledger:
                     yield task.model_copy(update={"pages": poor, "bundle": job.rounds[number - 1], "shard": shard})
 
     def pages(self, source: int, first: int, there: frozenset[str], rounds: int) -> list[PageRecord]:
-        """What is known of the pages of a range that was read: the reading of each that counts.
+        """Return what is known of the pages of a range that was read: the reading of each that counts.
 
         Args:
             source, first: the range.
@@ -250,7 +250,7 @@ class Ledger:
                     self.doubted.add(folder / name)
 
     def recalibrated(self, place: int) -> bool:
-        """Whether a device has a result, by the place of its first recording."""
+        """Return whether a device has a result, by the place of its first recording."""
         return self.shard(place, 0).name in self.results(place)
 
     def results(self, source: int) -> frozenset[str]:
@@ -266,7 +266,7 @@ class Ledger:
 
 
 def _task(job: Job, own: tuple[Source, ...], pages: tuple[int, ...], shard: Path) -> Task:
-    """What is done with pages of recordings that could be opened."""
+    """Return what is done with pages of recordings that could be opened."""
     first = own[0]
     return Task(
         choices=job.choices,

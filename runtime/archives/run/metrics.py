@@ -1,4 +1,4 @@
-"""What a bulk run shows to Prometheus: while it works to whoever scrapes, and after its end as a file."""
+"""Prometheus metrics of a bulk run: served while it works, written to a file after its end."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ def asked_job(
     retry_lost: bool,
     clock: Clock,
 ) -> Job:
-    """What is asked; that of the folder, where it is the same question or none.
+    """Return what is asked; that of the folder, where it is the same question or none.
 
     Args:
         folder: of the run.

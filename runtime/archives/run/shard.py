@@ -28,7 +28,7 @@ _WRITTEN = "what a bulk run has written; delete it to redo it"
 
 
 class PageState(StrEnum):
-    """What became of a page."""
+    """Outcome of a page."""
 
     READ = "read"
     LOST = "lost"
@@ -37,7 +37,7 @@ class PageState(StrEnum):
 
 
 class PageRecord(Plain):
-    """What became of a page.
+    """A page of a shard, and its outcome.
 
     Attributes:
         page: its number in the recording.
@@ -60,18 +60,18 @@ class PageRecord(Plain):
 
     @property
     def well(self) -> bool:
-        """Whether no other model could be asked for more: it was read, and the device is as it was calibrated."""
+        """Return whether no other model could do better: the page was read, and the device is as it was calibrated."""
         return self.state is PageState.LEFT_OUT or (self.state is PageState.READ and not self.recalibration_due)
 
     def better_than(self, earlier: PageRecord) -> bool:
-        """Whether this reading of a page counts in place of an earlier one: its pilots do not confirm less."""
+        """Return whether this reading of a page counts in place of an earlier one: its pilots do not confirm less."""
         if self.state is not PageState.READ or earlier.state is not PageState.READ:
             return self.state is PageState.READ
         return (self.confirmed_bits or 0.0) >= (earlier.confirmed_bits or 0.0)
 
 
 class Findings(Plain):
-    """What became of the pages of a range.
+    """Outcomes of the pages of a range.
 
     Attributes:
         pages: one each, in order.
@@ -121,7 +121,7 @@ class ShardRecord(Findings):
 
     @classmethod
     def read(cls, shard: Path) -> ShardRecord:
-        """What `write` has written.
+        """Return what `write` has written.
 
         Raises:
             InvalidInputError: it cannot be read.
@@ -138,7 +138,7 @@ _LOST = f'"state":"{PageState.LOST}"'.encode()
 
 
 def holds_losses(shard: Path) -> bool:
-    """Whether a shard's record holds lost pages; it need not be parsed for that.
+    """Return whether a shard's record holds lost pages; it need not be parsed for that.
 
     Raises:
         InvalidInputError, StorageError: the record cannot be read.
@@ -182,7 +182,7 @@ def write_user_bytes(shard: Path, pages: Sequence[tuple[int, PageBytes]]) -> Non
 
 
 def read_user_bytes(shard: Path) -> Iterable[tuple[int, PageBytes]]:
-    """What `write_user_bytes` has written: recorded numbers, and pages of which only header, file and data are told.
+    """Return the contents of `write_user_bytes`: recorded numbers, and pages with header, file and data alone.
 
     Raises:
         InvalidInputError: it cannot be read.

@@ -1,4 +1,4 @@
-"""What a worker is asked to do, and what it answers: small values that name pages and never hold any."""
+"""Tasks of workers and their answers: small values that name pages and never hold any."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lightpage.runtime.model.execution.providers import CPU
 
 
 class Operation(StrEnum):
-    """What is done with pages."""
+    """An operation on pages."""
 
     DECODE = "decode"
     RECOVER = "recover"
@@ -42,7 +42,7 @@ class Problem(Plain):
 
     @classmethod
     def of(cls, error: LightpageError) -> Problem:
-        """That of an error."""
+        """Return the cause of an error."""
         return cls(subject=error.subject, got=error.got, expected=error.expected, passes=may_pass(error))
 
     def about(self, device: str) -> Problem:
@@ -61,7 +61,7 @@ class Stamp(Plain):
 
     @classmethod
     def of(cls, path: Path) -> Stamp:
-        """That of a file.
+        """Return the identity of a file.
 
         Raises:
             OSError: there is none.
@@ -94,7 +94,7 @@ class RecordedFile(Plain):
 
 
 class FineTuning(Plain):
-    """How the network of a device is trained on, once its geometry is found.
+    """Settings of fine-tuning a device's network, once its geometry is found.
 
     Attributes:
         steps: of the optimiser.
@@ -118,7 +118,7 @@ KNOWN_PAGES = 2
 
 
 class Choices(Plain):
-    """What is asked beside recordings and bundles.
+    """Choices beside recordings and bundles.
 
     Attributes:
         operation: what is done.
@@ -177,7 +177,7 @@ class Task(Plain):
 
     @property
     def recalibrates(self) -> bool:
-        """Whether it is a device to recalibrate."""
+        """Return whether it is a device to recalibrate."""
         return self.choices.operation is Operation.RECALIBRATE
 
     @property
@@ -192,12 +192,12 @@ class Task(Plain):
 
     @property
     def weight(self) -> int:
-        """How many pages the work is worth in a count of all of it; a device that is recalibrated counts once."""
+        """Return the number of pages that the work counts as; a device that is recalibrated counts once."""
         return 1 if self.recalibrates else len(self.pages)
 
     @property
     def name(self) -> str:
-        """Of the range, for people."""
+        """Name the range, for people."""
         if self.recalibrates:
             more = len(self.files) - 1
             return f"recording {self.recording}" + (f" and {more} more" if more else "")
@@ -205,7 +205,7 @@ class Task(Plain):
 
 
 class Step(Plain):
-    """What a worker does with a device at the moment.
+    """The present step of a worker on a device.
 
     Attributes:
         device: its name.

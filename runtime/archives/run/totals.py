@@ -1,4 +1,4 @@
-"""What a bulk run has found, added up from its shards one after the other."""
+"""Findings of a bulk run, added up from its shards one after the other."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TOLD = 5
 
 
 class DeviceState(StrEnum):
-    """What became of a device that was to be recalibrated."""
+    """Outcome of a device that was to be recalibrated."""
 
     RECALIBRATED = "recalibrated"
     REFUSED = "refused"
@@ -74,7 +74,7 @@ class Means(dict[str, Mean]):
 
 @dataclass
 class Counts:
-    """What was found of pages, of a recording or of all.
+    """Counts of pages, of a recording or of all.
 
     Attributes:
         pages: all of them; of a fleet that is recalibrated, its devices.
@@ -125,7 +125,7 @@ class Counts:
 
 @dataclass
 class Round:
-    """What a later reading has brought.
+    """Gains of a later reading.
 
     Attributes:
         model: what read.
@@ -188,7 +188,7 @@ class Reading:
 
 @dataclass
 class Group(Counts):
-    """What was found of a device, or of a recording where there is no fleet.
+    """Findings of a device, or of a recording where there is no fleet.
 
     Attributes:
         recordings: that it has.
@@ -201,7 +201,7 @@ class Group(Counts):
 
 @dataclass
 class Totals(Counts):
-    """What a run has found.
+    """Findings of a run.
 
     Attributes:
         confidence_bins: of all pages of an evaluation together.
@@ -225,7 +225,7 @@ class Totals(Counts):
 
     @property
     def ece(self) -> float | None:
-        """Of an evaluation."""
+        """Return the expected calibration error of an evaluation."""
         bins = [
             ConfidenceBin(low, high, int(count), claimed / count, right / count)
             for (low, high), (count, claimed, right) in self.confidence_bins.items()

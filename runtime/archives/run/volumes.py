@@ -36,7 +36,7 @@ class Wanted:
     holes: bool = False
 
     def takes(self, volume: Volume) -> bool:
-        """Whether a volume's file is made."""
+        """Return whether a volume's file is made."""
         return self.volume_id in (None, volume.id) and self.checksum in (None, volume.checksum)
 
     def __str__(self) -> str:
@@ -114,7 +114,7 @@ def recovered_files(ledger: Ledger, job: Job, wanted: Wanted = ALL_FILES) -> lis
 
 
 def known_files(folder: Path) -> list[dict[str, Any]] | None:
-    """What became of the files of a run at the end of its last run; None where none has ended.
+    """Return what became of the files of a run at the end of its last run; None where none has ended.
 
     Raises:
         InvalidInputError: it cannot be read.

@@ -41,7 +41,7 @@ def recalibrated(
     deep: Callable[[], DeepRecalibration],
     tell: Callable[[Step], None],
 ) -> Findings:
-    """What becomes of a device; that its pages fit no geometry is a finding too. A deep recalibration is gone on with.
+    """Return the outcome of a device; pages that fit no geometry are one too. A deep recalibration is resumed.
 
     Args:
         task: which device.

@@ -32,7 +32,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class PageRange:
-    """What a worker reads.
+    """A range of pages for a worker to read.
 
     Attributes:
         task: which pages, and what is done with them.
@@ -47,7 +47,7 @@ class PageRange:
     tracker: Tracker
 
     def findings(self) -> Findings:
-        """What becomes of the pages; what they give beside it is written.
+        """Return what becomes of the pages; what they give beside it is written.
 
         Raises:
             LightpageError: something that says nothing of a page.

@@ -149,7 +149,7 @@ _worker: Worker | None = None
 
 
 def _work(task: Task, threads: int) -> Outcome:
-    """In a process of Ray: do a task."""
+    """Do a task, in a process of Ray."""
     global _worker
     if _worker is None:
         from lightpage.runtime.archives.workers.work import Worker

@@ -1,4 +1,4 @@
-"""What a worker does with a range: a warm decoder reads its pages in order and writes the shard."""
+"""Work of a worker on a range: a warm decoder reads its pages in order and writes the shard."""
 
 from __future__ import annotations
 

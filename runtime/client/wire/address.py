@@ -20,7 +20,7 @@ _ANSWER_S = 1.0
 
 
 def is_local(address: str) -> bool:
-    """Whether nobody beyond this machine can reach an address (HOST:PORT, HOST or unix:PATH)."""
+    """Return whether nobody beyond this machine can reach an address (HOST:PORT, HOST or unix:PATH)."""
     if address.startswith(_UNIX):
         return True
     host = (match[1] if (match := _HOST_PORT.fullmatch(address)) else address).strip("[]")
@@ -36,7 +36,7 @@ def host_and_port(host: str, port: int | str) -> str:
 
 
 def target_of(address: str, port: int) -> str:
-    """Where a client on this machine finds what listens at an address, HOST:PORT or unix:PATH, and got a port."""
+    """Return the target of a client on this machine for a listener at HOST:PORT or unix:PATH that got a port."""
     if address.startswith(_UNIX):
         return address
     host = address.rpartition(":")[0]
@@ -44,7 +44,7 @@ def target_of(address: str, port: int) -> str:
 
 
 def names_machine(host: str, known: Collection[str]) -> bool:
-    """Whether a request's ``Host`` names this machine in a way that no stranger can choose.
+    """Return whether a request's ``Host`` names this machine in a way that no stranger can choose.
 
     A page of a stranger may have its own name resolve to this machine (DNS rebinding), and then reads what is served
     there as if it were its own. An IP address, `localhost`, and names that somebody gave this service are not

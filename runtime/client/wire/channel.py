@@ -48,7 +48,7 @@ class Pem:
 
 @dataclass(frozen=True)
 class TlsFiles:
-    """What one end of a connection proves with who it is, and believes the other end by.
+    """Certificates of one end of a connection: its own, and the authorities that it trusts.
 
     Attributes:
         ca: certificates of the authorities that the other end's certificate may come from, PEM.
@@ -81,7 +81,7 @@ class TlsFiles:
         return pem
 
     def client_context(self) -> ssl.SSLContext:
-        """What an HTTP client connects with; raises as `read`."""
+        """Return what an HTTP client connects with; raises as `read`."""
         self.read()
         context = ssl.create_default_context(cafile=str(self.ca))
         context.load_cert_chain(self.certificate, self.key)

@@ -188,7 +188,7 @@ def _hints(kind: Callable[..., Any]) -> dict[str, Any]:
 
 
 def _prefix(enum: EnumDescriptor) -> str:
-    """What all names of an enumeration begin with, as that of its zero does."""
+    """Return what all names of an enumeration begin with, as that of its zero does."""
     return enum.values_by_number[0].name.removesuffix("UNSPECIFIED")
 
 

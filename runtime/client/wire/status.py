@@ -132,7 +132,7 @@ def detail_of(error: LightpageError) -> pb.ErrorDetail:
 
 
 def told(error: BaseException) -> str:
-    """What a caller reads. An unforeseen error gives its class only: its text may hold anything."""
+    """Return what a caller reads. An unforeseen error gives its class only: its text may hold anything."""
     error = foreseen(error)
     if isinstance(error, LightpageError):
         detail = detail_of(error)
@@ -174,7 +174,7 @@ def trailers(error: BaseException) -> tuple[tuple[str, bytes], ...]:
 
 
 def refusal_of(error: BaseException) -> pb.Refusal:
-    """How a call would have ended, for one page of many; an unforeseen error tells its class only."""
+    """Return how a call would have ended, for one page of many; an unforeseen error tells its class only."""
     error = foreseen(error)
     known = error if isinstance(error, LightpageError) else LightpageError("service", told(error), "an answer")
     return pb.Refusal(code=status_of(error).value[0], detail=detail_of(known), reason=reason_of(error))
@@ -201,7 +201,7 @@ def error_of(rpc: grpc.RpcError, target: str) -> LightpageError:
 
 
 def is_lost_connection(rpc: grpc.RpcError) -> bool:
-    """Whether a call ended since nobody was there any more, or in good time for another try, and no error was meant."""
+    """Return whether a call ended since the other end was gone, or early enough for another try, without an error."""
     call: Any = rpc
     if DETAIL_KEY in dict(call.trailing_metadata() or ()):
         return False

@@ -37,7 +37,7 @@ def check_metrics(address: str | None, insecure: bool, file: Path | None) -> Non
 
 @contextmanager
 def watched(ledger: Ledger, operation: Operation, address: str | None, file: Path | None) -> Iterator[Watch]:
-    """What keeps the metrics that were asked for; the file is written however the run ends."""
+    """Return what keeps the metrics that were asked for; the file is written however the run ends."""
     if address is None and file is None:
         yield Watch()
         return

@@ -1,4 +1,4 @@
-"""What `lightpage bulk` tells at its end: figures for programs, a table for people, and the error that it ends with."""
+"""The result of `lightpage bulk`: figures for programs, a table for people, and the error that it ends with."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lightpage.runtime.archives.run.volumes import RecoveredFile
 
 @dataclass(frozen=True)
 class Result:
-    """What a run was asked, has done and has found.
+    """The question, the work and the findings of a run.
 
     Attributes:
         job: what was asked.
@@ -131,7 +131,7 @@ class Result:
 
 
 def _device_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """What became of each device, for people."""
+    """Return what became of each device, for people."""
 
     def air(value: float | None) -> str:
         return "" if value is None else f"{value:.3f}"

@@ -109,7 +109,7 @@ def code(
 
 
 def _drifted_reading(decoder: Decoder, recording: Recording, needed: bool) -> DriftedReading | None:
-    """What reads pages as of a drifted device; None where a decoder's geometry cannot be moved, unless it is needed."""
+    """Return a reader of pages as of a drifted device; None where no geometry can be moved, unless it is needed."""
     try:
         return DriftedReading(decoder, recording)
     except (BundleError, CalibrationError) as error:

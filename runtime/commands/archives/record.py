@@ -86,7 +86,7 @@ def record(
 
 
 def _count(source: FrameSource, asked: int | None, symbols: Path | None) -> int:
-    """How many pages are to be recorded.
+    """Return how many pages are to be recorded.
 
     Raises:
         InvalidInputError: nobody says how many, or there are fewer.
@@ -103,7 +103,7 @@ def _count(source: FrameSource, asked: int | None, symbols: Path | None) -> int:
 
 
 def _identity(source: FrameSource, profile: Profile) -> Identity:
-    """What is known of the pages that a source shows before they are photographed."""
+    """Return what is known of the pages that a source shows before they are photographed."""
     if (pages := source.pages) is None:
         return Identity(profile, source.levels, source.bit_depth)
     symbols = pages.__getitem__ if len(pages) else None

@@ -130,7 +130,7 @@ def page_report(page: RemotePage) -> dict[str, Any]:
 
 
 def drifted(due: list[dict[str, Any]]) -> str:
-    """What to think of pages that confirm less than they would on the device as it was calibrated."""
+    """Return what to think of pages that confirm less than they would on the device as it was calibrated."""
     claimed, confirmed = (fmean(result[name] for result in due) for name in ("claimed_bits", "confirmed_bits"))
     pages = f"{len(due)} {'page' if len(due) == 1 else 'pages'}"
     return (
@@ -140,7 +140,7 @@ def drifted(due: list[dict[str, Any]]) -> str:
 
 
 def unknown_pistons(doubtful: list[dict[str, Any]]) -> str:
-    """What to think of pages whose pilots disagree."""
+    """Return what to think of pages whose pilots disagree."""
     pages = ", ".join(f"{result['page']} ({result['pilot_coherence']:.2f})" for result in doubtful)
     return (
         f"pilots agree to less than {LEAST_COHERENCE:g} on page {pages}: the piston is unknown, "
@@ -149,7 +149,7 @@ def unknown_pistons(doubtful: list[dict[str, Any]]) -> str:
 
 
 def table(results: list[dict[str, Any]]) -> str:
-    """One line a page."""
+    """Return a table with a line for each page."""
 
     def figure(value: float | None, form: str) -> str:
         return "-" if value is None else format(value, form)

@@ -189,7 +189,7 @@ def _start(client: LightpageClient, recording: str | None, pages: int, send: boo
 def _offline(
     bundle: str, recording: str, out: Path, pages: int, version: str | None, *, other_device: bool
 ) -> tuple[Recalibrated, RefitReport]:
-    """What came of it, and what the fit says of itself."""
+    """Return what came of it, and what the fit says of itself."""
     if out.exists():
         raise InvalidInputError(f"--out {out}", "something that exists", "a new path: bundles are never overwritten")
     if version is not None:

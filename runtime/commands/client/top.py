@@ -63,7 +63,7 @@ def top(address: str, interval: float, once: bool, tls: TlsFiles | None) -> None
 
 
 def view(scrapes: Scrapes, address: str, silent: str = "") -> RenderableType:
-    """What the scrapes say, for a terminal; `silent` says since when nobody answers, empty where somebody does."""
+    """Return the scrapes as text for a terminal; `silent` says since when nobody answers, empty where somebody does."""
     change = scrapes.change
     assert change is not None  # there is a scrape
     parts: list[RenderableType] = [_header(change, scrapes.restarts, address)]

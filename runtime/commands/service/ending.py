@@ -1,4 +1,4 @@
-"""How a service is told to end, and how its process ends whatever still computes."""
+"""The end of a service: signals that ask for it, and the end of its process whatever still computes."""
 
 from __future__ import annotations
 

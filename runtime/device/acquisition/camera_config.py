@@ -25,7 +25,7 @@ KEYS = "docs/cameras.md, all keys"
 
 
 class CameraTable(View, CameraSettings):
-    """One camera, and how it sees the image."""
+    """A camera, and its view of the image."""
 
     kind: Literal["genicam"] = "genicam"
 
@@ -84,7 +84,7 @@ class ExternalModulatorTable(TomlTable):
 
 
 class SimulatedTable(TomlTable):
-    """That of a simulated device."""
+    """The modulator, or the shutters, of a simulated device."""
 
     kind: Literal["simulated"]
     address: Annotated[str, Field(min_length=1)]

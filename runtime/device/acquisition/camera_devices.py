@@ -71,7 +71,7 @@ def _trigger(
 
 
 def _modulator(table: DeviceTable, place: str, folder: Path, profile: Profile, levels: int | None) -> Modulator | None:
-    """What shows the pages, of so many levels where that is known yet."""
+    """Return what shows the pages, of so many levels where that is known yet."""
     match table.modulator:
         case NoModulatorTable():
             return None
@@ -86,7 +86,7 @@ def _modulator(table: DeviceTable, place: str, folder: Path, profile: Profile, l
 
 
 def _greys(table: ScreenTable, folder: Path, levels: int | None) -> Callable[[int], NDArray[np.uint8]]:
-    """What makes a lookup table for the levels of the pages that are shown; tried with those that are known."""
+    """Return what makes a lookup table for the levels of the pages that are shown; tried with those that are known."""
     if table.lookup_table is None:
         return linear_table
     path = folder / table.lookup_table

@@ -1,4 +1,4 @@
-"""What becomes of one camera's frames before they are read."""
+"""Processing of one camera's frames before they are read."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Counts = NDArray[np.unsignedinteger[Any]]
 
 
 class View(TomlTable):
-    """How a camera sees the image: mirrored or not, as behind one more mirror.
+    """A camera's view of the image: mirrored or not, as behind one more mirror.
 
     Attributes:
         flip_x: left and right are the other way round.

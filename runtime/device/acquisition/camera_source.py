@@ -46,7 +46,7 @@ _AGAIN_S = 0.5
 
 
 class Exposures(StrictTable):
-    """How frames are taken.
+    """Numbers and times of exposures.
 
     Attributes:
         repeats: further shots of a page whose shot is lost, while it is on display.
@@ -233,7 +233,7 @@ class CameraSource(FrameSource):
         return pair
 
     def dark_frames(self) -> tuple[DarkFrame, DarkFrame]:
-        """What both cameras see without light, taken now; black level and hot pixels are minded from here on.
+        """Return what both cameras see without light, taken now; black level and hot pixels are minded from here on.
 
         Raises:
             LostShotError: they could not be taken.
@@ -262,7 +262,7 @@ class CameraSource(FrameSource):
         return page, self.pages[page]
 
     def _attempt(self, index: int, symbols: NDArray[np.uint8] | None, deadline: float) -> _Attempt:
-        """What takes a pair of a page. A further attempt leaves the page as it stands, where it still does."""
+        """Return what takes a pair of a page. A further attempt leaves the page as it stands, where it still does."""
         modulator, shown = self.modulator, False
         if modulator is None or symbols is None:
             return lambda: self._pairing.shot(deadline)

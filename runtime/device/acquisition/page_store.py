@@ -45,7 +45,7 @@ class PageStore:
 
     @property
     def code(self) -> str | None:
-        """What the pages of the file hold, JSON text, or None."""
+        """Return what the pages of the file hold, JSON text, or None."""
         with self._lock:
             return None if self._written is None else self._written.code
 

@@ -60,7 +60,7 @@ _FOLLOWING = 0.1
 
 
 class PairingSettings(StrictTable):
-    """How strictly frames are told apart.
+    """Tolerances of telling frames apart.
 
     Attributes:
         tolerance_s: largest deviation of a frame's time from its camera's reference. A wider one loses fewer shots to a
@@ -91,7 +91,7 @@ class PairingSettings(StrictTable):
 
 @dataclass
 class _Channel:
-    """One camera, and what is known of it.
+    """A camera, and the state of its clock and frames.
 
     Attributes:
         last_id: number of its last frame, None where it is not known.
@@ -146,12 +146,12 @@ class Pairing:
 
     @property
     def distrusted(self) -> bool:
-        """Whether so many shots in a row contradict what is remembered that the devices may not be set up any more."""
+        """Return whether so many shots in a row contradict the memory that the devices may have lost their settings."""
         return max(self._contradictions, self._skips) >= CONTRADICTIONS
 
     @property
     def synchronised(self) -> bool:
-        """Whether frames can be told apart now, without a synchronisation before."""
+        """Return whether frames can be told apart now, without a synchronisation before."""
         fresh = self.clock.now() - self._referenced_at < self.settings.expires_s
         return fresh and all(
             channel.reference_s is not None and channel.opened == channel.camera.opened for channel in self._channels

@@ -1,4 +1,4 @@
-"""What a frame source is, and how one is opened by its name.
+"""The interface of frame sources, and the opening of one by its name.
 
 Sources are entry points of the group `lightpage.sources`, so that another package may bring its own.
 """
@@ -38,7 +38,7 @@ def nobody(text: str) -> None:
 
 @dataclass(frozen=True)
 class Shot:
-    """One page as a source photographed it.
+    """A page as a source photographed it.
 
     Attributes:
         pair: both frames.
@@ -127,7 +127,7 @@ class FrameSource(ABC):
         return None
 
     def dark_frames(self) -> tuple[DarkFrame, DarkFrame] | None:
-        """What both cameras see without light, taken now, where the source can; it minds them from here on.
+        """Return what both cameras see without light, taken now, where the source can; it minds them from here on.
 
         Raises:
             LostShotError, SourceError: see `shot`.
@@ -135,7 +135,7 @@ class FrameSource(ABC):
         return None
 
     def page_count(self) -> int | None:
-        """How many pages it has, 0 where it shows pages and has none yet; None where any number can be photographed."""
+        """Return the number of its pages: 0 where it has none yet, None where any number can be photographed."""
         return None if self.pages is None else len(self.pages) or None
 
     def show_pages(self, pages: PageStore) -> None:

@@ -1,4 +1,4 @@
-"""One camera under Aravis: found, opened and given its settings, until it is let go of or has gone away."""
+"""A camera under Aravis: found, opened and given its settings, until it is released or has gone away."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _NUMBERS = {
 
 
 def says_gone(error: AravisError) -> bool:
-    """Whether the library means that the camera does not answer."""
+    """Return whether the library means that the camera does not answer."""
     return error.domain == _DEVICE_ERRORS and error.code in _GONE
 
 
@@ -76,11 +76,11 @@ class AravisConnection:
 
     @property
     def control_lost(self) -> bool:
-        """Whether the driver has noticed that it does not control the camera any more; costs nothing."""
+        """Return whether the driver has noticed that it does not control the camera any more; costs nothing."""
         return self._lost.is_set()
 
     def gone(self) -> bool:
-        """Whether the camera does not answer, or does so as if it had just been switched on; asks it."""
+        """Return whether the camera does not answer, or does so as if it had just been switched on; asks it."""
         return self.control_lost or (self.is_gige and not read_register(self.address, CONTROL_PRIVILEGE))
 
     def close(self, stream: int | None = None, gone: bool = False) -> None:
@@ -101,7 +101,7 @@ class AravisConnection:
 
 
 def _locate(library: AravisLibrary, settings: CameraSettings, name: str, known: bool) -> tuple[str, str]:
-    """What the library finds the camera by, and its address.
+    """Return what the library finds the camera by, and its address.
 
     A GigE camera with an address is asked for a sign of life first: the driver would wait for it for many seconds.
     """

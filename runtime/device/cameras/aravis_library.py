@@ -107,7 +107,7 @@ _OPTIONAL: Signatures = {"arv_buffer_get_image_padding": (None, (c_void_p, POINT
 
 
 class AravisError(Exception):
-    """What the library reports, before it becomes an error of this program.
+    """An error of the library, before it becomes an error of this program.
 
     Attributes:
         domain: which part of the library.
@@ -159,7 +159,7 @@ class AravisLibrary:
         return self._functions[name](*arguments)
 
     def knows(self, name: str) -> bool:
-        """Whether this version of it has a function."""
+        """Return whether this version of it has a function."""
         return name in self._functions
 
     def text(self, name: str, *arguments: Any) -> str:

@@ -1,4 +1,4 @@
-"""What a camera is to those who take pictures with it."""
+"""The interface of cameras."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lightpage.runtime.device.cameras.settings import CameraSettings
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame as a camera delivered it.
+    """A frame as a camera delivered it.
 
     Attributes:
         pixels: counts [row, column], uint8 or uint16, right-aligned, native byte order.
@@ -80,7 +80,7 @@ class Camera(Protocol):
 
 
 class DrivenCamera:
-    """What the drivers of `Camera` have in common.
+    """Base class of the drivers of `Camera`.
 
     Args:
         settings: which camera, and how it is set up.

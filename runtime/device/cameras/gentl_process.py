@@ -105,7 +105,7 @@ class GenTLSetup(sfnc.CameraSetup):
 
 
 class GenTLDevice(Helper):
-    """One camera. Where it does not answer, each method raises `LostShotError`, `Reason.CAMERA_GONE`."""
+    """A camera under GenTL. Where it does not answer, each method raises `LostShotError`, `Reason.CAMERA_GONE`."""
 
     farewell_s = 2.0
     """A producer that does not let go of its camera for so long is left as it is."""
@@ -224,7 +224,7 @@ class GenTLDevice(Helper):
         self._incomplete += 1
 
     def _read(self, buffer: Any) -> BrokenFrame | FrameInfo:
-        """What is in a complete buffer.
+        """Return what is in a complete buffer.
 
         Raises:
             LostShotError: something else than it was set up for; it is to be opened again.

@@ -1,4 +1,4 @@
-"""What is asked of a GigE camera and of this machine's network beside the driver: quickly, and without control."""
+"""Questions to a GigE camera and to this machine's network beside the driver: quick, and without control."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def receive_buffer_problem(frame_bytes: int) -> str:
 
 
 def may_read_packets() -> bool:
-    """Whether this program may read packets from the network card directly."""
+    """Return whether this program may read packets from the network card directly."""
     if not hasattr(socket, "AF_PACKET"):
         return False
     try:

@@ -63,7 +63,7 @@ def _spread_p(bits: int) -> Callable[[_Words], _Words]:
 
 
 def _spread_packed(low_bits: int) -> Callable[[_Words], _Words]:
-    """Of GigE Vision's packing, with two or four low bits of each pixel in the middle byte."""
+    """Return pixels from GigE Vision's packing, with two or four low bits of each pixel in the middle byte."""
     low = (1 << low_bits) - 1
     first, second = np.uint64(low << 8 | low << 40), np.uint64(low << 12 | low << 44)
     high, up = np.uint64(0x00FF00FF00FF00FF), np.uint64(low_bits)

@@ -1,4 +1,4 @@
-"""How one camera is found and set up."""
+"""Address and settings of one camera."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lightpage.runtime.device.cameras.pixel_formats import pixel_format
 
 
 class CameraSettings(StrictTable):
-    """One camera: which, and every setting that a frame depends on.
+    """Address of one camera, and every setting that a frame depends on.
 
     Attributes:
         driver: ``aravis``, for GigE Vision and USB3 Vision; ``gentl``, for whatever the camera's maker has a GenTL

@@ -81,11 +81,11 @@ class CameraSetup(ABC):
 
     @abstractmethod
     def has(self, feature: str) -> bool:
-        """Whether the camera has a feature now."""
+        """Return whether the camera has a feature now."""
 
     @abstractmethod
     def entries(self, feature: str) -> list[str]:
-        """What a feature that it has can be set to."""
+        """Return what a feature that it has can be set to."""
 
     @abstractmethod
     def write(self, feature: str, value: Any) -> None:
@@ -93,11 +93,11 @@ class CameraSetup(ABC):
 
     @abstractmethod
     def read(self, feature: str, kind: type) -> Any:
-        """What the camera itself says of a feature that was set to a value of this kind."""
+        """Return what the camera itself says of a feature that was set to a value of this kind."""
 
     @abstractmethod
     def limits(self, feature: str) -> str:
-        """What a feature that is a number, or the region, can be set to, for people."""
+        """Return what a feature that is a number, or the region, can be set to, for people."""
 
     @abstractmethod
     def told(self, error: Exception) -> str:
@@ -205,7 +205,7 @@ class CameraSetup(ABC):
         return SourceError(subject, got, expected)
 
     def _offers(self, setting: str) -> str:
-        """What the camera takes, for people; empty where it does not say."""
+        """Return what the camera takes, for people; empty where it does not say."""
         try:
             if setting in ("PixelFormat", "TriggerSource", "TriggerActivation"):
                 return f"one of {told}" if (told := ", ".join(self.entries(setting))) else ""

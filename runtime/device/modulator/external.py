@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 class Announcement(Generic[T]):
-    """What is wanted of somebody else, and what they say that there is. Its methods may be called from many threads.
+    """An order to a controller, and its answer. Its methods may be called from many threads.
 
     Args:
         clock: by which it is waited.
@@ -31,14 +31,14 @@ class Announcement(Generic[T]):
         self._asked = False
 
     def wanted(self) -> T | None:
-        """What is being waited for, or None where nothing is."""
+        """Return what is being waited for, or None where nothing is."""
         with self._changed:
             self._asked = self._asked or self._wanted is not None
             return self._wanted
 
     @property
     def heard_of(self) -> bool:
-        """Whether anybody has ever heard what was wanted, or said what there is."""
+        """Return whether anybody has ever heard what was wanted, or said what there is."""
         with self._changed:
             return self._asked or self._changes > 0
 

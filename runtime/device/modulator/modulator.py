@@ -1,4 +1,4 @@
-"""What shows a page, and what blocks the beams: a device, or a person."""
+"""The interfaces of the modulator, which shows pages, and of the beam control: a device, or a person."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Modulator(Protocol):
         """
 
     def shows(self) -> bool:
-        """Whether the page of the last `show` is still on display."""
+        """Return whether the page of the last `show` is still on display."""
 
     def close(self) -> None:
         """Let go of it; `show` connects again."""
@@ -67,7 +67,7 @@ class Beams(Protocol):
 
 
 class BeamState(NamedTuple):
-    """Of the signal and the reference beam, whether it is let through."""
+    """State of the signal and the reference beam: let through or blocked."""
 
     signal: bool
     reference: bool

@@ -30,7 +30,7 @@ class Shutter(StrictTable):
     settle_s: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)] = 0.05
 
     def level(self, is_open: bool) -> bool:
-        """Whether its channel is on while it is open, or closed."""
+        """Return whether its channel is on while it is open, or closed."""
         return is_open == (self.open_when == "high")
 
 

@@ -1,1 +1,1 @@
-"""What fires both cameras at once."""
+"""Triggers, which fire both cameras at once."""

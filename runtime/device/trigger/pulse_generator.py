@@ -35,7 +35,7 @@ Channel = Annotated[int, Field(ge=1, le=CHANNELS)]
 
 
 class PulseGeneratorSettings(LineTimes):
-    """How the pulse generator is reached, and what it does.
+    """Address and settings of the pulse generator.
 
     Attributes:
         port: ``/dev/serial/by-id/...``, ``/dev/ttyUSB0``, or a pyserial URL such as ``socket://192.168.1.9:2101``.
@@ -90,7 +90,7 @@ class PulseGenerator:
 
     @property
     def reached(self) -> bool:
-        """Whether it has ever answered: before, nothing but a question for its identity was sent."""
+        """Return whether it has ever answered: before, nothing but a question for its identity was sent."""
         return self._line.session > 0
 
     def arm(self) -> None:

@@ -62,7 +62,7 @@ _ROUNDS = 2
 
 
 class LineTimes(StrictTable):
-    """How long is waited on a line.
+    """Waiting times on a line.
 
     Attributes:
         answer_s: for an answer.
@@ -271,7 +271,7 @@ class ScpiPort:
         self.session += 1
 
     def _one_round(self, port: Serial, end: float) -> bool:
-        """Whether every identification that was due has come and nothing after it."""
+        """Return whether every identification that was due has come and nothing after it."""
         until = min(end, self._now() + self._times.answer_s)
         known, came, echo = self.identity, False, False
         while self._due:
@@ -302,7 +302,7 @@ class ScpiPort:
         return self._gone(f"{told}: nothing came", "its identification: look at its power, its cable and the baud rate")
 
     def _identified(self, line: str) -> bool:
-        """Whether a line is the identification, and one fewer is due then."""
+        """Return whether a line is the identification, and one fewer is due then."""
         if not (line == self.identity if self._known else _IDENTIFICATION.fullmatch(line)):
             return False
         self.identity = line
@@ -344,7 +344,7 @@ class ScpiPort:
         return line.decode("latin-1")
 
     def _read(self, port: Serial) -> bool:
-        """Whether something came that belongs to a line."""
+        """Return whether something came that belongs to a line."""
         found = port.read(max(1, port.in_waiting)).replace(b"\0", b"")
         self._buffer += found
         return bool(found.strip(_NO_LINE))
@@ -354,7 +354,7 @@ class ScpiPort:
 
 
 def _usb_adapters() -> dict[str, tuple[object, ...]]:
-    """What tells the USB adapters apart that are plugged in, by the paths of their ports; none that are alike in it."""
+    """Return the facts that tell plugged-in USB adapters apart, by their ports' paths; none that are alike in them."""
     from serial.tools import list_ports
 
     found = {
@@ -367,11 +367,11 @@ def _usb_adapters() -> dict[str, tuple[object, ...]]:
 
 
 def _words(error: BaseException) -> str:
-    """What an exception of pyserial says, with its kind: some say little else."""
+    """Return what an exception of pyserial says, with its kind: some say little else."""
     return f"{type(error).__name__} ({error})"
 
 
 def _quoted(what: str | bytes) -> str:
-    """What came, as an error quotes it."""
+    """Return what came, as an error quotes it."""
     text = what if isinstance(what, str) else what.decode("latin-1")
     return repr(text) if len(text) <= _QUOTED else f"{text[:_QUOTED]!r} and {len(text) - _QUOTED} characters more"

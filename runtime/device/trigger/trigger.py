@@ -1,4 +1,4 @@
-"""What a trigger is: one call, one edge to both cameras; and one without a pulse generator."""
+"""The interface of triggers: one call, one edge to both cameras; and one without a pulse generator."""
 
 from __future__ import annotations
 

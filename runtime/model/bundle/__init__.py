@@ -1,1 +1,1 @@
-"""What export writes and the runtime loads."""
+"""Bundles, which export writes and the runtime loads."""

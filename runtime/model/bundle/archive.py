@@ -72,7 +72,7 @@ def check_name(name: str, subject: str) -> None:
 
 
 def is_litter(name: str) -> bool:
-    """Whether a name is one that systems put beside files, e.g. `.DS_Store`, or `..data` of a mounted ConfigMap."""
+    """Return whether systems put such a name beside files, e.g. `.DS_Store`, or `..data` of a mounted ConfigMap."""
     hidden = name.startswith(".") and name not in (".", "..") and not any(mark in name for mark in "\\:\0")
     return hidden or name.lower() in _LITTER
 

@@ -130,7 +130,7 @@ class Bundle:
 
     @property
     def subject(self) -> str:
-        """What an error about this bundle calls it."""
+        """Return what an error about this bundle calls it."""
         return f"bundle {self.path}"
 
     @property
@@ -164,7 +164,7 @@ class Bundle:
 
     @cached_property
     def modulation(self) -> Modulation:
-        """What the modulator makes of its levels; nominal where the calibration does not tell.
+        """Return what the modulator makes of its levels; nominal where the calibration does not tell.
 
         Raises:
             CalibrationError: see `calibration`.
@@ -207,7 +207,7 @@ class Bundle:
 
     @cached_property
     def pilot_mask(self) -> NDArray[np.bool_]:
-        """Where this device's pages carry pilots, [ny, nx]: the bundle's own positions, or else the profile's.
+        """Return where this device's pages carry pilots, [ny, nx]: the bundle's own positions, or else the profile's.
 
         Raises:
             BundleError: the bundle's positions have another shape or type.
@@ -241,7 +241,7 @@ class Bundle:
 
     @cached_property
     def code(self) -> Code | None:
-        """How user bytes are protected on this device's pages, None where that was not chosen.
+        """Return how user bytes are protected on this device's pages, None where that was not chosen.
 
         Raises:
             BundleError: the manifest's code does not validate.
@@ -309,7 +309,7 @@ def read_manifest(path: Path) -> Manifest:
 
 
 def shows_page(coarse: float, limit: float) -> bool:
-    """Whether frames in few counts may stand for a page: how badly they fit the homodyne equations tells.
+    """Return whether frames in few counts may stand for a page: how badly they fit the homodyne equations tells.
 
     Args:
         coarse: residual of the frames `in_few_counts`.

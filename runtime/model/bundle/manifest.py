@@ -36,7 +36,7 @@ Scalar = Annotated[float, Field(allow_inf_nan=False)] | int | str | bool | None
 
 
 class Provenance(BaseModel):
-    """What made the bundle."""
+    """Origin of the bundle."""
 
     model_config = ConfigDict(frozen=True, extra="allow")
 

@@ -1,4 +1,4 @@
-"""Where the detached signature of a bundle lies, and how it is read."""
+"""The detached signature of a bundle: its path and its reader."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _HOW = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 
 
 def signature_path(bundle: Path) -> Path:
-    """Where the signature of a bundle lies."""
+    """Return where the signature of a bundle lies."""
     return bundle.with_name(bundle.name + SUFFIX)
 
 

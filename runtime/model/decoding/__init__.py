@@ -1,1 +1,1 @@
-"""From a frame pair to symbols, page after page."""
+"""Decoding of frame pairs into symbols, page after page."""

@@ -38,7 +38,7 @@ class FollowingDecoder(Decoder):
 
     @cached_property
     def tracker(self) -> Tracker:
-        """What follows the image."""
+        """Return what follows the image."""
         decoder = Decoder(self.bundle, self.threads, self.graph)
         return tracker_for(decoder) if self._tracking else NoTracker(decoder)
 

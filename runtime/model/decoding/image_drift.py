@@ -84,12 +84,12 @@ class Estimate:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     def gained_nats(self, prior: Real) -> float:
-        """What fitting to a page gains by chance: the volume of drifts that `prior` [4, 4] allows over that left."""
+        """Return the nats that a fit gains by chance: the log volume of drifts in `prior` [4, 4] over that left."""
         return max(0.0, float(np.linalg.slogdet(prior)[1] - np.linalg.slogdet(self.covariance)[1]) / 2)
 
 
 class DriftModel:
-    """What drift does to decoded phases.
+    """A linear model of the change that drift makes to decoded phases.
 
     Args:
         slopes: change of each symbol's decoded phase with the image's drift, [4, ny, nx], radians a unit of drift;
@@ -122,7 +122,7 @@ class DriftModel:
         return cls(slopes)
 
     def phase_change(self, drift: Real) -> Real:
-        """What `drift` [4] adds to decoded phases [ny, nx], radians, first order."""
+        """Return what `drift` [4] adds to decoded phases [ny, nx], radians, first order."""
         return np.asarray(np.tensordot(drift, self.slopes, 1))
 
     def estimate(self, inference: Inference, levels: int | Levels, pilots: Pilots, prior: Real) -> Estimate | None:

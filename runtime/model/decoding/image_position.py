@@ -1,4 +1,4 @@
-"""Where the image of a page lay."""
+"""Position of a page's image."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ImagePosition:
-    """Where the image of a page lay on the cameras.
+    """Position of a page's image on the cameras.
 
     Attributes:
         shift_x_px, shift_y_px: against where calibration saw it, camera pixels, on both cameras.

@@ -105,7 +105,7 @@ _LEARNT = ("drift", "covariance", "walk", "traced_tilt", "jump_px")
 
 @dataclass(frozen=True)
 class ImageState:
-    """What a page is decoded with.
+    """The image position and the drift that a page is decoded with.
 
     Attributes:
         drift: estimate since calibration, [4], see `lightpage.runtime.model.decoding.image_drift`.
@@ -139,7 +139,7 @@ class ImageState:
 
 @dataclass(frozen=True)
 class _Attempt:
-    """One decode of a page.
+    """A decode of a page.
 
     Attributes:
         state: what it was decoded with.
@@ -161,7 +161,7 @@ class _Attempt:
 
     @property
     def correction_px(self) -> float:
-        """How far from where it was looked at the image is now taken to lie, along the worse axis."""
+        """Return how far from where it was looked at the image is now taken to lie, along the worse axis."""
         return float(np.abs(self.after.drift[SHIFT] - self.state.looked_px).max())
 
 
@@ -449,7 +449,7 @@ class ImageTracker:
 
     @staticmethod
     def _around(state: ImageState) -> Real:
-        """Where to look: where calibration saw the image, and where it was last."""
+        """Return where to look: where calibration saw the image, and where it was last."""
         last = state.drift[SHIFT]
         return np.stack([np.zeros(2), last]) if np.abs(last).max() > NEARBY_PX else np.zeros((1, 2))
 
@@ -475,12 +475,12 @@ def tracker_for(decoder: Decoder, memory: TrackerMemory | None = None) -> Tracke
 
 
 def _search_may_pay(check: PilotCheck, begun: ImageState) -> bool:
-    """Whether the pilots disagree, or confirm much less than they lately did, and are not only too few."""
+    """Return whether the pilots disagree, or confirm much less than they lately did, and are not only too few."""
     return not check.agrees or (not check.sound and check.share < DROP * begun.share)
 
 
 def _walked(walk: Real, step: Estimate) -> Real:
-    """What is known of the walk, variances [4], after a page that has moved by `step`."""
+    """Return what is known of the walk, variances [4], after a page that has moved by `step`."""
     quiet, last = WALK**2, np.maximum(step.drift**2 - np.diag(step.covariance), 0)
     slow = np.abs(step.drift) <= LARGEST_WALK_PX
     slow[TILT] = False  # a page shows too little of it

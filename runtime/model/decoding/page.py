@@ -1,4 +1,4 @@
-"""What a page becomes on its way through the decoder."""
+"""The forms of a page on its way through the decoder."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SYMBOLS = 4096
 
 @dataclass(frozen=True)
 class Inference:
-    """What the graph says of a page: p float32 [2, ny, nx], its angle and its length [ny, nx]; piston still in it.
+    """Output of the graph for a page: p float32 [2, ny, nx], its angle and length [ny, nx]; piston still in it.
 
     The length is zero where a camera does not show the symbol, whatever p is.
 

@@ -96,7 +96,7 @@ class PhaseRefit:
 
 
 def _at(planes: NDArray[np.float64], coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What each symbol's coefficients [3, symbols] make of the planes [3, symbols] there."""
+    """Return what each symbol's coefficients [3, symbols] make of the planes [3, symbols] there."""
     first, *others = planes * coefficients
     return np.asarray(sum(others, first))
 

@@ -17,7 +17,7 @@ from lightpage.runtime.model.decoding.turns import Turn, Turns, patiently
 
 
 class TrackerMemory(BaseModel):
-    """What a tracker has learnt of a device, in plain numbers, so that another process can go on from there.
+    """Plain numbers that a tracker has learnt of a device, so that another process can go on from there.
 
     Attributes:
         drift: shift x, y (camera pixels) and tilt x, y (radians) since calibration, [4].
@@ -66,10 +66,10 @@ class Tracker(Protocol):
 
     @property
     def image_px(self) -> tuple[float, float]:
-        """Where the image of the last page lay against calibration, (x, y), camera pixels."""
+        """Return where the image of the last page lay against calibration, (x, y), camera pixels."""
 
     def memory(self) -> TrackerMemory | None:
-        """What it has learnt until now, for `tracker_for` in another process; None where it learns nothing."""
+        """Return what it has learnt until now, for `tracker_for` in another process; None where it learns nothing."""
 
     def anew(self) -> Tracker:
         """Another one for the same bundle that has learnt nothing."""
@@ -107,7 +107,7 @@ class NoTracker:
 
     @property
     def image_px(self) -> tuple[float, float]:
-        """Where calibration saw it."""
+        """Return where calibration saw it."""
         return 0.0, 0.0
 
     def memory(self) -> None:
@@ -155,6 +155,6 @@ def confirmed(page: DecodedPage, found: FoundImage | None = None) -> DecodedPage
 
 
 def unconfirmed_page(error: UnconfirmedPageError) -> DecodedPage:
-    """What was decoded of the page that an error of this process is about."""
+    """Return what was decoded of the page that an error of this process is about."""
     assert isinstance(error.page, DecodedPage)
     return error.page

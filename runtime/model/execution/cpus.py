@@ -1,4 +1,4 @@
-"""How many CPU cores this process may use: by its affinity and control group, not by the machine's size."""
+"""Count of the CPU cores that this process may use: by affinity and control group, not by the machine's size."""
 
 from __future__ import annotations
 

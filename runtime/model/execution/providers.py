@@ -18,7 +18,7 @@ _TEXT = re.compile(r"(cpu|cuda|tensorrt)(?::([0-9]{1,3}))?")
 
 @dataclass(frozen=True)
 class Provider:
-    """One execution provider on one device.
+    """An execution provider on one device.
 
     Attributes:
         name: `CPU`, `CUDA` or `TENSORRT`.
@@ -54,7 +54,7 @@ class Provider:
 
     @property
     def memory(self) -> str:
-        """Where its tensors lie, as ONNX Runtime calls it."""
+        """Return where its tensors lie, as ONNX Runtime calls it."""
         return "cpu" if self.name == CPU else "cuda"
 
     def chain(self, version: str, *, rounded: bool = False) -> list[tuple[str, dict[str, Any]]]:

@@ -42,7 +42,7 @@ class Port:
         return cls(_NUMPY_NAMES.get(kind, kind), shape)
 
     def admits(self, dtype: str, shape: tuple[int, ...]) -> bool:
-        """Whether an array of this type and shape fits."""
+        """Return whether an array of this type and shape fits."""
         return (
             self.dtype == dtype
             and len(self.shape) == len(shape)

@@ -157,7 +157,7 @@ def _cut(model: pb.Model, fixed: Collection[str]) -> CutGraph:
 
 
 def _needed(nodes: list[pb.Node], names: set[str]) -> list[pb.Node]:
-    """Those of some nodes that tensors follow from, in order."""
+    """Return the nodes among some that tensors follow from, in order."""
     found = []
     for node in reversed(nodes):
         if names.intersection(node.output):

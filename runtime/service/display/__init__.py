@@ -1,1 +1,1 @@
-"""What the device shows: pages that a controller uploads, the display that it watches, and shutters."""
+"""The display of the device: pages that a controller uploads, the orders that it watches, and shutters."""

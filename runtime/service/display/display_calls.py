@@ -87,7 +87,7 @@ class DisplayCalls:
 
 
 def _wanted(source: FrameSource) -> pb.WatchDisplayReply:
-    """What a source waits for: a page on display, beams, or neither.
+    """Return what a source waits for: a page on display, beams, or neither.
 
     Raises:
         NoSourceError: it does all by itself.

@@ -98,7 +98,7 @@ class PairReceiver:
 
     @property
     def complete(self) -> bool:
-        """Whether every pixel has come."""
+        """Return whether every pixel has come."""
         return self.filled == self.size
 
     def add(self, chunk: bytes | memoryview) -> None:

@@ -79,7 +79,7 @@ _MOST_VARINT = 10
 
 
 def model_inputs(bundle: Bundle) -> dict[str, Tensor]:
-    """What the model of a bundle takes, by name."""
+    """Return what the model of a bundle takes, by name."""
     frame = partial(Tensor, bundle.manifest.frame_dtype.upper(), bundle.profile.frame_shape, FrameError)
     page = bundle.profile.page_shape
     return {
@@ -119,24 +119,24 @@ class InferenceCalls:
 
     @rpc(Role.READ)
     async def ServerLive(self, request: oip.ServerLiveRequest, call: Call) -> oip.ServerLiveResponse:
-        """Whoever hears this is answered."""
+        """Answer that the server is alive."""
         return oip.ServerLiveResponse(live=True)
 
     @rpc(Role.READ)
     async def ServerReady(self, request: oip.ServerReadyRequest, call: Call) -> oip.ServerReadyResponse:
-        """Whether pages are decoded."""
+        """Return whether pages are decoded."""
         return oip.ServerReadyResponse(ready=self._ready)
 
     @rpc(Role.READ)
     async def ModelReady(self, request: oip.ModelReadyRequest, call: Call) -> oip.ModelReadyResponse:
-        """Whether a version is in service."""
+        """Return whether a version is in service."""
         current = self._plane.models.current.version
         ready = self._ready and request.name == MODEL and request.version in ("", current)
         return oip.ModelReadyResponse(ready=ready)
 
     @rpc(Role.READ)
     async def ServerMetadata(self, request: oip.ServerMetadataRequest, call: Call) -> oip.ServerMetadataResponse:
-        """What the service is."""
+        """Return what the service is."""
         return oip.ServerMetadataResponse(name="lightpage", version=installed_version("lightpage"))
 
     @rpc(Role.READ)
@@ -251,7 +251,7 @@ class UnknownCalls(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic
         self._calls = metrics.calls
 
     def service(self, handler_call_details: grpc.HandlerCallDetails) -> Any:
-        """What refuses a call of the protocol's service; None for those of others."""
+        """Return what refuses a call of the protocol's service; None for those of others."""
         service, _, method = handler_call_details.method.strip("/").partition("/")
         if service != INFERENCE.full_name:
             return None
@@ -368,7 +368,7 @@ def take_apart(data: bytes, most_beside: int) -> tuple[oip.ModelInferRequest, li
 
 
 def _content(data: bytes, at: int, kind: int) -> tuple[int, int]:
-    """Where the content of a field begins and ends."""
+    """Return where the content of a field begins and ends."""
     if kind == _VARINT:
         return at, _varint(data, at)[1]
     if kind == _BYTES:

@@ -70,7 +70,7 @@ class KeptPages:
         return lost > 0 and max(lost, read, known) >= MIN_PAGES
 
     def pages(self, decoder: Decoder, image_px: tuple[float, float]) -> KnownPages | LostPages | None:
-        """What to recalibrate by: the last pages that were read, or else those that were lost; None if there are none.
+        """Return the pages to recalibrate by: the last ones that were read, or else lost ones; None if there are none.
 
         Pages count that the model in service has decoded, at the levels of its code. Where the last ones were lost,
         those that were read before show a device that has changed since.

@@ -64,7 +64,7 @@ class SelfCalibrationSettings(SettingsTable):
 
     @property
     def is_on(self) -> bool:
-        """Whether the service recalibrates itself."""
+        """Return whether the service recalibrates itself."""
         return bool(self.pages) if self.enabled is None else self.enabled
 
     def rules(self) -> Iterator[Rule]:
@@ -191,7 +191,7 @@ class SelfCalibration:
         return self._plane.models.current.version != version
 
     def _pause_s(self) -> float:
-        """How long to sleep where nobody wakes: until it is looked again where a try is due, else for ever."""
+        """Return how long to sleep where nobody wakes: until it is looked again where a try is due, else for ever."""
         left = max(0.0, self._not_before - self._clock.now())
         return min(left, self._settings.busy_s) if self._monitor.due else threading.TIMEOUT_MAX
 
@@ -234,7 +234,7 @@ class SelfCalibration:
             )
 
     def _pages(self) -> PagesToUse:
-        """What to recalibrate with: pages that are named, or else those that are kept, or else the source's next ones.
+        """Return the pages to recalibrate by: named ones, or else kept ones, or else the source's next ones.
 
         Raises:
             SourceError: there is none of them.

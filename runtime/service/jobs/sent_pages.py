@@ -163,7 +163,7 @@ class SentPages:
 
 
 def _mask(flags: bytes, page_shape: tuple[int, int]) -> NDArray[np.bool_] | None:
-    """Where the pilots are, None for the device's own."""
+    """Return where the pilots are, None for the device's own."""
     if not flags:
         return None
     values = np.frombuffer(flags, np.uint8)

@@ -37,7 +37,7 @@ Write = Callable[[sqlite3.Connection], object]
 
 @dataclass(frozen=True)
 class Contents:
-    """What a database holds, besides the record of changes.
+    """Contents of a database besides the record of changes.
 
     Attributes:
         base: digest of the base bundle that the history begins with.
@@ -73,7 +73,7 @@ class Database:
 
     @property
     def exists(self) -> bool:
-        """Whether there is a file, damaged or not; an empty one holds nothing."""
+        """Return whether there is a file, damaged or not; an empty one holds nothing."""
         return self._memory is None and self.path.exists() and self.path.stat().st_size > 0
 
     def read(self) -> Contents:

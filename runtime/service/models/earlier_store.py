@@ -1,4 +1,4 @@
-"""What stores remember whose service had no database yet, as that of version 0.1.0."""
+"""Reader of stores whose service had no database yet, as that of version 0.1.0."""
 
 from __future__ import annotations
 

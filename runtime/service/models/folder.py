@@ -63,12 +63,12 @@ class BundleFolder:
 
     @property
     def subject(self) -> str:
-        """What an error says that it is about."""
+        """Return what an error says that it is about."""
         return f"model store {self._path}"
 
     @property
     def path(self) -> Path:
-        """Where it is.
+        """Return where it is.
 
         Raises:
             StoreError: there is no temporary folder that can be written.
@@ -88,7 +88,7 @@ class BundleFolder:
             self._temporary.cleanup()
 
     def bundle(self, version: str) -> Path:
-        """Where the bundle of this version is or will be."""
+        """Return where the bundle of this version is or will be."""
         return self.path / f"{version}.zip"
 
     def versions(self) -> list[str]:

@@ -1,4 +1,4 @@
-"""What is remembered of models: the order in which they came into service, and what is known of each bundle."""
+"""History of models: the order in which they came into service, and the facts of each bundle."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ HISTORY = 64
 
 
 class Origin(StrEnum):
-    """Where a bundle came from."""
+    """Origin of a bundle."""
 
     GIVEN = "given"
     RECALIBRATED = "recalibrated"
@@ -75,7 +75,7 @@ class History:
 
 @dataclass(frozen=True)
 class Known:
-    """What is known of a bundle.
+    """Facts of a bundle.
 
     Attributes:
         origin: where it came from, None where that is not known.

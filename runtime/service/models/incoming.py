@@ -116,7 +116,7 @@ class Incoming:
 
 
 def _stamp(path: Path) -> _Stamp | None:
-    """What changes with a bundle or its signature; None for what is no bundle, or is gone."""
+    """Return what changes with a bundle or its signature; None for what is no bundle, or is gone."""
     bundle = _file_stamp(path)
     return None if bundle is None else (bundle, _file_stamp(signature_path(path)))
 

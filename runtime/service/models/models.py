@@ -39,7 +39,7 @@ Change = Callable[[State], tuple[State, Model | None]]
 
 @dataclass(frozen=True)
 class ModelEntry:
-    """What is known of a model.
+    """Facts of a model.
 
     Attributes:
         manifest: of its bundle.

@@ -1,4 +1,4 @@
-"""What a service remembers across restarts, in a folder with its bundles, and how the disk of the folder is."""
+"""Memory of a service across restarts: a folder with its bundles and a database, and the health of its disk."""
 
 from __future__ import annotations
 
@@ -179,7 +179,7 @@ class Store(AbstractContextManager["Store"]):
 
     @property
     def is_damaged(self) -> bool:
-        """Whether it is not as it was left, and nobody has settled yet what is to be in service."""
+        """Return whether it is not as it was left, and nobody has settled yet what is to be in service."""
         return self._damage is not None
 
     def check(self, needed_bytes: int = 0) -> None:
@@ -218,14 +218,14 @@ class Store(AbstractContextManager["Store"]):
         return OSError(_NUMBERS.get(getattr(error, "sqlite_errorcode", 0) & 0xFF, errno.EIO), str(error))
 
     def trouble(self) -> Trouble | None:
-        """What is wrong with the store, None where nothing is; it is tried again where that was long ago."""
+        """Return what is wrong with the store, None where nothing is; it is tried again where that was long ago."""
         if self._clock() - self._probed >= PROBE_S:
             with suppress(StoreError):
                 self.check()
         return self.known_trouble()
 
     def known_trouble(self) -> Trouble | None:
-        """What was wrong with the store when it was tried last; its disk is left alone."""
+        """Return what was wrong with the store when it was tried last; its disk is left alone."""
         return self._failure or self._damage
 
 

@@ -1,4 +1,4 @@
-"""How the store is, for health checks and metrics: a disk that hangs must not silence the rest."""
+"""Health of the store, for health checks and metrics: a disk that hangs must not silence the rest."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LONGEST_S = 5.0
 
 
 class Reason(StrEnum):
-    """What is wrong with a store."""
+    """Faults of a store."""
 
     NOTE = "note"
     """Its database is damaged or gone, so that it is not known what was in service."""
@@ -31,7 +31,7 @@ class Reason(StrEnum):
 
 @dataclass(frozen=True)
 class Trouble:
-    """What is wrong with a store, and the same for people."""
+    """A fault of a store, and the same in words."""
 
     reason: Reason
     text: str
@@ -57,7 +57,7 @@ class StoreHealth:
         self._is_well = True
 
     def is_well(self, wait_s: float = 0.0) -> bool:
-        """What the last look that ended found; begins the next one, and waits for its end for `wait_s` at most."""
+        """Return the finding of the last look that ended; begin the next one, and wait at most `wait_s` for its end."""
         with self._beginning:
             if self._ended.is_set():
                 self._begun, ended = self._clock.now(), threading.Event()
@@ -70,7 +70,7 @@ class StoreHealth:
 
     @property
     def hangs(self) -> bool:
-        """Whether the present look takes longer than any should."""
+        """Return whether the present look takes longer than any should."""
         with self._beginning:
             return not self._ended.is_set() and self._clock.now() - self._begun > self._longest_s
 

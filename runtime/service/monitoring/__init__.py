@@ -1,1 +1,1 @@
-"""What an operator sees of the service: metrics, logs, traces, signs of drift, and frames of lost pages."""
+"""Monitoring of the service for its operator: metrics, logs, traces, signs of drift, and frames of lost pages."""

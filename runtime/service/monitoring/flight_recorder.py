@@ -106,7 +106,7 @@ class FileRing:
 
 
 class FlightSettings(SettingsTable):
-    """What is kept, and where: the table [flight_recorder] of the service's settings."""
+    """Folder and limits of the flight recorder: the table [flight_recorder] of the service's settings."""
 
     folder: Folder | None = Field(None, description="Folder in which the frames of lost and weak pages are kept.")
     pages: int = Field(64, ge=1, le=1_000_000, description="Kept there at most.")

@@ -1,4 +1,4 @@
-"""What the service logs to stderr: lines for people or of JSON, of one kind only so many a second."""
+"""Logging of the service to stderr: text or JSON lines, of one kind only so many a second."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _log = logging.getLogger(__name__)
 
 
 class LogSettings(SettingsTable):
-    """What goes to stderr: the table [logs] of the service's settings."""
+    """Format and level of logging to stderr: the table [logs] of the service's settings."""
 
     format: Literal["text", "json"] = "text"
     level: Literal["debug", "info", "warning", "error"] = "info"

@@ -1,4 +1,4 @@
-"""What the operator watches: counters and gauges in the Prometheus format, one registry per service."""
+"""Metrics of the service: counters and gauges in the Prometheus format, one registry per service."""
 
 from __future__ import annotations
 
@@ -206,7 +206,7 @@ class ServiceMetrics:
 
 
 class _Figures(Collector):
-    """What is counted elsewhere, as it is whenever somebody looks."""
+    """Figures that are counted elsewhere and read at each scrape."""
 
     def __init__(self, look: Callable[[], Iterator[Metric]]) -> None:
         self._look = look
@@ -217,7 +217,7 @@ class _Figures(Collector):
 
 
 def _load(decodes: Slots, received: ReceiveBudget) -> Iterator[Metric]:
-    """How busy the service is."""
+    """Return how busy the service is."""
     yield GaugeMetricFamily("lightpage_decodes_waiting", "Pages that wait for a slot.", value=decodes.queued)
     yield GaugeMetricFamily("lightpage_decodes_busy", "Slots in which a page is decoded.", value=decodes.busy)
     yield GaugeMetricFamily("lightpage_decodes_slots", "Pages decoded at once, at most.", value=decodes.count)
@@ -240,7 +240,7 @@ def _batches(pages: UnderWay) -> Iterator[Metric]:
 
 
 def _source(source: FrameSource) -> Iterator[Metric]:
-    """What a source counts by itself."""
+    """Return what a source counts by itself."""
     shots = CounterMetricFamily("lightpage_shots", "Shots of the cameras, by how they ended.", labels=["outcome"])
     for outcome, count in source.shots_by_outcome().items():
         shots.add_metric([outcome], count)
@@ -254,7 +254,7 @@ def _source(source: FrameSource) -> Iterator[Metric]:
 
 
 def _store(health: StoreHealth, trouble: Callable[[], Trouble | None]) -> Iterator[Metric]:
-    """How the store is; a disk that hangs is waited for no longer than `_LOOK_S`."""
+    """Return how the store is; a disk that hangs is waited for no longer than `_LOOK_S`."""
     is_well, found = health.is_well(_LOOK_S), None
     if not is_well and health.hangs:
         found = Reason.HUNG

@@ -133,7 +133,7 @@ class MonitorSettings:
 
 @dataclass(frozen=True)
 class SignState:
-    """How a sign stands.
+    """State of a sign of drift.
 
     Attributes:
         name: of the sign.
@@ -159,7 +159,7 @@ class SignState:
 
 @dataclass(frozen=True)
 class MonitorState:
-    """How a device stands.
+    """State of a device as the monitor sees it.
 
     Attributes:
         due: whether a recalibration is.
@@ -181,7 +181,7 @@ class MonitorState:
 
 @dataclass
 class _Followed:
-    """What is known of one figure since a model is in service."""
+    """History of one figure since a model is in service."""
 
     sign: Sign
     baseline_pages: int
@@ -217,14 +217,14 @@ class _Followed:
         self.noise = _MEDIAN_ERROR * _MAD_DEVIATIONS * float(np.median(steps)) / math.sqrt(2 * window)
 
     def _distance(self, by: float) -> float:
-        """How far from the baseline a threshold lies; `by` of the settings, and no nearer than noise allows."""
+        """Return how far from the baseline a threshold lies; `by` of the settings, and no nearer than noise allows."""
         assert self.baseline is not None  # asked for behind it alone
         least = self.sign.deviations * self.noise * by / self.sign.raise_by
         return max(by * abs(self.baseline) if self.sign.relative else by, least)
 
     @property
     def value(self) -> float | None:
-        """What counts of the last pages."""
+        """Return what counts of the last pages."""
         return self._smoothed(self.last) if len(self.last) == self.sign.window else None
 
     def _smoothed(self, values: Sequence[float]) -> float:
@@ -238,13 +238,13 @@ class _Followed:
 
 
 class PageFigures:
-    """What pages show, one after the other."""
+    """Figures of pages, one after the other."""
 
     def __init__(self) -> None:
         self._piston: float | None = None
 
     def of(self, observation: Observation) -> dict[str, float]:
-        """What a page says of the device; empty where it says nothing."""
+        """Return what a page says of the device; empty where it says nothing."""
         if observation.lost is not None and not (observation.tells and observation.lost in SHOWS_DEVICE):
             return {}
         data, page = observation.user_data, observation.page
@@ -310,7 +310,7 @@ class Monitor:
 
     @property
     def due(self) -> bool:
-        """Whether a recalibration is due."""
+        """Return whether a recalibration is due."""
         with self._lock:
             return self._due
 
@@ -322,7 +322,7 @@ class Monitor:
             return (raised or ("other",)) if self._due else ()
 
     def state(self) -> MonitorState:
-        """How the device stands, with the reasons."""
+        """Return how the device stands, with the reasons."""
         with self._lock:
             return MonitorState(self._due, self._version, self._pages, tuple(each.state() for each in self._signs))
 
@@ -412,7 +412,7 @@ class Monitors:
         return self.device if caller.session in self._device_sessions else self._sessions.of(caller.session)
 
     def shows(self, monitor: Monitor | None) -> bool:
-        """Whether a page that `monitor` follows is shown by the figures of the last page."""
+        """Return whether a page that `monitor` follows is shown by the figures of the last page."""
         return monitor is self.device or not self._shows_device
 
     def told_by(self, monitor: Monitor | None) -> Sequence[Observer]:

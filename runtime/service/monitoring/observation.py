@@ -1,4 +1,4 @@
-"""What is noted of every page, given out or lost, for those who watch the device: monitor, console, flight recorder."""
+"""Observations of every page, given out or lost, for monitor, console and flight recorder."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lightpage.runtime.model.decoding.page import DecodedPage
 
 @dataclass(frozen=True)
 class Observation:
-    """One page.
+    """An observation of one page.
 
     Attributes:
         subject: for people, e.g. ``page 3 of recording:R.h5``.

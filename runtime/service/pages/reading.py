@@ -48,7 +48,7 @@ class ReadAnswer:
 
 @dataclass(frozen=True)
 class DataPage:
-    """One page of a range.
+    """A page of a range.
 
     Attributes:
         source_page: its number in the source; None where its bytes were restored.
@@ -328,7 +328,7 @@ def _lacks_header(page: DataPage) -> bool:
 
 
 def _curable(page: DataPage) -> bool:
-    """Whether a page that came to nothing shows the device, so that a model which fits that may read it."""
+    """Return whether a page that came to nothing shows the device, so that a model which fits that may read it."""
     if page.found is not None:
         return page.found.loss in (Loss.HEADER, Loss.BODY, Loss.CHECKSUM)
     if isinstance(page.error, LostPageError):

@@ -1,4 +1,4 @@
-"""At most one shot for a request id: whoever asks again gets the answer of the first time."""
+"""Replay of answers: one shot for a request id at most; a repeated request gets the first answer."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _OWN_BYTES = 500
 
 @dataclass(eq=False, slots=True)
 class _Entry:
-    """What is known of a request id: plain bytes alone, so that no frame of a page is kept.
+    """Answer of a request id: plain bytes alone, so that no frame of a page is kept.
 
     Attributes:
         request: tells whether it is the same request.
@@ -61,7 +61,7 @@ class Replays:
 
     @property
     def held_bytes(self) -> int:
-        """How much of all answers and failures is kept, with their requests."""
+        """Return how much of all answers and failures is kept, with their requests."""
         with self._lock:
             return self._held
 

@@ -55,7 +55,7 @@ class Certificates:
         _warn_of(_own(self._pem))
 
     def pem(self) -> Pem:
-        """Those that count now."""
+        """Return the certificates that count now, PEM."""
         with self._lock:
             stamp = self._stamp_now()
             if stamp not in (self._stamp, self._refused):
@@ -74,7 +74,7 @@ class Certificates:
             return self._pem
 
     def server_credentials(self, *, callers_too: bool = True) -> grpc.ServerCredentials:
-        """What a gRPC server listens with; `callers_too`: whether callers must have a certificate."""
+        """Return what a gRPC server listens with; `callers_too`: whether callers must have a certificate."""
         told = self.pem()
 
         def changed() -> grpc.ServerCertificateConfiguration | None:
@@ -88,7 +88,7 @@ class Certificates:
         return grpc.dynamic_ssl_server_credentials(_configuration(told, callers_too), fetch, callers_too)
 
     def context(self) -> ssl.SSLContext:
-        """What an HTTP server meets the next caller with, who must have a certificate."""
+        """Return what an HTTP server meets the next caller with, who must have a certificate."""
         self.pem()
         return self._context
 

@@ -1,4 +1,4 @@
-"""One call from its first byte to its status: parsed, counted, handed to whoever answers it, and ended.
+"""Dispatch of a call from its first byte to its status: parse, count, hand over to the handler, end.
 
 A handler is a method named as the RPC, of one of the classes in this package. It takes the request, or an asynchronous
 iterator of requests, and the `Call`; it returns the reply, or is a generator of replies. A plain `def` runs in a thread
@@ -60,13 +60,13 @@ class Served:
     prefix: str = ""
 
     def handler(self, method: str) -> Callable[..., Any] | None:
-        """What answers a method."""
+        """Return what answers a method."""
         return next((found for one in self.handlers if (found := getattr(one, method, None))), None)
 
 
 @dataclass(frozen=True)
 class _Method:
-    """One RPC.
+    """An RPC.
 
     Attributes:
         service: full name of its service.
@@ -203,7 +203,7 @@ class Dispatcher:
                 await reader.close()
 
     def _no_load(self, task: asyncio.Task[Any] | None) -> None:
-        """From here on the call of a task counts as one that only watches."""
+        """Count the call of a task as one that only watches from here on."""
         if task is not None and task in self._active:
             self._active.discard(task)
             self._watching.add(task)
@@ -285,7 +285,7 @@ class Dispatcher:
             self._told.discard(task)
 
     def _identity(self, context: Any) -> Identity:
-        """Who calls, by the certificate of the connection.
+        """Return the caller's identity, by the certificate of the connection.
 
         Raises:
             NotAllowedError: a certificate that cannot be read.

@@ -42,7 +42,7 @@ class Describing:
 
     @rpc(Role.READ)
     def Describe(self, request: pb.DescribeRequest, call: Call) -> pb.DescribeReply:
-        """What the service is."""
+        """Return what the service is."""
         plane, model = self._plane, self._plane.models.current
         bundle, limits = model.decoder.bundle, self._plane.limits
         shared_bytes = 0 if plane.shared is None else plane.shared.most_bytes

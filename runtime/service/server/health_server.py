@@ -27,7 +27,7 @@ _log = logging.getLogger(__name__)
 
 
 def next_port(address: str) -> str:
-    """Where health checks are answered for a service at `address`: the next port, a free one for port 0.
+    """Return where health checks are answered for a service at `address`: the next port, a free one for port 0.
 
     Of a service that others reach, the next port of this machine alone.
     """
@@ -57,7 +57,7 @@ class HealthServer:
 
     @property
     def target(self) -> str:
-        """Where it is asked on this machine."""
+        """Return where it is asked on this machine."""
         return target_of(self._address, self.port)
 
     @property

@@ -46,7 +46,7 @@ class HealthServicer(health.aio.HealthServicer):  # type: ignore[misc,name-defin
 
     @property
     def is_watched(self) -> bool:
-        """Whether anybody watches."""
+        """Return whether anybody watches."""
         return bool(self._watchers)
 
     def end_watches(self) -> None:

@@ -1,4 +1,4 @@
-"""What comes to the server, message by message: how large each may be, and how many are on their way at once."""
+"""Gate of incoming messages: the size of each, and the number on their way at once."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class MessageGate(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]  # gene
         self._places: dict[tuple[str, bool], asyncio.Semaphore] = {}
 
     def _places_of(self, method: str) -> asyncio.Semaphore:
-        """Those that a method shares with others."""
+        """Return the places that a method shares with others."""
         is_stream = method in self._streams
         kind = method.strip("/").partition("/")[0], is_stream
         if kind not in self._places:

@@ -108,11 +108,11 @@ class LightpageServer:
 
     @property
     def target(self) -> str:
-        """Where a client on this machine finds it."""
+        """Return where a client on this machine finds it."""
         return target_of(self._address, self.port)
 
     def health(self) -> dict[str, bool]:
-        """Whether the service as a whole, by its name, and its store serve now; checks of this server say the same.
+        """Return whether the service, by its name, and its store serve now; checks of this server say the same.
 
         Raises:
             TimeoutError: its loop does not answer.

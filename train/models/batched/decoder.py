@@ -75,7 +75,7 @@ class BatchedDecoder(nn.Module):
         return {name: value.to(self.table_type(name)) for name, value in made.items()}
 
     def table_type(self, name: str) -> torch.dtype:
-        """In which a constant is held."""
+        """Return the type in which a constant is held."""
         return torch.float32 if PLACES in name else self.dtype
 
     def forward(self, in_phase: Tensor, quadrature: Tensor, shift: Tensor, tables: Tables) -> tuple[Tensor, Tensor]:

@@ -99,7 +99,7 @@ class BatchedField(nn.Module):
         return field
 
     def pull(self, seen: Seen, field: Parts, tables: Tables, floor: Tensor | float, share: float = 1.0) -> Parts:
-        """How the measurements pull at a field: see `lightpage.train.models.field.Measured.pull`, times the amplitude.
+        """Return the pull of the measurements at a field, times the amplitude: see `lightpage.train.models.field`.
 
         With r^2 for the floor's unit, a weight's numerator and denominator are both held times r^2.
         """
@@ -117,7 +117,7 @@ class BatchedField(nn.Module):
         return self._band((tables["lit"] * real, tables["lit"] * imaginary), tables)
 
     def left(self, seen: Seen, field: Parts, tables: Tables) -> Parts:
-        """What is left of the two equations inside the band, times the amplitude, in every `_EVERY`-th row."""
+        """Return what is left of the two equations inside the band, times the amplitude, in every `_EVERY`-th row."""
         left = []
         for measured, light in zip(seen, self._lights(field, tables), strict=True):
             left.append((measured - light[0] * light[0] - light[1] * light[1]) * tables["half_inverse"])

@@ -36,7 +36,7 @@ _EDGES = 5
 
 @dataclass(frozen=True)
 class Facet:
-    """What of the facet and of the plane no lens decides.
+    """Constants of facet and plane that no lens decides.
 
     Attributes:
         window: transmission at (X, Y'), [fx] and [fy, 1], metres, as [fy, fx]; None for one.
@@ -199,7 +199,7 @@ class BatchedLens(nn.Module):
         return padded(whole.reshape(-1, tiles, side), -1).flatten(1)
 
     def cropped(self, field: Tensor) -> Tensor:
-        """What is `laid_out`, [B, 2, Ty ny, Tx nx], as the plane has it, [B, 2, ny, nx]."""
+        """Return what is `laid_out`, [B, 2, Ty ny, Tx nx], as the plane has it, [B, 2, ny, nx]."""
         (tx, ty), (side_x, side_y) = self.tiles, self.sides
         rows, columns = (count // tiles for count, tiles in zip(sizes(field)[-2:], (ty, tx), strict=True))
         tiled = field.reshape(-1, 2, ty, rows, tx, columns)[:, :, :, :side_y, :, :side_x]
@@ -216,7 +216,7 @@ class BatchedLens(nn.Module):
         return part.reshape(ty, side_y, tx, side_x).permute(2, 0, 1, 3)[:, :, None]
 
     def _modes(self, axis: str, tilt: Parts) -> Parts:
-        """From a facet's few samples, by each tile's tilt [tiles, f], to sine modes by parity, [tiles, 2, K, few]."""
+        """Return sine modes by parity [tiles, 2, K, few] of a facet's few samples, by each tile's tilt [tiles, f]."""
         sine, up = self._axis(f"sine_{axis}"), self._axis(f"up_{axis}")
         real, imaginary = (padded(sine @ (part[:, None, :, None] * up), -1, -2) for part in tilt)
         return real, imaginary

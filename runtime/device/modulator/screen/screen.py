@@ -96,7 +96,7 @@ class ScreenModulator:
         self._has_page = True
 
     def shows(self) -> bool:
-        """Whether the page of the last `show` is still on display, as far as the X server knows."""
+        """Return whether the page of the last `show` is still on display, as far as the X server knows."""
         if not self._has_page or self._window is None:
             return False
         try:

@@ -53,7 +53,7 @@ _events[_COMPLETE_NOTIFY] = CompleteNotifyEvent
 
 
 class Monitor(NamedTuple):
-    """Where a monitor lies on the X server's screen, pixels."""
+    """Position of a monitor on the X server's screen, pixels."""
 
     x: int
     y: int
@@ -87,7 +87,7 @@ class XWindow:
 
     @property
     def shows(self) -> bool:
-        """Whether nothing covers the window, and its monitor is where and what it was."""
+        """Return whether nothing covers the window, and its monitor is where and what it was."""
         return self._visible and self._find_monitor() == self._monitor
 
     def draw(self, image: NDArray[np.uint8]) -> None:
