@@ -139,12 +139,7 @@ class TrueOptics:
             + aberration.coma_rad * radius2 * x
         )
         amplitude = 1 - self.device.slm.falloff_relative * radius2
-        return np.asarray(amplitude * np.exp(1j * phase))
-
-    @cached_property
-    def _illumination(self) -> Complex:
-        """The factor of the SLM's pixels in the engine's arrays."""
-        factor: Complex = self.engine.array(self.slm_factor)
+        factor: Complex = self.engine.array(amplitude * np.exp(1j * phase))
         return factor
 
     @cached_property
@@ -196,7 +191,7 @@ class TrueOptics:
 
     def _through(self, light: Complex) -> Complex:
         """Light on the SLM [ny, nx], illuminated evenly, to the exit facet, what the facets reflect included."""
-        field, ghost = self.channel.exit_field(self._illumination * light), self.device.geometry.ghost_relative
+        field, ghost = self.channel.exit_field(self.slm_factor * light), self.device.geometry.ghost_relative
         if ghost:
             back = self.channel.pipe.forward(field)
             field = field + ghost * self.channel.pipe.forward(back)
