@@ -45,7 +45,6 @@ def preset_trained(settings: Settings, data_set: DataSet, preset: str, work: Pat
         See `lightpage.study.trained.trained`; the angle is the calibration's, and user bytes those of `lightpage code`.
     """
     parts, lights = split(settings), settings.lights
-    made = lights.of(data_set, parts[-1].stop, settings.seed, progress)
     training, validation = parts[0][:_TRAINING_PAGES], parts[1]
     path, run, bundle = work / "recording.h5", work / "run", work / "bundle.zip"
     choices = PRESETS[preset].choices
@@ -56,6 +55,7 @@ def preset_trained(settings: Settings, data_set: DataSet, preset: str, work: Pat
     with reporting(None):  # the case's own progress is shown
         progress("record", 0.0)
         if not path.exists():
+            made = lights.of(data_set, parts[-1].stop, settings.seed, progress)
             _record(path, data_set, made, [*training, *validation, *parts[2]])
         with Recording.open(path) as recording:
             progress("calibrate and train", 0.2)

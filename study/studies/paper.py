@@ -109,15 +109,16 @@ def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:
 def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) -> Figure:
     read = [(case["name"], result) for case, result in zip(cases, results, strict=True) if "own_mi_map" in result]
     figure = Figure(figsize=(16, 9), layout="constrained")
-    above, below = (figure.add_subfigure(part) for part in figure.add_gridspec(2, 1))
-    maps, shown = above.subplots(2, _SHOWN // 2).ravel(), read[:_SHOWN]
+    wide = _SHOWN // 2
+    grid, shown = figure.add_gridspec(3, wide, height_ratios=(1, 1, 2)), read[:_SHOWN]
+    maps = [figure.add_subplot(grid[number // wide, number % wide]) for number in range(_SHOWN)]
     top = max((float(np.nanmax(result["own_mi_map"])) for _, result in shown), default=1.0)
     for axis, (name, result) in zip(maps, shown, strict=False):
         axis.imshow(result["own_mi_map"], vmin=0, vmax=top, cmap="viridis")
         axis.set_title(f"{name}: {result['own_mi']:.2f} bit", fontsize="medium")
     for axis in maps:
         axis.set_axis_off()
-    angles, bars = below.subplots(1, 2)
+    angles, bars = figure.add_subplot(grid[2, : wide // 2]), figure.add_subplot(grid[2, wide // 2 :])
     for name, result in read:
         if len(result["angles"]):
             angles.plot(*result["angles"].T, ".-", markersize=3, label=name)
