@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from lightpage.calibration.document import Calibration, load_calibration
+from lightpage.codec.choose import FEWEST_PAGES
 from lightpage.errors import InvalidInputError
 from lightpage.export.from_run import export_run
 from lightpage.metrics.information import page_kilobytes
@@ -74,7 +75,7 @@ def preset_trained(settings: Settings, data_set: DataSet, preset: str, work: Pat
             progress("evaluate", 0.9)
             decoder = Decoder.load(bundle)
             found = evaluate(decoder, recording, tracker_for(decoder))
-            user_bytes = _user_bytes(decoder, recording)
+            user_bytes = _user_bytes(decoder, recording, len(parts[2]))
     air, own = found.figures.air_bits_per_symbol, found.figures.own_mi_bits_per_symbol
     air_kb, own_kb = (page_kilobytes(bits, found.symbols_per_page) for bits in (air, own))
     path.unlink()
@@ -110,8 +111,10 @@ def _calibrated(path: Path, recording: Recording, data_set: DataSet) -> Calibrat
     return load_calibration(path)
 
 
-def _user_bytes(decoder: Decoder, recording: Recording) -> float:
-    """Return 0 where the pages are too few, or no code carries them."""
+def _user_bytes(decoder: Decoder, recording: Recording, unseen: int) -> float:
+    """Return 0 where no code carries the pages, and no number where they are too few to say."""
+    if unseen < FEWEST_PAGES:
+        return float("nan")
     try:
         return float(choose_code(decoder, recording, tracker_for(decoder))[0].user_bytes)
     except InvalidInputError:

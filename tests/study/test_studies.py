@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -100,6 +101,18 @@ def test_the_paper_goes_on_piece_by_piece_and_each_says_where_it_is_from(small: 
     assert {"own_mi_map", "angles", "validation_curve"} <= set(kept["arrays"])
     (row,) = written["rows"]
     assert row[written["header"].index("paper kB")] == 25.0
+
+
+def test_a_study_stops_in_time(small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Over:
+        def __init__(self, seconds: float, action: Callable[[int], None], arguments: list[int]) -> None:
+            assert seconds == 30
+            self.start, self.cancel = lambda: action(*arguments), lambda: None
+
+    monkeypatch.setattr("threading.Timer", Over)
+    with pytest.raises(click.Abort):
+        run("rays", "--quick", "--profile", small, "--out", tmp_path / "out", "--minutes", "0.5")
+    assert not list((tmp_path / "out/results").glob("*.json"))
 
 
 def test_the_paper_is_done_in_the_order_of_worth() -> None:
