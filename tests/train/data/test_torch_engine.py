@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 
 from lightpage.device.state import load_device
 from lightpage.errors import InvalidInputError
@@ -55,6 +56,25 @@ def test_pages_are_those_of_numpy_but_for_the_noise() -> None:
         assert np.abs(np.subtract(*still)).max() <= 1  # half a count may round either way
         hot = [getattr(simulator.dark(), name) for simulator in (plain, other)]
         np.testing.assert_array_equal(*hot)
+
+
+def test_a_page_is_made_on_one_device_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    meta = torch.device("meta")  # it computes nothing, and refuses tensors of others
+
+    class Noise:
+        poisson = staticmethod(torch.poisson)
+
+        def standard_normal(self, shape: tuple[int, ...], dtype: object = None) -> torch.Tensor:
+            return torch.randn(shape, device=meta)
+
+    monkeypatch.setattr("lightpage.train.data.torch_engine.torch_device", lambda _: meta)
+    engine = TorchEngine("cuda")
+    monkeypatch.setattr(engine, "generator", lambda _: Noise())
+    simulator = Simulator(PROFILE, ROUGH, engine=engine)
+    simulator.optics.__dict__["signal_scale"] = 1.0  # a number that comes back
+    seen = simulator.see(random_symbols(PROFILE, 256, 1, np.random.default_rng(0))[0])
+    assert {part.device for part in (*seen.frames, seen.exit_field)} == {meta}
+    assert [part.dtype for part in seen.frames] == [torch.uint16] * 2
 
 
 @pytest.mark.parametrize("name", ["cuda", "cuda:0", "tpu", "cuda:x", "cpu:1", ""])
