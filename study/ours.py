@@ -67,7 +67,7 @@ def preset_trained(settings: Settings, data_set: DataSet, preset: str, work: Pat
             chosen = Split(numbers[:first], numbers[first:second], numbers[second:], *shares)
             trainer = SymbolTrainer(PRESETS[preset].localizer, choices, 0, None)
             processes = Processes(1, compute=lights.compute)
-            calibration = _calibrated(work / "calibration.toml", recording, data_set)
+            calibration = _calibrated(work / "calibration.toml", recording, data_set, processes)
             make_run(run, recording, data_set.profile, trainer, usable, chosen, lambda: calibration, processes)
             progress("export", 0.8)
             if not bundle.exists():
@@ -104,10 +104,11 @@ def _record(path: Path, data_set: DataSet, made: MadePages, pages: list[int]) ->
             writer.append(made.symbols[page], made.pair(page))
 
 
-def _calibrated(path: Path, recording: Recording, data_set: DataSet) -> Calibration:
+def _calibrated(path: Path, recording: Recording, data_set: DataSet, processes: Processes) -> Calibration:
     """Return the calibration that is kept there, made if it is not: made again, it would differ in a last digit."""
     if not path.exists():
-        calibrate_recording(recording, data_set.profile, range(_CALIBRATED), lambda *_: None).save(path)
+        pages, quiet = range(_CALIBRATED), lambda *_: None
+        calibrate_recording(recording, data_set.profile, pages, quiet, compute=processes.device).save(path)
     return load_calibration(path)
 
 

@@ -56,6 +56,13 @@ class Processes:
         _, _, number = self.compute.partition(":")
         return [int(number or 0)] if self.accelerator == "gpu" else self.devices
 
+    @property
+    def device(self) -> torch.device:
+        """Device on which the first process prepares pages."""
+        if self.accelerator == AUTO:
+            return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        return torch.device(self.compute)
+
     def checked(self) -> Processes:
         """Check the processes, and return them as `torchrun` says if that has started this process.
 

@@ -7,9 +7,13 @@ import torch
 from lightpage.device.state import load_device
 from lightpage.errors import InvalidInputError
 from lightpage.page.symbols import random_symbols
+from lightpage.recording.frame_pair import FramePair
 from lightpage.simulator.cameras import resample
 from lightpage.simulator.simulator import Simulator
+from lightpage.simulator.true_optics import perfectly_calibrated
+from lightpage.train.data.features import FeatureExtractor
 from lightpage.train.data.torch_engine import TorchEngine, torch_device
+from lightpage.train.models.decoder import LOCALIZERS
 from tests.lightpage.small import random_phases, small_profile
 
 PROFILE = small_profile()
@@ -90,3 +94,14 @@ def test_a_device_beyond_the_last_is_refused(monkeypatch: pytest.MonkeyPatch) ->
     assert torch_device("cuda:1").index == 1
     with pytest.raises(InvalidInputError, match="cuda:1"):
         torch_device("cuda:2")
+
+
+@pytest.mark.parametrize("localizer", LOCALIZERS)
+def test_features_are_computed_where_they_are_asked_for_alone(localizer: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As above; what comes back to numpy is made up."""
+    monkeypatch.setattr(torch.Tensor, "cpu", lambda self: torch.zeros(self.shape, dtype=self.dtype))
+    device = perfectly_calibrated(PROFILE, ROUGH, FramePair(*np.full((2, *PROFILE.frame_shape), 9, np.uint16)))
+    extractor = FeatureExtractor(device, localizer, compute=torch.device("meta"))
+    page, _ = extractor.page(extractor.field(device.references), random_phases(PROFILE), np.zeros(2))
+    assert page.light.shape[-2:] == PROFILE.page_shape
+    assert {part.device.type for part in extractor.recovery.buffers()} == {"cpu"}
