@@ -6,7 +6,7 @@
 #       -e LIGHTPAGE_SERVICE__INSECURE=true lightpage:runtime
 #
 # The build argument `BASE` names the Debian that it is made from; a release names it with its digest. Python packages are
-# those of release/locks, each checked by its SHA-256 (docs/supply-chain.md).
+# those of release/locks, each checked by its SHA-256 (docs/reference/supply-chain.md).
 #
 # Two optional build secrets carry the builder's own package settings in without leaving them in a layer:
 # `pip_conf` (a pip configuration file) and `ca_bundle` (trusted certificates, where the registry needs its own). A build

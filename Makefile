@@ -187,7 +187,7 @@ bench-image-search: $(STAMP)  ## how the image is found, followed and confirmed:
 	$(BIN)/python -m analysis.tracking.image_search --out runs/bench-image-search
 
 RESULTS_ARGS ?=
-results: $(STAMP)  ## write docs/results.md from analysis/results: RESULTS_ARGS="--from runs/bench-decoders" collects first
+results: $(STAMP)  ## write docs/results/index.md from analysis/results: RESULTS_ARGS="--from runs/bench-decoders" collects first
 	$(BIN)/python -m analysis.results.page $(RESULTS_ARGS)
 
 proto: $(STAMP)  ## regenerate the gRPC stubs from proto/

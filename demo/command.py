@@ -13,7 +13,7 @@ from lightpage.cli.progress_bar import percent_bar
 from lightpage.demo.demo import run_demo
 from lightpage.demo.result import DemoResult
 from lightpage.errors import InvalidInputError
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.runtime.archives.recordings.coded_pages import AIR_LEVELS
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 
@@ -40,9 +40,8 @@ def demo(bundle: str, out: Path, seed: int, spec: str | None, json_path: Path | 
     with percent_bar() as progress:
         result = run_demo(bundle_path(bundle), out, seed, progress, spec)
     figures = result.to_json() | {"seconds": time.perf_counter() - start}
-    write_json(out / "demo.json", figures)
-    if json_path is not None:
-        write_json(json_path, figures)
+    for path in (out / "demo.json", json_path):
+        write_figures(path, figures, bundle=bundle_path(bundle), options={"seed": seed, "source": spec})
     write_figure(result, out / "demo.png")
     click.echo(describe(result))
     click.echo(f"\nwritten to {out}: demo.json, demo.png, pages.h5, pictures ({figures['seconds']:.0f} s)")

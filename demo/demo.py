@@ -102,7 +102,7 @@ def heal(recalibrator: Recalibrator, kept: KeptPages, decoder: Decoder, progress
         InvalidInputError: none was lost.
     """
     pages = recalibrator.kept_pages(kept)
-    if pages is None or not kept.lost(decoder):
+    if pages is None or not kept.enough_for_lost(decoder):
         raise InvalidInputError(
             "demo, after the drift", "no page that was lost", "a device that this drift is too much for"
         )

@@ -38,7 +38,8 @@ from lightpage.runtime.service.settings import TABLES
 ROOT = Path(__file__).resolve().parents[1]
 DOCS, PAGES, SITE = ROOT / "docs", ROOT / "build" / "pages", ROOT / "build" / "site"
 MADE = "<!-- Made of the code by release/build_site.py. -->\n\n"
-METRICS = {"Counter", "Gauge", "Histogram", "CounterMetricFamily", "GaugeMetricFamily", "HistogramMetricFamily"}
+METRICS = {"counter", "gauge", "histogram"}
+"""Kinds of metrics, as functions and classes that make them are called, `MetricFamily` at the end left out."""
 
 
 def commands() -> str:
@@ -108,14 +109,14 @@ def _metrics_of(path: Path) -> Iterator[tuple[str, str, list[str], str]]:
         match node:
             case ast.Call(
                 func=ast.Name(id=kind), args=[ast.Constant(value=str(name)), ast.Constant(value=str(text)), *rest]
-            ) if kind in METRICS:
+            ) if (kind := kind.removesuffix("MetricFamily").lower()) in METRICS:
                 lists = [
                     one
                     for one in (*rest, *(k.value for k in node.keywords if k.arg == "labels"))
                     if isinstance(one, ast.List)
                 ]
                 labels = [label.value for one in lists for label in one.elts if isinstance(label, ast.Constant)]
-                yield name, kind.removesuffix("MetricFamily").lower(), [str(label) for label in labels], text
+                yield name, kind, [str(label) for label in labels], text
 
 
 def calls() -> str:

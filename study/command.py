@@ -16,8 +16,7 @@ from lightpage.cli.paths import OutputFolder
 from lightpage.cli.progress_bar import percent_bar
 from lightpage.device.profile import load_profile
 from lightpage.errors import InvalidInputError
-from lightpage.files import write_json
-from lightpage.metrics.provenance import with_provenance
+from lightpage.metrics.provenance import write_figures
 from lightpage.run_files import BEGUN
 from lightpage.study import STUDIES
 from lightpage.study.lights import Lights
@@ -138,10 +137,8 @@ def study(
         "header": list(chosen.header),
         "rows": [list(row) for row in chosen.rows(cases, results)],
     }
-    figures = with_provenance(figures, settings=settings.key(), results=results_folder)
     for path in (out / "study.json", json_path):
-        if path is not None:
-            write_json(path, figures)
+        write_figures(path, figures, settings=settings.key(), results=results_folder)
     click.echo(f"{table}\n\nwritten to {out}")
 
 

@@ -2,7 +2,7 @@
 
     python -m analysis.attacks.identity --json FILE
 
-The certificates are made by the very commands of docs/operations.md, and the table of roles is read from there. A
+The certificates are made by the very commands of docs/guides/serving.md, and the table of roles is read from there. A
 service in a process of its own is called over TLS; each call's request is empty. A caller without a good certificate
 must find no connection (UNAVAILABLE), and one whose role is lacking must hear PERMISSION_DENIED. Any other end means
 that a call was let in. UNAVAILABLE for a caller with a good certificate is wrong, whatever its role.
@@ -34,7 +34,7 @@ from lightpage.runtime.client.wire.channel import TlsFiles, open_channel
 from lightpage.runtime.service.frames.inference_calls import INFERENCE, PREFIX
 from lightpage.runtime.service.server.dispatcher import SERVICE
 
-OPERATIONS = Path(__file__).resolve().parents[2] / "docs" / "operations.md"
+SERVING = Path(__file__).resolve().parents[2] / "docs" / "guides" / "serving.md"
 CALL_S = 10.0
 _UNKNOWN = ("none", "wrong", "expired", "service")
 """Callers without a good certificate, who may not even connect."""
@@ -72,18 +72,18 @@ CALLERS: Mapping[str, Sequence[str]] = {
 
 def commands_of(section: str) -> str:
     """The first commands of a section of the documentation, for bash."""
-    found = re.search(rf"### {section}\n.*?```\n(.*?)```", OPERATIONS.read_text("utf-8"), re.DOTALL)
+    found = re.search(rf"### {section}\n.*?```\n(.*?)```", SERVING.read_text("utf-8"), re.DOTALL)
     if found is None:
-        raise RuntimeError(f"{OPERATIONS.name}: no commands in {section}")
+        raise RuntimeError(f"{SERVING.name}: no commands in {section}")
     return found[1]
 
 
 def documented() -> tuple[str, dict[str, str]]:
     """The commands that make certificates, and the role that each call needs, as the documentation has them."""
-    text = OPERATIONS.read_text("utf-8")
+    text = SERVING.read_text("utf-8")
     rows = re.findall(r"^\| `(read|decode|recalibrate|admin)` \| (.+) \|$", text, re.MULTILINE)
     needed = {call: role for role, calls in rows for call in re.findall(r"`([\w/]+)`", calls)}
-    return commands_of("Certificates from nothing"), needed
+    return commands_of("Make certificates"), needed
 
 
 def expected(caller: str, role: str) -> str:

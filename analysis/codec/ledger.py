@@ -29,7 +29,7 @@ from lightpage.codec.page_codec import PageCodec
 from lightpage.codec.volume import DATA_PAGES, PARITY_PAGES, Volume, encode_volume
 from lightpage.device.profile import Profile, load_profile
 from lightpage.device.state import Device
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.recording.pages import Pages, PagesWriter
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.coded_pages import choose_code
@@ -196,7 +196,7 @@ def main(out: Path, pages: int, names: tuple[str, ...]) -> None:
         figures["margins"] = [page.margin_bits for page in found.pages]
         figures["losses"] = [asdict(page) for page in found.unread]
         ledger[name] = figures
-        write_json(out / "ledger.json", ledger)
+        write_figures(out / "ledger.json", ledger, bundle=bundle_path("bench"), weights=WEIGHTS)
         click.echo(line(name, figures))
 
 

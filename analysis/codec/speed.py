@@ -30,7 +30,7 @@ from lightpage.codec.page_codec import PageCodec
 from lightpage.codec.volume import DATA_PAGES, PARITY_PAGES, Volume, encode_volume
 from lightpage.device.profile import Profile, load_profile
 from lightpage.errors import InvalidInputError
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.page.levels import Levels
 from lightpage.page.modulation import NOMINAL, Modulation
 from lightpage.page.symbols import pilot_mask, pilot_symbols, symbol_phases
@@ -130,9 +130,10 @@ def main(blocks: int, rounds: int, json_path: Path | None) -> None:
     for name, (profile_name, size, code) in PAGES.items():
         encoding[name] = time_encoding(load_profile(profile_name).with_symbols_of(size), code, 2_000_000)
         click.echo(f"{name}: a file to pages {encoding[name]:.1f} MB/s")
-    if json_path is not None:
-        found = {"page_code": in_use(), "decoders": found, "pages": pages, "encode_MB_per_second": encoding}
-        write_json(json_path, found)
+    found = {"page_code": in_use(), "decoders": found, "pages": pages, "encode_MB_per_second": encoding}
+    write_figures(
+        json_path, found, pages={name: (profile, size, code.id) for name, (profile, size, code) in PAGES.items()}
+    )
 
 
 if __name__ == "__main__":

@@ -24,8 +24,8 @@ from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, load_device
 from lightpage.errors import InvalidInputError
-from lightpage.files import write_json
 from lightpage.metrics.information import own_information
+from lightpage.metrics.provenance import write_figures
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 from lightpage.page.symbols import random_symbols
 from lightpage.progress import track
@@ -58,6 +58,7 @@ def earlier(path: Path, asked: dict[str, object]) -> list[list[float]]:
 
 @click.command()
 @click.option("--profile", "profile_name", default="bench", show_default=True, help="Shipped profile or TOML file.")
+@click.option("--symbol-size", type=click.IntRange(1), help="Pixels; the profile's if left out.")
 @click.option("--device", "state", type=click.Path(path_type=Path), help="True state (TOML).")
 @click.option("--set", "settings", multiple=True, metavar="TABLE.KEY=VALUE", help="Of the true state.")
 @click.option("--levels", type=click.IntRange(MIN_LEVELS, MAX_LEVELS), default=MAX_LEVELS, show_default=True)
@@ -67,6 +68,7 @@ def earlier(path: Path, asked: dict[str, object]) -> list[list[float]]:
 @click.option("--json", "json_path", type=OutputFile(), required=True)
 def main(
     profile_name: str,
+    symbol_size: int | None,
     state: Path | None,
     settings: tuple[str, ...],
     levels: int,
@@ -77,6 +79,7 @@ def main(
 ) -> None:
     """Print the bound with its standard error, bits a symbol."""
     profile = load_profile(profile_name)
+    profile = profile.with_symbols_of(symbol_size or profile.page.symbol_size_px)
     device = (Device() if state is None else load_device(state)).of_profile(profile).with_settings([*settings])
     asked: dict[str, object] = {
         "profile": profile.to_toml(),
@@ -91,10 +94,10 @@ def main(
         bound = LightBound(profile, device, random_symbols(profile, levels, 1, rng)[0], levels)
         places = rng.integers(profile.page_shape, size=(symbols, 2))
         found.append([bound.concentration(row, column) for row, column in places.tolist()])
-        write_json(json_path, {"asked": asked, "concentrations": found})
+        write_figures(json_path, {"asked": asked, "concentrations": found}, asked=asked)
     each = bits([one for page in found[:pages] for one in page], levels, np.random.default_rng(seed))
     figures = {"bits": float(each.mean()), "standard_error": float(each.std(ddof=1) / np.sqrt(each.size))}
-    write_json(json_path, {"asked": asked, **figures, "concentrations": found})
+    write_figures(json_path, {"asked": asked, **figures, "concentrations": found}, asked=asked)
     click.echo(f"bound {figures['bits']:.3f} +- {figures['standard_error']:.3f} bits a symbol, {each.size} symbols")
 
 

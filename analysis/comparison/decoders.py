@@ -37,7 +37,7 @@ from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFolder
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, Sensor, ideal_device
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.train.fitting.memory import keep_freed_memory
 from lightpage.train.models.hyperparameters import Hyperparameters
 from lightpage.train.models.presets import FAST
@@ -187,7 +187,9 @@ def main(
                     "ideal": ideal,
                     "outcomes": [outcome.as_json() for outcome in outcomes],
                 }
-                write_json(out / "figures.json", {"pages": pages, "seed": seed, "data_sets": [*measured, data_set]})
+                figures = {"pages": pages, "seed": seed, "data_sets": [*measured, data_set]}
+                inputs = {"profile": nominal.to_toml(), "weights": trained / Path(profile_name).stem}
+                write_figures(out / "figures.json", figures, **inputs)
                 draw([*measured, data_set], out)
         measured.append(data_set)
         click.echo(f"\n{title(data_set)}")

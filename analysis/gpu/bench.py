@@ -11,10 +11,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import re
-import subprocess
-import sys
 import time
 import traceback
 from collections import defaultdict
@@ -33,6 +30,7 @@ from analysis.gpu.kept_form import Form, Scene, form_of, scene_of
 from lightpage.errors import InvalidInputError
 from lightpage.export.operators.batches import BatchFile
 from lightpage.files import write_json
+from lightpage.metrics.provenance import PROVENANCE, commit, provenance
 from lightpage.runtime.model.decoding.batch_graph import SHIFT
 from lightpage.runtime.model.execution.providers import Provider
 from lightpage.runtime.model.execution.session import BoundSession, open_session
@@ -68,9 +66,10 @@ class Kept:
     def __init__(self, path: Path, head: Mapping[str, Any]) -> None:
         self.path = path
         self.whole: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {PARTS: {}}
-        for name in ("card", "commit"):  # figures of two cards or programs are not mixed
-            if self.whole.get(name, head.get(name)) != head.get(name):
-                raise InvalidInputError(f"{path}: {name}", self.whole[name], f"{head.get(name)}, or another folder")
+        for name, now in (("card", head["card"]), ("commit", commit())):  # of two cards or programs nothing is mixed
+            before = (self.whole if name in head else self.whole.get(PROVENANCE, {})).get(name, now)
+            if before != now:
+                raise InvalidInputError(f"{path}: {name}", before, f"{now}, or another folder")
         self.whole |= dict(head)
 
     def part(self, name: str, measure: Callable[[], Any]) -> Any:
@@ -366,9 +365,7 @@ def main(
     machine = Machine.of(provider)
     torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
     card = torch.cuda.get_device_name(0) if provider == CUDA else "cpu"
-    commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
-    command = f"python -m analysis.gpu.bench {' '.join(sys.argv[1:])}"
-    kept = Kept(out / "gpu.json", {"card": card, "command": command, "commit": os.environ.get("COMMIT", commit)})
+    kept = Kept(out / "gpu.json", {"card": card, PROVENANCE: provenance(weights=folder).to_json()})
     kept.part("ceilings", lambda: ceilings(machine))
     scene = scene_of(folder, simulated or out)
     for preset in presets:

@@ -1,1 +1,1 @@
-"""Figures of the benchmarks, one JSON file for each measurement, and docs/results.md made from them."""
+"""Figures of the benchmarks, one JSON file for each measurement, and docs/results/index.md made from them."""

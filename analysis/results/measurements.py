@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
-import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
+from lightpage.device.profile import parse_profile
 from lightpage.errors import InvalidInputError
 from lightpage.files import write_json
+from lightpage.metrics.provenance import PROVENANCE, Provenance
 
 Figures = dict[str, Any]
 
@@ -28,8 +30,11 @@ COMPARISONS = (
 )
 """Folders of `make bench-decoders`."""
 EVALUATION, DEMO, IMAGE_SEARCH, LEDGER = "evaluation", "demo", "image-search", "ledger"
+PAGE_CODE = "page-code"
 SPEED = "speed-"
 """Before the name of a profile."""
+BOUND = "bound-"
+"""Before the name of a data set."""
 
 
 @dataclass(frozen=True)
@@ -38,12 +43,12 @@ class Measurement:
 
     Attributes:
         figures: under the names that the benchmark gave them.
-        source: "measured DATE on COMMIT", or the document that they were copied from.
+        provenance: what measured them, or where they were copied from.
         note: remark that a reader must know, if any.
     """
 
     figures: Figures
-    source: str
+    provenance: Provenance
     note: str = ""
 
     @classmethod
@@ -55,14 +60,14 @@ class Measurement:
         """
         kept = read_object(path)
         try:
-            return cls(kept["figures"], kept["source"], kept.get("note", ""))
-        except KeyError as error:
-            raise InvalidInputError(f"figures {path}", f"no {error}", "a file of analysis/results") from None
+            return cls(kept["figures"], Provenance.model_validate(kept[PROVENANCE]), kept.get("note", ""))
+        except (KeyError, ValidationError) as error:
+            raise InvalidInputError(f"figures {path}", error, "a file of analysis/results") from None
 
     def write(self, path: Path) -> None:
         """Write it as JSON."""
         note = {"note": self.note} if self.note else {}
-        write_json(path, {"source": self.source, **note, "figures": self.figures})
+        write_json(path, {PROVENANCE: self.provenance.to_json(), **note, "figures": self.figures})
 
 
 def read_object(path: Path) -> Figures:
@@ -85,36 +90,24 @@ def kept_measurements(folder: Path = KEPT) -> dict[str, Measurement]:
     return {path.stem: Measurement.read(path) for path in sorted(folder.glob("*.json"))}
 
 
-def collected(name: str, path: Path, commit: str | None = None) -> Measurement:
+def collected(name: str, path: Path) -> Measurement:
     """Collect the figures that a benchmark has written, reduced to those that the pages need.
 
     Args:
         name: name of the measurement.
-        path: path of its JSON, whose date is taken for the measurement's.
-        commit: commit that was measured; the one that is checked out where the JSON lies if None.
+        path: path of its JSON.
 
     Raises:
-        InvalidInputError: no JSON of that benchmark, or a checkout that is younger than it or missing.
+        InvalidInputError: no JSON of that benchmark, or one that does not say where it is from.
     """
-    figures = slim(name, read_object(path))
-    written = path.stat().st_mtime
-    if commit is None:
-        commit, committed = checked_out(path.parent)
-        if not commit or committed > written:
-            got = "a younger commit checked out" if commit else "no checkout"
-            raise InvalidInputError(f"figures {path}", got, "--commit with the commit that was measured")
-    return Measurement(figures, f"measured {datetime.fromtimestamp(written, UTC):%Y-%m-%d} on commit {commit[:7]}")
-
-
-def checked_out(folder: Path) -> tuple[str, int]:
-    """The commit that is checked out where a folder lies, and its time, seconds since 1970; "" and 0 without one."""
-    command = ["git", "-C", str(folder), "log", "-1", "--format=%H %ct"]
+    figures = read_object(path)
     try:
-        told = subprocess.run(command, capture_output=True, text=True, check=False).stdout
-    except OSError:
-        told = ""
-    commit, _, committed = told.strip().partition(" ")
-    return commit, int(committed or 0)
+        provenance = Provenance.model_validate(figures.pop(PROVENANCE, {}))
+    except ValidationError as error:
+        raise InvalidInputError(f"figures {path}", error, "a provenance") from None
+    if provenance.unknown:
+        raise InvalidInputError(f"figures {path}", f"no {', '.join(provenance.unknown)}", "all of the provenance")
+    return Measurement(slim(name, figures), provenance)
 
 
 def slim(name: str, figures: Figures) -> Figures:
@@ -123,7 +116,7 @@ def slim(name: str, figures: Figures) -> Figures:
     Raises:
         InvalidInputError: another benchmark's.
     """
-    take = comparison if name in COMPARISONS else _TAKE.get(name, speed)
+    take = comparison if name in COMPARISONS else bound if name.startswith(BOUND) else _TAKE.get(name, speed)
     try:
         return take(figures)
     except (KeyError, TypeError, IndexError) as error:
@@ -149,9 +142,11 @@ def methods(measurement: Measurement) -> set[str]:
 
 
 def evaluation(figures: Figures) -> Figures:
-    """Keep the numbers and texts of the figures of `lightpage evaluate`."""
+    """Keep the numbers and texts of the figures of `lightpage evaluate`, but for its times: others work beside it."""
     return {"air_bits_per_symbol": figures["air_bits_per_symbol"]} | {
-        key: value for key, value in figures.items() if isinstance(value, int | float | str)
+        key: value
+        for key, value in figures.items()
+        if isinstance(value, int | float | str) and not key.endswith("seconds_per_page")
     }
 
 
@@ -181,6 +176,21 @@ def ledger(figures: Figures) -> Figures:
 def speed(figures: Figures) -> Figures:
     """Keep the figures of `analysis.speed.speed` that the pages need."""
     return {key: figures[key] for key in ("profile", "threads", "repeats", "decoders")}
+
+
+def bound(figures: Figures) -> Figures:
+    """Keep the figures of `analysis.comparison.bound`, with what tells its data set."""
+    profile, sensor = parse_profile(figures["asked"]["profile"], "bound"), figures["asked"]["device"]["sensor"]
+    return {
+        "profile": profile.name,
+        "angle_deg": figures["asked"]["device"]["geometry"]["pipe_angle_deg"],
+        "full_well_e": sensor["full_well_e"],
+        "exposure": sensor["exposure_relative"],
+        "symbol_size_px": profile.page.symbol_size_px,
+        "bits": figures["bits"],
+        "standard_error": figures["standard_error"],
+        "symbols": sum(map(len, figures["concentrations"])),
+    }
 
 
 _TAKE: dict[str, Callable[[Figures], Figures]] = {

@@ -1,4 +1,4 @@
-"""Writes docs/results.md from the figures in analysis/results, after collecting newer ones if asked to.
+"""Writes docs/results/index.md from the figures in analysis/results, after collecting newer ones if asked to.
 
     python -m analysis.results.page --from runs/bench-decoders
 
@@ -9,6 +9,7 @@ that is kept is not collected: it is not finished.
 from __future__ import annotations
 
 import sys
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +19,7 @@ from jinja2 import Environment, StrictUndefined
 
 from analysis.comparison.outcome import SETTLED_BITS
 from analysis.results.measurements import (
+    BOUND,
     COMPARISONS,
     DEMO,
     EVALUATION,
@@ -31,6 +33,7 @@ from analysis.results.measurements import (
     kept_measurements,
     methods,
     read_object,
+    slim,
 )
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
@@ -38,20 +41,33 @@ from lightpage.device.profile import load_profile
 from lightpage.device.state import Device
 from lightpage.files import replace_file, replace_text
 
+_DATA_SET = ("angle_deg", "full_well_e", "exposure", "symbol_size_px")
+"""Keys of a data set that tell its light."""
+
 ROOT = Path(__file__).parents[2]
-PAGE, PICTURE = ROOT / "docs" / "results.md", Path("images") / "decoders.png"
+PAGE, PICTURE = ROOT / "docs" / "results" / "index.md", Path("images") / "decoders.png"
 PICTURED = "sheared"
 """The comparison whose picture the page shows."""
 TEMPLATE = "results.md.j2"
 LEDGER_LABELS = {
-    "bright": "quarter scale, 4x4, 15,000 electrons, shipped",
-    "32e": "quarter scale, 4x4, 32 electrons, two passes",
+    "bright": "bench, 4x4, 15,000 electrons, shipped",
+    "32e": "bench, 4x4, 32 electrons, two passes",
     "full-size 4x4 fast": "full size, 4x4, 32 electrons, `fast`",
     "full-size 4x4 standard": "full size, 4x4, 32 electrons, `standard`",
     "full-size 4x4": "full size, 4x4, 32 electrons, two passes",
     "full-size 2x2": "full size, 2x2, 32 electrons, two passes",
 }
 """Data sets of the ledger of user bytes, in the order of its table."""
+SPEED_LABELS = {
+    "fast": "`--preset fast`",
+    "coherent": "one pass, coherent",
+    "wave": "`--preset standard`",
+    "refined": "`--preset accurate`",
+    "ray 32/64": "published, ray localizer",
+}
+"""Decoders of the speed benchmark, in the order of its table."""
+FULL_SIZE = "full-size"
+"""Begins the names of comparisons on the profile `paper`; others are on `bench`."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +95,7 @@ class Results:
             for outcome in data_set["outcomes"]:
                 # the name of a method with several passes ends with their number
                 if data_set["angle_deg"] == angle_deg and outcome["method"].removesuffix(" 1") == method:
-                    return {"exposure": data_set["exposure"], **outcome}
+                    return {**{key: data_set[key] for key in _DATA_SET}, **outcome}
         self._miss(f"{name}, {angle_deg:g} degree, {method}")
         return None
 
@@ -89,14 +105,42 @@ class Results:
         whole = [outcome for outcome in found if outcome is not None]
         return whole if len(whole) == len(methods) else None
 
-    def times(self, profile: str, decoder: str, other: str) -> float | None:
-        """Return a decoder's time over another's in the speed benchmark; None where one of them was not timed."""
+    def seconds(self, profile: str, decoder: str) -> float | None:
+        """Return the seconds of a page in the speed benchmark; None where the decoder was not timed."""
         name = f"{SPEED}{profile}"
-        seconds = {timed["decoder"]: timed["seconds"] for timed in (self.figures(name) or {"decoders": []})["decoders"]}
-        lacking = [f"{name}, {one}" for one in (decoder, other) if one not in seconds]
-        for what in lacking:
-            self._miss(what)
-        return None if lacking else float(seconds[decoder] / seconds[other])
+        for timed in (self.figures(name) or {"decoders": []})["decoders"]:
+            if timed["decoder"] == decoder:
+                return float(timed["seconds"])
+        self._miss(f"{name}, {decoder}")
+        return None
+
+    def bounds(self) -> list[Figures]:
+        """Return the bounds of the light that are known."""
+        return [of.figures for name, of in self.measurements.items() if name.startswith(BOUND)]
+
+    def bound(self, name: str, outcome: Figures) -> Figures | None:
+        """Return the bound of a comparison's light, None where it is not known or the device has no defects."""
+        profile = "paper" if name.startswith(FULL_SIZE) else "bench"
+        return self.bound_of(profile, *(outcome[key] for key in _DATA_SET))
+
+    def bound_of(self, profile: str, *data_set: float) -> Figures | None:
+        """Return the bound of a device's light.
+
+        Args:
+            profile: name of the profile.
+            data_set: values of `_DATA_SET`.
+        """
+        asked = [profile, *data_set]
+        return next((of for of in self.bounds() if [of[key] for key in ("profile", *_DATA_SET)] == asked), None)
+
+    def origins(self) -> list[tuple[tuple[str, str], list[str]]]:
+        """Return the names of measurements by their commit, shortened, and their source."""
+        found = defaultdict[tuple[str, str], list[str]](list)
+        for name, measurement in self.measurements.items():
+            of = measurement.provenance
+            source = "notebook" if "notebook" in of.source else "output" if of.source else "complete"
+            found[of.commit[:7], source].append(name)
+        return list(found.items())
 
     def _miss(self, what: str) -> None:
         if what not in self.missing:
@@ -116,6 +160,7 @@ def render(results: Results) -> str:
         symbols=symbols,
         learning_bits=SETTLED_BITS,
         LEDGER_LABELS=LEDGER_LABELS,
+        SPEED_LABELS=SPEED_LABELS,
     )
 
 
@@ -140,6 +185,12 @@ def symbols(profile: str, size_px: int) -> str:
     return f"{columns} x {rows} of {size_px}x{size_px}"
 
 
+def bound_name(figures: Figures) -> str:
+    """Return the name under which a bound is kept."""
+    angle, well, exposure, size = (f"{figures[key]:g}" for key in _DATA_SET)
+    return f"{BOUND}{figures['profile']}_{angle}deg_{well}e_{exposure}x_{size}px"
+
+
 def copy_picture(path: Path, to: Path) -> None:
     """Copy a picture whole, into a folder that is made if it is not there.
 
@@ -158,6 +209,13 @@ def copy_picture(path: Path, to: Path) -> None:
     type=click.Path(exists=True, file_okay=False, path_type=Path),
     help="Collect the comparisons below this folder.",
 )
+@click.option(
+    "--bound",
+    "bounds",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    help="Collect a JSON of `analysis.comparison.bound`.",
+)
 @click.option("--evaluation", type=click.Path(path_type=Path), help="Collect the JSON of `lightpage evaluate`.")
 @click.option("--demo", type=click.Path(path_type=Path), help="Collect the demo.json of `lightpage demo`.")
 @click.option("--image-search", type=click.Path(path_type=Path), help="Collect the figures.json of the image search.")
@@ -169,7 +227,6 @@ def copy_picture(path: Path, to: Path) -> None:
     multiple=True,
     help="Collect a JSON of `analysis.speed.speed`.",
 )
-@click.option("--commit", help="That was measured; the one checked out where the JSON lies if left out.")
 @click.option(
     "--kept",
     type=click.Path(exists=True, file_okay=False, path_type=Path),
@@ -177,21 +234,22 @@ def copy_picture(path: Path, to: Path) -> None:
     show_default="analysis/results",
     help="Folder of the figures.",
 )
-@click.option("--out", type=OutputFile(), default=PAGE, show_default="docs/results.md", help="The page.")
+@click.option("--out", type=OutputFile(), default=PAGE, show_default="docs/results/index.md", help="The page.")
 def main(
     comparisons: Path | None,
+    bounds: tuple[Path, ...],
     evaluation: Path | None,
     demo: Path | None,
     image_search: Path | None,
     ledger: Path | None,
     speeds: tuple[Path, ...],
-    commit: str | None,
     kept: Path,
     out: Path,
 ) -> None:
-    """Write docs/results.md from the kept figures."""
+    """Write docs/results/index.md from the kept figures."""
     given = {EVALUATION: evaluation, DEMO: demo, IMAGE_SEARCH: image_search, LEDGER: ledger}
     found = {name: path for name, path in given.items() if path is not None}
+    found |= {bound_name(slim(BOUND, read_object(path))): path for path in bounds}
     found |= {f"{SPEED}{read_object(path).get('profile')}": path for path in speeds}
     if comparisons is not None:
         below = {name: comparisons / name / "figures.json" for name in COMPARISONS}
@@ -200,15 +258,15 @@ def main(
             click.echo(f"not collected, no {below[name]}")
     before = kept_measurements(kept)
     for name, path in found.items():
-        measurement = collected(name, path, commit)
+        measurement = collected(name, path)
         lacking = methods(before[name]) - methods(measurement) if name in before else set()
         if lacking:  # a comparison writes its figures method by method
             click.echo(f"not collected, unfinished: {path} lacks {', '.join(sorted(lacking))}")
             continue
         measurement.write(kept / f"{name}.json")
-        click.echo(f"{name}: {measurement.source}")
+        click.echo(f"{name}: {measurement.provenance.time}, commit {measurement.provenance.commit[:7]}")
         if name == PICTURED and (drawn := path.with_name("figure.png")).exists():
-            copy_picture(drawn, out.parent / PICTURE)
+            copy_picture(drawn, out.absolute().parents[1] / PICTURE)
     results = Results(kept_measurements(kept))
     replace_text(out, render(results), "page")
     for what in results.missing:

@@ -43,7 +43,7 @@ NODES = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 ETHERNET_BYTES_PER_S = 1.25e9
 """10 Gbit/s."""
 FULL_SIZE_S, FULL_SIZE_BYTES, FULL_SIZE_SYMBOLS = 3.324, 2 * 5472 * 3648.0, 350 * 225
-"""Seconds of a page of two passes on two cores (docs/experiments/full-size.md), bytes of its frames, its symbols."""
+"""Seconds of a page of two passes on two cores (docs/results/full-size.md), bytes of its frames, its symbols."""
 BENCH_SYMBOLS = 87 * 56
 _DRAWS = 20
 """Jobs whose mean is compared with one that was run."""

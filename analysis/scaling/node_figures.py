@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from analysis.scaling.idle_worker import nothing
 from lightpage.errors import InvalidInputError
 from lightpage.helper_process import same_packages
+from lightpage.metrics.provenance import Provenance, provenance
 from lightpage.runtime.archives.run.engine import Engine
 from lightpage.runtime.archives.run.job import Job
 from lightpage.runtime.archives.run.ledger import Ledger
@@ -80,6 +81,7 @@ class NodeFigures(Part):
     """Figures of a node that the model of a cluster is made from.
 
     Attributes:
+        provenance: where they are from.
         cores: cores of the machine.
         range_pages, pages: numbers of pages of a range, and of a run.
         measured: runs that the model is made from, by their workers.
@@ -90,6 +92,7 @@ class NodeFigures(Part):
         local, ray: the driver of either engine.
     """
 
+    provenance: Provenance = Provenance()
     cores: int
     range_pages: int
     pages: int
@@ -136,6 +139,7 @@ def measure(recording: Path, folder: Path, range_pages: int, worker_counts: tupl
     with connected(None):
         ray = tuple(_driver(RayEngine(None, in_flight, 1, nothing), in_flight) for in_flight in IN_FLIGHT)
     return NodeFigures(
+        provenance=provenance(recording=recording),
         cores=available_cpus(),
         range_pages=range_pages,
         pages=found.pages,

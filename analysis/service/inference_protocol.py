@@ -33,7 +33,7 @@ PACKAGES = ("tritonclient[grpc]==2.73.0", "grpcio-health-checking==1.81.1", "grp
 
 _INSTALL_S = 600.0
 _CHECKS_S = 1800.0
-_PAGE = Path(__file__).resolve().parents[2] / "docs" / "contract-inference.md"
+_PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "contract.md"
 _PROGRAM = Path(__file__).with_name("triton_checks.py")
 
 
@@ -87,7 +87,8 @@ def expect(service: RunningService, bundle: Bundle, folder: Path) -> None:
         pilot_mask=bundle.pilot_mask.astype(np.uint8),
     )
     (folder / "expected.json").write_text(json.dumps(told), "utf-8")
-    found_example = re.search(r"```python\n(.*?)```", _PAGE.read_text("utf-8"), re.DOTALL)
+    section = _PAGE.read_text("utf-8").partition("\n## Open Inference Protocol\n")[2]
+    found_example = re.search(r"```python\n(.*?)```", section, re.DOTALL)
     assert found_example is not None  # the page has one
     (folder / "example.py").write_text(found_example[1].replace(ADDRESS, service.target), "utf-8")
 

@@ -25,7 +25,7 @@ from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import load_profile
 from lightpage.export.onnx_files import decoder_onnx
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.runtime.model.execution.cpus import available_cpus
 
 _PROFILED = 3
@@ -98,8 +98,7 @@ def main(
             found = profiled(model, feeds, threads, machine)
             click.echo("\n".join([f"\n{name}", *lines(found)]))
             figures["parts"][name] = [asdict(part) for part in found]
-    if json_path is not None:
-        write_json(json_path, figures)
+    write_figures(json_path, figures, profile=profile.to_toml())
 
 
 if __name__ == "__main__":

@@ -18,10 +18,11 @@ from pathlib import Path
 
 import click
 
+from analysis.comparison.weight_store import TRAINED
 from analysis.tracking.cost import full_size, speed
 from analysis.tracking.figure import POINTS, draw
 from analysis.tracking.first_pages import APART_PX, OFFSETS_PX, apart, offsets
-from analysis.tracking.operating_points import Figures, points
+from analysis.tracking.operating_points import NOISY, Figures, points
 from analysis.tracking.tables import (
     tell_apart,
     tell_full_size,
@@ -37,7 +38,8 @@ from analysis.tracking.wrong_pages import false_acquisitions
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFolder
 from lightpage.errors import InvalidInputError
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
+from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 
 WANTED_SHARE = 0.98
 WALKED = 200
@@ -62,7 +64,8 @@ class FigureStore:
         """The figures of a part, measured if they are not there."""
         if name not in self.figures:
             self.figures[name] = make()
-            write_json(self.path, self.figures)
+            inputs = {"bundle": bundle_path(DEFAULT), "weights": TRAINED / "bench" / NOISY}
+            write_figures(self.path, self.figures, **inputs)
         part: Figures = self.figures[name]
         return part
 

@@ -1,6 +1,6 @@
 """User bytes on a page and back: checksum, scrambler, Reed-Solomon words, LDPC blocks, interleaver, levels.
 
-`docs/formats.md` specifies the page bit by bit; this file follows its order.
+`docs/reference/formats.md` specifies the page bit by bit; this file follows its order.
 """
 
 from __future__ import annotations

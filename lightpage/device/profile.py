@@ -38,9 +38,12 @@ class TomlTable(BaseModel):
 
 
 class StrictTable(TomlTable):
-    """A table whose values are of the right type to begin with: no text stands for a number."""
+    """A table whose values are of the right type to begin with: no text stands for a number.
 
-    model_config = ConfigDict(strict=True)
+    The text below a key is its description.
+    """
+
+    model_config = ConfigDict(strict=True, use_attribute_docstrings=True)
 
 
 T = TypeVar("T", bound=TomlTable)
@@ -49,14 +52,14 @@ T = TypeVar("T", bound=TomlTable)
 class Light(TomlTable):
     """The laser."""
 
-    wavelength_m: Length = Field(description="in vacuum")
+    wavelength_m: Length = Field(description="Wavelength in vacuum")
 
 
 class Lens(TomlTable):
     """The launch and the de-launch lens, both in a 2f arrangement."""
 
-    focal_length_m: Length = Field(description="of both lenses, or of the launch lens alone")
-    camera_focal_length_m: Length | None = Field(None, description="of the de-launch lens, where it is another one")
+    focal_length_m: Length = Field(description="Focal length of both lenses, or of the launch lens alone")
+    camera_focal_length_m: Length | None = Field(None, description="Focal length of the de-launch lens, if it differs")
 
 
 class Relay(TomlTable):
@@ -64,19 +67,19 @@ class Relay(TomlTable):
 
     magnification: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] = Field(
         1.0,
-        description="size on the sensors over size behind the de-launch lens; a turned image is the cameras' matter",
+        description="Size of the image on the sensors over that behind the de-launch lens; flips mend a turned one",
     )
 
 
 class LensPath(TomlTable):
     """Optical path of either lens beyond an ideal one's, by its terms, for the page's corner at the pipe's wall."""
 
-    piston_rad: Radians = Field(0.0, description="of the field alone, its fourth power")
-    distortion_rad: Radians = Field(0.0, description="of the third power of the field")
-    astigmatism_rad: Radians = Field(0.0, description="of the second power of the field along it")
-    field_curvature_rad: Radians = Field(0.0, description="of the second power of the field")
-    coma_rad: Radians = Field(0.0, description="of the field's first power")
-    spherical_rad: Radians = Field(0.0, description="of the aperture alone, its fourth power")
+    piston_rad: Radians = Field(0.0, description="Term of the fourth power of the field")
+    distortion_rad: Radians = Field(0.0, description="Term of the third power of the field")
+    astigmatism_rad: Radians = Field(0.0, description="Term of the second power of the field, along it")
+    field_curvature_rad: Radians = Field(0.0, description="Term of the second power of the field")
+    coma_rad: Radians = Field(0.0, description="Term of the first power of the field")
+    spherical_rad: Radians = Field(0.0, description="Term of the fourth power of the aperture")
 
     def at(self, share: float) -> LensPath:
         """The same lenses, stated for a page whose corner lies at that share of this one's distance."""
@@ -98,43 +101,45 @@ class LensPath(TomlTable):
 class Pipe(TomlTable):
     """The light-pipe: a glass prism whose cross-section is a rhombus of height `width_m`, sheared by `angle_deg`."""
 
-    length_m: Length = Field(description="along the light")
-    width_m: Length = Field(description="between opposite walls")
-    refractive_index: Annotated[float, Field(ge=1, le=4)] = Field(description="of its glass, at the wavelength")
+    length_m: Length = Field(description="Length along the light")
+    width_m: Length = Field(description="Distance of opposite walls")
+    refractive_index: Annotated[float, Field(ge=1, le=4)] = Field(
+        description="Refractive index of the glass at the wavelength"
+    )
     angle_deg: Annotated[float, Field(ge=-5, le=5)] = Field(
-        0.0, description="by which its cross-section misses the right angle"
+        0.0, description="Angle by which the cross-section misses the right angle"
     )
 
 
 class Slm(TomlTable):
     """The spatial light modulator."""
 
-    pitch_m: Length = Field(description="from one pixel to the next")
+    pitch_m: Length = Field(description="Distance from one pixel to the next")
 
 
 class PageLayout(TomlTable):
     """Layout of symbols on the SLM, and which of them are pilots."""
 
-    columns: Count = Field(description="symbols side by side")
-    rows: Count = Field(description="symbols above one another")
-    symbol_size_px: Count = Field(description="edge of a symbol, modulator pixels")
-    pilot_fraction: Annotated[float, Field(gt=0, lt=0.5)] = Field(0.01, description="share of known symbols")
-    pilot_seed: Annotated[int, Field(ge=0)] = Field(0, description="of their places and values")
+    columns: Count = Field(description="Symbols side by side")
+    rows: Count = Field(description="Symbols above one another")
+    symbol_size_px: Count = Field(description="Edge of a symbol, modulator pixels")
+    pilot_fraction: Annotated[float, Field(gt=0, lt=0.5)] = Field(0.01, description="Share of known symbols")
+    pilot_seed: Annotated[int, Field(ge=0)] = Field(0, description="Seed of the positions and values of pilots")
 
 
 class Camera(TomlTable):
     """The sensor of both cameras."""
 
-    columns_px: Side = Field(description="width of a frame")
-    rows_px: Side = Field(description="height of a frame")
-    pitch_m: Length = Field(description="from one pixel of the sensor to the next")
+    columns_px: Side = Field(description="Width of a frame")
+    rows_px: Side = Field(description="Height of a frame")
+    pitch_m: Length = Field(description="Distance from one sensor pixel to the next")
 
 
 class Profile(TomlTable):
     """Data sheet of a device. Lengths in metres, angles in degrees, pixels where the key says so."""
 
-    schema_version: Literal[1] = Field(description="of this layout")
-    name: Annotated[str, Field(min_length=1)] = Field(description="of the device, for messages")
+    schema_version: Literal[1] = Field(description="Version of this layout")
+    name: Annotated[str, Field(min_length=1)] = Field(description="Name of the device, for messages")
     light: Light
     lens: Lens
     pipe: Pipe

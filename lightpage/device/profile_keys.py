@@ -52,7 +52,7 @@ def keys() -> Iterator[Key]:
 
 
 def key_table() -> str:
-    """Return all keys as a table in Markdown, which `docs/formats.md` holds."""
+    """Return all keys as a table in Markdown."""
     rows = ["| key | value | if left out | meaning |", "|---|---|---|---|"]
     for key in keys():
         absent = "refused" if key.required else key.default or "none"

@@ -27,7 +27,7 @@ from lightpage.waves.grid import check_camera
 _SAMPLE_BYTES = 1 << 26
 """Of frames that are read."""
 _MOST_PAGES = 8
-_NEEDED = "data as docs/formats.md describes them"
+_NEEDED = "data as docs/reference/formats.md describes them"
 
 
 def look_at(path: Path, profile: Profile | None) -> Finding:

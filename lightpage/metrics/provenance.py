@@ -18,6 +18,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict
 
 from lightpage.failures import os_failure
+from lightpage.files import write_json
 from lightpage.systems import cores
 
 PROVENANCE = "provenance"
@@ -79,9 +80,14 @@ def provenance(**inputs: object) -> Provenance:
     )
 
 
-def with_provenance(figures: dict[str, Any], **inputs: object) -> dict[str, Any]:
-    """Return figures with their provenance (see `provenance`), for `lightpage.files.write_json`."""
-    return {PROVENANCE: provenance(**inputs).to_json(), **figures}
+def write_figures(path: Path | None, figures: dict[str, Any], **inputs: object) -> None:
+    """Write figures with their provenance, as `lightpage.files.write_json` and `provenance` do; nothing without a path.
+
+    Raises:
+        InvalidInputError, StorageError, SurroundingsError: a file cannot be read or written.
+    """
+    if path is not None:
+        write_json(path, {**figures, PROVENANCE: provenance(**inputs).to_json()})
 
 
 def digest(value: object) -> str:

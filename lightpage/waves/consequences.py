@@ -19,7 +19,7 @@ _DECODERS = {
     "accurate": ((4_872, 0.132), (78_750, 3.410), 3.59e9),
 }
 """Costs by preset: symbols and seconds a page of either shipped device on two cores, and bytes at the larger one's
-peak (docs/experiments/full-size.md)."""
+peak (docs/results/full-size.md)."""
 _BASE_BYTES = 0.25e9
 """Memory of a process that holds a bundle and no page yet."""
 

@@ -125,7 +125,7 @@ def _page(path: Path, rows: Rows, shape: tuple[int, int]) -> NDArray[np.float64]
 
 
 def _golden(bundle: _Bundle) -> Golden | str:
-    """The bundle's golden page; a sentence where it is gone. Layout: docs/formats.md, this package has no runtime."""
+    """Return the golden page, or a sentence where it is gone. docs/reference/formats.md has its layout."""
     path = Path(bundle.path)
     try:
         root = zipfile.Path(path) if path.is_file() else path

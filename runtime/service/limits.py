@@ -36,10 +36,13 @@ class Limits(SettingsTable):
     """
 
     message_bytes: _Bytes = MESSAGE_BYTES
+    """One message to the service, except of `ModelInfer`, which takes a pair in one."""
     chunk_bytes: _Bytes = CHUNK_BYTES
+    """One chunk of frames. The Python client sends chunks of 1 MiB, which a smaller limit refuses."""
     pair_bytes: _MemoryBytes = 256 << 20
     """Both frames of a pair: three times a full-scale 20-megapixel pair of 16 bits."""
     reply_bytes: _Bytes = REPLY_BYTES
+    """One reply. The Python client takes none of more than 64 MiB."""
     receive_bytes: _MemoryBytes = 1 << 30
     """Bytes of pairs that were received and are not yet decoded, of all callers together: bounds the memory."""
     concurrent_decodes: Annotated[int, Field(ge=1, le=256)] = 2
@@ -49,51 +52,58 @@ class Limits(SettingsTable):
     """Calls at once; beyond them the service refuses at once. A call that waits for its turn holds a thread, and one
     that sends its frames does not."""
     receive_s: _Seconds = 30.0
-    """A client that has not sent its frames by then is too slow, and its buffer is given back."""
+    """Time to send a frame pair, or pages to upload. A slower client's buffer is given back."""
     stall_s: _Seconds = 5.0
-    """A client that sends nothing for so long in the middle of its frames has stalled."""
+    """Longest pause of a client in the middle of its frames; then it has stalled."""
     shared_bytes: _MemoryBytes = 1 << 30
     """Memory shared with clients, all of it together: a dozen full-size pairs of 16 bits."""
     shared_regions: _Count = 64
-    """Regions of it at once."""
+    """Regions of shared memory at once."""
     replay_s: _Seconds = 600.0
-    """An answer with a request id is kept for so long: a controller that lost its connection has time to come back."""
+    """Time for which an answer with a request id is kept: a controller that lost its connection has time to come
+    back."""
     replay_bytes: _MemoryBytes = 64 << 20
-    """All such answers together: some 300 full-size pages of symbols and confidences."""
+    """All answers that are kept for request ids: some 300 full-size pages of symbols and confidences."""
     model_bytes: _MemoryBytes = 1 << 30
     """An uploaded bundle: five times a full-size one."""
     model_s: _Seconds = 600.0
-    """A bundle that has not come by then is dropped: a full-size one comes over a slow line in that time."""
+    """Time to send a bundle: a full-size one comes over a slow line in that time."""
     jobs_kept: Annotated[int, Field(ge=1, le=1_000_000)] = JOBS_KEPT
+    """Results of jobs; the oldest are forgotten."""
     decode_s: _Seconds = 120.0
-    """A decode that takes longer has hung, and health checks fail: three times a full-size page by waves on two
+    """Time after which a decode has hung, and health checks fail: three times a full-size page by waves on two
     cores."""
     deadline_s: _Seconds = 60.0
-    """Wait for a free slot where the caller set no deadline of its own."""
+    """Wait for a free slot if the caller set no deadline of its own."""
     recalibration_pages: _Count = 16
     """Pages that one recalibration reads into memory."""
     kept_bytes: _MemoryBytes = 512 << 20
     """Frames of the last pages that a service keeps to recalibrate itself by: eight full-size pairs of 16 bits."""
     recalibration_s: _Seconds = 300.0
-    """One recalibration in its own process. On two cores a bench device's takes 8 s beside an idle service, and 90 s
-    beside reads without a pause on both cores, since its priority leaves it what they do not use and a tenth of a
-    core."""
+    """Time of one recalibration in its own process. On two cores a bench device's takes 16 s beside an idle service,
+    and 95 s beside reads without a pause on both cores, since its priority leaves it what they do not use and a tenth
+    of a core."""
     uploaded_bytes: _MemoryBytes = UPLOADED_BYTES
+    """Uploaded pages, which lie in memory until the service ends."""
     concurrent_ranges: _Count = 4
     """Ranges of pages of which a page is being read. A range whose caller takes its time to read a reply does not
     count."""
     range_pages: Annotated[int, Field(ge=1, le=1 << 32)] = 4096
     """Pages of one range."""
     range_s: _Seconds = 3600.0
-    """A range that is not read to its end by then is dropped."""
+    """Time to read a range to its end; then it is dropped."""
     reader_s: _Seconds = 60.0
-    """A caller that does not take a reply of a stream for so long has stalled, and its call is ended: until then the
-    reply and what was read ahead for it lie in memory."""
+    """Time for a caller to take a reply of a stream. Then it has stalled, and its call is ended: until then the reply
+    and what was read ahead for it lie in memory."""
     concurrent_watches: _Count = 2
     """Controllers that watch what is to be shown: one, and one whose connection has been lost."""
     grace_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] = GRACE_S
+    """Time for calls in progress when the service is told to stop; then they are ended."""
     connection_age_s: Annotated[float | None, _DAY] = None
+    """Age at which a connection is closed, give or take a tenth, so that callers behind a balancer connect anew. Calls
+    on it end first, and its session ends with it."""
     connection_grace_s: Annotated[float | None, _DAY] = None
+    """Time for the calls that are still on a connection of that age; without it they are never cut off."""
 
     def rules(self) -> Iterator[Rule]:
         """Yield the rules among limits."""

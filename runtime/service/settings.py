@@ -61,17 +61,17 @@ class ServiceTable(SettingsTable):
     bundle_key: File | None = Field(None, description="Public key, PEM, that bundles must be signed with.")
     source: Text | None = Field(
         None,
-        description="simulator:PROFILE, recording:FILE, camera:CONFIG.toml; without it only sent frames decode.",
+        description="Pages to read: simulator:PROFILE, recording:FILE, camera:CONFIG.toml; without, only sent frames.",
     )
-    pages: File | None = Field(None, description="Pages that the source is to show, PAGES.h5.")
-    address: _Address = Field(ADDRESS, description="HOST:PORT to listen on; port 0 takes a free one.")
+    pages: File | None = Field(None, description="Pages for the source to show, PAGES.h5; ReadPage.page is the row.")
+    address: _Address = Field(ADDRESS, description="HOST:PORT or unix:PATH to listen on; port 0 takes a free one.")
     insecure: bool = False
     """Whether addresses that others reach may do without TLS, as in a container whose ports are published on its own
     machine alone."""
     health_address: _HealthAddress | None = Field(
         None,
-        description="HOST:PORT of health checks, answered by a process of their own; by default the next port. "
-        "off: none.",
+        description="HOST:PORT of health checks, answered by a process of their own; by default the next port of this "
+        "machine, or unix:PATH.health. off: none.",
     )
     shared_memory: bool = Field(False, description="Share memory with clients at the service's Unix socket.")
     store: Folder | None = Field(
@@ -83,11 +83,14 @@ class ServiceTable(SettingsTable):
         None, description="Folder whose recordings a caller may name to recalibrate with."
     )
     threads: int | None = Field(None, ge=1, le=4096)
+    """Threads of one inference; by default all cores."""
     code_threads: int = Field(
         1, ge=1, le=64, description="Threads that share the code of a page, where it is compiled."
     )
     provider: Annotated[str, checked(Provider.parse)] = CPU
+    """What computes pages: cpu, cuda or tensorrt, with :N behind it for another GPU than the first."""
     engine_cache: Folder | None = None
+    """Folder where TensorRT keeps its engines; without, it builds them at each start, for minutes."""
     tracking: bool = Field(True, description="Follow the image, and find it again.")
 
     def rules(self) -> Iterator[Rule]:
@@ -104,7 +107,7 @@ class BatchesTable(SettingsTable):
 
     largest: int = Field(1, ge=1, le=64, description="Pages computed together at most, on a GPU; 1: each by itself.")
     longest_wait_ms: Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)] = 5.0
-    """For which a batch waits for pages whose frames are there and are being checked: it bounds what one slow caller
+    """Longest wait of a batch for pages whose frames are there and are being checked: it bounds what one slow caller
     costs the others."""
 
     def batching(self) -> Batching:
@@ -119,7 +122,7 @@ class TlsTable(SettingsTable):
     certificate: File | None = Field(None, description="TLS: certificate of the service, PEM.")
     key: File | None = Field(None, description="TLS: its private key, PEM.")
     plain_health: bool = False
-    """Whether health checks are answered without TLS, for those who ask that know none."""
+    """Whether health checks are answered without TLS, for programs that know none."""
 
     def files(self) -> TlsFiles | None:
         """Return the three files, None for none."""
@@ -138,34 +141,36 @@ class TlsTable(SettingsTable):
 class MetricsTable(SettingsTable):
     """The address of metrics and console; without a port they are not shown."""
 
-    host: Text = Field("127.0.0.1", description="Where the figures are shown.")
+    host: Text = Field("127.0.0.1", description="Host of metrics and console.")
     port: int | None = Field(None, ge=0, le=65535, description="Show metrics and console on this port.")
     names: Annotated[tuple[Text, ...], Field(strict=False)] = ()
-    """By which they may be asked for, beside IP addresses, `localhost`, `host` and this machine's own name."""
+    """Further host names by which metrics and console may be asked for, beside IP addresses, `localhost`, `host` and
+    this machine's own name."""
 
 
 class TracesTable(SettingsTable):
     """The collector of spans of calls; without an endpoint none are sent."""
 
     endpoint: Annotated[str, checked(check_endpoint)] | None = None
-    """Of a collector that takes OTLP over gRPC, http://HOST:PORT or https://HOST:PORT."""
+    """Collector that takes OTLP over gRPC, http://HOST:PORT or https://HOST:PORT."""
     share: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] = 1.0
-    """Of the calls that are traced, where their callers have not decided."""
+    """Share of the calls that are traced, if their callers have not decided."""
 
 
 class InferenceTable(SettingsTable):
     """The Open Inference Protocol, beside the service's own contract; it takes a whole frame pair in one message."""
 
     enabled: bool = True
+    """Whether it is served; without it, messages are at most `limits.message_bytes`."""
 
 
 class AuditTable(SettingsTable):
     """The record of model changes."""
 
     file: File | None = None
-    """Where it is; without, `audit.jsonl` in the store."""
+    """File of the record; by default `audit.jsonl` in the store."""
     file_bytes: Annotated[int, Field(ge=1024)] = AUDIT_BYTES
-    """A larger file is put aside, and a new one begun."""
+    """Size beyond which the file is put aside, and a new one begun."""
     kept: Annotated[int, Field(ge=1, le=1000)] = AUDIT_KEPT
     """Files put aside that stay."""
 
@@ -306,7 +311,7 @@ def service_settings(
         origin, got, wanted = problems[0]
         raise InvalidInputError(origin or subject, got, wanted)
     told = "; ".join(f"{got}{f' ({origin})' * bool(origin)}, wanted {wanted}" for origin, got, wanted in problems)
-    raise InvalidInputError(subject, told, "settings as docs/service-settings.md explains them")
+    raise InvalidInputError(subject, told, "settings as docs/guides/serving.md explains them")
 
 
 def _of_environment(environment: Mapping[str, str]) -> Iterator[Given]:

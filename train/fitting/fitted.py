@@ -13,6 +13,7 @@ import torch
 
 from lightpage.errors import InvalidInputError
 from lightpage.files import replace_file, replace_text
+from lightpage.metrics.provenance import PROVENANCE
 from lightpage.train.fitting.curves import Curve
 from lightpage.train.fitting.modules import DecoderTraining
 from lightpage.train.fitting.provenance import provenance_of
@@ -50,7 +51,7 @@ class Fitted(Generic[M]):
     def save(self, run: Path) -> None:
         """Keep it in the folder of its run, weights first: what is said to be finished is whole."""
         replace_file(run / FITTED_WEIGHTS, partial(torch.save, self.module.network.state_dict()), "weights")
-        kept = {"validation_air": self.validation_air, "seconds": self.seconds, "made_by": provenance_of(run)}
+        kept = {"validation_air": self.validation_air, "seconds": self.seconds, PROVENANCE: provenance_of(run)}
         kept["curves"] = self.curves
         replace_text(run / FITTED, json.dumps(kept, indent=1) + "\n", "result of a training")
 

@@ -15,6 +15,7 @@ from lightpage.calibration.document import Calibration
 from lightpage.calibration.known_pages import known_pages, lit_pages
 from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError, RecordingError
+from lightpage.metrics.provenance import command, commit
 from lightpage.page.symbols import pilot_mask, pilot_symbols, symbol_phases
 from lightpage.progress import note, warn
 from lightpage.recording.layout import hash_frames
@@ -22,7 +23,6 @@ from lightpage.recording.reader import Recording
 from lightpage.run_files import DESCRIPTION
 from lightpage.train.data.features import FeatureExtractor
 from lightpage.train.data.training_inputs import TrainingInputs
-from lightpage.train.fitting.provenance import provenance
 from lightpage.train.models.decoder import LOCALIZERS
 from lightpage.train.models.hyperparameters import Hyperparameters
 from lightpage.train.processes import AS_IT_IS, Processes, is_first_process
@@ -178,7 +178,7 @@ def make_run(
         seconds=trained.seconds,
         pages=(len(split.training), len(split.validation), len(split.left)),
         synthetic_pages=trained.synthetic_pages,
-        provenance=provenance() | {"seed": trainer.choices.seed},
+        provenance={"command": command(), "commit": commit(), "seed": trainer.choices.seed},
     )
     run.save(out)
     return run

@@ -50,24 +50,23 @@ class BulkMetrics(Watch):
             return Gauge(name, what, one, registry=own).labels(*values)
 
         # What has its labels is shown at once: Prometheus sees no rise from nothing to the first one.
-        self._pages = Counter("lightpage_bulk_pages", "Pages, by what became of them.", [*one, "state"], registry=own)
+        self._pages = Counter("lightpage_bulk_pages", "Pages or devices, by outcome.", [*one, "state"], registry=own)
         self._lost = Counter("lightpage_bulk_pages_lost", "Lost pages, by cause.", [*one, "reason"], registry=own)
         for state in PageState:
             self._pages.labels(*values, state)
         for reason in _CAUSES.get(operation, ()):
             self._lost.labels(*values, reason)
-        self._failed = counter("lightpage_bulk_ranges_failed", "Ranges or files without a result.")
+        self._failed = counter("lightpage_bulk_ranges_failed", "Ranges without a result; files that cannot be opened.")
         self._died = counter("lightpage_bulk_workers_died", "Workers that died.")
         self._read_bytes = counter("lightpage_bulk_read_bytes", "Frames, as they lie in recordings.")
-        self._job_pages = gauge("lightpage_bulk_job_pages", "Pages of the whole job, or devices.")
-        self._left = gauge("lightpage_bulk_job_pages_left", "Those yet to be read, or read again.")
-        self._in_flight = gauge("lightpage_bulk_ranges_in_flight", "Page ranges handed out.")
-        self._workers = gauge("lightpage_bulk_workers", "Workers alive.")
-        self._ended = Gauge("lightpage_bulk_end_timestamp_seconds", "When the run ended.", one, registry=own)
+        self._job_pages = gauge("lightpage_bulk_job_pages", "Pages or devices of the job, or of this part of it.")
+        self._left = gauge("lightpage_bulk_job_pages_left", "Pages or devices yet to be read, or read again.")
+        self._in_flight = gauge("lightpage_bulk_ranges_in_flight", "Page ranges that workers are reading.")
+        self._workers = gauge("lightpage_bulk_workers", "Workers alive; with Ray, as many as its CPUs suffice for.")
+        self._ended = Gauge("lightpage_bulk_end_timestamp_seconds", "End of the run, in Unix time.", one, registry=own)
         info = Gauge("lightpage_bulk_info", "1 for what the run does.", [*one, "operation"], registry=own)
         info.labels(*values, operation).set(1)
-        told = "A worker's time for a page, mean of its range."
-        seconds = Histogram("lightpage_bulk_page_seconds", told, one, buckets=_SECONDS, registry=own)
+        seconds = Histogram("lightpage_bulk_page_seconds", "Mean time for a page.", one, buckets=_SECONDS, registry=own)
         self._page_seconds = seconds.labels(*values)
 
     def wanted(self, total: int, left: int) -> None:

@@ -52,7 +52,7 @@ def bulk() -> None:
 
 
 def _tuning(name: str, kind: click.ParamType[Any], what: str) -> Decorator:
-    """An option of `FineTuning`."""
+    """Return an option of `FineTuning`."""
     told = f"With --deep: {what}; {getattr(FineTuning(), name):g} by default."
     return click.option(f"--{name.replace('_', '-')}", type=kind, help=told)
 
@@ -72,9 +72,9 @@ _options = _together(
     click.option("--threads", type=click.IntRange(1), help="Threads of a worker; by default its share of cores."),
     PROVIDER,
     BATCHES,
-    click.option("--workers", type=click.IntRange(1), help="How many; by default one for every two cores."),
-    click.option("--address", help="With --engine ray: of the cluster, `auto` for the one that runs here."),
-    click.option("--engine", type=click.Choice([LOCAL, RAY]), default=LOCAL, show_default=True, help="Who works."),
+    click.option("--workers", type=click.IntRange(1), help="Number of workers; by default one for every two cores."),
+    click.option("--address", help="With --engine ray: address of the cluster, `auto` for the one here."),
+    click.option("--engine", type=click.Choice([LOCAL, RAY]), default=LOCAL, show_default=True, help="Runs workers."),
     click.option("--bundle", help=f"A bundle's path, or the name of a shipped one; {DEFAULT} by default."),
     click.option("--fleet", type=_FILE, help="TOML file of devices: name, bundle, recordings."),
     click.option("--recordings", multiple=True, metavar="GLOB", help="HDF5 recordings; may be given repeatedly."),
@@ -103,7 +103,7 @@ def decode(**asked: Any) -> None:
 @bulk.command()
 @_options
 @_pages_options
-@click.option("--code", "code_path", type=_FILE, help="Code; the recordings' or the bundles'.")
+@click.option("--code", "code_path", type=_FILE, help="Code; by default the recordings' or the bundles'.")
 @click.option("--heal/--no-heal", "heals", default=None, help="Re-fit by pages that are not read; the default.")
 @click.option("--volume", metavar="ID[:CHECKSUM]", help="Write the file of this volume alone.")
 @click.option("--holes", is_flag=True, help="Where data are lost, write FILE.holes with zeros in their place.")
@@ -125,10 +125,10 @@ def evaluate(**asked: Any) -> None:
 @_options
 @click.option("--pages", type=click.IntRange(2), help=f"Known pages to use; {KNOWN_PAGES} by default, all with --deep.")
 @click.option("--deep", is_flag=True, help="Train the network on, too, from the run that the fleet names; needs torch.")
-@_tuning("steps", click.IntRange(10), "of the optimiser")
-@_tuning("learning_rate", FiniteRange(0, min_open=True), "at its peak")
-@_tuning("synthetic_pages", click.IntRange(0), "of the drifted device, trained on too")
-@_tuning("seed", click.IntRange(0), "of the training")
+@_tuning("steps", click.IntRange(10), "steps of the optimiser, of a second pass a quarter")
+@_tuning("learning_rate", FiniteRange(0, min_open=True), "peak learning rate of a one-cycle schedule")
+@_tuning("synthetic_pages", click.IntRange(0), "pages to simulate after drifts, trained on too")
+@_tuning("seed", click.IntRange(0), "seed of batches and rotations")
 def recalibrate(pages: int | None, deep: bool, fleet: Path | None, **asked: Any) -> None:
     """Recalibrate devices, each from recordings of its own; the new bundles are in OUT."""
     given = {name: value for name in FineTuning.model_fields if (value := asked.pop(name)) is not None}

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from lightpage.cli.options import JSON
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.progress import warn
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.evaluation import Evaluation, NothingReadError
@@ -30,14 +30,15 @@ def evaluate(load: Load, recording: str, json_path: Path | None, tracking: bool)
     make the exit status 2; pages that storage does not give make it 75.
     """
     decoder = load()
+    inputs = {"bundle": decoder.bundle.path, "recording": Path(recording)}
     with Recording.open(recording) as pages:
         tracker = tracker_for(decoder) if tracking else NoTracker(decoder)
         try:
             count, result = pages.pages, evaluate_recording(decoder, pages, tracker)
         except NothingReadError as error:
-            write_json(json_path, error.figures)
+            write_figures(json_path, error.figures, **inputs)
             raise error.refusal from None
-    write_json(json_path, result.to_json())
+    write_figures(json_path, result.to_json(), **inputs)
     click.echo(describe(result))
     if result.figures.air_bits_per_symbol <= 0:
         warn(WORTH_NOTHING)

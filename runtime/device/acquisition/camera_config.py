@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Discriminator, Field, Tag, ValidationError, model_validator
 
 from lightpage.device.problems import Problem, problems_of
-from lightpage.device.profile import StrictTable, TomlTable
+from lightpage.device.profile import StrictTable
 from lightpage.errors import InvalidInputError
 from lightpage.files import read_toml
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
@@ -20,27 +20,26 @@ from lightpage.runtime.device.modulator.screen.raster import ScreenSettings
 from lightpage.runtime.device.modulator.shutters import Shutter
 from lightpage.runtime.device.trigger.pulse_generator import PulseGeneratorSettings
 
-KEYS = "docs/cameras.md, all keys"
-"""Where what a file may say is explained."""
+KEYS = "reference/camera-keys.md of the documentation"
+"""Page that lists the keys."""
 
 
 class CameraTable(View, CameraSettings):
     """A camera, and its view of the image."""
 
     kind: Literal["genicam"] = "genicam"
+    """A camera that Lightpage drives."""
 
 
 class PluginTable(StrictTable):
-    """A device by a driver that another package brings, an entry point.
-
-    Attributes:
-        driver: its name.
-        options: what it is to know, as it says itself.
-    """
+    """A device by a driver that another package brings, an entry point."""
 
     kind: Literal["plugin"]
+    """A driver of another package."""
     driver: Annotated[str, Field(min_length=1)]
+    """Name of the driver among the entry points."""
     options: dict[str, Any] = {}  # noqa: RUF012  # pydantic copies it
+    """A table that is handed to the driver."""
 
 
 class PluginCameraTable(View, PluginTable):
@@ -61,92 +60,103 @@ class PulseGeneratorTable(PulseGeneratorSettings):
     """A pulse generator with one channel for each camera."""
 
     kind: Literal["pulse_generator"]
+    """A pulse generator with a channel for each camera."""
 
 
-class SoftwareTriggerTable(TomlTable):
+class SoftwareTriggerTable(StrictTable):
     """The cameras are told over their own lines, one after the other."""
 
     kind: Literal["software"]
+    """A command to each camera, one after the other. Both need `trigger_source = "Software"`."""
 
 
 class ScreenTable(ScreenSettings):
     """A modulator that is a monitor."""
 
     kind: Literal["screen"]
+    """A monitor of an X server."""
     lookup_table: Annotated[str, Field(min_length=1)] | None = None
-    """File of grey values; without one, 256 grey values are one wave."""
+    """File of grey values. Without it 256 grey values are one wave."""
 
 
-class ExternalModulatorTable(TomlTable):
+class ExternalModulatorTable(StrictTable):
     """The controller shows the pages, and says so over gRPC."""
 
     kind: Literal["external"]
+    """The controller shows the pages, and says so over gRPC."""
 
 
-class SimulatedTable(TomlTable):
+class SimulatedTable(StrictTable):
     """The modulator, or the shutters, of a simulated device."""
 
     kind: Literal["simulated"]
+    """Part of a simulated device."""
     address: Annotated[str, Field(min_length=1)]
-    """Its Unix socket; as all paths here, relative to the folder of this file."""
+    """Unix socket of the simulated device."""
 
 
-class NoModulatorTable(TomlTable):
+class NoModulatorTable(StrictTable):
     """Something else shows pages and knows nothing of shots: a page stands for as long as it is photographed."""
 
     kind: Literal["none"] = "none"
+    """Something else shows the pages."""
 
 
-class ShuttersTable(TomlTable):
+class ShuttersTable(StrictTable):
     """Shutters in both beams, on channels of the pulse generator."""
 
     kind: Literal["shutters"]
+    """Shutters on channels of the pulse generator."""
     signal: Shutter
+    """Shutter of the signal beam."""
     reference: Shutter
+    """Shutter of the reference beam, with the keys of `signal`."""
 
 
 class ExternalBeamsTable(StrictTable):
     """The controller moves the shutters, and says so over gRPC."""
 
     kind: Literal["external"]
+    """The controller moves the shutters, and says so over gRPC."""
     timeout_s: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)] = 10.0
+    """Longest wait for the controller."""
 
 
-class OperatorTable(TomlTable):
+class OperatorTable(StrictTable):
     """Somebody blocks the beams by hand when `lightpage record` asks."""
 
     kind: Literal["operator"] = "operator"
+    """`record` asks you to block the beams."""
 
 
 class DeviceTable(StrictTable):
-    """The whole file.
-
-    Attributes:
-        profile: nominal device: a shipped name, or a file.
-        levels: M of the pages, where no page file says it.
-        pages: file of pages to show, or None: some are uploaded, or named with the source.
-        in_phase, quadrature: the cameras.
-        trigger: what fires them.
-        modulator: what shows the pages.
-        beams: what blocks signal and reference.
-        pairing, exposures: how frames are taken and told apart.
-    """
+    """The file of a device, with a table for each of its parts."""
 
     profile: str
+    """Nominal device: a shipped name, or a file."""
     levels: Annotated[int, Field(ge=MIN_LEVELS, le=MAX_LEVELS)] | None = None
+    """Number of levels of the pages, where no file of pages says it."""
     pages: str | None = None
+    """File of pages to show. `--symbols` and `--pages` override it."""
     in_phase: AnyCameraTable
+    """The in-phase camera."""
     quadrature: AnyCameraTable
+    """The quadrature camera, with the keys of `in_phase`."""
     trigger: Annotated[PulseGeneratorTable | SoftwareTriggerTable | PluginTable, Field(discriminator="kind")]
+    """Trigger of both cameras."""
     modulator: Annotated[
         ScreenTable | ExternalModulatorTable | SimulatedTable | NoModulatorTable | PluginTable,
         Field(discriminator="kind"),
     ] = NoModulatorTable()
+    """Display of the pages."""
     beams: Annotated[
         ShuttersTable | ExternalBeamsTable | SimulatedTable | OperatorTable, Field(discriminator="kind")
     ] = OperatorTable()
+    """Shutters of both beams, for dark and reference frames."""
     pairing: PairingSettings = PairingSettings()
+    """How frames of one shot are told from others."""
     exposures: Exposures = Exposures()
+    """How many frames are taken."""
 
     @model_validator(mode="after")
     def _two_cameras(self) -> Self:

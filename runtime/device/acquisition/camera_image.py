@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.device.profile import TomlTable
+from lightpage.device.profile import StrictTable
 from lightpage.progress import warn
 from lightpage.recording.black_level import DarkFrame, PixelRepair, without_black
 from lightpage.recording.exposure import describe, greatest_count, unused_low_bits
@@ -17,16 +17,13 @@ from lightpage.runtime.device.cameras.camera import Camera, Frame
 Counts = NDArray[np.unsignedinteger[Any]]
 
 
-class View(TomlTable):
-    """A camera's view of the image: mirrored or not, as behind one more mirror.
-
-    Attributes:
-        flip_x: left and right are the other way round.
-        flip_y: top and bottom are.
-    """
+class View(StrictTable):
+    """A camera's view of the image: mirrored or not, as behind one more mirror."""
 
     flip_x: bool = False
+    """The camera sees left and right exchanged."""
     flip_y: bool = False
+    """The camera sees top and bottom exchanged."""
 
     def upright(self, pixels: Counts) -> Counts:
         """The frame [row, column] as the modulator has it."""

@@ -46,18 +46,16 @@ _AGAIN_S = 0.5
 
 
 class Exposures(StrictTable):
-    """Numbers and times of exposures.
-
-    Attributes:
-        repeats: further shots of a page whose shot is lost, while it is on display.
-        reference_frames, dark_frames: shots that make the mean of each.
-        shot_s: longest wait for one page, repeats included.
-    """
+    """Numbers and times of exposures."""
 
     repeats: Annotated[int, Field(ge=0, le=100)] = 1
+    """Further shots of a page whose shot is lost."""
     reference_frames: Annotated[int, Field(ge=1, le=256)] = 8
+    """Shots that make the mean reference frame."""
     dark_frames: Annotated[int, Field(ge=1, le=256)] = 8
+    """Shots that make the mean dark frame."""
     shot_s: Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)] = SHOT_S
+    """Longest wait for a page, repeats included."""
 
 
 class CameraSource(FrameSource):

@@ -60,22 +60,18 @@ _FOLLOWING = 0.1
 
 
 class PairingSettings(StrictTable):
-    """Tolerances of telling frames apart.
-
-    Attributes:
-        tolerance_s: largest deviation of a frame's time from its camera's reference. A wider one loses fewer shots to a
-            busy machine, and takes longer for every shot.
-        frame_s: longest wait for both frames after a trigger.
-        quiet_s: silence that ends a fault.
-        spacing_s: least distance of two triggers; at least 2.5 tolerances.
-        clock_drift: relative drift of a camera's clock against this machine's that is allowed for.
-    """
+    """Tolerances of telling frames apart."""
 
     tolerance_s: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.02
+    """Largest deviation of a frame's time. Wider: fewer lost shots, and slower ones."""
     frame_s: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)] = 0.5
+    """Longest wait for both frames. Longer than the exposure."""
     quiet_s: Annotated[float, Field(gt=0, le=60, allow_inf_nan=False)] = 0.15
+    """Silence that ends a fault."""
     spacing_s: Annotated[float, Field(gt=0, le=60, allow_inf_nan=False)] = 0.06
+    """Least time from trigger to trigger. At least 2.5 `tolerance_s`."""
     clock_drift: Annotated[float, Field(gt=0, le=0.01, allow_inf_nan=False)] = 1e-4
+    """Drift of a camera's clock against this machine's that is allowed for, relative."""
 
     @model_validator(mode="after")
     def _tells_shots_apart(self) -> Self:

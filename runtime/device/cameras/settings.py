@@ -12,41 +12,36 @@ from lightpage.runtime.device.cameras.pixel_formats import pixel_format
 
 
 class CameraSettings(StrictTable):
-    """Address of one camera, and every setting that a frame depends on.
-
-    Attributes:
-        driver: ``aravis``, for GigE Vision and USB3 Vision; ``gentl``, for whatever the camera's maker has a GenTL
-            producer for.
-        producer: file of that producer, ``*.cti``.
-        serial: number of the camera; either this or `address`.
-        address: IP address or host name of a GigE camera; of ``aravis`` only.
-        pixel_format: as GenICam names it.
-        exposure_us: exposure time in microseconds.
-        gain_db: gain in dB, in the camera's own steps where it knows no dB; None leaves it as it is.
-        black_level_counts: what the camera adds to every pixel; None leaves it as it is.
-        offset_x_px: first column of the region that is read.
-        offset_y_px: first row of it.
-        trigger_source: where the trigger comes in, as the camera names it, e.g. ``Line0``; ``Software`` for a command.
-        trigger_activation: which edge triggers, as the camera names it.
-        packet_bytes: size of a GigE packet, headers included; None for what camera and network agree on. A producer
-            chooses by itself.
-        buffers: frames that may wait in this machine.
-    """
+    """Identity of one camera, and every setting that a frame depends on."""
 
     driver: Literal["aravis", "gentl"] = "aravis"
+    """`aravis`: GigE Vision and USB3 Vision. `gentl`: any camera with a GenTL producer."""
     producer: str | None = Field(default=None, min_length=1)
+    """File of the GenTL producer, `*.cti`. Needed with `gentl`."""
     serial: str | None = Field(default=None, min_length=1)
+    """The camera's number. Give either this or `address`."""
     address: str | None = Field(default=None, min_length=1)
+    """IP address or host name of a GigE camera, with `aravis` only."""
     pixel_format: str = "Mono8"
+    """A grey format, as GenICam names it, e.g. `Mono8`, `Mono12p`. The same for both cameras."""
     exposure_us: float = Field(default=10_000.0, gt=0, allow_inf_nan=False)
+    """Exposure time, microseconds."""
     gain_db: float | None = Field(default=None, ge=0, allow_inf_nan=False)
+    """Gain, dB, or the camera's own steps. Without it the gain stays as it is."""
     black_level_counts: int | None = Field(default=None, ge=0)
+    """Counts that the camera adds to each pixel. Without it the level stays as it is."""
     offset_x_px: int = Field(default=0, ge=0)
+    """First column of the region that is read."""
     offset_y_px: int = Field(default=0, ge=0)
+    """First row of the region that is read."""
     trigger_source: str = Field(default="Line0", min_length=1)
+    """Input of the trigger, as the camera names it. `Software` for a command."""
     trigger_activation: str = Field(default="RisingEdge", min_length=1)
+    """Edge that triggers, as the camera names it."""
     packet_bytes: int | None = Field(default=None, ge=576, le=65_535)
+    """Size of a GigE packet, headers included, with `aravis` only. Without it camera and network agree."""
     buffers: int = Field(default=8, ge=2, le=256)
+    """Frames that may wait in this machine."""
 
     @field_validator("pixel_format")
     @classmethod

@@ -17,17 +17,14 @@ _log = logging.getLogger(__name__)
 
 
 class Shutter(StrictTable):
-    """A shutter on a channel of the pulse generator.
-
-    Attributes:
-        channel: 1 is channel A; none that triggers a camera.
-        open_when: level at which it is open: ``high`` while the channel is on, ``low`` while it is off.
-        settle_s: it has moved after this.
-    """
+    """A shutter on a channel of the pulse generator."""
 
     channel: Channel
+    """Channel of the shutter, none of the cameras'. 1 is A."""
     open_when: Literal["high", "low"] = "high"
+    """The shutter is open while the channel is on (`high`) or off (`low`)."""
     settle_s: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)] = 0.05
+    """Time that the shutter takes to move."""
 
     def level(self, is_open: bool) -> bool:
         """Return whether its channel is on while it is open, or closed."""

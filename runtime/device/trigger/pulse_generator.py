@@ -35,28 +35,24 @@ Channel = Annotated[int, Field(ge=1, le=CHANNELS)]
 
 
 class PulseGeneratorSettings(LineTimes):
-    """Address and settings of the pulse generator.
-
-    Attributes:
-        port: ``/dev/serial/by-id/...``, ``/dev/ttyUSB0``, or a pyserial URL such as ``socket://192.168.1.9:2101``.
-        baud: bits per second of a serial port.
-        channels: that trigger the cameras; 1 is channel A.
-        width_s: of their pulses.
-        delay_s: of their pulses after T0.
-        polarity: of their pulses; ``inverted`` rests high.
-        fire: ``single``: starting T0, which is in single-shot mode, is the shot; ``software``: T0 waits for an edge,
-            and ``*TRG`` stands for one.
-        reset: send ``*RST`` before anything is set.
-    """
+    """Address and settings of the pulse generator."""
 
     port: Annotated[str, Field(min_length=1)]
+    """Device of the serial line, e.g. `/dev/serial/by-id/...`, or `socket://HOST:PORT`."""
     baud: Annotated[int, Field(ge=1200, le=4_000_000)] = 115200
+    """Bits per second of a serial line."""
     channels: Annotated[tuple[Channel, ...], Field(min_length=1, strict=False)] = (1, 2)
+    """Channels that trigger the cameras. 1 is A."""
     width_s: Annotated[float, Field(ge=RESOLUTION_S, le=10.0)] = 1e-3
+    """Width of their pulses."""
     delay_s: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0
+    """Delay of their pulses after T0."""
     polarity: Literal["normal", "inverted"] = "normal"
+    """Polarity of their pulses. `inverted` rests high."""
     fire: Literal["single", "software"] = "single"
+    """`single` starts T0 in single-shot mode. `software` sends `*TRG`, which stands for an edge."""
     reset: bool = False
+    """Send `*RST` before anything is set."""
 
     @field_validator("channels")
     @classmethod

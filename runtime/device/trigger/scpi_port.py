@@ -62,19 +62,16 @@ _ROUNDS = 2
 
 
 class LineTimes(StrictTable):
-    """Waiting times on a line.
-
-    Attributes:
-        answer_s: for an answer.
-        quiet_s: silence that shows that no answer is on its way.
-        late_s: for an identification that is due while another has come already; what is later still is taken as lost.
-        synchronise_s: for synchronising, all in all.
-    """
+    """Waiting times on a line."""
 
     answer_s: Annotated[float, Field(ge=0.02, le=10.0)] = 0.5
+    """Longest wait for an answer."""
     quiet_s: Annotated[float, Field(ge=0.005, le=1.0)] = 0.05
+    """Silence that shows that no answer is on its way."""
     late_s: Annotated[float, Field(ge=0.02, le=10.0)] = 1.0
+    """Longest wait for a late identification, while another has come already."""
     synchronise_s: Annotated[float, Field(ge=0.2, le=60.0)] = 4.0
+    """Longest wait until a disturbed line is in order."""
 
     @property
     def longest_s(self) -> float:

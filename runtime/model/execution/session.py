@@ -151,7 +151,7 @@ def check_provider(provider: Provider) -> None:
     """
     available = onnxruntime.get_available_providers()
     if provider.runtime_name not in available:
-        expected = "onnxruntime-gpu in place of onnxruntime (docs/gpu.md), or provider cpu"
+        expected = "onnxruntime-gpu in place of onnxruntime (docs/guides/speed.md), or provider cpu"
         raise ProviderError(f"provider {provider}", f"an onnxruntime with {', '.join(available)}", expected)
 
 

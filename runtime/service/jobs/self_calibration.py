@@ -55,12 +55,14 @@ class SelfCalibrationSettings(SettingsTable):
     least_s: Seconds = 60.0
     """Shortest time between two recalibrations: a device that drifts faster needs a mechanic."""
     longest_s: Seconds = 3600.0
-    """To which that time is doubled by one refusal or failure after another, or by recalibrations that bring next to
-    nothing. What was refused once will hardly be better a minute later, and each try costs reads a few pages' time."""
+    """Longest time between two recalibrations. Each refusal or failure, and each recalibration that brings next to
+    nothing, doubles the time up to it. What was refused once will hardly be better a minute later, and each try costs
+    reads a few pages' time."""
     most_share: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.1
-    """Of all time, that recalibrations may take at most: whoever sends noise buys no more of the device than that."""
+    """Share of all time that recalibrations may take at most: a sender of noise buys no more of the device than
+    that."""
     busy_s: Seconds = 5.0
-    """Time after which it is looked again whether a recalibration that somebody else runs has ended."""
+    """Time after which the service looks again whether a caller's recalibration has ended."""
 
     @property
     def is_on(self) -> bool:

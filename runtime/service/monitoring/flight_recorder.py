@@ -109,14 +109,14 @@ class FlightSettings(SettingsTable):
     """Folder and limits of the flight recorder: the table [flight_recorder] of the service's settings."""
 
     folder: Folder | None = Field(None, description="Folder in which the frames of lost and weak pages are kept.")
-    pages: int = Field(64, ge=1, le=1_000_000, description="Kept there at most.")
+    pages: int = Field(64, ge=1, le=1_000_000, description="Pages kept there at most.")
     ring_bytes: int = Field(1 << 30, ge=1)
-    """Of them all: 64 pages of a bench device take 160 MB, 25 of a 20-megapixel device all of it."""
+    """Bytes of all kept pages: 64 pages of a bench device take 160 MB, 25 of a 20-megapixel device all of it."""
     low_margin_bits: float = Field(0.05, ge=0, le=8, allow_inf_nan=False)
-    """A page with less margin is kept, bits a symbol: one in ten thousand of a quiet bench device."""
+    """Margin below which a page is kept, bits a symbol: that of one in ten thousand of a quiet bench device."""
     read_every_s: float = Field(60.0, ge=0, le=31e6, allow_inf_nan=False)
-    """Of pages that were read, with a low margin or while a recalibration is due, one is kept in this time, seconds:
-    more would push out the pages that show how it began."""
+    """Time in which one page is kept of those that were read, with a low margin or while a recalibration is due,
+    seconds: more would push out the pages that show how it began."""
 
 
 @dataclass(frozen=True)

@@ -30,10 +30,12 @@ class LogSettings(SettingsTable):
     """Format and level of logging to stderr: the table [logs] of the service's settings."""
 
     format: Literal["text", "json"] = "text"
+    """Lines for people, or one object of JSON a line."""
     level: Literal["debug", "info", "warning", "error"] = "info"
-    """Lesser lines are left out."""
+    """Least level of a line; lesser lines are left out."""
     lines_per_second: int = Field(5, ge=1, le=100_000)
-    """Of one kind; the others are counted. Enough to see that it goes on, and too few to fill a disk in a night."""
+    """Lines of one kind in a second; the others are counted. Enough to see that it goes on, and too few to fill a disk
+    in a night."""
 
 
 class PageLog:

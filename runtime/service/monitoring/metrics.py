@@ -48,7 +48,10 @@ VERSIONS = 32
 
 
 class ServiceMetrics:
-    """The figures of one service."""
+    """Figures of one service.
+
+    Gauges of the last page show the device: where the service has a source, frames of callers do not set them.
+    """
 
     def __init__(self) -> None:
         self.registry = own = CollectorRegistry()
@@ -58,46 +61,47 @@ class ServiceMetrics:
         self._versions: list[str] = []
         self._naming = threading.Lock()
         """Held while `_versions` and the labels of `pages` are read or changed."""
-        self.calls = Counter("lightpage_calls", "Finished calls.", ["method", "code"], registry=own)
-        self.in_flight = Gauge("lightpage_calls_in_flight", "Calls being served.", registry=own)
+        counter, gauge = partial(Counter, registry=own), partial(Gauge, registry=own)
+        self.calls = counter("lightpage_calls", "Finished calls, by their gRPC status.", ["method", "code"])
+        self.in_flight = gauge("lightpage_calls_in_flight", "Calls being served.")
         self.call_seconds = Histogram(
             "lightpage_call_seconds",
-            "Whole calls, watches left out.",
+            "Time of whole calls, except those that only watch.",
             ["method"],
             buckets=(*_FINE_SECONDS, 300.0),
             registry=own,
         )
         self.stage_seconds = Histogram(
             "lightpage_stage_seconds",
-            "Stages of pages on their way through calls.",
+            "Time of pages in each stage of their way through calls.",
             ["method", "stage"],
             buckets=_FINE_SECONDS,
             registry=own,
         )
-        self.rejects = Counter("lightpage_rejects", "Calls and pages refused, by reason.", ["reason"], registry=own)
-        self.pages = Counter("lightpage_pages", "Decoded pages.", ["model_version"], registry=own)
-        self.decode = Histogram("lightpage_decode_seconds", "Decode of one page.", buckets=_SECONDS, registry=own)
-        self.confidence = Gauge("lightpage_confidence_mean", "Mean confidence of the last page.", registry=own)
-        self.concentration = Gauge("lightpage_concentration_mean", "Mean kappa of the last page.", registry=own)
-        self.piston = Gauge("lightpage_piston_radians", "Piston of the last page.", registry=own)
-        self.pilots = Gauge("lightpage_pilot_coherence", "Agreement of the last pilots, 0..1.", registry=own)
-        self.trust = Gauge("lightpage_pilot_trust", "Claim that the last pilots bear out, 0..1.", registry=own)
-        self.share = Gauge("lightpage_pilot_share", "Claimed information that the last pilots confirm.", registry=own)
-        self.due = Gauge("lightpage_recalibration_due", "1 where they confirm too little of it.", registry=own)
-        self.lost_pages = Counter("lightpage_pages_lost", "Pages not given out.", ["reason"], registry=own)
-        self.margin = Gauge("lightpage_margin_bits", "Of the last page beyond what its code needs.", registry=own)
-        self.data_pages = Counter("lightpage_data_pages", "Pages read for their bytes.", ["loss"], registry=own)
-        self.corrected = Counter("lightpage_corrected_symbols", "Mended by Reed-Solomon.", registry=own)
-        self.code_iterations = Gauge("lightpage_code_iterations", "Of the last page's blocks, mean.", registry=own)
-        self.searches = Counter("lightpage_image_searches", "Pages searched for.", ["found"], registry=own)
-        self.image = Gauge("lightpage_image_shift_px", "Of the last page since calibration.", ["axis"], registry=own)
-        self.recalibrations = Counter("lightpage_recalibrations", "By their end.", ["result"], registry=own)
-        self.monitor_due = Gauge("lightpage_monitor_due", "1 where many pages say so.", registry=own)
-        self.monitor_signs = Gauge("lightpage_monitor_sign", "Smoothed over pages.", ["sign"], registry=own)
-        self.monitor_raised = Gauge("lightpage_monitor_sign_raised", "1 where beyond it.", ["sign"], registry=own)
-        self.sessions_due = Gauge("lightpage_sessions_due", "Callers' sessions that say so.", registry=own)
-        self.flight_pages = Counter("lightpage_flight_pages", "Kept, dropped or failed.", ["result"], registry=own)
-        self.model = Gauge("lightpage_model_info", "1 for the model in service.", ["version"], registry=own)
+        self.rejects = counter("lightpage_rejects", "Calls and pages that ended with an error.", ["reason"])
+        self.pages = counter("lightpage_pages", "Decoded and confirmed pages of the newest models.", ["model_version"])
+        self.decode = Histogram("lightpage_decode_seconds", "Decode of a page.", buckets=_SECONDS, registry=own)
+        self.confidence = gauge("lightpage_confidence_mean", "Mean confidence of the last confirmed page.")
+        self.concentration = gauge("lightpage_concentration_mean", "Mean von Mises kappa of the last confirmed page.")
+        self.piston = gauge("lightpage_piston_radians", "Piston of the last confirmed page.")
+        self.pilots = gauge("lightpage_pilot_coherence", "Agreement of the last page's pilots on the piston, 0 to 1.")
+        self.trust = gauge("lightpage_pilot_trust", "Claimed concentration that the last page's pilots confirm.")
+        self.share = gauge("lightpage_pilot_share", "Claimed information that the last page's pilots confirm.")
+        self.due = gauge("lightpage_recalibration_due", "1 if the last page asks for a recalibration, else 0.")
+        self.lost_pages = counter("lightpage_pages_lost", "Lost pages, by reason.", ["reason"])
+        self.margin = gauge("lightpage_margin_bits", "Information of a symbol beyond what the page's code needs, bits.")
+        self.data_pages = counter("lightpage_data_pages", "Pages read for user bytes, by their loss or none.", ["loss"])
+        self.corrected = counter("lightpage_corrected_symbols", "Symbols of user bytes that Reed-Solomon corrected.")
+        self.code_iterations = gauge("lightpage_code_iterations", "Iterations of the last page's code, mean of blocks.")
+        self.searches = counter("lightpage_image_searches", "Searches for the image of a page, by result.", ["found"])
+        self.image = gauge("lightpage_image_shift_px", "Shift of the last page's image since calibration.", ["axis"])
+        self.recalibrations = counter("lightpage_recalibrations", "Recalibrations, by how they ended.", ["result"])
+        self.monitor_due = gauge("lightpage_monitor_due", "1 if many pages together ask for a recalibration, else 0.")
+        self.monitor_signs = gauge("lightpage_monitor_sign", "Signs of the monitor, smoothed over pages.", ["sign"])
+        self.monitor_raised = gauge("lightpage_monitor_sign_raised", "1 if the sign is raised, else 0.", ["sign"])
+        self.sessions_due = gauge("lightpage_sessions_due", "Sessions of callers that ask for a recalibration.")
+        self.flight_pages = counter("lightpage_flight_pages", "Pages of the flight recorder, by result.", ["result"])
+        self.model = gauge("lightpage_model_info", "1 for the model in service.", ["version"])
         self._begin_at_zero()
 
     def _begin_at_zero(self) -> None:
@@ -190,8 +194,9 @@ class ServiceMetrics:
 
     def watch_certificates(self, ends_s: Callable[[], float]) -> None:
         """Show when the first certificate ends, whenever somebody looks."""
-        name, about = "lightpage_certificate_ends_seconds", "First end of its own and its authorities', since 1970."
-        Gauge(name, about, registry=self.registry).set_function(ends_s)
+        own = self.registry
+        ends = Gauge("lightpage_certificate_ends_seconds", "First end of a certificate, Unix time.", registry=own)
+        ends.set_function(ends_s)
 
     def in_service(self, version: str) -> None:
         """Say which model decodes now."""
@@ -222,8 +227,8 @@ def _load(decodes: Slots, received: ReceiveBudget) -> Iterator[Metric]:
     yield GaugeMetricFamily("lightpage_decodes_busy", "Slots in which a page is decoded.", value=decodes.busy)
     yield GaugeMetricFamily("lightpage_decodes_slots", "Pages decoded at once, at most.", value=decodes.count)
     yield CounterMetricFamily("lightpage_received_bytes", "Frames that callers sent.", value=received.taken)
-    yield GaugeMetricFamily("lightpage_receive_buffer_bytes", "Of them not yet decoded.", value=received.used)
-    yield GaugeMetricFamily("lightpage_receive_buffer_limit_bytes", "At most so many.", value=received.size)
+    yield GaugeMetricFamily("lightpage_receive_buffer_bytes", "Undecoded frames of callers.", value=received.used)
+    yield GaugeMetricFamily("lightpage_receive_buffer_limit_bytes", "Limit of undecoded frames.", value=received.size)
 
 
 def _batches(pages: UnderWay) -> Iterator[Metric]:
@@ -231,9 +236,9 @@ def _batches(pages: UnderWay) -> Iterator[Metric]:
     runs = pages.runs.copy()
     bounds = {**{str(bound): bound for bound in _BATCH_PAGES}, "+Inf": math.inf}
     buckets = [(told, sum(runs[size] for size in runs if size <= bound)) for told, bound in bounds.items()]
-    about, total = "Pages of a batch.", sum(size * count for size, count in runs.items())
-    yield HistogramMetricFamily("lightpage_batch_pages", about, buckets=buckets, sum_value=total)
-    spent = CounterMetricFamily("lightpage_device_seconds", "What computes batches, by what it did.", labels=["state"])
+    total = sum(size * count for size, count in runs.items())
+    yield HistogramMetricFamily("lightpage_batch_pages", "Pages of a batch.", buckets=buckets, sum_value=total)
+    spent = CounterMetricFamily("lightpage_device_seconds", "What computes batches, by state.", labels=["state"])
     for state, seconds in pages.seconds().items():
         spent.add_metric([state.value], seconds)
     yield spent
@@ -241,7 +246,7 @@ def _batches(pages: UnderWay) -> Iterator[Metric]:
 
 def _source(source: FrameSource) -> Iterator[Metric]:
     """Return what a source counts by itself."""
-    shots = CounterMetricFamily("lightpage_shots", "Shots of the cameras, by how they ended.", labels=["outcome"])
+    shots = CounterMetricFamily("lightpage_shots", "Shots, TAKEN or by why they were lost.", labels=["outcome"])
     for outcome, count in source.shots_by_outcome().items():
         shots.add_metric([outcome], count)
     yield shots
@@ -249,8 +254,8 @@ def _source(source: FrameSource) -> Iterator[Metric]:
     for camera, value in source.saturated_shares().items():
         share.add_metric([camera], value)
     yield share
-    about = "1 where pages of the source can be read, 0 where a beam may be blocked."
-    yield GaugeMetricFamily("lightpage_source_ok", about, value=float(not source.trouble()))
+    is_well = float(not source.trouble())
+    yield GaugeMetricFamily("lightpage_source_ok", "1 if pages of the source can be read, else 0.", value=is_well)
 
 
 def _store(health: StoreHealth, trouble: Callable[[], Trouble | None]) -> Iterator[Metric]:
@@ -260,8 +265,8 @@ def _store(health: StoreHealth, trouble: Callable[[], Trouble | None]) -> Iterat
         found = Reason.HUNG
     elif not is_well and (known := trouble()) is not None:
         found = known.reason
-    yield GaugeMetricFamily("lightpage_store_ok", "1 where the model store is well.", value=float(is_well))
-    reasons = GaugeMetricFamily("lightpage_store_trouble", "1 for what is wrong with it.", labels=["reason"])
+    yield GaugeMetricFamily("lightpage_store_ok", "1 if the model store is well, else 0.", value=float(is_well))
+    reasons = GaugeMetricFamily("lightpage_store_trouble", "1 for what is wrong with the store.", labels=["reason"])
     for reason in Reason:
         reasons.add_metric([reason.value], float(reason is found))
     yield reasons

@@ -1,5 +1,4 @@
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +7,8 @@ from click.testing import CliRunner, Result
 from analysis.results.measurements import Measurement, kept_measurements
 from analysis.results.page import PAGE, ROOT, Results, main, render
 from lightpage.codec.code import Code
+from lightpage.metrics.provenance import PROVENANCE, Provenance
+from lightpage.run_files import BEGUN
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.shipped import bundle_path
 
@@ -20,6 +21,7 @@ README = {
     "told the device's true state (oracle), two passes": "oracle-refined",
 }
 """Methods by their names in the README's table."""
+ORIGIN = {"command": "a command", "commit": "0123456", "machine": "a machine", "time": "2026", "inputs": {"a": "0"}}
 
 
 def outcome(method: str, air: float, gained: float = 0.001) -> dict[str, Any]:
@@ -28,8 +30,8 @@ def outcome(method: str, air: float, gained: float = 0.001) -> dict[str, Any]:
 
 
 def toy(*outcomes: dict[str, Any], angle_deg: float = -0.6) -> dict[str, Any]:
-    data_set = {"angle_deg": angle_deg, "full_well_e": 32.0, "exposure": 0.5, "outcomes": list(outcomes)}
-    return {"pages": 60, "seed": 1, "data_sets": [data_set]}
+    light = {"angle_deg": angle_deg, "full_well_e": 32.0, "exposure": 0.5, "symbol_size_px": 4}
+    return {"pages": 60, "seed": 1, "data_sets": [light | {"outcomes": list(outcomes)}]}
 
 
 def written(path: Path, figures: object) -> Path:
@@ -39,8 +41,9 @@ def written(path: Path, figures: object) -> Path:
 
 
 def command(folder: Path, *options: object) -> Result:
-    (folder / "kept").mkdir(exist_ok=True)
-    own = ("--kept", folder / "kept", "--out", folder / "page.md")
+    for name in ("kept", "results"):
+        (folder / name).mkdir(exist_ok=True)
+    own = ("--kept", folder / "kept", "--out", folder / "results" / "index.md")
     return CliRunner().invoke(main, [str(word) for word in (*own, *options)], catch_exceptions=False)
 
 
@@ -76,6 +79,15 @@ def test_the_readme_says_what_the_kept_figures_say() -> None:
     assert dim["pages_unread"] == bright["pages_unread"] == 0
 
 
+def test_kept_figures_say_where_they_are_from() -> None:
+    configurations = {BEGUN, "mlserver-model.json", "mlserver-settings.json"}
+    paths = [path for path in (ROOT / "analysis").rglob("*.json") if path.name not in configurations]
+    assert paths
+    for path in paths:
+        found = Provenance.model_validate(json.loads(path.read_text("utf-8")).get(PROVENANCE, {}))
+        assert not found.unknown or (found.command and found.commit and found.source), path
+
+
 def test_the_ledger_is_that_of_the_shipped_code() -> None:
     shipped = Bundle.open(bundle_path("bench")).code
     assert shipped is not None
@@ -88,22 +100,22 @@ def test_the_ledger_is_that_of_the_shipped_code() -> None:
 
 def test_figures_are_collected_without_their_curves_and_what_lacks_is_left_out(tmp_path: Path) -> None:
     figures = toy(outcome("ray", 2.344, gained=0.02), outcome("coherent", 4.5), outcome("refined 1", 5.0))
-    path = written(tmp_path / "runs" / "sheared" / "figures.json", figures)
+    path = written(tmp_path / "runs" / "sheared" / "figures.json", {PROVENANCE: ORIGIN, **figures})
     (path.parent / "figure.png").write_bytes(b"picture")
-    os.utime(path, (1_700_000_000, 1_700_000_000))
     (tmp_path / "kept").mkdir()
-    Measurement(toy(outcome("ray", 1.0)), "a document", "a caveat").write(tmp_path / "kept" / "sheared.json")
-    done = command(tmp_path, "--from", tmp_path / "runs", "--commit", "0123456789abcdef")
+    earlier = Measurement(toy(outcome("ray", 1.0)), Provenance(), "a caveat")
+    earlier.write(tmp_path / "kept" / "sheared.json")
+    done = command(tmp_path, "--from", tmp_path / "runs")
     assert done.exit_code == 0
     kept = kept_measurements(tmp_path / "kept")
     assert list(kept) == ["sheared"]
-    assert (kept["sheared"].source, kept["sheared"].note) == ("measured 2023-11-14 on commit 0123456", "")
+    assert (kept["sheared"].provenance.to_json(), kept["sheared"].note) == (ORIGIN, "")
     for one in figures["data_sets"][0]["outcomes"]:
         del one["training_curve"], one["validation_curve"]
     assert kept["sheared"].figures == figures
     assert (tmp_path / "images" / "decoders.png").read_bytes() == b"picture"
-    assert "| published, ray localizer | 2.34 | 1.17 |" in (tmp_path / "page.md").read_text()
+    assert "| published, ray localizer | 2.34 | open | 1.17 |" in (tmp_path / "results" / "index.md").read_text()
     # a comparison that is not finished replaces nothing
-    written(path, toy(outcome("ray", 3.0)))
-    command(tmp_path, "--from", tmp_path / "runs", "--commit", "0123456")
+    written(path, {PROVENANCE: ORIGIN, **toy(outcome("ray", 3.0))})
+    command(tmp_path, "--from", tmp_path / "runs")
     assert kept_measurements(tmp_path / "kept")["sheared"].figures == figures

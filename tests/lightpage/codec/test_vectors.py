@@ -1,4 +1,4 @@
-"""Pages and pilots are those of docs/formats.md, as an independent writer made them: vectors.json says how."""
+"""Pages and pilots are those of docs/reference/formats.md, as an independent writer made them (vectors.json)."""
 
 import hashlib
 import io

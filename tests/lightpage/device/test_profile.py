@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from lightpage.device.profile import SHIPPED, load_profile, parse_profile
-from lightpage.device.profile_keys import commented_toml, key_table, keys
+from lightpage.device.profile_keys import commented_toml, keys
 from lightpage.errors import ProfileError
 from tests.lightpage.refused import refused
 
@@ -72,10 +72,6 @@ def test_a_profile_to_fill_in_has_every_key_and_is_the_same(name: str) -> None:
     assert parse_profile(text) == load_profile(name)
     for key in keys():
         assert re.search(rf"^(# )?{key.name} = ?.*# .*: {key.meaning}$", text, re.MULTILINE), key
-
-
-def test_the_document_lists_every_key() -> None:
-    assert key_table() in (Path(__file__).parents[3] / "docs" / "formats.md").read_text("utf-8")
 
 
 def test_earlier_profiles_keep_their_text_and_hash() -> None:

@@ -34,7 +34,7 @@ LEVELS, PAGES = 16, 4
 COUNTS = ("in_phase", "quadrature", "reference_in_phase", "reference_quadrature")
 TURNS = [Upright("", turn) for turn in (180, 270, 90)]
 WAYS = [Upright("x"), Upright("y"), *TURNS, Upright("x", 270), Upright("x", 90)]
-"""Options that docs/your-device.md names, in the order of `ORIENTATIONS`."""
+"""Options that docs/guides/your-device.md names, in the order of `ORIENTATIONS`."""
 Arrays = dict[str, np.ndarray]
 
 

@@ -19,7 +19,7 @@ from lightpage.runtime.device.acquisition.camera_devices import open_camera
 from lightpage.runtime.device.acquisition.source import open_source
 from tests.runtime.device.acquisition.lab import reason_of
 
-TEXT = (Path(__file__).parents[3] / "docs" / "drivers.md").read_text("utf-8")
+TEXT = (Path(__file__).parents[3] / "docs" / "guides" / "drivers.md").read_text("utf-8")
 DECLARED, DEVICE = (text for text in re.findall(r"```toml\n(.*?)```", TEXT, re.DOTALL))
 MOST_LINES = 80
 SHAPE = load_profile("bench").frame_shape

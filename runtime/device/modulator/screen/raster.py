@@ -18,29 +18,28 @@ class ScreenSettings(StrictTable):
     """A modulator that is a monitor of an X server, and where a page lies on it.
 
     Pixels are the modulator's; row 0 is its upper edge, column 0 its left one.
-
-    Attributes:
-        rows_px, columns_px: the modulator's resolution.
-        offset_x_px: how far right of the modulator's centre the page's centre lies.
-        offset_y_px: how far below it.
-        flip_x: mirror the page, left for right; it stays where it is.
-        flip_y: mirror the page, top for bottom; it stays where it is.
-        background_grey: grey value beside the page.
-        x_display: the server, and its screen, as in ``:0`` or ``:0.1``; None for that of the variable DISPLAY.
-        monitor: which monitor of that screen, from 0, in the order of ``xrandr --listactivemonitors``.
-        settle_s: wait after the display has scanned the page out once, for the liquid crystal, seconds.
     """
 
     rows_px: Side
+    """The modulator's rows. The monitor's mode must have as many."""
     columns_px: Side
+    """The modulator's columns."""
     offset_x_px: Offset = 0
+    """Distance of the page's middle to the right of the modulator's."""
     offset_y_px: Offset = 0
+    """Distance of the page's middle below the modulator's."""
     flip_x: bool = False
+    """Mirror the page, left for right. It stays where it is."""
     flip_y: bool = False
+    """Mirror the page, top for bottom. It stays where it is."""
     background_grey: Annotated[int, Field(ge=0, le=255)] = 0
+    """Grey value beside the page."""
     x_display: Annotated[str, Field(min_length=1)] | None = None
+    """X display and screen, e.g. `:0`. Without it the variable DISPLAY counts."""
     monitor: Annotated[int, Field(ge=0, le=99)] = 0
+    """Number of the monitor, from 0, as `xrandr --listactivemonitors` has it."""
     settle_s: Annotated[float, Field(ge=0, le=60, allow_inf_nan=False)] = 0.05
+    """Wait for the liquid crystal, after the page was scanned out once."""
 
 
 class Raster:

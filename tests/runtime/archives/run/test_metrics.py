@@ -10,8 +10,6 @@ from prometheus_client.parser import text_string_to_metric_families
 from lightpage.runtime.archives.run.task import Task
 from tests.runtime.archives.archive import PAGES, RANGE, Archive, spoil_page
 
-DOCUMENT = Path(__file__).resolve().parents[4] / "docs" / "scaling.md"
-
 
 def values(text: str) -> dict[str, float]:
     """Every sample by name and labels, without those of the run and its part."""
@@ -57,13 +55,6 @@ def test_a_run_is_scraped_while_it_works_and_its_end_is_in_a_file(
     assert end["lightpage_bulk_read_bytes_total{}"] == sum(each.read_bytes for each in archive.records().values())
     finished = [record.finished_s for record in archive.records().values() if record.finished_s is not None]
     assert max(finished) <= end["lightpage_bulk_end_timestamp_seconds{}"]
-
-
-def test_every_metric_is_documented(archive: Archive, tmp_path: Path) -> None:
-    archive.run("evaluate", "--metrics-file", str(file := tmp_path / "bulk.prom"))
-    shown = dict(re.findall(r"^# TYPE (lightpage_\S+) (\S+)$", file.read_text(), re.MULTILINE))
-    told = dict(re.findall(r"^\| `(lightpage_bulk_\w+)` \| (\w+) \|", DOCUMENT.read_text(), re.MULTILINE))
-    assert told == {name: kind for name, kind in shown.items() if not name.endswith("_created")}
 
 
 def test_a_file_is_written_however_a_run_ends(archive: Archive, tmp_path: Path) -> None:

@@ -87,7 +87,7 @@ def test_the_commands_for_operators_make_good_certificates_and_renew_them(tmp_pa
         assert {name: (each.name, each.roles) for name, each in found[-1].items()} == {
             name: (name, expected) for name, expected in roles.items()
         }
-        bash(commands_of("New certificates"), tmp_path)
+        bash(commands_of("Renew certificates"), tmp_path)
     changed = {path.name for path in tls.iterdir() if path.read_bytes() != before.get(path.name)}
     assert changed == {*(f"{name}.pem" for name in ("service", *roles)), "ca.srl"}
     assert all(found[1][name].until >= found[0][name].until for name in roles)

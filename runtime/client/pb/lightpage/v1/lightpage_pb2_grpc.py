@@ -29,8 +29,9 @@ if _version_not_supported:
 class LightpageStub(object):
     """INVALID_ARGUMENT: what the caller sent is wrong. RESOURCE_EXHAUSTED: it is too large (no RetryInfo), or the service has too
     much to do to answer before the caller's deadline (RetryInfo says when to try again). ABORTED: the model in service is not
-    the one that was expected, or another recalibration runs. FAILED_PRECONDITION: the service's own source or models do not allow it. DATA_LOSS: the page is lost,
-    and nothing that the caller sent need be wrong; `ErrorDetail.reason` says why.
+    the one that was expected, or another recalibration runs. FAILED_PRECONDITION: the service's own source or models do not
+    allow it. DATA_LOSS: the page is lost, and nothing that the caller sent need be wrong; `ErrorDetail.reason` says why.
+    docs/reference/contract.md says which calls to repeat after which error.
     """
 
     def __init__(self, channel):
@@ -154,43 +155,47 @@ class LightpageStub(object):
 class LightpageServicer(object):
     """INVALID_ARGUMENT: what the caller sent is wrong. RESOURCE_EXHAUSTED: it is too large (no RetryInfo), or the service has too
     much to do to answer before the caller's deadline (RetryInfo says when to try again). ABORTED: the model in service is not
-    the one that was expected, or another recalibration runs. FAILED_PRECONDITION: the service's own source or models do not allow it. DATA_LOSS: the page is lost,
-    and nothing that the caller sent need be wrong; `ErrorDetail.reason` says why.
+    the one that was expected, or another recalibration runs. FAILED_PRECONDITION: the service's own source or models do not
+    allow it. DATA_LOSS: the page is lost, and nothing that the caller sent need be wrong; `ErrorDetail.reason` says why.
+    docs/reference/contract.md says which calls to repeat after which error.
     """
 
     def Describe(self, request, context):
-        """What the service is: device, model, limits.
+        """Describe the service: device, model, limits.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def DecodeFrames(self, request_iterator, context):
-        """Decode one frame pair: a header first, then chunks of at most `Limits.chunk_bytes`: the in-phase frame, whole, followed
-        by the quadrature frame. A chunk may span the border.
+        """Decode one frame pair. Send a header, then chunks of at most `Limits.chunk_bytes`: the whole in-phase frame, followed by
+        the whole quadrature frame. A chunk may span the border. No chunks follow a header with `shared` frames.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def DecodePages(self, request_iterator, context):
-        """Decode frame pairs, one after another, in one call: each is a header, then its chunks as in DecodeFrames. A reply for
-        each, in their order; a pair that is refused or lost ends nothing. At most two pairs are on their way at a time: the
-        service reads no further until the first is answered.
+        """Decode frame pairs, one after another, in one call: each is a header, then its chunks as in DecodeFrames. A reply comes
+        for each, in their order; a pair that is refused or lost ends nothing. At most two pairs are on their way at a time: the
+        service reads no further until the first is answered. The call ends where the next pair cannot be found: after messages
+        in the wrong order, an unknown `pixel_type`, a pair or a chunk above its limit, or more or fewer bytes than the header
+        says; and after 5 s without a message (`limits.stall_s`), between two pairs too.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def ReadPage(self, request, context):
-        """Read a page from the service's own source and decode it.
+        """Read a page from the service's own source and decode it. Without a page, read the next one; the first follows the last.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def ReadPages(self, request, context):
-        """Read pages from the service's own source, one after another. A reply for each, in their order; a lost page ends nothing.
+        """Read pages from the service's own source, one after another. A reply comes for each, in their order; a lost page ends
+        nothing, nor does one that storage did not give. At most `Limits.range_pages`.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -200,14 +205,16 @@ class LightpageServicer(object):
         """Read a range of pages from the service's own source and send their user bytes, a message a page. A lost page ends
         nothing: its message says why. Where data pages of a group are missing and enough of it was read, their bytes follow
         once three other groups have begun, or at the end; their figures are 0. The range ends with the source's last page.
-        Where the service recalibrates itself, a lost page that it can read then comes last, once more under its number.
+        Where the service recalibrates itself, a lost page that it can read then comes last, once more under its number. The call
+        ends with STORAGE where storage fails; ask again from that page on. Pages of four ranges are read at once
+        (`limits.concurrent_ranges`); a range ends after an hour (`limits.range_s`). FAILED_PRECONDITION: the model has no code.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def UploadPages(self, request_iterator, context):
-        """Give the source's modulator more pages to show, behind those that it has; all of the call or none. They are kept until
+        """Give the source's modulator more pages to show, after those that it has; all of the call or none. They are kept until
         the service ends. ReadPage.page is a page's number.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
@@ -215,15 +222,16 @@ class LightpageServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def WatchDisplay(self, request, context):
-        """For a controller that shows pages, or moves shutters, by itself: what the service waits for, one message for each
-        change, until the caller leaves. FAILED_PRECONDITION where the source's device does this by itself.
+        """Follow what the service waits for, for a controller that shows pages or moves shutters by itself: one message for each
+        change, until the caller leaves. Two controllers may watch at once (`limits.concurrent_watches`). FAILED_PRECONDITION
+        where the source's device does this by itself.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def ReportDisplay(self, request, context):
-        """The controller says what is on display now, or how the beams are now, once that has settled.
+        """Report what is on display now, or how the beams are now, once that has settled.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -246,79 +254,92 @@ class LightpageServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def ListModels(self, request, context):
-        """All models that can be served at once, the oldest first.
+        """List all models that can be served at once, the oldest first.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def RollForward(self, request, context):
-        """The opposite of Rollback: FAILED_PRECONDITION where there is no later model.
+        """Undo a Rollback. FAILED_PRECONDITION where there is no later model.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def UploadModel(self, request_iterator, context):
-        """Give the service a bundle: a header first, then the .zip in chunks. It is checked as at a start, its golden page
-        included, and kept in the store; it is not in service before ActivateModel. ALREADY_EXISTS: there is one of its version.
+        """Give the service a bundle: a header first, then the .zip in chunks of at most `Limits.message_bytes`, within ten minutes
+        (`limits.model_s`). It is checked as at a start, its golden page included, and must have the frames, page and bit depth of
+        the model in service. It is kept in the store as VERSION.zip, and is not in service before ActivateModel. One upload runs
+        at a time; a failed one leaves nothing. ALREADY_EXISTS: there is one of its version. FAILED_PRECONDITION: there is no
+        store, or it cannot be written or lacks room.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def ActivateModel(self, request, context):
-        """Put a model of the store in service.
+        """Put a model of the store in service, from the next request on. Models ahead of the current one leave the history.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def PinModel(self, request, context):
-        """A pinned model is never deleted. While the model in service is pinned, the service does not recalibrate by itself.
+        """Pin or unpin a model. A pinned model is never deleted. While the model in service is pinned, the service does not
+        recalibrate by itself.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def StartRecalibration(self, request, context):
-        """Start a recalibration and return at once. It goes on when the caller leaves; one runs at a time.
+        """Start a recalibration and return at once. It goes on when the caller leaves; one runs at a time. The call ends, and there
+        is no job, where another job runs (ABORTED), where another model than expected is in service (ABORTED), where there are
+        more pages than the service takes, no such recording or no source, or where nothing can be written (FAILED_PRECONDITION,
+        STORE). What shows only when pages are read fails the job. The expected version is checked again then.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def RecalibrateFrames(self, request_iterator, context):
-        """The same with frames that the caller sends: a header, then reference frames (once), then for each page its pair and its
-        symbols. The job starts once all has come.
+        """Start a recalibration with frames that the caller sends: a header, the reference frames once, then for each page its
+        symbols in one message and its pair in chunks of at most `Limits.chunk_bytes`. A chunk may span the border of the two
+        frames. The job starts once all has come and the caller has closed the stream; a stream that breaks off starts nothing.
+        The header is checked before the frames. Pages without light are left out; fewer than two others are refused. The bytes
+        count among received frames until the job has ended: RetryInfo where there is no room now.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def ListJobs(self, request, context):
-        """Jobs that run, and those that ended lately; the newest first. Results are kept across restarts.
+        """List the jobs that run, and those that ended lately; the newest first. The last 64 are kept (`limits.jobs_kept`), across
+        restarts where there is a store.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def GetJob(self, request, context):
-        """NOT_FOUND: no such job, or one that ended long ago.
+        """Return a job as it is now. NOT_FOUND: no such job, or one that ended long ago.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def WatchJob(self, request, context):
-        """The job now, and at each change, until it has ended. A caller that lost its connection watches again.
+        """Follow a job: as it is now, and at each change, until it has ended. Changes are looked for ten times a second; at most 256
+        watches run at once. A watch ends when the service stops. A caller that lost its connection watches again.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def CancelJob(self, request, context):
-        """Stop a job at its next step; returns it as it is then. One that has ended stays as it is.
+        """Stop a job at its next step. The call waits up to 2 s for that and returns the job as it is then, perhaps still running.
+        A job that has ended stays as it is, and so does one whose model is in service.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -448,8 +469,9 @@ def add_LightpageServicer_to_server(servicer, server):
 class Lightpage(object):
     """INVALID_ARGUMENT: what the caller sent is wrong. RESOURCE_EXHAUSTED: it is too large (no RetryInfo), or the service has too
     much to do to answer before the caller's deadline (RetryInfo says when to try again). ABORTED: the model in service is not
-    the one that was expected, or another recalibration runs. FAILED_PRECONDITION: the service's own source or models do not allow it. DATA_LOSS: the page is lost,
-    and nothing that the caller sent need be wrong; `ErrorDetail.reason` says why.
+    the one that was expected, or another recalibration runs. FAILED_PRECONDITION: the service's own source or models do not
+    allow it. DATA_LOSS: the page is lost, and nothing that the caller sent need be wrong; `ErrorDetail.reason` says why.
+    docs/reference/contract.md says which calls to repeat after which error.
     """
 
     @staticmethod
