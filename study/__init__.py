@@ -10,6 +10,7 @@ from lightpage.study.studies import (
     heads,
     imaging_condition,
     lens_path,
+    paper,
     pipe_length,
     rays,
     receptive_field,
@@ -20,6 +21,7 @@ from lightpage.study.studies import (
 from lightpage.study.study import Study
 
 STUDIES: dict[str, Study] = {
+    "paper": paper.STUDY,
     "folding": folding.STUDY,
     "rays": rays.STUDY,
     "cross-section": cross_section.STUDY,

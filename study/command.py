@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import click
@@ -12,10 +16,12 @@ from lightpage.cli.paths import OutputFolder
 from lightpage.cli.progress_bar import percent_bar
 from lightpage.device.profile import load_profile
 from lightpage.errors import InvalidInputError
-from lightpage.files import replace_file, replace_text, write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.run_files import BEGUN
 from lightpage.study import STUDIES
-from lightpage.study.study import RESULTS, Settings, aligned, measured
+from lightpage.study.lights import Lights
+from lightpage.study.study import RESULTS, Settings, left, measured, written
+from lightpage.train.data.torch_engine import torch_device
 from lightpage.train.fitting.memory import keep_freed_memory
 from lightpage.train.runs import begin, sole_writer
 
@@ -49,6 +55,17 @@ _RESULTS = "results"
     metavar="WORD",
     help="Of a study that varies many things, the cases whose names begin so; others can follow in the same OUT.",
 )
+@click.option("--left", "tell_left", is_flag=True, help="Name the cases that are left to measure, in order, and end.")
+@click.option(
+    "--minutes",
+    type=FiniteRange(min=0.1, max=10_000),
+    help="Stop after so long as after Ctrl-C: what is measured is kept, what is trained goes on from its last pass.",
+)
+@click.option(
+    "--compute",
+    metavar="cpu|cuda[:N]",
+    help="Where light is made and networks are trained.  [default: cuda where there is a GPU]",
+)
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 @JSON
 def study(
@@ -60,6 +77,9 @@ def study(
     share: float,
     channels: int,
     only: tuple[str, ...],
+    tell_left: bool,
+    minutes: float | None,
+    compute: str | None,
     seed: int,
     json_path: Path | None,
 ) -> None:
@@ -68,7 +88,8 @@ def study(
     if full and profile_name is not None:
         raise InvalidInputError("--full", f"--profile {profile_name} beside it", "one of them")
     chosen = STUDIES[name]
-    if full and chosen.trains and not torch.cuda.is_available():
+    device = torch_device(compute or ("cuda" if torch.cuda.is_available() else "cpu"))
+    if full and chosen.trains and device.type != "cuda" and not tell_left:
         raise InvalidInputError(f"study {name} --full", "no CUDA device", "one: it trains networks at full scale")
     if share < 1 and not chosen.trains:
         raise InvalidInputError(f"study {name} --share", f"{share:g} of a study that trains nothing", "no --share")
@@ -79,9 +100,14 @@ def study(
         raise InvalidInputError(f"study {name} --only", " ".join(only), "no --only: its picture needs all of its cases")
     context = click.get_current_context()
     context.meta["lightpage.resume"] = "run the same command again; it goes on where it was"
-    settings = Settings(load_profile(_FULL if full else profile_name or "bench"), quick, seed, share, channels)
+    settings = Settings(
+        load_profile(_FULL if full else profile_name or "bench"), quick, seed, share, channels, Lights(str(device))
+    )
     results_folder = out / _RESULTS
-    chosen.chosen(settings, only, results_folder)  # before anything is written
+    cases = chosen.chosen(settings, only, results_folder)  # before anything is written
+    if tell_left:
+        click.echo("\n".join(left(chosen, settings, results_folder)) or "none")
+        return
     context.with_resource(sole_writer(out))
     if results_folder.exists() and not results_folder.is_dir():
         raise InvalidInputError(f"study {out}: {_RESULTS}", "a file", "a folder, or another --out")
@@ -90,8 +116,8 @@ def study(
         raise InvalidInputError(f"study {out}", "results of unknown origin", expected)
     begin(out, {"study": name, "results": RESULTS, **settings.key()})
     results_folder.mkdir(exist_ok=True)
-    cases, results = chosen.chosen(settings, only, results_folder), []
-    with percent_bar() as progress:
+    results = []
+    with percent_bar() as progress, _stopped_after(minutes):
         for number, case in enumerate(cases):
             results.append(
                 measured(
@@ -102,20 +128,30 @@ def study(
                     lambda what, share, n=number, c=case: progress(f"{c['name']}: {what}", (n + share) / len(cases)),  # type: ignore[misc]
                 )
             )
-    rows = chosen.rows(cases, results)
-    table = aligned(chosen.header, rows)
-    figure = chosen.plot(settings, cases, results)
-    replace_file(out / "figure.png", lambda file: figure.savefig(file, format="png", dpi=110), "picture of the study")
     how = "" if share == 1 else f"; {share:.0%} of the authors' steps"
     how += "" if channels == Settings.channels else f"; network of {channels}/{2 * channels} channels"
-    replace_text(out / "table.txt", f"{chosen.title} ({chosen.source}){how}\n\n{table}\n", "table of the study")
+    table = written(out, chosen, settings, cases, results, how)
     figures = {
         "study": name,
         **settings.key(),
         "header": list(chosen.header),
-        "rows": [list(row) for row in rows],
+        "rows": [list(row) for row in chosen.rows(cases, results)],
     }
     for path in (out / "study.json", json_path):
-        if path is not None:
-            write_json(path, figures)
+        write_figures(path, figures, settings=settings.key(), results=results_folder)
     click.echo(f"{table}\n\nwritten to {out}")
+
+
+@contextmanager
+def _stopped_after(minutes: float | None) -> Iterator[None]:
+    """Interrupt the program as Ctrl-C does, where the work within takes longer."""
+    if minutes is None:
+        yield
+        return
+    alarm = threading.Timer(60 * minutes, signal.raise_signal, [signal.SIGINT])
+    alarm.daemon = True
+    alarm.start()
+    try:
+        yield
+    finally:
+        alarm.cancel()

@@ -11,18 +11,23 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from lightpage.metrics.information import decide
+from lightpage.codec.choose import FEWEST_PAGES, DrawnPage, choose
+from lightpage.errors import InvalidInputError
+from lightpage.metrics.information import achievable_rate, decide
 from lightpage.metrics.measures import measure, symbol_maps
 from lightpage.metrics.reliability import expected_calibration_error
+from lightpage.page.levels import MAX_LEVELS, Levels
+from lightpage.page.symbols import symbol_phases
 from lightpage.train.data.features import PageState
 from lightpage.train.fitting.concentration_scale import decode_pages, most_likely_factor
 from lightpage.train.fitting.validation import without_piston
 from lightpage.train.models.parts import turned
-from lightpage.train.published.training import FramePages, PublishedTraining, nearest_class, rate_of_classes
+from lightpage.train.published.held_pages import HeldPages
+from lightpage.train.published.training import PublishedTraining, nearest_class, rate_of_classes
 
 
 def estimates(
-    module: PublishedTraining, pages: FramePages, mask: NDArray[np.bool_], knows_piston: bool
+    module: PublishedTraining, pages: HeldPages, mask: NDArray[np.bool_], knows_piston: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """p [2, pages, N] of the data symbols, the piston taken off, and their true phases [pages, N].
 
@@ -53,8 +58,38 @@ def figures_of_p(
     return {"air_map": maps.air, "own_mi_map": maps.own_mi, "error_map": maps.error_rad, "ece": figures.ece}
 
 
+def user_bytes(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.bool_]) -> float:
+    """User bytes of a page by the code that carries most of what is read, `lightpage code`'s choice.
+
+    Args:
+        p: calibrated estimates of the data symbols, [2, pages, N].
+        phases: true ones, [pages, N].
+        mask: pilots, bool [ny, nx].
+
+    Returns:
+        0 where no code carries them; not a number where the pages are too few to say.
+    """
+    errors, kappa = np.arctan2(p[1], p[0]).astype(float) - phases, np.hypot(p[0], p[1]).astype(float)
+    if len(errors) < FEWEST_PAGES:
+        return float("nan")
+
+    def draw(levels: int, rng: np.random.Generator) -> list[DrawnPage]:
+        pages = []
+        for error, concentration in zip(errors, kappa, strict=True):
+            symbols = rng.integers(0, levels, error.shape).astype(np.uint8)
+            phase = np.angle(np.exp(1j * (symbol_phases(symbols, levels) + error)))
+            pages.append(DrawnPage(phase, concentration, symbols, Levels.of(levels)))
+        return pages
+
+    air = float(achievable_rate(errors, kappa, np.zeros(errors.shape, np.int64), MAX_LEVELS).mean())
+    try:
+        return float(choose(draw, air, mask)[0].user_bytes)
+    except InvalidInputError:
+        return 0.0
+
+
 def figures_of_classes(
-    module: PublishedTraining, validation: FramePages, unseen: FramePages, mask: NDArray[np.bool_]
+    module: PublishedTraining, validation: HeldPages, unseen: HeldPages, mask: NDArray[np.bool_]
 ) -> dict[str, Any]:
     """Return the figures of posteriors over classes, as `figures_of_p` names them, without phase errors.
 
@@ -81,12 +116,12 @@ def figures_of_classes(
     }
 
 
-def _scored(module: PublishedTraining, pages: FramePages, data: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+def _scored(module: PublishedTraining, pages: HeldPages, data: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
     """Scores [classes, N] and true classes [N] of the data symbols of each page."""
     with torch.no_grad():
         for frames, state, phases in (pages[index] for index in range(len(pages))):
-            scores = module.network.scores(frames[None], state[None, :2])[0]
-            yield scores[:, data].float(), nearest_class(phases + state[2], module.choices.classes)[data]
+            scores = module.network.scores(frames[None], state[None, :2])[0].float().cpu()
+            yield scores[:, data], nearest_class(phases + state[2], module.choices.classes).cpu()[data]
 
 
 def _over_pages(values: Sequence[NDArray[np.floating]], mask: NDArray[np.bool_]) -> NDArray[np.float32]:

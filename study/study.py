@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,14 @@ from matplotlib.figure import Figure
 
 from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError
-from lightpage.files import replace_text
+from lightpage.files import replace_file, replace_text
+from lightpage.metrics.provenance import PROVENANCE, provenance
 from lightpage.progress import Progress
+from lightpage.study.lights import Lights
 from lightpage.train.published.training import PublishedChoices
 from lightpage.train.runs import load_arrays, save_arrays
 
-RESULTS = 4
+RESULTS = 5
 """Raised when results that were kept by an earlier version do not go together with those of this one."""
 Case = Mapping[str, Any]
 """Values that are varied, by name; `name` tells it from the others and names its files."""
@@ -37,6 +39,7 @@ class Settings:
         seed: seed of everything random.
         share: share of the authors' steps that networks are trained for.
         channels: channels of the published network at sample pitch, twice as many below; the authors' if left out.
+        lights: light that cases share; where they compute does not set them apart.
     """
 
     profile: Profile
@@ -44,10 +47,12 @@ class Settings:
     seed: int = 0
     share: float = 1.0
     channels: int = PublishedChoices.channels[0]
+    lights: Lights = field(default_factory=Lights, compare=False)
 
     def key(self) -> dict[str, Any]:
         """The settings as JSON keeps them."""
-        return asdict(self) | {"profile": self.profile.to_toml()}
+        kept = {name: getattr(self, name) for name in ("quick", "seed", "share", "channels")}
+        return {"profile": self.profile.to_toml(), **kept}
 
 
 @dataclass(frozen=True)
@@ -109,8 +114,24 @@ def measured(study: Study, settings: Settings, case: Case, folder: Path, progres
     work = folder / str(case["name"])
     work.mkdir(parents=True, exist_ok=True)
     result = study.measure(settings, case, work, progress)
-    _save(path, result)
+    _save(path, result, provenance(settings=settings.key(), case=dict(case)).to_json())
     return result
+
+
+def left(study: Study, settings: Settings, folder: Path) -> list[str]:
+    """Names of the cases without a result in the folder, in order."""
+    return [str(case["name"]) for case in study.cases(settings) if not (folder / f"{case['name']}.json").exists()]
+
+
+def written(
+    folder: Path, study: Study, settings: Settings, cases: Sequence[Case], results: Sequence[Result], how: str = ""
+) -> str:
+    """Write the table and the picture of results, and return the table; `how` is told beside the title."""
+    table = aligned(study.header, study.rows(cases, results))
+    figure, picture = study.plot(settings, cases, results), "picture of the study"
+    replace_file(folder / "figure.png", lambda file: figure.savefig(file, format="png", dpi=110), picture)
+    replace_text(folder / "table.txt", f"{study.title} ({study.source}){how}\n\n{table}\n", "table of the study")
+    return table
 
 
 def _names(cases: Sequence[Case]) -> str:
@@ -131,12 +152,13 @@ def _text(value: object) -> str:
     return str(value)
 
 
-def _save(path: Path, result: Result) -> None:
-    """Arrays beside the rest, and first: a result that is there is whole."""
+def _save(path: Path, result: Result, made_by: dict[str, Any]) -> None:
+    """Keep arrays beside the rest, and first: a result that is there is whole."""
     arrays = {name: value for name, value in result.items() if isinstance(value, np.ndarray)}
     rest = {name: value for name, value in result.items() if name not in arrays}
     save_arrays(_arrays(path), arrays)
-    replace_text(path, json.dumps({"values": rest, "arrays": list(arrays)}, indent=1), "result of a study")
+    kept = {PROVENANCE: made_by, "values": rest, "arrays": list(arrays)}
+    replace_text(path, json.dumps(kept, indent=1), "result of a study")
 
 
 def load_result(path: Path) -> Result:

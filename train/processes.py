@@ -36,11 +36,32 @@ class Processes:
         devices: number of devices of each node; "auto" for all GPUs, or one process without one.
         nodes: machines.
         strategy: name out of `STRATEGIES`.
+        compute: device of the only process, `cpu`, `cuda` or `cuda:N`; chosen by `devices` if left out.
     """
 
     devices: int | str = AUTO
     nodes: int = 1
     strategy: str = AUTO
+    compute: str = ""
+
+    @property
+    def accelerator(self) -> str:
+        """Lightning's name of the kind of device."""
+        kind = self.compute.partition(":")[0]
+        return {"": AUTO, "cuda": "gpu"}.get(kind, kind)
+
+    @property
+    def chosen_devices(self) -> int | str | list[int]:
+        """Number of devices, or those that are chosen, as Lightning takes them."""
+        _, _, number = self.compute.partition(":")
+        return [int(number or 0)] if self.accelerator == "gpu" else self.devices
+
+    @property
+    def device(self) -> torch.device:
+        """Device on which the first process prepares pages."""
+        if self.accelerator == AUTO:
+            return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        return torch.device(self.compute)
 
     def checked(self) -> Processes:
         """Check the processes, and return them as `torchrun` says if that has started this process.

@@ -15,6 +15,7 @@ from lightpage.files import write_json
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 from lightpage.progress import note
 from lightpage.recording.pages import Pages
+from lightpage.simulator.engine import CPU
 from lightpage.simulator.recording_job import RecordingJob
 
 
@@ -42,6 +43,13 @@ from lightpage.simulator.recording_job import RecordingJob
     help="Its true state: `rough`, or TOML; a realistic one if absent: a pipe 0.6 degree below the profile's.",
 )
 @click.option("--set", "settings", multiple=True, metavar="TABLE.KEY=VALUE", help="Change one number of that state.")
+@click.option(
+    "--compute",
+    default=CPU,
+    show_default=True,
+    metavar="cpu|cuda[:N]",
+    help="Where pages are computed; a GPU needs torch. It gives the same light, and draws other noise.",
+)
 @click.option("--truth/--no-truth", default=True, help="Keep what only a simulator knows beside the pages.")
 @click.option("--force", is_flag=True, help="Overwrite a recording that exists, or pages begun with other settings.")
 @JSON
@@ -54,6 +62,7 @@ def simulate(
     seed: int,
     device_file: str | None,
     settings: tuple[str, ...],
+    compute: str,
     truth: bool,
     force: bool,
     json_path: Path | None,
@@ -81,7 +90,7 @@ def simulate(
         if profile is None:
             raise InvalidInputError("options", "no --profile", "one, or --symbols with pages that carry it")
         device = _true_device(profile, device_file, settings)
-        job = RecordingJob(profile, device, many, seed, truth, out, written)
+        job = RecordingJob(profile, device, many, seed, truth, out, written, compute)
         job.claim(force)
         count = pages or len(written or ())
         job.run(count)

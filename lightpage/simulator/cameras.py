@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from lightpage.device.profile import Camera
 from lightpage.device.state import CameraPose, Sensor
+from lightpage.simulator.engine import NUMPY, Engine
 
 Real = NDArray[np.floating]
 Complex = NDArray[np.complexfloating]
@@ -23,7 +24,8 @@ _SPECK_DEPTH = 0.3, 0.9
 
 def in_phase_intensity(field: Complex, reference: Complex) -> Real:
     """|E + R|^2: the s-polarised port of the homodyne detector (supplement S12, eq. 3-4, up to its constant)."""
-    return np.asarray(np.abs(field + reference) ** 2)
+    intensity: Real = abs(field + reference) ** 2
+    return intensity
 
 
 def quadrature_intensity(field: Complex, reference: Complex, error: float = 0.0, sign: int = 1) -> Real:
@@ -35,7 +37,8 @@ def quadrature_intensity(field: Complex, reference: Complex, error: float = 0.0,
         error: deviation of the turn from 90 degrees, radians.
         sign: -1 when the wave plate is mounted the other way and the turn is -90 degrees.
     """
-    return np.asarray(np.abs(field + sign * 1j * np.exp(1j * error) * reference) ** 2)
+    intensity: Real = abs(field + reference * (sign * 1j * np.exp(1j * error))) ** 2
+    return intensity
 
 
 @dataclass(frozen=True)
@@ -56,14 +59,15 @@ class CameraView:
     distortion_radius_m: float
     edges_m: tuple[float, float]
 
-    def positions_m(self) -> tuple[Real, Real]:
+    def positions_m(self, engine: Engine = NUMPY) -> tuple[Real, Real]:
         """Points (x, y) of the camera plane that land on the pixels, two arrays [rows, columns], metres."""
-        column = np.arange(self.camera.columns_px) - (self.camera.columns_px - 1) / 2 - self.pose.shift_x_px
-        row = np.arange(self.camera.rows_px) - (self.camera.rows_px - 1) / 2 - self.pose.shift_y_px
-        rotation = np.deg2rad(self.pose.rotation_deg)
+        columns, rows = np.arange(self.camera.columns_px), np.arange(self.camera.rows_px)
+        column = engine.exact(columns - (self.camera.columns_px - 1) / 2 - self.pose.shift_x_px)
+        row = engine.exact(rows - (self.camera.rows_px - 1) / 2 - self.pose.shift_y_px)
+        rotation = math.radians(self.pose.rotation_deg)
         per_px = self.camera.pitch_m / (1 + self.pose.scale_relative_error)
-        x = per_px * (np.cos(rotation) * column[None, :] + np.sin(rotation) * row[:, None])
-        y = per_px * (-np.sin(rotation) * column[None, :] + np.cos(rotation) * row[:, None])
+        x = per_px * (math.cos(rotation) * column[None, :] + math.sin(rotation) * row[:, None])
+        y = per_px * (-math.sin(rotation) * column[None, :] + math.cos(rotation) * row[:, None])
         keystone = (
             self.pose.keystone_x_relative * x / self.edges_m[0] + self.pose.keystone_y_relative * y / self.edges_m[1]
         )
@@ -78,26 +82,30 @@ class Blemishes:
     Attributes:
         transmission: share of the light that dust lets through, float32 [rows, columns], or 1.
         hot: pixels that are always at full scale, [rows, columns]; none if there are no such.
+        engine: what the arrays belong to.
     """
 
     transmission: Real | float = 1.0
     hot: NDArray[np.bool_] | None = None
+    engine: Engine = NUMPY
 
     @classmethod
-    def of(cls, camera: Camera, sensor: Sensor, which: int) -> Self:
+    def of(cls, camera: Camera, sensor: Sensor, which: int, engine: Engine = NUMPY) -> Self:
         """Draw those of camera number `which`, always the same."""
         shape = camera.rows_px, camera.columns_px
         hot_rng, dust_rng = (np.random.default_rng([sensor.blemish_seed, which, kind]) for kind in range(2))
         hot, transmission = None, None
         if sensor.hot_pixel_share:
-            hot = hot_rng.random(shape, dtype=np.float32) < sensor.hot_pixel_share
+            hot = engine.array(hot_rng.random(shape, dtype=np.float32) < sensor.hot_pixel_share)
         if sensor.dust_specks:
-            transmission = _behind_dust(shape, dust_rng.random((sensor.dust_specks, 4)))
-        return cls(1.0 if transmission is None else transmission, hot)
+            transmission = engine.array(_behind_dust(shape, dust_rng.random((sensor.dust_specks, 4))))
+        return cls(1.0 if transmission is None else transmission, hot, engine)
 
-    def counted(self, counts: NDArray[np.uint16], sensor: Sensor) -> NDArray[np.uint16]:
-        """Counts with those of hot pixels."""
-        return counts if self.hot is None else np.where(self.hot, np.uint16(2**sensor.bit_depth - 1), counts)
+    def counted(self, counts: Any, sensor: Sensor) -> Any:
+        """Counts with those of hot pixels, in the type of the frames."""
+        if self.hot is not None:
+            counts = self.engine.xp.where(self.hot, 2.0**sensor.bit_depth - 1, counts)
+        return self.engine.counts(counts, sensor.bit_depth)
 
 
 def _behind_dust(shape: tuple[int, int], drawn: Real) -> Real:
@@ -118,29 +126,29 @@ def _behind_dust(shape: tuple[int, int], drawn: Real) -> Real:
     return passed
 
 
-def resample(image: Real, x_m: Real, y_m: Real, at_x_m: Real, at_y_m: Real) -> Real:
+def resample(image: Real, x_m: Real, y_m: Real, at_x_m: Real, at_y_m: Real, engine: Engine = NUMPY) -> Real:
     """Cubic-spline values of `image`, sampled on the uniform axes (y_m, x_m), at scattered points, float32."""
-    rows = (at_y_m - y_m[0]) / (y_m[1] - y_m[0])
-    columns = (at_x_m - x_m[0]) / (x_m[1] - x_m[0])
-    return np.asarray(
-        scipy.ndimage.map_coordinates(
-            image.astype(np.float32), [rows, columns], order=3, mode="nearest", prefilter=True
-        )
-    )
+    rows = (at_y_m - float(y_m[0])) / float(y_m[1] - y_m[0])
+    columns = (at_x_m - float(x_m[0])) / float(x_m[1] - x_m[0])
+    values: Real = engine.spline(image, rows, columns)
+    return values
 
 
-def expose(intensity: Real, electrons_per_unit: float, sensor: Sensor, rng: np.random.Generator) -> NDArray[np.uint16]:
-    """Shot noise, read noise, clipping at the full well and quantisation; counts of the sensor's bit depth."""
-    expected = np.clip(intensity * electrons_per_unit, 0, None)
-    electrons = rng.poisson(expected) + sensor.read_noise_e * rng.standard_normal(intensity.shape, dtype=np.float32)
-    return to_counts(electrons, sensor)
+def expose(intensity: Real, electrons_per_unit: float, sensor: Sensor, noise: Any, engine: Engine = NUMPY) -> Real:
+    """Shot noise, read noise, clipping at the full well and quantisation; counts of the sensor's bit depth.
+
+    `noise` is a generator of the engine.
+    """
+    expected = engine.xp.clip(intensity * electrons_per_unit, 0, None)
+    electrons = noise.poisson(expected) + sensor.read_noise_e * noise.standard_normal(intensity.shape, dtype=np.float32)
+    return to_counts(electrons, sensor, engine)
 
 
-def to_counts(electrons: Real, sensor: Sensor) -> NDArray[np.uint16]:
-    """Electrons to counts: full scale is the full well."""
+def to_counts(electrons: Real, sensor: Sensor, engine: Engine = NUMPY) -> Real:
+    """Electrons to counts, whole numbers: full scale is the full well."""
     if sensor.nonlinearity_relative:
-        electrons = np.minimum(electrons, sensor.full_well_e)
+        electrons = engine.xp.clip(electrons, None, sensor.full_well_e)
         electrons = electrons * (1 + sensor.nonlinearity_relative * electrons / sensor.full_well_e)
     top = 2**sensor.bit_depth - 1
-    counts = np.clip(np.rint(electrons * (top / sensor.full_well_e)), 0, top)
-    return np.asarray(counts, dtype=np.uint16)
+    counts: Real = engine.xp.clip(engine.xp.round(electrons * (top / sensor.full_well_e)), 0, top)
+    return counts

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from lightpage.device.state import SlmDefects
@@ -12,21 +13,30 @@ Real = NDArray[np.floating]
 Complex = NDArray[np.complexfloating]
 
 
-def modulated(slm: SlmDefects, phase: Real) -> Complex:
-    """Light that a modulator makes of levels of so much nominal phase, radians; of unit amplitude on average nearly."""
+def modulated(slm: SlmDefects, phase: Real, xp: Any = np) -> Complex:
+    """Light that a modulator makes of levels of so much nominal phase, radians; of unit amplitude on average nearly.
+
+    `xp` is the array library of the phases.
+    """
     turn = phase + slm.stroke_relative_error * phase
-    turn = turn + slm.level_sine_rad * np.sin(phase) + slm.level_cosine_rad * np.cos(phase)
-    turn = turn + slm.level_sine_twice_rad * np.sin(2 * phase)
-    amplitude = 1 + slm.level_amplitude_relative * np.cos(phase)
-    return np.asarray(amplitude * np.exp(1j * turn) + slm.unmodulated_relative * np.exp(1j * slm.unmodulated_phase_rad))
+    turn = turn + slm.level_sine_rad * xp.sin(phase) + slm.level_cosine_rad * xp.cos(phase)
+    turn = turn + slm.level_sine_twice_rad * xp.sin(2 * phase)
+    amplitude = 1 + slm.level_amplitude_relative * xp.cos(phase)
+    unmodulated = complex(slm.unmodulated_relative * np.exp(1j * slm.unmodulated_phase_rad))
+    light: Complex = amplitude * xp.exp(1j * turn) + unmodulated
+    return light
 
 
-def with_crosstalk(phase: Real, share: float) -> Real:
+def with_crosstalk(phase: Real, share: float, xp: Any = np) -> Real:
     """Phases [ny, nx] of which each takes over a share of the step to each of its four neighbours."""
     if not share:
         return phase
-    cross = np.array([[0, share, 0], [share, 1 - 4 * share, share], [0, share, 0]])
-    return np.asarray(scipy.ndimage.convolve(phase, cross, mode="nearest"))
+    above, below = (xp.concatenate(rows) for rows in ((phase[:1], phase[:-1]), (phase[1:], phase[-1:])))
+    before, after = (
+        xp.concatenate(columns, 1) for columns in ((phase[:, :1], phase[:, :-1]), (phase[:, 1:], phase[:, -1:]))
+    )
+    mixed: Real = (1 - 4 * share) * phase + share * (above + below + before + after)
+    return mixed
 
 
 def dead_pixels(slm: SlmDefects, shape: tuple[int, int]) -> tuple[NDArray[np.bool_], Complex]:

@@ -16,9 +16,10 @@ from lightpage.recording.hdf5 import patiently
 from lightpage.recording.pages import Pages
 from lightpage.recording.unfinished import claim, settings_path
 from lightpage.recording.writer import RecordingWriter
+from lightpage.simulator.engine import CPU, NUMPY, engine_on
 from lightpage.simulator.simulator import LIGHT, Simulator
 
-_SYMBOLS = 3
+SYMBOLS = 3
 """Random stream of the pages' symbols, beside those of the simulator."""
 
 
@@ -33,6 +34,7 @@ class RecordingJob:
         truth: whether to keep what only a simulator knows beside the pages.
         out: the recording.
         written: pages that the modulator shows; random ones if left out.
+        compute: where pages are computed, see `lightpage.simulator.engine.engine_on`.
 
     Raises:
         RecordingError: pages for another profile.
@@ -47,12 +49,14 @@ class RecordingJob:
         truth: bool,
         out: Path,
         written: Pages | None = None,
+        compute: str = CPU,
     ) -> None:
         self.profile, self.device, self.levels, self.seed, self.truth = profile, device, levels, seed, truth
         self.out, self._written = out, written
         if written is not None:
             written.check_against(profile)
-        self._simulator = Simulator(profile, device, levels, seed)
+        self._engine = engine_on(compute)
+        self._simulator = Simulator(profile, device, levels, seed, engine=self._engine)
 
     def claim(self, force: bool) -> None:
         """Note the settings, unless pages begun with others are there.
@@ -62,6 +66,8 @@ class RecordingJob:
         """
         # references alone would not tell two devices apart: the pipe does not show in them
         text = f"light = {LIGHT}\nlevels = {self.levels}\nseed = {self.seed}\ntruth = {str(self.truth).lower()}\n"
+        if self._engine is not NUMPY:
+            text += f"noise = {type(self._engine).__name__}\n"  # of a stream of its own
         if self._written is not None:
             digest = patiently(self._digest, f"pages {self._written.path}", otherwise=RecordingError)
             text += f"symbols = {digest}\n"
@@ -98,7 +104,7 @@ class RecordingJob:
 
     def _append(self, writer: RecordingWriter, simulator: Simulator, page: int) -> None:
         if self._written is None:
-            rng = np.random.default_rng([self.seed, _SYMBOLS, page])
+            rng = np.random.default_rng([self.seed, SYMBOLS, page])
             symbols = random_symbols(self.profile, self.levels, 1, rng)[0]
         else:
             symbols = self._written[page]

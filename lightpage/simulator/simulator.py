@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,6 @@ from lightpage.device.state import CameraPose, Device
 from lightpage.page.levels import check_levels
 from lightpage.page.symbols import check_symbols, symbol_phases
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.layout import frame_type
 from lightpage.simulator.cameras import (
     expose,
     in_phase_intensity,
@@ -20,6 +20,7 @@ from lightpage.simulator.cameras import (
     resample,
     to_counts,
 )
+from lightpage.simulator.engine import NUMPY, Engine
 from lightpage.simulator.true_optics import Place, TrueOptics
 from lightpage.waves.grid import check_camera
 
@@ -48,6 +49,21 @@ class SimulatedPage:
     shift_px: tuple[float, float]
 
 
+@dataclass(frozen=True)
+class SeenPage:
+    """The same in the arrays of the engine that has computed it.
+
+    Attributes:
+        frames: counts of the in-phase and of the quadrature camera.
+        exit_field, piston, shift_px: see `SimulatedPage`.
+    """
+
+    frames: tuple[Any, Any]
+    exit_field: Any
+    piston: float
+    shift_px: tuple[float, float]
+
+
 class Simulator:
     """A device with a memory: its piston and image shift walk from page to page, and it may be knocked.
 
@@ -60,6 +76,7 @@ class Simulator:
         steps: splitting steps of a sheared pipe; `splitting_steps` if left out.
         reference_stays: whether the image moves over the reference, as when page or pipe move, and not with it, as when
             the cameras do.
+        engine: what computes. Another one gives the same light and draws other noise.
 
     Raises:
         PageError: a level count outside 2..256.
@@ -75,10 +92,11 @@ class Simulator:
         steps: int | None = None,
         *,
         reference_stays: bool = False,
+        engine: Engine = NUMPY,
     ) -> None:
         check_levels(levels)
         check_camera(profile)
-        self.optics = TrueOptics(profile, device, steps)
+        self.optics = TrueOptics(profile, device, steps, engine)
         self.levels = levels
         self.seed = seed
         self.reference_stays = reference_stays
@@ -99,7 +117,7 @@ class Simulator:
 
     def set_device(self, device: Device) -> None:
         """Move the device to another true state (slow drift); piston and shift go on from where they are."""
-        self.optics = TrueOptics(self.profile, device, self.optics.channel.steps)
+        self.optics = TrueOptics(self.profile, device, self.optics.channel.steps, self.optics.engine)
 
     def knock(self, shift_px: tuple[float, float]) -> None:
         """Move the image at once by (x, y) camera pixels, on both cameras; it walks on from there."""
@@ -120,27 +138,37 @@ class Simulator:
         Raises:
             PageError: symbols of the wrong shape, type or range.
         """
+        seen, to_numpy = self.see(symbols), self.optics.engine.to_numpy
+        return SimulatedPage(
+            FramePair(*map(to_numpy, seen.frames)), to_numpy(seen.exit_field), seen.piston, seen.shift_px
+        )
+
+    def see(self, symbols: NDArray[np.uint8]) -> SeenPage:
+        """`simulate`, with what it computes left where the engine has it."""
         check_symbols(symbols, self.profile.page_shape, self.levels, "symbols to simulate")
-        device, rng = self.device, np.random.default_rng([self.seed, _NOISE, self._page])
+        device, engine = self.device, self.optics.engine
+        rng = engine.generator([self.seed, _NOISE, self._page])
         flicker = device.slm.flicker_rad * np.random.default_rng([self.seed, _FLICKER, self._page]).standard_normal()
         self._drift()
         shift = (float(self._shift[0]), float(self._shift[1]))
         size = self.profile.page.symbol_size_px
-        phase = np.kron(symbol_phases(symbols, self.levels), np.ones((size, size)))
+        phases, pixels = map(engine.array, (symbol_phases(symbols, self.levels), np.ones((size, size))))
+        phase = engine.xp.kron(phases, pixels)
         noise = device.slm.phase_noise_rad * rng.standard_normal(phase.shape)
         exit_field = self.optics.exit_field(phase, noise, flicker)
         frames = self._frames(exit_field, shift, rng)
-        return SimulatedPage(frames, exit_field, self._piston, shift)
+        return SeenPage(frames, exit_field, self._piston, shift)
 
     def references(self) -> FramePair:
         """Reference-only frames, the mean of so many exposures that only quantisation is left."""
-        return self._frames(None, (0.0, 0.0), None)
+        return FramePair(*map(self.optics.engine.to_numpy, self._frames(None, (0.0, 0.0), None)))
 
     def dark(self) -> FramePair:
         """Frames without any light, in which hot pixels alone show."""
-        sensor, dark = self.device.sensor, np.zeros(self.profile.frame_shape, np.uint16)
-        frames = (blemishes.counted(dark, sensor) for blemishes in self.optics.blemishes)
-        return FramePair(*(frame.astype(frame_type(sensor.bit_depth)) for frame in frames))
+        engine = self.optics.engine
+        dark = engine.array(np.zeros(self.profile.frame_shape))
+        frames = (blemishes.counted(dark, self.device.sensor) for blemishes in self.optics.blemishes)
+        return FramePair(*map(engine.to_numpy, frames))
 
     def _drift(self) -> None:
         """Walk on by one page; its noise has a stream of its own, so that pages can pass without being computed."""
@@ -149,15 +177,13 @@ class Simulator:
         self._shift = self._shift + drift.shift_px * self._walk.standard_normal(2)
         self._page += 1
 
-    def _frames(
-        self, exit_field: Complex | None, shift: tuple[float, float], noise: np.random.Generator | None
-    ) -> FramePair:
-        device = self.device
+    def _frames(self, exit_field: Complex | None, shift: tuple[float, float], noise: Any | None) -> tuple[Any, Any]:
+        device, engine = self.device, self.optics.engine
         homodyne = device.homodyne
         error, sign = np.deg2rad(homodyne.quadrature_error_deg), homodyne.quadrature_sign
-        piston, frames = np.complex64(np.exp(1j * self._piston)), []
+        piston, frames = complex(np.exp(1j * self._piston)), []
         together = Place.of(device.in_phase_camera) == Place.of(device.quadrature_camera)
-        field: Complex = np.zeros(1, np.complex64)
+        field: Complex = engine.array(np.zeros(1, np.complex64))
         if exit_field is not None and together:
             field = self.optics.camera_field(exit_field) * piston
         for which, pose in enumerate((device.in_phase_camera, device.quadrature_camera)):
@@ -169,14 +195,14 @@ class Simulator:
             else:
                 intensity = in_phase_intensity(field, reference)
             blemishes = self.optics.blemishes[which]
-            seen = resample(intensity, *self.optics.camera_axes_m, *self.optics.view(pose, shift))
+            seen = resample(intensity, *self.optics.camera_axes_m, *self.optics.view(pose, shift), engine)
             seen = seen * blemishes.transmission
             if noise is None:
-                counts = to_counts(seen * self.optics.electrons_per_unit, device.sensor)
+                counts = to_counts(seen * self.optics.electrons_per_unit, device.sensor, engine)
             else:
-                counts = expose(seen, self.optics.electrons_per_unit, device.sensor, noise)
-            frames.append(blemishes.counted(counts, device.sensor).astype(frame_type(device.sensor.bit_depth)))
-        return FramePair(*frames)
+                counts = expose(seen, self.optics.electrons_per_unit, device.sensor, noise, engine)
+            frames.append(blemishes.counted(counts, device.sensor))
+        return frames[0], frames[1]
 
     def _reference_behind(self, pose: CameraPose, shift: tuple[float, float]) -> Complex:
         """The reference where a camera sees it behind an image that has moved by `shift`, on the image's plane."""

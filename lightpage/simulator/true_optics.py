@@ -19,6 +19,7 @@ from lightpage.page.modulation import NOMINAL, Modulation, basis
 from lightpage.page.symbols import symbol_phases
 from lightpage.recording.frame_pair import FramePair
 from lightpage.simulator.cameras import Blemishes, CameraView
+from lightpage.simulator.engine import NUMPY, Engine
 from lightpage.simulator.modulator import dead_pixels, modulated, with_crosstalk
 from lightpage.waves.channel import WaveChannel
 from lightpage.waves.geometry import WaveGeometry, cells_for, taper_defocus
@@ -63,11 +64,18 @@ class Place(NamedTuple):
 
 
 class TrueOptics:
-    """The noise-free optics of one device: what a simulator, or an oracle that may know the truth, computes with."""
+    """The noise-free optics of one device: what a simulator, or an oracle that may know the truth, computes with.
 
-    def __init__(self, profile: Profile, device: Device, steps: int | None = None) -> None:
+    Args:
+        profile, device: nominal and true.
+        steps: splitting steps of a sheared pipe; `splitting_steps` if left out.
+        engine: what computes; phases and light that are given and returned are its arrays.
+    """
+
+    def __init__(self, profile: Profile, device: Device, steps: int | None = None, engine: Engine = NUMPY) -> None:
         self.profile = profile
         self.device = device
+        self.engine = engine
         self._steps = splitting_steps(profile) if steps is None else steps
         self._tilted: dict[tuple[float, float], WaveChannel] = {}
 
@@ -114,6 +122,7 @@ class TrueOptics:
             steps=self._steps,
             envelope_m=pitch,
             blur_m=self.device.slm.blur_px * pitch,
+            arrays=self.engine,
         )
 
     @cached_property
@@ -130,17 +139,18 @@ class TrueOptics:
             + aberration.coma_rad * radius2 * x
         )
         amplitude = 1 - self.device.slm.falloff_relative * radius2
-        return np.asarray(amplitude * np.exp(1j * phase))
+        factor: Complex = self.engine.array(amplitude * np.exp(1j * phase))
+        return factor
 
     @cached_property
     def signal_scale(self) -> float:
         """Factor that makes the signal's mean power over the page's image one."""
         size = self.profile.page.symbol_size_px
         symbols = np.exp(2j * np.pi * np.random.default_rng(0).random(self.profile.page_shape))
-        field = self._through(np.kron(symbols, np.ones((size, size))))
+        field = self._through(self.engine.array(np.kron(symbols, np.ones((size, size)))))
         # the de-launch is unitary on samples of the camera's pitch, and the page is imaged at its own size
         samples = self.profile.page_width_m * self.profile.page_height_m / self.profile.image_pixel_m**2
-        return float(np.sqrt(samples) / np.linalg.norm(field))
+        return float(np.sqrt(samples) / float(self.engine.xp.linalg.norm(field)))
 
     def exit_field(self, page_phase: Real, noise_rad: Real | float = 0.0, flicker_rad: float = 0.0) -> Complex:
         """Nominal phase written on the SLM [ny, nx], radians, to the field on the exit facet.
@@ -163,7 +173,9 @@ class TrueOptics:
 
     def _shown(self, slm: SlmDefects, page_phase: Real, noise_rad: Real | float = 0.0) -> Complex:
         """Light that the SLM makes of nominal phases, [ny, nx]."""
-        shown = modulated(slm, with_crosstalk(page_phase, slm.crosstalk_relative)) * np.exp(1j * np.asarray(noise_rad))
+        xp = self.engine.xp
+        noise = np.exp(1j * noise_rad) if isinstance(noise_rad, float) else xp.exp(1j * noise_rad)
+        shown: Complex = modulated(slm, with_crosstalk(page_phase, slm.crosstalk_relative, xp), xp) * noise
         if self._dead_pixels is not None:
             dead, light = self._dead_pixels
             shown[dead] = light
@@ -171,8 +183,11 @@ class TrueOptics:
 
     @cached_property
     def _dead_pixels(self) -> tuple[NDArray[np.bool_], Complex] | None:
+        if not self.device.slm.dead_pixel_share:
+            return None
         page_x, page_y = self.page_axes_m
-        return dead_pixels(self.device.slm, (len(page_y), len(page_x))) if self.device.slm.dead_pixel_share else None
+        dead, light = map(self.engine.array, dead_pixels(self.device.slm, (len(page_y), len(page_x))))
+        return dead, light
 
     def _through(self, light: Complex) -> Complex:
         """Light on the SLM [ny, nx], illuminated evenly, to the exit facet, what the facets reflect included."""
@@ -186,7 +201,7 @@ class TrueOptics:
     def blemishes(self) -> tuple[Blemishes, Blemishes]:
         """Hot pixels and dust of the in-phase and of the quadrature camera."""
         camera, sensor = self.profile.camera, self.device.sensor
-        return Blemishes.of(camera, sensor, 0), Blemishes.of(camera, sensor, 1)
+        return Blemishes.of(camera, sensor, 0, self.engine), Blemishes.of(camera, sensor, 1, self.engine)
 
     def camera_field(self, exit_field: Complex, camera: CameraPose | None = None) -> Complex:
         """Field on the exit facet to the computed camera plane, of one camera, or of where both stand on average."""
@@ -231,7 +246,9 @@ class TrueOptics:
             turns_x, turns_y = rng.uniform(-3, 3, 2)
             ripple += np.cos(2 * np.pi * (turns_x * x / half_width + turns_y * y / half_height + rng.random()))
         ripple *= knobs.ripple_relative / np.sqrt(3)
-        return np.asarray(knobs.amplitude_ratio * (1 + ripple) * np.exp(1j * phase), dtype=np.complex64)
+        beam = knobs.amplitude_ratio * (1 + ripple) * np.exp(1j * phase)
+        taken: Complex = self.engine.array(beam.astype(np.complex64))
+        return taken
 
     def view(self, pose: CameraPose, shift_px: tuple[float, float] = (0.0, 0.0)) -> tuple[Real, Real]:
         """Camera-plane points (x, y) of one camera's pixels, with the drift's shift added to its pose."""
@@ -241,7 +258,7 @@ class TrueOptics:
         distortion = self.device.aberration.distortion_relative
         edges = self.profile.page_width_m / 2, self.profile.page_height_m / 2
         camera = self.profile.camera.model_copy(update={"pitch_m": self.profile.image_pixel_m})
-        return CameraView(camera, moved, distortion, self.profile.corner_m, edges).positions_m()
+        return CameraView(camera, moved, distortion, self.profile.corner_m, edges).positions_m(self.engine)
 
     @property
     def electrons_per_unit(self) -> float:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.waves.arrays import NUMPY, Arrays
 from lightpage.waves.geometry import (
     Complex,
     Real,
@@ -39,6 +40,7 @@ class WaveChannel:
         steps: splitting steps of a sheared pipe (`lightpage.waves.grid.splitting_steps`).
         envelope_m: edge of the SLM pixel, whose sinc is applied on the entrance facet; 0 for point samples.
         blur_m: standard deviation of the SLM's blur.
+        arrays: array library of the fields.
 
     Every term of the de-launch lens is a product over the camera plane, so its light is computed on few samples
     (`sparse_axis`), and interpolated.
@@ -53,16 +55,17 @@ class WaveChannel:
     steps: int
     envelope_m: float = 0.0
     blur_m: float = 0.0
+    arrays: Arrays = NUMPY
 
     @cached_property
     def launch_lens(self) -> FourierLens:
         """SLM plane to entrance facet."""
-        return FourierLens(self.geometry, self.page_x_m, self.page_y_m, self.cells)
+        return FourierLens(self.geometry, self.page_x_m, self.page_y_m, self.cells, arrays=self.arrays)
 
     @cached_property
     def delaunch_lens(self) -> FourierLens:
         """Sparse samples of the camera plane to exit facet (its `to_plane` is the de-launch)."""
-        return FourierLens(self.geometry, *self.sparse_axes_m, self.cells, second=True)
+        return FourierLens(self.geometry, *self.sparse_axes_m, self.cells, second=True, arrays=self.arrays)
 
     @cached_property
     def sparse_axes_m(self) -> tuple[Real, Real]:
@@ -79,20 +82,21 @@ class WaveChannel:
         if x is self.camera_x_m and y is self.camera_y_m:
             return None
         axes = (self.camera_y_m, y), (self.camera_x_m, x)
-        down, across = (interpolation(*both).astype(np.float32) for both in axes)
+        down, across = (self.arrays.array(interpolation(*both).astype(np.float32)) for both in axes)
         return down, across
 
     @cached_property
     def pipe(self) -> PipePropagator:
         """The light-pipe."""
-        return PipePropagator(self.geometry, self.cells, self.steps)
+        return PipePropagator(self.geometry, self.cells, self.steps, self.arrays)
 
     @cached_property
     def entrance_window(self) -> Real:
         """Transmission of the SLM's pixel shape and blur at the entrance facet, [cells_y - 1, cells_x - 1]."""
         facet_y, facet_x = map(facet_axis, self.cells, self.geometry.facet_sides_m())
         window = entrance_window(self.geometry, facet_x, facet_y, self.envelope_m, self.blur_m)
-        return np.asarray(window, dtype=np.float32)
+        entrance: Real = self.arrays.array(np.asarray(window, dtype=np.float32))
+        return entrance
 
     @cached_property
     def facet_radius2_m2(self) -> Real:
@@ -122,7 +126,7 @@ class WaveChannel:
             defocus: factor of R^2 on the facet, rad/m^2.
         """
         if defocus:
-            exit_field = exit_field * np.exp(1j * defocus * self.facet_radius2_m2).astype(np.complex64)
+            exit_field = exit_field * self._defocused(defocus)
         sparse = self.delaunch_lens.to_plane(exit_field)
         if self._between is None:
             return sparse
@@ -136,8 +140,12 @@ class WaveChannel:
             field = real_products(down.T, field, across)
         exit_field = self.delaunch_lens.to_facet(field)
         if defocus:
-            exit_field = exit_field * np.exp(-1j * defocus * self.facet_radius2_m2).astype(np.complex64)
+            exit_field = exit_field * self._defocused(-defocus)
         return exit_field
+
+    def _defocused(self, by: float) -> Complex:
+        phasor: Complex = self.arrays.array(np.exp(1j * by * self.facet_radius2_m2).astype(np.complex64))
+        return phasor
 
     def to_page(self, exit_field: Complex) -> Complex:
         """Field on the exit facet's grid back to the SLM, by the adjoint: undoes the pipe exactly."""

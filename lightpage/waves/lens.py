@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from lightpage.device.lens_path import IDEAL, SeidelTerms
+from lightpage.waves.arrays import NUMPY, Arrays
 from lightpage.waves.geometry import (
     Complex,
     Couplings,
@@ -104,6 +105,7 @@ class FourierLens:
         x_m, y_m: sample positions on the plane, uniform, [nx] and [ny].
         cells: sample intervals of the pipe along (y', x).
         second: whether this is the second lens, between cameras and exit.
+        arrays: array library of the fields and the attributes.
 
     Attributes:
         x_to_x, y_and_x, y_to_y: the three couplings that factor, [nx, fx], [ny, fx] and [fy, ny].
@@ -112,7 +114,14 @@ class FourierLens:
     """
 
     def __init__(
-        self, geometry: WaveGeometry, x_m: Real, y_m: Real, cells: tuple[int, int], *, second: bool = False
+        self,
+        geometry: WaveGeometry,
+        x_m: Real,
+        y_m: Real,
+        cells: tuple[int, int],
+        *,
+        second: bool = False,
+        arrays: Arrays = NUMPY,
     ) -> None:
         height, width = geometry.facet_sides_m(second=second)
         facet_y, facet_x = facet_axis(cells[0], height), facet_axis(cells[1], width)
@@ -141,28 +150,32 @@ class FourierLens:
             self.on_plane = _phasor(path.of_field(x_m, y_m[:, None]))
         if path != IDEAL:
             self.on_facet = _phasor(parts.on_facet(facet_x, facet_y[:, None]))
+        self._arrays = arrays
+        self.terms = self.terms if arrays.xp is np else self.terms.on(arrays)
+        for name in ("x_to_x", "y_and_x", "y_to_y", "on_plane", "on_facet"):
+            setattr(self, name, arrays.array(getattr(self, name)))
 
     def to_facet(self, field: Complex) -> Complex:
         """Field on the plane [ny, nx] to the facet's grid [cells_y - 1, cells_x - 1]."""
-        field = field.astype(np.complex64) * self.on_plane
-        total: Complex | None = None
+        field = self._arrays.complex64(field) * self.on_plane
+        total: Any = None
         for at_plane, at_facet in self.terms.terms():
             term = self.y_to_y @ (((field * at_plane) @ self.x_to_x) * self.y_and_x)
             term *= at_facet
             total = term if total is None else total + term
-        assert total is not None
-        return np.asarray(total * self.on_facet)
+        light: Complex = total * self.on_facet
+        return light
 
     def to_plane(self, field: Complex) -> Complex:
         """The adjoint of `to_facet`: a field on the facet's grid to the plane [ny, nx], kernel exp(+i ...)."""
-        field = field.astype(np.complex64) * self.on_facet.conj()
-        total: Complex | None = None
+        field = self._arrays.complex64(field) * self.on_facet.conj()
+        total: Any = None
         for at_plane, at_facet in self.terms.terms():
             inner = (self.y_to_y.conj().T @ (field * at_facet.conj())) * self.y_and_x.conj()
             term = (inner @ self.x_to_x.conj().T) * at_plane.conj()
             total = term if total is None else total + term
-        assert total is not None
-        return np.asarray(total * self.on_plane.conj())
+        light: Complex = total * self.on_plane.conj()
+        return light
 
 
 def _phasor(phase: Real) -> Complex:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy
 from numpy.polynomial.legendre import leggauss, legvander
 from numpy.typing import NDArray
+
+from lightpage.waves.arrays import Arrays
 
 Complex = NDArray[np.complexfloating]
 Real = NDArray[np.floating]
@@ -64,6 +67,19 @@ class Expansion:
             second=_coefficients(left.conj().T @ kernel, *axes[2:]),
             first_axes=(axes[1].at_samples, axes[0].at_samples),
             second_axes=(axes[3].at_samples, axes[2].at_samples),
+        )
+
+    def on(self, arrays: Arrays) -> Expansion:
+        """The expansion in arrays of another library."""
+
+        def taken(values: Real) -> Any:
+            return arrays.array(values.astype(np.complex64))
+
+        first_y, first_x = map(taken, self.first_axes)
+        second_y, second_x = map(taken, self.second_axes)
+        first, second = arrays.array(self.first), arrays.array(self.second)
+        return replace(
+            self, first=first, second=second, first_axes=(first_y, first_x), second_axes=(second_y, second_x)
         )
 
     def terms(self) -> Iterator[tuple[Complex, Complex]]:
@@ -214,7 +230,8 @@ def _coefficients(values: Complex, x: _Axis, y: _Axis) -> Complex:
 
 def _values(coefficients: Complex, axes: tuple[Real, Real]) -> Complex:
     y, x = map(_varying, axes)
-    return np.asarray(y @ coefficients @ x.T)
+    product: Complex = y @ coefficients @ x.T
+    return product
 
 
 def _varying(at_samples: Real) -> Real:

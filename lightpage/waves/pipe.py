@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
+from lightpage.waves.arrays import NUMPY, Arrays
 from lightpage.waves.geometry import UNCOUPLED, Complex, Real, WaveGeometry, mode_detuning, sine_matrix
 
 
@@ -28,32 +30,34 @@ class PipePropagator:
         geometry: the device.
         cells: sample intervals along (y', x).
         steps: splitting steps over the whole pipe; 1 suffices without shear.
+        arrays: array library of the fields.
 
     Attributes:
-        bases: sine modes along (y', x), by parity.
-        half: phasors of half a step, [2, 2, Ky, Kx] by parity.
-        cos, sin: cosine and sine of the turn of each pair of modes in a step, [Ky, Kx].
         steps: splitting steps.
         sheared: whether modes couple at all.
     """
 
-    def __init__(self, geometry: WaveGeometry, cells: tuple[int, int], steps: int) -> None:
+    def __init__(self, geometry: WaveGeometry, cells: tuple[int, int], steps: int, arrays: Arrays = NUMPY) -> None:
         self.sheared = abs(geometry.pipe_angle) > 0
         self.steps = steps if self.sheared else 1
         w, nk = geometry.pipe_width_m, geometry.refractive_index * geometry.wave_number
         dz = geometry.pipe_length_m / self.steps
         sides = w * (1 + geometry.pipe_height_relative), w
-        self.bases = [
+        bases = [
             _parity_basis(n, float(dz * (np.pi / side) ** 2 / (2 * nk))) for n, side in zip(cells, sides, strict=True)
         ]
-        y, x = (basis.mode_numbers for basis in self.bases)
+        y, x = (basis.mode_numbers for basis in bases)
         detuning = mode_detuning(geometry, y[:, None, :, None], x[None, :, None, :])
-        self.half = np.exp(0.5j * dz * detuning).astype(np.complex64)
-        coupling = np.outer(self.bases[0].couplings, self.bases[1].couplings) / w**2
+        coupling = np.outer(bases[0].couplings, bases[1].couplings) / w**2
         coupling /= 1 + geometry.pipe_height_relative
         angle = dz / nk * np.sin(geometry.pipe_angle) * coupling
-        self.cos = np.cos(angle).astype(np.float32)
-        self.sin = np.sin(angle).astype(np.float32)
+        self._xp = arrays.xp
+        self._sine_y, self._sine_x = (arrays.array(basis.sine_by_parity) for basis in bases)
+        self._pairs_y, self._pairs_x = (arrays.array(basis.singular) for basis in bases)
+        self._half = arrays.array(np.exp(0.5j * dz * detuning).astype(np.complex64))
+        # modes of parities (p, q) turn with those of (1 - p, 1 - q), one way where p = q and the other where not
+        sine = _ONE_WAY[:, :, None, None] * np.sin(angle)
+        self._cos, self._turn = (arrays.array(part.astype(np.complex64)) for part in (np.cos(angle), 1j * sine))
 
     def forward(self, field: Complex) -> Complex:
         """Entrance facet [cells_y - 1, cells_x - 1] to exit facet."""
@@ -64,17 +68,27 @@ class PipePropagator:
         return self._run(field, adjoint=True)
 
     def _run(self, field: Complex, *, adjoint: bool) -> Complex:
-        y, x = self.bases
-        modes = _split(y.sine_by_parity, field, x.sine_by_parity)
-        half = self.half.conj() if adjoint else self.half
+        half, turn = (self._half.conj(), -self._turn) if adjoint else (self._half, self._turn)
         full = half * half
-        sine = -self.sin if adjoint else self.sin
-        modes = modes * half
+        modes = real_products(self._sine_y[:, None], field[None, None], self._sine_x.swapaxes(1, 2)[None]) * half
         for step in range(self.steps):
             if self.sheared:
-                modes = _rotate(modes, y.singular, x.singular, self.cos, sine)
+                modes = self._rotate(modes, turn)
             modes = modes * (full if step < self.steps - 1 else half)
-        return _join(y.sine_by_parity, modes, x.sine_by_parity)
+        fields: Any = real_products(self._sine_y.swapaxes(1, 2)[:, None], modes, self._sine_x[None])
+        field = fields.sum((0, 1))
+        return field
+
+    def _rotate(self, modes: Complex, turn: Complex) -> Complex:
+        """Apply exp(i angle d_x d_y') to modes [2, 2, Ky, Kx]."""
+        y, x = self._pairs_y, self._pairs_x
+        inner = real_products(y.swapaxes(1, 2)[:, None], modes, x[None])
+        turned = self._cos * inner + turn * self._xp.flip(inner, (0, 1))
+        return real_products(y[:, None], turned, x.swapaxes(1, 2)[None])
+
+
+_ONE_WAY = np.array([[1, -1], [-1, 1]])
+"""Sense of the turn by the parities of the modes along y' and x."""
 
 
 class ParityBasis:
@@ -123,23 +137,5 @@ def _parity_basis(cells: int, lag: float) -> ParityBasis:
 
 def real_products(left: Real, stack: Complex, right: Real) -> Complex:
     """left @ stack @ right with real factors, as products of the real and the imaginary part."""
-    return np.asarray((left @ stack.real @ right) + 1j * (left @ stack.imag @ right), dtype=np.complex64)
-
-
-def _split(y: Real, field: Complex, x: Real) -> Complex:
-    """Field [Ny, Nx] to modes [2, 2, Ky, Kx] by parity."""
-    return real_products(y[:, None], field[None, None], x.transpose(0, 2, 1)[None])
-
-
-def _join(y: Real, modes: Complex, x: Real) -> Complex:
-    """Modes [2, 2, Ky, Kx] to field [Ny, Nx]."""
-    return np.asarray(real_products(y.transpose(0, 2, 1)[:, None], modes, x[None]).sum(axis=(0, 1)))
-
-
-def _rotate(modes: Complex, y: Real, x: Real, cos: Real, sin: Real) -> Complex:
-    """Apply exp(i angle d_x d_y') to modes [2, 2, Ky, Kx]."""
-    inner = real_products(y.transpose(0, 2, 1)[:, None], modes, x[None])
-    turned = np.empty_like(inner)
-    for (p, q), sign in (((0, 0), 1), ((1, 1), 1), ((0, 1), -1), ((1, 0), -1)):
-        turned[p, q] = cos * inner[p, q] + (1j * sign) * (sin * inner[1 - p, 1 - q])
-    return real_products(y[:, None], turned, x.transpose(0, 2, 1)[None])
+    product: Complex = (left @ stack.real @ right) + 1j * (left @ stack.imag @ right)
+    return product

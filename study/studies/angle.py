@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from lightpage.device.state import Device
 from lightpage.progress import Progress
+from lightpage.study.lights import DataSet
 from lightpage.study.study import Case, Result, Row, Settings, Study
-from lightpage.study.trained import DataSet, trained
+from lightpage.study.trained import trained
 
 _LOCKED = 0.3
 """Training AIR, bits a symbol, from which a decoder counts as locked; `none` comes to it too, if later, by heart."""
@@ -31,12 +32,10 @@ def _cases(settings: Settings) -> list[Case]:
 
 
 def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> Result:
-    data_set = DataSet("light", settings.profile, Device())
+    data_set = DataSet(settings.profile, Device())
     if case["matched"]:
         curvature = settings.profile.light_curvature_rad
-        data_set = DataSet(
-            "light-matched", settings.profile, Device().with_settings([f"reference.curvature_rad={curvature}"])
-        )
+        data_set = DataSet(settings.profile, Device().with_settings([f"reference.curvature_rad={curvature}"]))
     return trained(settings, data_set, case["localizer"], work, progress)
 
 

@@ -148,7 +148,7 @@ def _crosshairs(settings: Settings, progress: Progress) -> Result:
     for number, shift in enumerate(truth):
         progress("crosshairs", number / frames)
         view = optics.view(device.in_phase_camera, (float(shift[0]), float(shift[1])))
-        counts = expose(resample(power, *optics.camera_axes_m, *view), per_unit, device.sensor, rng)
+        counts = expose(resample(power, *optics.camera_axes_m, *view), per_unit, device.sensor, rng).astype(np.uint16)
         found.append(locate(counts, scale))
         first = counts if first is None else first
     drift = np.array(found) - found[0]

@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 
 from lightpage.device.state import ideal_device
 from lightpage.progress import Progress
+from lightpage.study.lights import DataSet
 from lightpage.study.study import Case, Result, Row, Settings, Study
-from lightpage.study.trained import DataSet, trained
+from lightpage.study.trained import trained
 
 LEVELS = (16, 256)
 HEADS = ("von Mises", "classes")
@@ -28,7 +29,7 @@ def _cases(settings: Settings) -> list[Case]:
 
 def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> Result:
     # classes ask for a piston that is known, and a square pipe lets the mode localizer do all that it can
-    data_set = DataSet(f"light-{case['levels']}", settings.profile.with_ideal_lenses(), ideal_device(), case["levels"])
+    data_set = DataSet(settings.profile.with_ideal_lenses(), ideal_device(), case["levels"])
     classes = case["levels"] if case["head"] == "classes" else 0
     return trained(settings, data_set, "mode", work, progress, knows_piston=True, classes=classes)
 

@@ -11,8 +11,9 @@ from matplotlib.figure import Figure
 from lightpage.device.profile import Profile, load_profile
 from lightpage.device.state import ideal_device
 from lightpage.progress import Progress
+from lightpage.study.lights import DataSet
 from lightpage.study.study import Case, Result, Row, Settings, Study
-from lightpage.study.trained import DataSet, trained
+from lightpage.study.trained import trained
 
 LENGTHS_MM = tuple(10 + 32.5 * step for step in range(13))
 """Lengths of the full-size pipe, 10 to 400; those of a smaller device are as much shorter as its focal length."""
@@ -46,7 +47,7 @@ def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> 
     length = scaled_length_m(settings.profile, case["length_mm"])
     pipe = settings.profile.pipe.model_copy(update={"length_m": length, "angle_deg": 0.0})
     profile = settings.profile.with_ideal_lenses().model_copy(update={"pipe": pipe})
-    data_set = DataSet(f"light-{case['length_mm']:g}mm", profile, ideal_device())
+    data_set = DataSet(profile, ideal_device())
     # as with the authors, who trained the angle of their device alone: a simulated pipe is known to be square
     return trained(settings, data_set, case["localizer"], work, progress, angle_rate=0.0)
 

@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 
 from lightpage.device.state import Device
 from lightpage.progress import Progress
+from lightpage.study.lights import DataSet
 from lightpage.study.study import Case, Result, Row, Settings, Study
-from lightpage.study.trained import DataSet, trained
+from lightpage.study.trained import trained
 
 SIZES_PX = (16, 8, 4, 2)
 LOCALIZERS = ("mode", "ray")
@@ -27,7 +28,7 @@ def _cases(settings: Settings) -> list[Case]:
 
 
 def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> Result:
-    data_set = DataSet(f"light-{case['size']}", settings.profile.with_symbols_of(case["size"]), Device())
+    data_set = DataSet(settings.profile.with_symbols_of(case["size"]), Device())
     return trained(settings, data_set, case["localizer"], work, progress)
 
 

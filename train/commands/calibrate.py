@@ -8,6 +8,7 @@ from pathlib import Path
 
 import click
 import numpy as np
+import torch
 
 from lightpage.calibration.calibrate import calibrate as register
 from lightpage.calibration.coherence import seen_share
@@ -22,6 +23,8 @@ from lightpage.files import replace_file, write_json
 from lightpage.pictures import write_figure_png
 from lightpage.progress import Progress, warn
 from lightpage.recording.reader import Recording
+from lightpage.train.data.features import CPU
+from lightpage.train.data.torch_engine import torch_device
 from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
 from lightpage.train.models.twin import RayTwin, TorchTwin
 
@@ -49,6 +52,9 @@ MAX_PAGES = 4
 @click.option(
     "--picture", type=OutputFile(), help="Draw to this PNG where the light lies that the fit does not explain."
 )
+@click.option(
+    "--compute", default="cpu", show_default=True, metavar="cpu|cuda[:N]", help="Where the light's field is recovered."
+)
 @JSON
 def calibrate(
     profile_name: str | None,
@@ -57,6 +63,7 @@ def calibrate(
     pages: int,
     orientation: str,
     picture: Path | None,
+    compute: str,
     json_path: Path | None,
 ) -> None:
     """Find this device's geometry, from nominal, with the first pages of a recording that show light.
@@ -64,11 +71,13 @@ def calibrate(
     The fit is called good where a decoder loses less than 0.1 bit a symbol by what it leaves unexplained, usable
     below 0.3, else wrong. A wrong one is written too, and ends the command with an error.
     """
-    start = time.perf_counter()
+    start, device = time.perf_counter(), torch_device(compute)
     with Recording.open(recording) as file, percent_bar() as progress:
         profile = file.header.device(named_profile(profile_name))
         chosen = first_lit_pages(file, pages, warn)
-        calibration = calibrate_recording(file, profile, chosen, progress, any_orientation=orientation == "any")
+        calibration = calibrate_recording(
+            file, profile, chosen, progress, any_orientation=orientation == "any", compute=device
+        )
     seconds = time.perf_counter() - start
     calibration.save(out)
     lost = int(np.sum(seen_share(TorchTwin(RayTwin(profile)), calibration.vector, profile) < 0.5))
@@ -98,6 +107,7 @@ def calibrate_recording(
     progress: Progress,
     *,
     any_orientation: bool = False,
+    compute: torch.device = CPU,
 ) -> Calibration:
     """Calibrate from nominal with some pages of a recording.
 
@@ -109,7 +119,7 @@ def calibrate_recording(
     known = known_pages(recording, profile, pages)
     registered = register(
         TorchTwin(RayTwin(profile)),
-        TorchFieldSolver(FieldRecovery(profile)),
+        TorchFieldSolver(FieldRecovery(profile).to(compute)),
         profile,
         recording.references(),
         known,

@@ -95,7 +95,7 @@ def train(
         trainer = chosen_trainer(localizer, profile, len(split.training), given)
 
         def calibration() -> Calibration:
-            found = _calibration(recording, profile, list(usable)[:DEFAULT_PAGES], calibration_path, out)
+            found = _calibration(recording, profile, list(usable)[:DEFAULT_PAGES], calibration_path, out, processes)
             if not accept_wrong_fit:
                 found.check_good(f"calibration {calibration_path or 'of the recording'}", f", or {ACCEPT}")
             return found
@@ -128,7 +128,9 @@ def _tell(run: Run, folder: Path, json_path: Path | None) -> None:
     )
 
 
-def _calibration(recording: Recording, profile: Profile, pages: list[int], path: Path | None, out: Path) -> Calibration:
+def _calibration(
+    recording: Recording, profile: Profile, pages: list[int], path: Path | None, out: Path, processes: Processes
+) -> Calibration:
     """The calibration that was named, or was made of these pages for this run before, or is made of them now."""
     if path is not None:
         return load_calibration(path)
@@ -142,6 +144,6 @@ def _calibration(recording: Recording, profile: Profile, pages: list[int], path:
     if made():
         return load_calibration(kept)
     with percent_bar() as progress:
-        calibration = calibrate_recording(recording, profile, pages, progress)
+        calibration = calibrate_recording(recording, profile, pages, progress, compute=processes.device)
     calibration.save(kept)
     return calibration

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,6 +32,7 @@ from lightpage.waves.grid import GRID_STEP_PX, FieldGrid
 
 Real = NDArray[np.float64]
 
+CPU = torch.device("cpu")
 _PROBE_PX = 0.3
 _LARGEST_STEP_PX = 0.5
 
@@ -75,6 +77,7 @@ class FeatureExtractor:
         localizer: `coherent` or `wave`.
         choices: hyperparameters of the decoder that the features are for.
         with_signal_power: see `FieldRecovery`.
+        compute: where fields and light are computed; `measure` computes on the CPU.
     """
 
     def __init__(
@@ -84,6 +87,7 @@ class FeatureExtractor:
         choices: Hyperparameters | None = None,
         *,
         with_signal_power: bool = True,
+        compute: torch.device = CPU,
     ) -> None:
         choices = choices or Hyperparameters()
         profile, parameters = device.profile, device.parameters
@@ -92,9 +96,9 @@ class FeatureExtractor:
         self.table: SamplingTable = sampling_table(self._twin, parameters, device.quadrature_phase_rad, profile)
         self._apart = self.table["apart"] if device.stands_apart else None
         self.recovery = choices.field_recovery(profile, with_signal_power=with_signal_power)
-        self._solve = TorchFieldSolver(self.recovery)
-        self._coherent = choices.coherent_localizer(profile)
-        self._wave = WaveLocalizer(profile, parameters, self.grid) if localizer == "wave" else None
+        self._solve = TorchFieldSolver(self.recovery if compute == CPU else deepcopy(self.recovery).to(compute))
+        self._coherent = choices.coherent_localizer(profile).to(compute)
+        self._wave = WaveLocalizer(profile, parameters, self.grid).to(compute) if localizer == "wave" else None
         shares = branch_shares(self.table["positions"].reshape(2, -1).T.astype(float))
         self._shares = shares.reshape(len(COHERENT_BRANCHES), *profile.page_shape)
         self._chosen = [BRANCHES.index(name) for name in COHERENT_BRANCHES]
@@ -214,20 +218,17 @@ def demodulate(
     places = table["places"]
     if shift is not None:
         places = places + (shift / GRID_STEP_PX).astype(np.float32)[None, :, None, None]
+    device = next(localizer.buffers()).device
+    known = (torch.from_numpy(values).to(device) for values in (places, table["place_gradients"], table["phases"]))
     with torch.no_grad():
-        light: NDArray[np.float32] = localizer(
-            stacked(field),
-            torch.from_numpy(places),
-            torch.from_numpy(table["place_gradients"]),
-            torch.from_numpy(table["phases"]),
-        ).numpy()
+        light: NDArray[np.float32] = localizer(stacked(field).to(device), *known).cpu().numpy()
     return light
 
 
 def localized(waves: WaveLocalizer, field: NDArray[np.complexfloating]) -> NDArray[np.float32]:
     """The wave localizer's light [2, 1, S, ny, nx] of a field [Gy, Gx]."""
     with torch.no_grad():
-        light: NDArray[np.float32] = waves(stacked(field)).numpy()
+        light: NDArray[np.float32] = waves(stacked(field).to(next(waves.buffers()).device)).cpu().numpy()
     return light
 
 

@@ -25,12 +25,12 @@ _AT_A_BOUND = 1e-3
 
 
 def decode_pages(module: DecoderTraining[Any], pages: Dataset[Page]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Decode pages with a trained module: return p [pages, 2, ny, nx] and the true phases [pages, ny, nx]."""
+    """Decode pages with a trained module, where it is: p [pages, 2, ny, nx] and the true phases [pages, ny, nx]."""
     outputs, truths = [], []
     with torch.no_grad():
         for *page, phases in DataLoader(pages, batch_size=None):
-            outputs.append(module(*(part[None] for part in page))[0].float().numpy())
-            truths.append(phases.numpy())
+            outputs.append(module(*(part[None].to(module.device) for part in page))[0].float().cpu().numpy())
+            truths.append(phases.cpu().numpy())
     return np.stack(outputs), np.stack(truths)
 
 

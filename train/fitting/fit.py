@@ -111,6 +111,8 @@ def fit(
     What a finished training made is kept in the folder and returned when it is asked for again. On several devices
     Lightning runs the program once for each; all of them return the same.
 
+    The trained module is on the CPU.
+
     Raises KeyboardInterrupt after Ctrl-C, with the last checkpoint in place, and LightpageError where another process
     has ended.
 
@@ -140,7 +142,8 @@ def fit(
             precision=lightning_precision(precision),  # type: ignore[arg-type]
             logger=TensorBoardLogger(str(run), name="", version=TENSORBOARD),
             callbacks=[*callbacks, best, timer, newest, _Steps()],
-            devices=processes.devices,
+            accelerator=processes.accelerator,
+            devices=processes.chosen_devices,
             num_nodes=processes.nodes,
             strategy=processes.strategy,
             plugins=[processes.environment()],
@@ -174,12 +177,14 @@ def fit(
         assert found is not None  # it was waited for
         return found
     # the last steps are the quietest, and no validation need have followed them
-    rates = {}
+    rates, device = {}, trainer.strategy.root_device
     for path in {last, folder / Path(best.best_model_path or last).name}:  # the run may have been moved meanwhile
         module.load_state_dict(_checkpoint(path)["state_dict"])
-        module.float().eval()
+        module.float().eval().to(device)
         with torch.no_grad():
-            rates[path] = fmean(module.rate(page) for page in DataLoader(validation, batch_size=1))
+            batches = (tuple(part.to(device) for part in page) for page in DataLoader(validation, batch_size=1))
+            rates[path] = fmean(map(module.rate, batches))
+    module.cpu()
     chosen = max(rates, key=lambda path: rates[path])
     module.load_state_dict(_checkpoint(chosen)["state_dict"])
     curves = {name: thinned(curve, KEPT_POINTS) for name, curve in curves_of(run).items()}

@@ -366,7 +366,7 @@ def relative_power(residual: Tensor, field: Tensor) -> Tensor:
 
 
 class TorchFieldSolver:
-    """`FieldRecovery` behind the numpy interface that registration takes (`FieldSolver`)."""
+    """`FieldRecovery` behind the numpy interface that registration takes (`FieldSolver`); it computes where that is."""
 
     def __init__(self, recovery: FieldRecovery) -> None:
         self._recovery = recovery
@@ -381,12 +381,9 @@ class TorchFieldSolver:
     ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
         """See `lightpage.calibration.interfaces.FieldSolver`."""
         frames = (pair.in_phase, pair.quadrature, references.in_phase, references.quadrature)
+        device = next(self._recovery.buffers()).device
+        seen = (torch.from_numpy(each.astype(np.float32)).to(device) for each in (*frames, registration, homodyne))
         with torch.no_grad():
-            field, residual = self._recovery(
-                *(torch.from_numpy(frame.astype(np.float32)) for frame in frames),
-                torch.from_numpy(registration),
-                torch.from_numpy(homodyne),
-                None if apart is None else torch.from_numpy(apart),
-            )
-        real, imaginary = field.numpy()
-        return np.asarray(real + 1j * imaginary, dtype=np.complex64), residual.numpy()
+            field, residual = self._recovery(*seen, None if apart is None else torch.from_numpy(apart).to(device))
+        real, imaginary = field.cpu().numpy()
+        return np.asarray(real + 1j * imaginary, dtype=np.complex64), residual.cpu().numpy()

@@ -20,6 +20,7 @@ from lightpage.train.fitting.fit import fit, seed_stretch
 from lightpage.train.fitting.fitted import Fitted
 from lightpage.train.processes import AS_IT_IS, Processes
 from lightpage.train.published.decoder import PARAXIAL, PublishedDecoder, make_localizer
+from lightpage.train.published.held_pages import HeldPages
 from lightpage.train.published.states import page_states
 from lightpage.train.published.training import DataPages, FramePages, PublishedChoices, PublishedTraining
 from lightpage.train.published.unet import samples_for
@@ -97,8 +98,8 @@ def train_published(
     profile: Profile,
     quadrature_phase: float,
     mask: NDArray[np.bool_],
-    training: FramePages,
-    validation: FramePages,
+    training: FramePages | HeldPages,
+    validation: FramePages | HeldPages,
     *,
     callbacks: Sequence[Callback] = (),
     processes: Processes = AS_IT_IS,
@@ -109,12 +110,11 @@ def train_published(
         run: folder.
         localizer, choices, profile, quadrature_phase: see `published_decoder`.
         mask: pilots, bool [ny, nx], which are not learnt from.
-        training, validation: pages of one recording.
+        training, validation: pages of one device.
         callbacks, processes: see `lightpage.train.fitting.fit.fit`.
     """
     seed_stretch(run, choices.seed)
-    recording = training.recording
-    decoder = published_decoder(localizer, choices, profile, recording.references(), quadrature_phase)
+    decoder = published_decoder(localizer, choices, profile, training.references, quadrature_phase)
     module = PublishedTraining(decoder, choices, mask, training.levels)
     return fit(
         run,

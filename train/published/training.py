@@ -83,6 +83,7 @@ class FramePages(Dataset[Page]):
         modulation: Modulation = NOMINAL,
     ) -> None:
         self.recording, self._pages, self.states = recording, pages, states
+        self.references = recording.references()
         self.levels = modulation.page_levels(recording.levels)
 
     def __len__(self) -> int:
@@ -120,7 +121,7 @@ class DataPages(Dataset[Page]):
     def __getitem__(self, index: int) -> Page:
         """Return a page, with NaN for the phases of its pilots."""
         *shown, phases = self._pages[index]
-        return *shown, torch.where(self._pilots, torch.nan, phases)
+        return *shown, torch.where(self._pilots.to(phases.device), torch.nan, phases)
 
 
 class PublishedTraining(DecoderTraining[PublishedDecoder]):

@@ -136,7 +136,7 @@ def make_run(
     options["calibration"] = calibration.to_toml()
     features = trainer.localizer if trainer.localizer in LOCALIZERS else LOCALIZERS[0]
     choices = trainer.choices if isinstance(trainer, SymbolTrainer) else Hyperparameters()
-    extractor = FeatureExtractor(calibration.device(profile, references), features, choices)
+    extractor = FeatureExtractor(calibration.device(profile, references), features, choices, compute=processes.device)
     extractor.check(known_pages(recording, profile, split.training[:1])[0], calibration.coherence_after)
     begin(out, options) if is_first_process() else check_begun(out, options)
     if (out / DESCRIPTION).exists():

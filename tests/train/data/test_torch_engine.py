@@ -1,0 +1,107 @@
+"""The simulator in torch: the light of numpy's within the rounding of float32, noise of its own, clear refusals."""
+
+import numpy as np
+import pytest
+import torch
+
+from lightpage.device.state import load_device
+from lightpage.errors import InvalidInputError
+from lightpage.page.symbols import random_symbols
+from lightpage.recording.frame_pair import FramePair
+from lightpage.simulator.cameras import resample
+from lightpage.simulator.simulator import Simulator
+from lightpage.simulator.true_optics import perfectly_calibrated
+from lightpage.train.data.features import FeatureExtractor
+from lightpage.train.data.torch_engine import TorchEngine, torch_device
+from lightpage.train.models.decoder import LOCALIZERS
+from tests.lightpage.small import random_phases, small_profile
+
+PROFILE = small_profile()
+SETTINGS = (
+    "slm.crosstalk_relative=0.02 slm.dead_pixel_share=1e-3 sensor.hot_pixel_share=1e-4 sensor.dust_specks=3 "
+    "in_phase_camera.axial_rad=0.4 geometry.ghost_relative=0.01 sensor.bit_depth=12"
+)
+ROUGH = load_device("rough").with_settings(SETTINGS.split())
+
+
+def test_the_light_is_that_of_numpy_within_the_rounding_of_single_precision() -> None:
+    phase = np.kron(random_phases(PROFILE), np.ones((4, 4)))
+    seen = []
+    for engine in ({}, {"engine": TorchEngine("cpu")}):
+        optics = Simulator(PROFILE, ROUGH, seed=1, **engine).optics  # type: ignore[arg-type]
+        leaving = optics.exit_field(optics.engine.array(phase), flicker_rad=0.01)
+        field = optics.camera_field(leaving, ROUGH.in_phase_camera)
+        view = optics.view(ROUGH.in_phase_camera, (1.2, -0.7))
+        power = resample(abs(field) ** 2, *optics.camera_axes_m, *view, optics.engine)
+        seen.append([optics.engine.to_numpy(part) for part in (leaving, field, power)])
+    for plain, other in zip(*seen, strict=True):
+        assert other.dtype.itemsize == plain.dtype.itemsize
+        assert np.abs(other - plain).max() < 1e-5 * np.abs(plain).max()  # 32 steps, each of some roundings
+
+
+def test_pages_are_those_of_numpy_but_for_the_noise() -> None:
+    symbols = random_symbols(PROFILE, 256, 2, np.random.default_rng(0))
+    plain, other, again = (
+        Simulator(PROFILE, ROUGH, seed=4, **engine)  # type: ignore[arg-type]
+        for engine in ({}, {"engine": TorchEngine("cpu")}, {"engine": TorchEngine("cpu")})
+    )
+    again.skip(1)
+    expected, found = ([simulator.simulate(page) for page in symbols] for simulator in (plain, other))
+    assert [page.shift_px for page in found] == [page.shift_px for page in expected]
+    np.testing.assert_array_equal(found[1].pair.quadrature, again.page(symbols[1]).quadrature)
+    for name in ("in_phase", "quadrature"):
+        one, two = (np.asarray(getattr(page[0].pair, name), float) for page in (expected, found))
+        assert getattr(found[0].pair, name).dtype == np.uint16
+        apart, correlation = one - two, np.corrcoef(one.ravel(), two.ravel())[0, 1]
+        shot = 4095 / 15_000 * np.sqrt(one.mean() * 15_000 / 4095 + 2.5**2)
+        assert abs(apart.mean()) < 5 * shot / np.sqrt(apart.size / 50)  # the page's own phase noise is common to many
+        assert correlation > 0.95
+        still = (getattr(simulator.references(), name).astype(int) for simulator in (plain, other))
+        assert np.abs(np.subtract(*still)).max() <= 1  # half a count may round either way
+        hot = [getattr(simulator.dark(), name) for simulator in (plain, other)]
+        np.testing.assert_array_equal(*hot)
+
+
+def test_a_page_is_made_on_one_device_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    meta = torch.device("meta")  # it computes nothing, and refuses tensors of others
+
+    class Noise:
+        poisson = staticmethod(torch.poisson)
+
+        def standard_normal(self, shape: tuple[int, ...], dtype: object = None) -> torch.Tensor:
+            return torch.randn(shape, device=meta)
+
+    monkeypatch.setattr("lightpage.train.data.torch_engine.torch_device", lambda _: meta)
+    engine = TorchEngine("cuda")
+    monkeypatch.setattr(engine, "generator", lambda _: Noise())
+    simulator = Simulator(PROFILE, ROUGH, engine=engine)
+    simulator.optics.__dict__["signal_scale"] = 1.0  # a number that comes back
+    seen = simulator.see(random_symbols(PROFILE, 256, 1, np.random.default_rng(0))[0])
+    assert {part.device for part in (*seen.frames, seen.exit_field)} == {meta}
+    assert [part.dtype for part in seen.frames] == [torch.uint16] * 2
+
+
+@pytest.mark.parametrize("name", ["cuda", "cuda:0", "tpu", "cuda:x", "cpu:1", ""])
+def test_a_device_that_is_not_there_is_refused(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(InvalidInputError, match="--compute"):
+        torch_device(name)
+
+
+def test_a_device_beyond_the_last_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
+    assert torch_device("cuda:1").index == 1
+    with pytest.raises(InvalidInputError, match="cuda:1"):
+        torch_device("cuda:2")
+
+
+@pytest.mark.parametrize("localizer", LOCALIZERS)
+def test_features_are_computed_where_they_are_asked_for_alone(localizer: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As above; what comes back to numpy is made up."""
+    monkeypatch.setattr(torch.Tensor, "cpu", lambda self: torch.zeros(self.shape, dtype=self.dtype))
+    device = perfectly_calibrated(PROFILE, ROUGH, FramePair(*np.full((2, *PROFILE.frame_shape), 9, np.uint16)))
+    extractor = FeatureExtractor(device, localizer, compute=torch.device("meta"))
+    page, _ = extractor.page(extractor.field(device.references), random_phases(PROFILE), np.zeros(2))
+    assert page.light.shape[-2:] == PROFILE.page_shape
+    assert {part.device.type for part in extractor.recovery.buffers()} == {"cpu"}
