@@ -13,6 +13,7 @@ import base64
 import inspect
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -38,6 +39,8 @@ from lightpage.runtime.service.settings import TABLES
 ROOT = Path(__file__).resolve().parents[1]
 DOCS, PAGES, SITE = ROOT / "docs", ROOT / "build" / "pages", ROOT / "build" / "site"
 MADE = "<!-- Made of the code by release/build_site.py. -->\n\n"
+TOP = {"README.md": "index.md", "CONTRIBUTING.md": "CONTRIBUTING.md", "CHANGELOG.md": "CHANGELOG.md"}
+"""Pages at the top of the repository, and what they are called in the site."""
 METRICS = {"counter", "gauge", "histogram"}
 """Kinds of metrics, as functions and classes that make them are called, `MetricFamily` at the end left out."""
 
@@ -268,6 +271,18 @@ GENERATED = {
 """Pages of the reference by name, and what makes each."""
 
 
+def front(text: str) -> str:
+    """Return a page of the repository's top as one of the site: links lead into it, those to other files are words."""
+
+    def link(match: re.Match[str]) -> str:
+        words, target = match.groups()
+        if target.startswith("docs/"):
+            return f"[{words}]({target.removeprefix('docs/').replace('.ipynb', '.md')})"
+        return match[0] if "://" in target or target[0] == "#" or target in TOP else words
+
+    return re.sub(r"\[([^\]]*)\]\(([^)]+)\)", link, text)
+
+
 def write_pages() -> None:
     """Write all pages of the site, made ones and others, into build/pages."""
     shutil.rmtree(PAGES, ignore_errors=True)
@@ -275,6 +290,8 @@ def write_pages() -> None:
     (PAGES / "reference").mkdir(exist_ok=True)
     for name, made in GENERATED.items():
         (PAGES / "reference" / f"{name}.md").write_text(MADE + made(), "utf-8")
+    for name, page in TOP.items():
+        (PAGES / page).write_text(front((ROOT / name).read_text("utf-8")), "utf-8")
     for path in sorted(DOCS.glob("notebooks/*.ipynb")):
         page = PAGES / "notebooks" / f"{path.stem}.md"
         page.parent.mkdir(exist_ok=True)
