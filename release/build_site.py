@@ -293,9 +293,9 @@ def write_pages() -> None:
     for name, page in TOP.items():
         (PAGES / page).write_text(front((ROOT / name).read_text("utf-8")), "utf-8")
     for path in sorted(DOCS.glob("notebooks/*.ipynb")):
-        page = PAGES / "notebooks" / f"{path.stem}.md"
-        page.parent.mkdir(exist_ok=True)
-        page.write_text(notebook(path, PAGES / "images"), "utf-8")
+        out = PAGES / "notebooks" / f"{path.stem}.md"
+        out.parent.mkdir(exist_ok=True)
+        out.write_text(notebook(path, PAGES / "images"), "utf-8")
 
 
 def main() -> int:
