@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +14,7 @@ from numpy.typing import NDArray
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.coherence import COHERENT_BRANCHES, page_coherence
 from lightpage.calibration.goodness.measure import measure_goodness
-from lightpage.calibration.goodness.verdict import Goodness
+from lightpage.calibration.goodness.verdict import USABLE, Goodness
 from lightpage.calibration.interfaces import FieldSolver, RememberingTwin, Twin
 from lightpage.calibration.parameters import NAMES, PARAMETERS, indices, nominal
 from lightpage.calibration.patch_fit import PatchFit, fit_parameters
@@ -160,6 +162,14 @@ _DRIFT_SCALE: Real = np.array([_DRIFT_SHARES.get(parameter.group, 0.05) for para
 """Drift of a device, as a share of the prior about nominal. What a fit cannot tell well stays as it was: a decoder
 has learned the earlier calibration's errors, and loses 0.1 bit a symbol where a re-fit draws others."""
 
+_APART_RAD = (-2.2, -1.1, 0.0, 1.1, 2.2)
+"""Differences of the cameras' axial places that a fit is begun at where it has not explained the light."""
+_SCALES = tuple((camera, axis) for camera in ("in_phase", "quadrature") for axis in "xy")
+_ONE_SCALE = 0.03
+"""Share of the prior about a camera's scale that holds it while its place is found."""
+_TO_PIXELS = ("scale_x_relative", "turn_xy_slope", "turn_yx_slope", "scale_y_relative")
+"""Names of a camera's map from the page to pixels, less the identity, row by row."""
+
 _HELD = 1e-6
 """Share of a prior that leaves a parameter where it is."""
 
@@ -200,8 +210,23 @@ def calibrate(
     work.waves("relation of the cameras", ("in_phase", "quadrature"))
     for stage in _PHASES:
         work.complex_field(stage)
+    before = work.parameters, work.quadrature_phase, work.modulation
     work.waves("waves", _ALL_GROUPS)
-    return work.result()
+    found = work.result()
+    for axis in (0, 1):
+        if _bits_lost(found) <= USABLE:
+            break
+        work.parameters, work.quadrature_phase, work.modulation = before
+        work.total += 4
+        work.relation_apart(axis)
+        work.waves("waves of cameras apart", _ALL_GROUPS)
+        with suppress(CalibrationError):
+            found = min(found, work.result(), key=_bits_lost)
+    return found
+
+
+def _bits_lost(found: Registered) -> float:
+    return math.inf if found.goodness is None else found.goodness.bits_lost
 
 
 def refine(
@@ -341,7 +366,7 @@ class _Registration:
         self.fit: PatchFit | None = None
         self.illumination: NDArray[np.complexfloating] | None = None
         self.total = 1
-        self._stage, self._done = "", 0
+        self._stage, self._done, self._behind = "", 0, 0.0
         self._pixel = profile.image_pixel_m
         self._looked: list[Measurement] = []
         self._found: list[Measurement] = []
@@ -352,8 +377,9 @@ class _Registration:
         self._tell(0.0)
 
     def _tell(self, share: float) -> None:
-        """Report progress: the share of the present stage that is done."""
-        self.progress(self._stage, (self._done - 1 + share) / self.total)
+        """Report progress: the share of the present stage that is done. Where stages were added, it stands still."""
+        self._behind = max(self._behind, (self._done - 1 + share) / self.total)
+        self.progress(self._stage, self._behind)
 
     def single_camera(self, stage: _Stage) -> None:
         """Measure the direct branch on each camera by itself and fit places and slopes."""
@@ -455,6 +481,41 @@ class _Registration:
         self.quadrature_phase = found.quadrature_phase
         self.modulation, self.modulation_deviations = found.modulation, found.modulation_deviations
         self.illumination = found.illumination
+
+    def relation_apart(self, axis: int) -> None:
+        """Relate the cameras anew as ones that stand apart along the optical axis and see both axes as they see one.
+
+        Through an astigmatic launch a camera off its plane sees the page stretched along one axis. A fit by places
+        takes that for two scales, and the fit by waves does not find back from there.
+        """
+        self._begin("relation of cameras apart")
+        page, scales = self.pages[0], [NAMES.index(f"{camera}_scale_{axis}_relative") for camera, axis in _SCALES]
+        fit = WaveFit(self.twin, self.profile, page.pair, self.references, page.symbols)
+        held = np.ones_like(self.parameters)
+        held[scales] = _ONE_SCALE
+        starts = [self._apart(difference, axis) for difference in _APART_RAD]
+        found = []
+        for number, start in enumerate(starts):
+            told = partial(self._tell_part, number, len(starts))
+            groups, turn = ("in_phase", "quadrature"), self.quadrature_phase
+            found.append(fit.fit(start, turn, groups, start, held, told, self.modulation, rough=True))
+        best = min(found, key=lambda one: one.residual)
+        self.parameters, self.quadrature_phase = best.parameters, best.quadrature_phase
+
+    def _tell_part(self, number: int, count: int, share: float) -> None:
+        self._tell((number + share) / count)
+
+    def _apart(self, difference_rad: float, axis: int) -> Real:
+        """Return the parameters with the cameras' axial places moved apart and the scale of one axis for both."""
+        moved = self.parameters.copy()
+        for camera, share in (("in_phase", 0.5), ("quadrature", -0.5)):
+            moved[NAMES.index(f"{camera}_axial_rad")] += share * difference_rad
+            places = [NAMES.index(f"{camera}_{name}") for name in _TO_PIXELS]
+            matrix = np.eye(2) + moved[places].reshape(2, 2)
+            lengths = np.linalg.norm(matrix, axis=0)
+            matrix[:, 1 - axis] *= lengths[axis] / lengths[1 - axis]
+            moved[places] = (matrix - np.eye(2)).ravel()
+        return moved
 
     def result(self) -> Registered:
         """Judge the outcome."""

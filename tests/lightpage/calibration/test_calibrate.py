@@ -1,10 +1,12 @@
 """Claims about registration on pages smaller than the shipped devices': how far it gets, and what it says then."""
 
 import numpy as np
+import pytest
 
 from lightpage.calibration.calibrate import KnownPage, calibrate, refine
+from lightpage.calibration.parameters import as_dict
 from lightpage.device.profile import PageLayout, load_profile
-from lightpage.device.state import Device
+from lightpage.device.state import Device, draw_device
 from lightpage.errors import CalibrationError
 from lightpage.page.symbols import symbol_phases
 from lightpage.progress import Progress
@@ -51,3 +53,18 @@ def test_a_re_fit_tells_which_share_is_behind_when_its_first_stage_fails() -> No
         begin(lambda stage, share: shares.append(share), again=True)
     assert shares == sorted(shares)
     assert 0 < shares[-1] < 0.5
+
+
+@pytest.mark.long
+def test_cameras_far_apart_behind_an_astigmatic_launch_are_found_at_a_second_start() -> None:
+    profile = load_profile("bench")
+    simulator = Simulator(profile, draw_device(np.random.default_rng(1006)).of_profile(profile), levels=256, seed=3)
+    symbols = np.random.default_rng(0).integers(256, size=profile.page_shape).astype(np.uint8)
+    page = KnownPage(simulator.page(symbols), np.exp(1j * symbol_phases(symbols, 256)))
+    shares = list[float]()
+    twin, solver = TorchTwin(RayTwin(profile)), TorchFieldSolver(FieldRecovery(profile))
+    found = calibrate(twin, solver, profile, simulator.references(), [page], lambda _, share: shares.append(share))
+    assert found.goodness is not None
+    assert found.goodness.verdict == "good"
+    assert as_dict(found.parameters)["in_phase_axial_rad"] == pytest.approx(-1.4346, abs=0.01)
+    assert shares == sorted(shares)

@@ -19,7 +19,7 @@ from lightpage.device.profile import Profile
 from lightpage.errors import CalibrationError, InvalidInputError
 from lightpage.metrics import provenance
 from lightpage.page.symbols import pilot_mask
-from lightpage.progress import Progress, reporting
+from lightpage.progress import reporting
 from lightpage.recording.reader import Recording
 from lightpage.train.commands import train as cli_train
 from lightpage.train.commands.options import CHOICES, chosen_localizer, chosen_trainer, given_choices
@@ -224,7 +224,7 @@ def test_a_run_is_calibrated_on_its_first_usable_pages_once(
 ) -> None:
     made: list[list[int]] = []
 
-    def found(recording: Recording, profile: Profile, pages: Sequence[int], progress: Progress) -> Calibration:
+    def found(recording: Recording, profile: Profile, pages: Sequence[int], *_: object, **__: object) -> Calibration:
         made.append(list(pages))
         hashes = tuple(recording.page_hash(page) for page in pages)
         return load_calibration(device[5]).model_copy(update={"calibrated_pages": hashes})
