@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +28,7 @@ from lightpage.calibration.patches import (
 )
 from lightpage.calibration.samplers import FieldSampler, FrameSampler
 from lightpage.calibration.sampling_table import cameras_apart, registration_coefficients, stand_apart
+from lightpage.calibration.waves.cameras_apart import related_apart
 from lightpage.calibration.waves.wave_fit import LevelPrior, WaveFit
 from lightpage.device.profile import Profile
 from lightpage.errors import CalibrationError
@@ -162,14 +162,6 @@ _DRIFT_SCALE: Real = np.array([_DRIFT_SHARES.get(parameter.group, 0.05) for para
 """Drift of a device, as a share of the prior about nominal. What a fit cannot tell well stays as it was: a decoder
 has learned the earlier calibration's errors, and loses 0.1 bit a symbol where a re-fit draws others."""
 
-_APART_RAD = (-2.2, -1.1, 0.0, 1.1, 2.2)
-"""Differences of the cameras' axial places that a fit is begun at where it has not explained the light."""
-_SCALES = tuple((camera, axis) for camera in ("in_phase", "quadrature") for axis in "xy")
-_ONE_SCALE = 0.03
-"""Share of the prior about a camera's scale that holds it while its place is found."""
-_TO_PIXELS = ("scale_x_relative", "turn_xy_slope", "turn_yx_slope", "scale_y_relative")
-"""Names of a camera's map from the page to pixels, less the identity, row by row."""
-
 _HELD = 1e-6
 """Share of a prior that leaves a parameter where it is."""
 
@@ -218,11 +210,18 @@ def calibrate(
             break
         work.parameters, work.quadrature_phase, work.modulation = before
         work.total += 4
-        work.relation_apart(axis)
+        _relate_apart(work, axis)
         work.waves("waves of cameras apart", _ALL_GROUPS)
         with suppress(CalibrationError):
             found = min(found, work.result(), key=_bits_lost)
     return found
+
+
+def _relate_apart(work: _Registration, axis: int) -> None:
+    """Begin anew with cameras that stand apart, see `related_apart`."""
+    work.begin("relation of cameras apart")
+    found = related_apart(work.wave_fit(), work.parameters, work.quadrature_phase, work.modulation, axis, work.tell)
+    work.parameters, work.quadrature_phase = found.parameters, found.quadrature_phase
 
 
 def _bits_lost(found: Registered) -> float:
@@ -371,19 +370,19 @@ class _Registration:
         self._looked: list[Measurement] = []
         self._found: list[Measurement] = []
 
-    def _begin(self, what: str) -> None:
+    def begin(self, what: str) -> None:
         """Begin the next stage, and report it."""
         self._stage, self._done = what, self._done + 1
-        self._tell(0.0)
+        self.tell(0.0)
 
-    def _tell(self, share: float) -> None:
+    def tell(self, share: float) -> None:
         """Report progress: the share of the present stage that is done. Where stages were added, it stands still."""
         self._behind = max(self._behind, (self._done - 1 + share) / self.total)
         self.progress(self._stage, self._behind)
 
     def single_camera(self, stage: _Stage) -> None:
         """Measure the direct branch on each camera by itself and fit places and slopes."""
-        self._begin(stage.name)
+        self.begin(stage.name)
         found = self._on_each_camera(stage)
         if stage.middle_only:
             found = self._orient(stage, found)
@@ -439,7 +438,7 @@ class _Registration:
 
     def complex_field(self, stage: _Stage, prior_scale: float | Real = 1.0) -> None:
         """Measure branches on the recovered field and fit."""
-        self._begin(stage.name)
+        self.begin(stage.name)
         sampler = FieldSampler(self._field(self.pages[0])[0], self.grid)
         (found,) = self._measure(stage, {(0, 1): sampler})
         self._fit(stage, found, prior_scale)
@@ -447,7 +446,7 @@ class _Registration:
     def estimate_turn(self) -> None:
         """The angle between the arms, from the phases that the same known symbols show on either camera."""
         stage = _Stage("angle between the arms", 0, 1, (), COHERENT_BRANCHES)
-        self._begin(stage.name)
+        self.begin(stage.name)
         total = 0j
         for one, other in zip(*self._on_each_camera(stage), strict=True):
             if min(one.significance, other.significance) > SIGNIFICANT:
@@ -461,18 +460,21 @@ class _Registration:
                 "about +90 or -90 degrees",
             )
 
+    def wave_fit(self) -> WaveFit:
+        """Return a fit to the waves of the first page."""
+        page = self.pages[0]
+        return WaveFit(self.twin, self.profile, page.pair, self.references, page.symbols)
+
     def waves(self, what: str, groups: tuple[str, ...], prior_scale: float | Real = 1.0) -> None:
         """Fit `groups` and the angle between the arms to the waves of the first page."""
-        self._begin(what)
-        page = self.pages[0]
-        fit = WaveFit(self.twin, self.profile, page.pair, self.references, page.symbols)
-        found = fit.fit(
+        self.begin(what)
+        found = self.wave_fit().fit(
             self.parameters,
             self.quadrature_phase,
             groups,
             self.centre,
             prior_scale,
-            self._tell,
+            self.tell,
             self.modulation,
             self.levels,
             rough=self.rough,
@@ -482,46 +484,11 @@ class _Registration:
         self.modulation, self.modulation_deviations = found.modulation, found.modulation_deviations
         self.illumination = found.illumination
 
-    def relation_apart(self, axis: int) -> None:
-        """Relate the cameras anew as ones that stand apart along the optical axis and see both axes as they see one.
-
-        Through an astigmatic launch a camera off its plane sees the page stretched along one axis. A fit by places
-        takes that for two scales, and the fit by waves does not find back from there.
-        """
-        self._begin("relation of cameras apart")
-        page, scales = self.pages[0], [NAMES.index(f"{camera}_scale_{axis}_relative") for camera, axis in _SCALES]
-        fit = WaveFit(self.twin, self.profile, page.pair, self.references, page.symbols)
-        held = np.ones_like(self.parameters)
-        held[scales] = _ONE_SCALE
-        starts = [self._apart(difference, axis) for difference in _APART_RAD]
-        found = []
-        for number, start in enumerate(starts):
-            told = partial(self._tell_part, number, len(starts))
-            groups, turn = ("in_phase", "quadrature"), self.quadrature_phase
-            found.append(fit.fit(start, turn, groups, start, held, told, self.modulation, rough=True))
-        best = min(found, key=lambda one: one.residual)
-        self.parameters, self.quadrature_phase = best.parameters, best.quadrature_phase
-
-    def _tell_part(self, number: int, count: int, share: float) -> None:
-        self._tell((number + share) / count)
-
-    def _apart(self, difference_rad: float, axis: int) -> Real:
-        """Return the parameters with the cameras' axial places moved apart and the scale of one axis for both."""
-        moved = self.parameters.copy()
-        for camera, share in (("in_phase", 0.5), ("quadrature", -0.5)):
-            moved[NAMES.index(f"{camera}_axial_rad")] += share * difference_rad
-            places = [NAMES.index(f"{camera}_{name}") for name in _TO_PIXELS]
-            matrix = np.eye(2) + moved[places].reshape(2, 2)
-            lengths = np.linalg.norm(matrix, axis=0)
-            matrix[:, 1 - axis] *= lengths[axis] / lengths[1 - axis]
-            moved[places] = (matrix - np.eye(2)).ravel()
-        return moved
-
     def result(self) -> Registered:
         """Judge the outcome."""
         if self.fit is None:
             raise CalibrationError("calibration", "no fit", "at least one stage")
-        self._begin("coherence")
+        self.begin("coherence")
         after = self._coherence(self.parameters, self.modulation)
         significant = len(self._found) / len(self._looked)
         reflected = {branch: self._share(branch) for branch in _REFLECTED}
@@ -550,12 +517,12 @@ class _Registration:
         """Verdict on the fit, by the light of the first page."""
         if self.illumination is None or self.rough:
             return None
-        self._begin("unexplained light")
+        self.begin("unexplained light")
         device = CalibratedDevice(
             self.profile, self.parameters, self.quadrature_phase, self.references, self.modulation
         )
         page = self.pages[0]
-        return measure_goodness(self.twin, device, self.illumination, page.pair, page.symbols, self._tell)
+        return measure_goodness(self.twin, device, self.illumination, page.pair, page.symbols, self.tell)
 
     def _share(self, branch: str) -> float:
         """Share of the patches of a branch that the last stage found."""
@@ -566,7 +533,7 @@ class _Registration:
         """Mean over the pages; takes half of the stage, of which the share `begun` is behind."""
         found = []
         for number, page in enumerate(self.pages):
-            self._tell(begun + number / len(self.pages) / 2)
+            self.tell(begun + number / len(self.pages) / 2)
             sampler = FieldSampler(self._field(page, parameters)[0], self.grid)
             light = page.light(modulation)
             found.append(page_coherence(sampler, self.twin, parameters, self.profile, light))
@@ -612,7 +579,7 @@ class _Registration:
         twin, where, light = RememberingTwin(self.twin), self._where(stage), self.pages[0].light(self.modulation)
         found: list[list[Measurement]] = [[] for _ in samplers]
         for number, patch in enumerate(where):
-            self._tell(number / len(where))
+            self.tell(number / len(where))
             for own, (cameras, sampler) in zip(found, samplers.items(), strict=True):
                 own += measure(
                     sampler,
