@@ -104,7 +104,7 @@ def metrics() -> str:
         for name, kind, labels, text in _metrics_of(path)
     ]
     table = _table(("name", "type", "labels", "meaning"), sorted(rows))
-    return f"# Metrics\n\nCounters end in `_total` where they are read.\n\n{table}"
+    return f"# Metrics\n\nThose of `lightpage bulk` have the labels `run` and `part`, too.\n\n{table}"
 
 
 def _metrics_of(path: Path) -> Iterator[tuple[str, str, list[str], str]]:
@@ -119,7 +119,7 @@ def _metrics_of(path: Path) -> Iterator[tuple[str, str, list[str], str]]:
                     if isinstance(one, ast.List)
                 ]
                 labels = [label.value for one in lists for label in one.elts if isinstance(label, ast.Constant)]
-                yield name, kind, [str(label) for label in labels], text
+                yield f"{name}_total" if kind == "counter" else name, kind, [str(label) for label in labels], text
 
 
 def calls() -> str:
@@ -198,10 +198,10 @@ def notebook(path: Path, images: Path) -> str:
         parts.append(text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```")
         for index, output in enumerate(cell.get("outputs", [])):
             data: dict[str, Any] = output.get("data", {})
-            if "image/png" in data:
-                picture = images / f"{path.stem}-{number}-{index}.png"
+            if drawn := [kind for kind in ("png", "jpeg") if f"image/{kind}" in data]:
+                picture = images / f"{path.stem}-{number}-{index}.{drawn[0]}"
                 picture.parent.mkdir(parents=True, exist_ok=True)
-                picture.write_bytes(base64.b64decode(data["image/png"]))
+                picture.write_bytes(base64.b64decode(data[f"image/{drawn[0]}"]))
                 parts.append(f"![output of cell {number}](../{images.name}/{picture.name})")
             elif told := "".join(output.get("text", data.get("text/plain", ""))).rstrip():
                 parts.append(f"```text\n{told}\n```")
@@ -278,7 +278,10 @@ def front(text: str) -> str:
         words, target = match.groups()
         if target.startswith("docs/"):
             return f"[{words}]({target.removeprefix('docs/').replace('.ipynb', '.md')})"
-        return match[0] if "://" in target or target[0] == "#" or target in TOP else words
+        name, mark, anchor = target.partition("#")
+        if name in TOP:
+            return f"[{words}]({TOP[name]}{mark}{anchor})"
+        return match[0] if "://" in target or not name else words
 
     return re.sub(r"\[([^\]]*)\]\(([^)]+)\)", link, text)
 

@@ -75,7 +75,7 @@ def preset_trained(settings: Settings, data_set: DataSet, preset: str, work: Pat
             progress("evaluate", 0.9)
             decoder = Decoder.load(bundle)
             found = evaluate(decoder, recording, tracker_for(decoder))
-            user_bytes = _user_bytes(decoder, recording, len(parts[2]))
+            user_bytes = _user_bytes(decoder, recording, len(parts[2]) - len(found.refused))
     air, own = found.figures.air_bits_per_symbol, found.figures.own_mi_bits_per_symbol
     air_kb, own_kb = (page_kilobytes(bits, found.symbols_per_page) for bits in (air, own))
     path.unlink()
@@ -88,6 +88,7 @@ def preset_trained(settings: Settings, data_set: DataSet, preset: str, work: Pat
         "own_mi_claimed_kB": own_kb,
         "user_bytes": user_bytes,
         "ece": found.figures.ece,
+        "refused": len(found.refused),
         "steps": choices.steps,
         "angle_deg": calibration.angle_deg(data_set.profile),
         "air_map": found.maps.air,

@@ -204,17 +204,23 @@ def calibrate(
         work.complex_field(stage)
     before = work.parameters, work.quadrature_phase, work.modulation
     work.waves("waves", _ALL_GROUPS)
-    found = work.result()
+    found, failure = list[Registered](), CalibrationError("calibration", "no outcome", "one")
+    try:
+        found.append(work.result())
+    except CalibrationError as error:
+        failure = error
     for axis in (0, 1):
-        if _bits_lost(found) <= USABLE:
+        if found and min(map(_bits_lost, found)) <= USABLE:
             break
         work.parameters, work.quadrature_phase, work.modulation = before
         work.total += 4
-        _relate_apart(work, axis)
-        work.waves("waves of cameras apart", _ALL_GROUPS)
         with suppress(CalibrationError):
-            found = min(found, work.result(), key=_bits_lost)
-    return found
+            _relate_apart(work, axis)
+            work.waves("waves of cameras apart", _ALL_GROUPS)
+            found.append(work.result())
+    if not found:
+        raise failure
+    return min(found, key=_bits_lost)
 
 
 def _relate_apart(work: _Registration, axis: int) -> None:

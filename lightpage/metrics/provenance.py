@@ -121,10 +121,10 @@ def command() -> str:
 @cache
 def machine() -> str:
     """Return the processor, the usable cores, the GPUs and the system, without the machine's name."""
-    described = [(Path("/proc/cpuinfo"), "model name")]
-    described += [(path, "Model:") for path in sorted(Path("/proc/driver/nvidia/gpus").glob("*/information"))]
-    names = [name for path, key in described for name in _values(path, key)[:1]] or [platform.processor()]
-    return ", ".join([names[0], f"{cores()} cores", *names[1:], f"{platform.system()} {platform.machine()}"])
+    processor = (_values(Path("/proc/cpuinfo"), "model name") or [platform.processor()])[0]
+    files = sorted(Path("/proc/driver/nvidia/gpus").glob("*/information"))
+    gpus = [name for path in files for name in _values(path, "Model:")[:1]]
+    return ", ".join([processor, f"{cores()} cores", *gpus, f"{platform.system()} {platform.machine()}"])
 
 
 def _values(path: Path, key: str) -> list[str]:

@@ -32,6 +32,7 @@ from lightpage.runtime.service.pages.reading import read_page
 from lightpage.runtime.service.settings import Given, service_settings
 from lightpage.runtime.service.stages import Stages
 from tests.deploy.manifests import DEPLOY
+from tests.release.scripts import script
 from tests.runtime import toy
 
 DASHBOARD = DEPLOY / "grafana" / "lightpage.json"
@@ -98,6 +99,17 @@ def test_every_metric_that_somebody_asks_for_is_shown(shown: str) -> None:
     named = {one: metrics_in(one) for one in asked}
     assert [one for one, names in named.items() if not (names or re.search(r"\b(up|ALERTS)\b", one))] == []
     assert set().union(*named.values()) <= known
+
+
+def test_every_own_metric_is_on_the_page_of_metrics_with_its_labels(shown: str) -> None:
+    families = dict(re.findall(r"^# TYPE (lightpage_\S+) (\S+)$", shown, re.MULTILINE))
+    own = {name: kind for name, kind in families.items() if not name.endswith("_created")}
+    rows = re.findall(r"^\| `(lightpage_\w+)` \| (\w+) \|([^|]*)\|", script("build_site").metrics(), re.MULTILINE)
+    told = {name: (kind, set(re.findall(r"`(\w+)`", given))) for name, kind, given in rows if "_bulk_" not in name}
+    assert {name: kind for name, (kind, _) in told.items()} == own
+    for name, inside in re.findall(r"^(lightpage_\w+)\{(.*)\} ", shown, re.MULTILINE):
+        base = name if name in own else re.sub(r"_(bucket|sum|count)$", "", name)
+        assert set(re.findall(r'(\w+)="', inside)) - {"le"} <= told.get(base, ("", set(re.findall(r"\w+", inside))))[1]
 
 
 def test_every_alert_is_documented_and_tested() -> None:

@@ -12,6 +12,7 @@ site = script("build_site")
 def test_the_site_builds_and_its_links_lead_somewhere() -> None:
     assert site.main() == 0
     reference = site.SITE / "reference"
+    assert "<Figure" not in (site.SITE / "notebooks" / "decode-a-recording.html").read_text("utf-8")
     for page, named in {
         "commands": "lightpage bulk decode",
         "settings": "longest_wait_ms",

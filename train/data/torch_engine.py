@@ -29,8 +29,8 @@ def torch_device(compute: str) -> torch.device:
     Raises:
         InvalidInputError: another name, or a device that this machine or this torch has not.
     """
-    kind, _, number = compute.partition(":")
-    if kind not in ("cpu", "cuda") or (number and not (kind == "cuda" and number.isdecimal())):
+    kind, colon, number = compute.partition(":")
+    if kind not in ("cpu", "cuda") or (colon and not (kind == "cuda" and number.isdecimal())):
         raise InvalidInputError("--compute", compute, "cpu, cuda or cuda:N")
     if kind == "cuda":
         there = torch.cuda.device_count() if torch.cuda.is_available() else 0
@@ -39,7 +39,7 @@ def torch_device(compute: str) -> torch.device:
             raise InvalidInputError("--compute", f"{compute} without a GPU: {built}", "cpu, or a machine with one")
         if int(number or 0) >= there:
             raise InvalidInputError("--compute", compute, f"cuda:0 to cuda:{there - 1}, this machine's")
-    return torch.device(compute)
+    return torch.device(kind, int(number)) if number else torch.device(kind)
 
 
 class TorchNoise:

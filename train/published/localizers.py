@@ -161,6 +161,7 @@ class RayLocalizer(Localizer):
         landed = known.places + (self.angle - known.angle) * known.slopes
         return torch.as_tensor(self.registration(landed))
 
+    @torch.inference_mode(mode=False)  # forward derivatives need it off
     @torch.no_grad()
     def _trace(self, angle: float) -> _Landed:
         half = torch.tensor(self._half, dtype=torch.float64, device=self.places.device)

@@ -18,7 +18,8 @@ from lightpage.page.modulation import Modulation
 Real = NDArray[np.float64]
 
 _APART_RAD = (-2.2, -1.1, 0.0, 1.1, 2.2)
-"""Differences of the cameras' axial places that a fit begins at: their capture range, in steps of half a basin."""
+"""Changes of the difference of the cameras' axial places that a fit begins at: their capture range, in steps of half a
+basin."""
 _ONE_SCALE = 0.03
 """Share of the prior about a camera's scale that holds it while its place is found."""
 _TO_PIXELS = ("scale_x_relative", "turn_xy_slope", "turn_yx_slope", "scale_y_relative")

@@ -62,12 +62,11 @@ class KeptPages:
         Pages count that the model in service has decoded, at the levels of its code. Those whose symbols the source
         knows are lost, too, where they gave no bytes.
         """
-        kept = self._of(decoder)
-        found = [_found(one, decoder) for one in kept]
-        lost = sum(page is None or page.loss not in (None, Loss.CODE) for page in found)
-        read = sum(page is not None and page.loss is None for page in found)
-        known = sum(one.symbols is not None for one in kept)
-        return lost > 0 and max(lost, read, known) >= MIN_PAGES
+        found = (_found(one, decoder) for one in self._of(decoder))
+        if not any(page is None or page.loss not in (None, Loss.CODE) for page in found):
+            return False
+        known, lost, _ = self._sorted(decoder)
+        return max(len(known), len(lost)) >= MIN_PAGES
 
     def pages(self, decoder: Decoder, image_px: tuple[float, float]) -> KnownPages | LostPages | None:
         """Return the pages to recalibrate by: the last ones that were read, or else lost ones; None if there are none.

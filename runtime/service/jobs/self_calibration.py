@@ -161,7 +161,7 @@ class SelfCalibration:
 
         Where the last recalibration is not long enough ago, none begins and nobody waits; as many callers wait as
         ranges are read at once. One lost page that nothing else is kept with is not enough: a model fitted by it could
-        not be judged.
+        not be judged. After a knock the first lost page is tried by pages of before it, which brings nothing.
 
         Args:
             caller: waits for as long as it has time. Where it leaves, the work goes on.
