@@ -79,10 +79,10 @@ class Limits(SettingsTable):
     """Pages that one recalibration reads into memory."""
     kept_bytes: _MemoryBytes = 512 << 20
     """Frames of the last pages that a service keeps to recalibrate itself by: eight full-size pairs of 16 bits."""
-    recalibration_s: _Seconds = 300.0
+    recalibration_s: _Seconds = 900.0
     """Time of one recalibration in its own process. On two cores a bench device's takes 16 s beside an idle service,
     and 95 s beside reads without a pause on both cores, since its priority leaves it what they do not use and a tenth
-    of a core."""
+    of a core. One that heals takes up to four times as long."""
     uploaded_bytes: _MemoryBytes = UPLOADED_BYTES
     """Uploaded pages, which lie in memory until the service ends."""
     concurrent_ranges: _Count = 4
