@@ -104,7 +104,7 @@ def metrics() -> str:
         for name, kind, labels, text in _metrics_of(path)
     ]
     table = _table(("name", "type", "labels", "meaning"), sorted(rows))
-    return f"# Metrics\n\nThose of `lightpage bulk` have the labels `run` and `part`, too.\n\n{table}"
+    return f"# Metrics\n\nMetrics of `lightpage bulk` also have the labels `run` and `part`.\n\n{table}"
 
 
 def _metrics_of(path: Path) -> Iterator[tuple[str, str, list[str], str]]:

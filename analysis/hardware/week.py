@@ -14,8 +14,8 @@ With `--stroke -0.02 --axial 0.2`, the light drifts too: the modulator's stroke,
 The table then says what was true and what the model in service took for it. Focus needs a `--bundle` whose graphs know
 axial places.
 
-In the simulated week a recalibration ends before the next page is read. Here pages are read without a pause; while a
-recalibration runs, `--pages-during` of them are read at most, and then its end is waited for.
+In a real week a recalibration ends before the next page is read, as with `--pages-during 0`. By default two pages are
+read while one runs, and then its end is waited for.
 """
 
 from __future__ import annotations

@@ -204,7 +204,7 @@ def calibrate(
         work.complex_field(stage)
     before = work.parameters, work.quadrature_phase, work.modulation
     work.waves("waves", _ALL_GROUPS)
-    found, failure = list[Registered](), CalibrationError("calibration", "no outcome", "one")
+    found, failure = list[Registered](), None
     try:
         found.append(work.result())
     except CalibrationError as error:
@@ -218,7 +218,7 @@ def calibrate(
             _relate_apart(work, axis)
             work.waves("waves of cameras apart", _ALL_GROUPS)
             found.append(work.result())
-    if not found:
+    if failure is not None and not found:
         raise failure
     return min(found, key=_bits_lost)
 

@@ -1,4 +1,4 @@
-"""What a simulator computes with: an array library, its random numbers and its splines."""
+"""Engines of the simulator: an array library, its random numbers and its splines."""
 
 from __future__ import annotations
 

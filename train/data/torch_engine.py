@@ -1,4 +1,4 @@
-"""What a simulator computes with on a GPU: torch, whose light on a CPU is that of numpy within float32 rounding."""
+"""The simulator's engine for a GPU: torch, whose light on a CPU is that of numpy within float32 rounding."""
 
 from __future__ import annotations
 

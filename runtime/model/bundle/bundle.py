@@ -84,7 +84,8 @@ class Bundle:
     `lightpage.runtime.model.execution.twin.OnnxTwin` checks the twin, where it is needed.
 
     Attributes:
-        path, manifest: of it.
+        path: folder or zip that it was read from.
+        manifest: facts of the bundle and hashes of its files.
         files: contents of the others by name.
         digest: SHA-256 of the manifest as it is written, and so of all of the bundle.
     """

@@ -23,7 +23,9 @@ class FollowingDecoder(Decoder):
     for, so another order or another recording of the device costs time alone.
 
     Args:
-        bundle, threads, provider: see `Decoder`.
+        bundle: opened and checked.
+        threads: of an inference; all cores if None.
+        provider: that computes the graph.
         tracking: whether the image is followed; else each page is decoded where calibration saw it.
 
     Raises:
@@ -46,7 +48,9 @@ class FollowingDecoder(Decoder):
         """Decode a frame pair into symbols of `levels` levels.
 
         Args:
-            pair, levels, pilots: see `Decoder.decode`.
+            pair: frames of the page.
+            levels: M of the page.
+            pilots: known symbols, where they are others than the bundle's.
 
         Raises:
             UnconfirmedPageError: the page's pilots contradict what was decoded.

@@ -59,8 +59,8 @@ class KeptPages:
     def enough_for_lost(self, decoder: Decoder) -> bool:
         """Return whether pages are lost, and enough kept to fit by and to judge by: a single lost page shows neither.
 
-        Pages count that the model in service has decoded, at the levels of its code. Those whose symbols the source
-        knows are lost, too, where they gave no bytes.
+        Pages count that the model in service has decoded, at the levels of its code. A page whose symbols the
+        source knows counts as lost where it gave no bytes.
         """
         found = (_found(one, decoder) for one in self._of(decoder))
         if not any(page is None or page.loss not in (None, Loss.CODE) for page in found):
