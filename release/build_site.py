@@ -141,10 +141,14 @@ def metrics() -> str:
         for name, kind, labels, text in _metrics_of(path)
     ]
     table = _table(("name", "type", "labels", "meaning"), sorted(rows))
-    return (
-        "# Metrics\n\nGauges of the last page show the device: where the service has a source, frames of callers' own "
-        "sessions do not set them. Metrics of `lightpage bulk` also have the labels `run` and `part`.\n\n" + table
+    told = (
+        "Gauges of the last page show the device: where the service has a source, frames of callers' own sessions "
+        "do not set them, nor do lost pages that came with a caller's own pilots. Without a source there is no "
+        "`lightpage_source_ok`, without TLS no `lightpage_certificate_ends_seconds`. Counters of reasons begin at "
+        "0. What a fit in a process of its own takes is in none. Metrics of `lightpage bulk` also have the labels "
+        "`run` and `part`."
     )
+    return f"# Metrics\n\n{told}\n\n{table}"
 
 
 def _metrics_of(path: Path) -> Iterator[tuple[str, str, list[str], str]]:
