@@ -30,10 +30,11 @@ from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto
 from grpc_tools import protoc
 from pydantic import BaseModel
 
-from lightpage import _HOMES
+from lightpage import _HOMES, errors
 from lightpage.cli.main import lightpage as program
 from lightpage.device.problems import tables_in, tag_of
 from lightpage.device.profile_keys import default_of, key_table, wanted
+from lightpage.errors import LightpageError
 from lightpage.runtime.device.acquisition.camera_config import DeviceTable
 from lightpage.runtime.service.settings import TABLES
 
@@ -224,8 +225,10 @@ def _type(field: FieldDescriptorProto) -> str:
 
 
 def python() -> str:
-    """Return the page of the package's public names, of parts and of interfaces, which mkdocstrings fills in."""
+    """Return the page of the package's public names, errors, parts and interfaces, which mkdocstrings fills in."""
     chapters = {"# Python": [f"{home}.{name}" for name, home in sorted(_HOMES.items())]}
+    kinds = [each for each in vars(errors).values() if isinstance(each, type) and issubclass(each, LightpageError)]
+    chapters["## Errors"] = [f"{errors.__name__}.{each.__name__}" for each in kinds if each is not LightpageError]
     for told, modules in PARTS.items():
         chapters[f"## {told}"] = [
             f"lightpage.runtime.{module}.{name}" for module, names in modules.items() for name in names.split()
