@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from lightpage.metrics.measures import SMOOTH
 from lightpage.report import figures
 from lightpage.report.contents.data import ReportData
 from lightpage.report.tables import geometry, zones
@@ -30,7 +31,7 @@ def shown(data: ReportData) -> dict[str, Any]:
         "geometry": geometry(data),
         "goodness": figures.goodness(data),
         "zones": NOT_TRACED if centroids is None else zones(data, centroids),
-        "smooth": figures.SMOOTH,
+        "smooth": SMOOTH,
         "maps": figures.maps(data, centroids),
         "reliability": [figures.reliability(data), figures.concentration(data)],
         "training": curves if curves is None or isinstance(curves, str) else figures.training(curves),

@@ -10,10 +10,10 @@ import numpy as np
 from matplotlib import colormaps, patheffects
 from matplotlib.axes import Axes
 from matplotlib.colors import Colormap
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from lightpage.calibration.goodness.figure import goodness_figure
+from lightpage.metrics.measures import smoothed
 from lightpage.report.contents.data import Golden, Real, ReportData
 from lightpage.report.drawing import BLUE, GREEN, GREY, ORANGE, Picture, as_picture, new_figure, one_axis
 from lightpage.report.words import number, signed
@@ -21,8 +21,6 @@ from lightpage.report.words import number, signed
 if TYPE_CHECKING:
     from lightpage.train.fitting.curves import Curve
 
-SMOOTH = 5
-"""Symbols along each side of the square over which maps are smoothed."""
 _TRIMMED = 1.0
 """Per cent at either end that do not stretch a colour scale."""
 _BRIGHTEST = 99.8
@@ -67,13 +65,6 @@ def maps(data: ReportData, centroids: Real | None) -> list[Picture]:
         _map(label, values, colormaps[colours], limits, centroids, caption)
         for label, values, colours, limits, caption in rows
     ]
-
-
-def smoothed(values: Real) -> Real:
-    """Return the means of a map [ny, nx] over squares of `SMOOTH` symbols around each; pilots, NaN, do not count."""
-    around = [(SMOOTH // 2, SMOOTH // 2)] * 2
-    squares = sliding_window_view(np.pad(values, around, constant_values=np.nan), (SMOOTH, SMOOTH))
-    return np.asarray(np.nanmean(squares, axis=(2, 3)), np.float64)
 
 
 def goodness(data: ReportData) -> list[Picture]:

@@ -1,4 +1,4 @@
-"""Writes docs/results/index.md and its picture from the figures in analysis/results, after collecting newer ones if asked to.
+"""Writes docs/results/index.md and its picture from the figures in analysis/results; collects newer ones if asked to.
 
     python -m analysis.results.page --from runs/bench-decoders
 
@@ -262,7 +262,7 @@ def main(
     if pictured := results.figures(PICTURED):
         (data_set,) = pictured["data_sets"]
         light = results.bound(PICTURED, data_set)
-        draw(data_set, light and light["bits"], out.absolute().parents[1] / PICTURE)
+        draw(data_set, None if light is None else float(light["bits"]), out.absolute().parents[1] / PICTURE)
     for what in results.missing:
         click.echo(f"left out, no figures: {what}")
     click.echo(f"written to {out}")
