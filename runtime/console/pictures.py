@@ -37,9 +37,7 @@ def frame_png(frame: NDArray[np.integer[Any]], bit_depth: int) -> bytes:
     top = 2**bit_depth - 1
     white = max(_DARKEST * top, float(np.percentile(seen, _WHITE_PERCENT)))
     grey = np.clip(255 * seen / white, 0, 255).astype(np.uint8)
-    picture = np.repeat(grey[..., None], 3, axis=2)
-    picture[seen >= top] = _SATURATED
-    return _png(picture)
+    return _png(np.where((seen < top)[..., None], grey[..., None], np.array(_SATURATED, np.uint8)))
 
 
 def air_png(concentration: NDArray[np.floating[Any]], usual: float | None) -> bytes:
@@ -53,9 +51,8 @@ def air_png(concentration: NDArray[np.floating[Any]], usual: float | None) -> by
     from matplotlib import colormaps  # takes long to import
 
     bits = information(np.nan_to_num(concentration.astype(np.float64))) / math.log(2)
-    low, high = AIR_BITS
-    shade = (bits - (bits.mean() if usual is None else usual) - low) / (high - low)
-    colours = (255 * colormaps["RdYlBu"](np.clip(shade, 0, 1))[..., :3]).astype(np.uint8)
+    shade = np.interp(bits - (bits.mean() if usual is None else usual), AIR_BITS, (0, 1))
+    colours = (255 * colormaps["RdYlBu"](shade)[..., :3]).astype(np.uint8)
     size = max(1, _LEAST_MAP_PX // concentration.shape[1])
     return _png(np.kron(colours, np.ones((size, size, 1), np.uint8)))
 

@@ -13,7 +13,7 @@ from lightpage.runtime.console.pictures import air_png, frame_png
 from lightpage.runtime.service.caller import Identity
 from lightpage.runtime.service.models.loader import Model
 from lightpage.runtime.service.models.models import Models
-from lightpage.runtime.service.monitoring.monitor import AIR, Monitor, SignState
+from lightpage.runtime.service.monitoring.monitor import AIR, Monitor
 
 POINTS = 600
 """Most points of a series."""
@@ -67,7 +67,7 @@ class ConsoleState:
             "pages": self._last_pages.pages,
             "picture": {"number": number, "frames": pair is not None, "air": concentration is not None},
             "series": {name: [row[name] for row in told] for name in ("time_s", "lost", "unread", *_SERIES)},
-            "signs": {sign.name: _sign(sign) for sign in monitor.signs},
+            "signs": {sign.name: vars(sign) for sign in monitor.signs},
             "losses": [vars(loss) for loss in self._last_pages.losses()],
             "models": [_model(model, model is self._models.current) for model in self._models.loaded],
             "caller": "" if identity is None else identity.name,
@@ -80,16 +80,11 @@ class ConsoleState:
         """Return a picture of the last page, as PNG; None where there is none of this path."""
         _, pair, concentration = self._last_pages.pictures()
         if path == "/air.png" and concentration is not None:
-            return air_png(concentration, self._usual_air())
+            return air_png(concentration, next(s.baseline for s in self._monitor.state().signs if s.name == AIR.name))
         if path not in ("/frames/in_phase.png", "/frames/quadrature.png") or pair is None:
             return None
         depth = self._models.current.decoder.bundle.manifest.camera_bit_depth
         return frame_png(pair.in_phase if "in_phase" in path else pair.quadrature, depth)
-
-    def _usual_air(self) -> float | None:
-        """Return the estimated AIR of a usual page, bits a symbol; None where nobody knows it."""
-        usual = next((sign.baseline for sign in self._monitor.state().signs if sign.name == AIR.name), None)
-        return calibrated_air(self._models.current) if usual is None else usual
 
 
 def _condition(rows: list[PageRow], due: bool, now: float) -> str:
@@ -103,17 +98,6 @@ def _condition(rows: list[PageRow], due: bool, now: float) -> str:
     return "idle" if now - rows[-1].time_s > _IDLE_S else "reading"
 
 
-def _sign(sign: SignState) -> dict[str, Any]:
-    return {"usual": sign.baseline, "alarm": sign.raise_at, "raised": sign.raised}
-
-
-def calibrated_air(model: Model) -> float | None:
-    """Return the AIR of a model on the pages that judged its last calibration or training; None where it has none."""
-    metrics = model.decoder.bundle.manifest.metrics
-    known = (metrics.get(name) for name in ("recalibration_air_bits_per_symbol", "validation_air_bits_per_symbol"))
-    return next((float(air) for air in known if isinstance(air, int | float)), None)
-
-
 def _model(model: Model, current: bool) -> dict[str, Any]:
     manifest = model.decoder.bundle.manifest
     metrics = manifest.metrics
@@ -122,5 +106,5 @@ def _model(model: Model, current: bool) -> dict[str, Any]:
         "created": manifest.created,
         "current": current,
         "air_before": metrics.get("recalibration_air_bits_per_symbol_before"),
-        "air": calibrated_air(model),
+        "air": metrics.get("recalibration_air_bits_per_symbol", metrics.get("validation_air_bits_per_symbol")),
     }

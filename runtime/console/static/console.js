@@ -58,7 +58,7 @@ function places(times) {
 function marksOf(chart, state) {
   const marks = [];
   chart.signs.forEach((name, k) => {
-    const { usual, alarm } = state.signs[name], whose = chart.signs.length > 1 ? `${chart.lines[k][1]} ` : "";
+    const { baseline: usual, raise_at: alarm } = state.signs[name], whose = chart.signs.length > 1 ? `${chart.lines[k][1]} ` : "";
     if (usual === null) return;
     const far = Math.abs(alarm - usual), about = chart.either ? "±" : "";
     if (!chart.either) marks.push([[usual], `${whose}usual ${shown(usual, chart.digits)}`, "usual"]);
