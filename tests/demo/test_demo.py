@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from lightpage.page.symbols import pilot_mask, symbol_phases
 from lightpage.runtime.client.answers import RemotePage, RemoteTimings
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.refit import refit
+from lightpage.runtime.recalibration.separate_process import recalibrate_apart
 from tests.runtime import toy
 from tests.runtime.recalibration.toy_worker import known, quiet
 
@@ -67,7 +69,6 @@ def test_a_bundle_without_code_field_or_calibration_is_no_demo(decoder: Decoder,
         refit(decoder.bundle, known(count=1), quiet, decoder)
 
 
-@pytest.mark.timeout(1800)  # its healing takes only what time others leave
 def test_a_picture_is_lost_by_drift_and_won_back_by_its_pages_with_the_shipped_bundle(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -75,6 +76,8 @@ def test_a_picture_is_lost_by_drift_and_won_back_by_its_pages_with_the_shipped_b
     shorter = {"demo.picture": lambda: small, "drift.DRIFT_STEPS": (0.15,), "pages.GROUPS": 1, "pages.PARITY_PAGES": 1}
     for name, value in shorter.items():
         monkeypatch.setattr(f"lightpage.demo.{name}", value)
+    apart = partial(recalibrate_apart, worker="tests.runtime.recalibration.toy_worker:Unyielding")
+    monkeypatch.setattr("lightpage.runtime.service.jobs.recalibrator.recalibrate_apart", apart)
     monkeypatch.setattr("lightpage.runtime.service.jobs.kept_pages._KEPT", 5)  # what was read before the drift is gone
     result = CliRunner().invoke(demo, ["--out", str(tmp_path)], standalone_mode=False, catch_exceptions=False)
     assert result.exception is None

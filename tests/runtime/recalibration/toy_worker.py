@@ -51,6 +51,11 @@ class Sound(RecalibrationWorker):
         yield_to_reads()
 
 
+class Unyielding(RecalibrationWorker):
+    def __init__(self) -> None:
+        """Take one's share of the processor: other tests leave little else."""
+
+
 class Refusing(Helper):
     def recalibrate(self, *task: Any, progress: Progress) -> None:
         raise RecalibrationRefusedError("fit", "worse", "better")

@@ -61,7 +61,7 @@ def test_a_name_is_the_shipped_bundle_even_beside_a_folder_of_that_name(
 def test_the_shipped_decoder_follows_an_image_that_moves_over_its_reference() -> None:
     """Which tilts it; so far off, the table is traced again, and holds the tilt from then on."""
     decoder = Decoder.load(bundle_path(DEFAULT))
-    profile, levels, by = decoder.bundle.profile, 256, np.array([6.0, -4.0])
+    profile, levels, by = decoder.bundle.profile, 256, np.array([9.0, -6.0])
     simulator = Simulator(profile, Device().with_settings(["drift.shift_px=0.0"]), levels, 8, reference_stays=True)
     written = np.asarray(random_symbols(profile, levels, 1, np.random.default_rng(8))[0])
     tracker = tracker_for(decoder)
