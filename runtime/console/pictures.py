@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 from typing import Any
 
 import numpy as np
@@ -17,8 +16,6 @@ SIDE_PX = 900
 _SATURATED = (230, 60, 30)
 _WHITE_PERCENT = 99.5
 """Percentile of a frame's counts that is white: full scale would leave most frames dark."""
-_DARKEST = 0.05
-"""Share of full scale that may be white, so that a black frame stays black."""
 _LEAST_MAP_PX = 320
 """A map of few symbols is enlarged to about this width."""
 AIR_BITS = (-2.0, 0.5)
@@ -26,7 +23,7 @@ AIR_BITS = (-2.0, 0.5)
 
 
 def frame_png(frame: NDArray[np.integer[Any]], bit_depth: int) -> bytes:
-    """A frame, thinned to at most `SIDE_PX`, in grey from black to its bright pixels; saturated ones are red.
+    """A frame, thinned to at most `SIDE_PX`, brightened at most twentyfold; saturated pixels are red.
 
     Args:
         frame: counts [row, column].
@@ -35,7 +32,7 @@ def frame_png(frame: NDArray[np.integer[Any]], bit_depth: int) -> bytes:
     step = max(1, -(-max(frame.shape) // SIDE_PX))
     seen = frame[::step, ::step].astype(np.float64)
     top = 2**bit_depth - 1
-    white = max(_DARKEST * top, float(np.percentile(seen, _WHITE_PERCENT)))
+    white = max(top / 20, float(np.percentile(seen, _WHITE_PERCENT)))
     grey = np.clip(255 * seen / white, 0, 255).astype(np.uint8)
     return _png(np.where((seen < top)[..., None], grey[..., None], np.array(_SATURATED, np.uint8)))
 
@@ -50,7 +47,7 @@ def air_png(concentration: NDArray[np.floating[Any]], usual: float | None) -> by
     settle_matplotlib()
     from matplotlib import colormaps  # takes long to import
 
-    bits = information(np.nan_to_num(concentration.astype(np.float64))) / math.log(2)
+    bits = information(np.nan_to_num(concentration.astype(np.float64))) / np.log(2)
     shade = np.interp(bits - (bits.mean() if usual is None else usual), AIR_BITS, (0, 1))
     colours = (255 * colormaps["RdYlBu"](shade)[..., :3]).astype(np.uint8)
     size = max(1, _LEAST_MAP_PX // concentration.shape[1])
