@@ -18,7 +18,7 @@ from lightpage.cli.main import RESUME_KEY
 from lightpage.cli.options import JSON, named_profile
 from lightpage.cli.paths import NewPath
 from lightpage.device.profile import Profile
-from lightpage.errors import InvalidInputError
+from lightpage.errors import FrameError, InvalidInputError, PageError
 from lightpage.failures import os_errors
 from lightpage.files import read_text, write_json
 from lightpage.foreign.array import ForeignArray
@@ -30,7 +30,7 @@ from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 from lightpage.progress import warn
 from lightpage.recording.layout import MAX_BIT_DEPTH, MIN_BIT_DEPTH
 from lightpage.recording.pages import Pages
-from lightpage.recording.unfinished import claim, settings_path
+from lightpage.recording.unfinished import claim, drop_claim
 from lightpage.recording.writer import RecordingWriter
 
 FLIPS: dict[str, Flip] = {each or "none": each for each in get_args(Flip)}
@@ -120,9 +120,13 @@ def import_frames(out: Path, force: bool, keep_unlit: bool, json_path: Path | No
             overwrite=force,
             black_level=material.black_level,
         )
-        with writer:
-            unlit = write(material, exposure, writer, keep_unlit=keep_unlit)
-    settings_path(out).unlink(missing_ok=True)
+        try:
+            with writer:
+                unlit = write(material, exposure, writer, keep_unlit=keep_unlit)
+        except (FrameError, PageError):  # the files or the options are to be mended, which makes it another recording
+            drop_claim(out, pages=True)
+            raise
+    drop_claim(out)
     if unlit:
         warn(f"pages {describe(unlit)}")
     figures = {
@@ -189,8 +193,8 @@ class _Sources:
         """
         for option, files in self.files.items():
             if out.exists() and any(path.samefile(out) for path in files):
-                named = f"what --{option.replace('_', '-')} names"
-                raise InvalidInputError(f"--out {out}", named, "a file of its own")
+                named = f"the same file as --{option.replace('_', '-')}"
+                raise InvalidInputError(f"--out {out}", named, "another name")
 
     def described(self) -> str:
         """Return what the pages are made of: the options, and a digest of name, size and time of the files of each."""

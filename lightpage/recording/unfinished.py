@@ -101,7 +101,7 @@ def claim(path: Path, settings: str, *, force: bool) -> None:
     try:
         begun = note.read_text("utf-8") if note.exists() else None
         if partial.exists() and begun != settings:
-            if not force:
+            if not force and _pages_begun(partial):
                 raise InvalidInputError(
                     f"--out {path}",
                     f"pages begun with other settings ({partial.name})",
@@ -111,6 +111,22 @@ def claim(path: Path, settings: str, *, force: bool) -> None:
         note.write_text(settings, "utf-8")
     except OSError as error:
         raise os_failure(f"--out {path}", error, "a place that can be written") from None
+
+
+def drop_claim(path: Path, *, pages: bool = False) -> None:
+    """Remove the note of `claim`, and with `pages` the unfinished pages of the recording `path`."""
+    if pages:
+        discard_partial(path)
+    settings_path(path).unlink(missing_ok=True)
+
+
+def _pages_begun(partial: Path) -> bool:
+    """Return whether an unfinished recording has pages that would be lost; what cannot be read may have some."""
+    try:
+        with retried(lambda: h5py.File(str(partial), "r", locking=False)) as file:
+            return pages_of(file) > 0
+    except CUT_OFF:
+        return True
 
 
 def pages_there(path: Path, identity: Identity, *, overwrite: bool = False) -> int:

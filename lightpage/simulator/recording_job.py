@@ -14,7 +14,7 @@ from lightpage.page.symbols import random_symbols
 from lightpage.progress import track
 from lightpage.recording.hdf5 import patiently
 from lightpage.recording.pages import Pages
-from lightpage.recording.unfinished import claim, settings_path
+from lightpage.recording.unfinished import claim, drop_claim
 from lightpage.recording.writer import RecordingWriter
 from lightpage.simulator.engine import CPU, NUMPY, engine_on
 from lightpage.simulator.simulator import LIGHT, Simulator
@@ -100,7 +100,7 @@ class RecordingJob:
             simulator.skip(writer.pages)
             for page in track(range(writer.pages, pages), "simulate", total=pages, done=writer.pages):
                 self._append(writer, simulator, page)
-        settings_path(self.out).unlink(missing_ok=True)
+        drop_claim(self.out)
 
     def _append(self, writer: RecordingWriter, simulator: Simulator, page: int) -> None:
         if self._written is None:
