@@ -97,14 +97,21 @@ def check_outputs(context: click.Context) -> None:
         InvalidInputError: the same file is to be read and written, or written twice.
     """
     given = [(param, context.params.get(param.name or "")) for param in context.command.params]
-    paths = [(param, Path(value)) for param, value in given if isinstance(value, str | Path) and str(value)]
+    paths = [(param, Path(value)) for param, value in given if _names_file(param, value)]
     for param, path in paths:
         for other, there in paths:
             if param is other or not isinstance(param.type, NewPath | OutputFile):
                 continue
             if path.resolve() == there.resolve() and path != STDOUT:
                 named = other.opts[0] if isinstance(other, click.Option) else other.make_metavar(context)
-                raise InvalidInputError(_option(path, param), f"what {named} names", "a file of its own")
+                raise InvalidInputError(_option(path, param), f"the same file as {named}", "another name")
+
+
+def _names_file(param: click.Parameter, value: object) -> bool:
+    """Return whether the value of an option is a file; a bare text is one where there is a file of that name."""
+    if isinstance(value, Path):
+        return bool(str(value))
+    return isinstance(value, str) and not isinstance(param.type, click.Choice) and os.path.exists(value)
 
 
 def _file(value: Any, param: click.Parameter | None) -> Path:
