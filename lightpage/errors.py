@@ -72,6 +72,10 @@ class SurroundingsError(LightpageError):
     """The program lacks what it needs to run, e.g. memory: nothing that it was given is wrong."""
 
 
+class NoRoomError(SurroundingsError):
+    """A disk or a quota is full; once it has room, the same command may go well."""
+
+
 class FrameError(InvalidInputError):
     """A camera frame of the wrong size, type or bit depth, or without usable light."""
 

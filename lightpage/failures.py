@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from lightpage.errors import Cause, InvalidInputError, LightpageError, StorageError, SurroundingsError
+from lightpage.errors import Cause, InvalidInputError, LightpageError, NoRoomError, StorageError, SurroundingsError
 
 _STORAGE = frozenset(
     getattr(errno, name)
@@ -55,6 +55,8 @@ _SHORT = {
     errno.ENOBUFS: "buffers of the network",
 }
 """Error numbers of a resource that is short, and which it is."""
+_FULL = frozenset({errno.ENOSPC, errno.EFBIG, errno.EDQUOT})
+"""Those of storage without room."""
 
 _HDF5_ERRNO = re.compile(r"\berrno = (\d+)")
 """HDF5 tells the number in its message alone."""
@@ -123,13 +125,13 @@ def os_failure(
         otherwise: class of the error where neither storage nor a short resource is the cause, e.g. no such file.
 
     Returns:
-        A `StorageError`, a `SurroundingsError` that names what is short, or one of class `otherwise`.
+        A `StorageError`, a `SurroundingsError` or `NoRoomError` that names what is short, or one of class `otherwise`.
     """
     number = error_number(error)
     if number is not None and number in _STORAGE:
         return StorageError(subject, os.strerror(number), expected)
     if number is not None and number in _SHORT:
-        return SurroundingsError(subject, os.strerror(number), f"more {_SHORT[number]}")
+        return _short_of(subject, os.strerror(number), number)
     if number == errno.ENOLCK:
         remedy = "a file system with locks, or HDF5_USE_FILE_LOCKING=FALSE in the environment"
         return SurroundingsError(subject, os.strerror(number), remedy)
@@ -161,11 +163,17 @@ def hdf5_failure(
     return otherwise(subject, "damaged data", expected)
 
 
+def _short_of(subject: str, got: object, number: int) -> SurroundingsError:
+    """Return the error of a resource by the number of `_SHORT`."""
+    return (NoRoomError if number in _FULL else SurroundingsError)(subject, got, f"more {_SHORT[number]}")
+
+
 def short_resource(subject: str, error: BaseException) -> SurroundingsError | None:
     """The error of a short resource, however a library says it; None where the failure is another one."""
     text = " ".join(str(error).split())
-    if isinstance(error, OSError) and (what := _SHORT.get(error_number(error) or 0)):
-        return SurroundingsError(subject, error, f"more {what}")
+    number = error_number(error) if isinstance(error, OSError) else None
+    if number is not None and number in _SHORT:
+        return _short_of(subject, error, number)
     if isinstance(error, MemoryError):
         return SurroundingsError(subject, text or "too little memory", "more memory")
     if "no usable temporary directory" in text.lower():

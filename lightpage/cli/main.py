@@ -26,15 +26,15 @@ from lightpage.cli.stand_ins import stand_ins
 from lightpage.cli.streams import LastingStream, take_streams
 from lightpage.cli.usage import misused
 from lightpage.errors import (
-    InvalidInputError,
     LightpageError,
     LostDataError,
     MissingResultsError,
+    NoRoomError,
     StorageError,
     SurroundingsError,
     TakenError,
 )
-from lightpage.failures import understood
+from lightpage.failures import os_failure, understood
 from lightpage.files import results_on_stdout
 from lightpage.progress import reporting
 from lightpage.systems import ENDING, LINUX_MODULES, NEEDS_LINUX
@@ -302,7 +302,7 @@ def _fail(error: LightpageError) -> int:
     click.echo("lightpage: error: " + " ".join(str(error).split()), err=True)
     if isinstance(error, LostDataError):
         return EXIT_LOST
-    return EXIT_AGAIN if isinstance(error, (MissingResultsError, StorageError, TakenError)) else EXIT_ERROR
+    return EXIT_AGAIN if isinstance(error, (MissingResultsError, NoRoomError, StorageError, TakenError)) else EXIT_ERROR
 
 
 def main() -> NoReturn:
@@ -318,7 +318,7 @@ def main() -> NoReturn:
     for stream in streams:
         stream.flush()
     if status == 0 and (told := sys.stdout.failure if isinstance(sys.stdout, LastingStream) else None):
-        status = _fail(InvalidInputError("stdout", told, "a stream that takes the result"))
+        status = _fail(os_failure("stdout", told, "a stream that takes the result"))
     sys.exit(status)
 
 

@@ -13,7 +13,7 @@ import click
 import pytest
 
 from lightpage.cli.paths import OutputFile
-from lightpage.errors import InvalidInputError, StorageError, SurroundingsError
+from lightpage.errors import InvalidInputError, NoRoomError, StorageError, SurroundingsError
 from lightpage.files import lock, move_to_new_name, new_file, read_text, replace_file, replace_text
 from lightpage.temporary import settle_matplotlib, short_folder, temporary_folder
 
@@ -64,10 +64,10 @@ def test_content_and_name_are_on_the_disk_before_a_file_is_said_to_be_there(
 def test_a_write_that_fails_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     full = Mock(side_effect=OSError(28, "No space left on device"))
     (tmp_path / "F").write_text("earlier")
-    with pytest.raises(SurroundingsError, match="F: got"):
+    with pytest.raises(NoRoomError, match="F: got"):
         replace_file(tmp_path / "F", full)
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(SurroundingsError, match="F: got"):
+    with pytest.raises(NoRoomError, match="F: got"):
         replace_text(tmp_path / "F", "text")
     assert [path.name for path in tmp_path.iterdir()] == ["F"]
     assert (tmp_path / "F").read_text() == "earlier"
@@ -115,7 +115,7 @@ def test_what_a_file_system_lacks_is_gone_without(
 
 
 @pytest.mark.parametrize(
-    ("number", "kind"), [(errno.EIO, StorageError), (errno.EDQUOT, SurroundingsError), (errno.EROFS, InvalidInputError)]
+    ("number", "kind"), [(errno.EIO, StorageError), (errno.EDQUOT, NoRoomError), (errno.EROFS, InvalidInputError)]
 )
 def test_what_is_needed_is_named(
     number: int, kind: type[Exception], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -37,7 +37,7 @@ def shell(script: str, folder: Path, **variables: str) -> subprocess.CompletedPr
     [
         ("lightpage --help | true; exit ${PIPESTATUS[0]}", 0),
         ("lightpage --help <&- >&- 2>&-", 0),
-        ("lightpage --help > /dev/full", 2),
+        ("lightpage --help > /dev/full", 75),
         ("lightpage nonsense 2> /dev/full", 2),
     ],
 )

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lightpage.errors import LightpageError, StorageError, SurroundingsError
+from lightpage.errors import LightpageError, NoRoomError, StorageError, SurroundingsError
 from lightpage.page.symbols import random_symbols
 from lightpage.recording import hdf5, hdf_file
 from lightpage.recording.pages import Pages, PagesWriter
@@ -77,7 +77,7 @@ def test_writes_that_fail_for_a_moment_cost_nothing(tmp_path: Path, disk: type[D
 
 @pytest.mark.parametrize(
     ("number", "kind"),
-    [(errno.EIO, StorageError), (errno.ENOSPC, SurroundingsError), (errno.EDQUOT, SurroundingsError)],
+    [(errno.EIO, StorageError), (errno.ENOSPC, NoRoomError), (errno.EDQUOT, NoRoomError)],
 )
 def test_wherever_writing_fails_the_pages_before_stay(
     tmp_path: Path, disk: type[Disk], number: int, kind: type[LightpageError]

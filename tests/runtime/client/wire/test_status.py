@@ -50,7 +50,7 @@ MEANINGS = {
     "RESOURCE_EXHAUSTED TOO_LARGE": ["LimitError"],
     "RESOURCE_EXHAUSTED OVERLOADED": ["SlotsTakenError"],
     "RESOURCE_EXHAUSTED DEADLINE_TOO_SHORT": ["OverloadedError"],  # without a time after which to come again
-    "RESOURCE_EXHAUSTED SURROUNDINGS": ["SurroundingsError"],
+    "RESOURCE_EXHAUSTED SURROUNDINGS": ["NoRoomError", "SurroundingsError"],
     "DATA_LOSS SHOT_LOST": ["LostShotError"],
     "DATA_LOSS PAGE_NOT_BELIEVED": ["LostDataError", "LostPageError", "UnconfirmedPageError"],
     "ABORTED OTHER_MODEL": ["OtherModelError"],
