@@ -48,6 +48,7 @@ _FIGURES = (
 @click.option("--pages", type=click.IntRange(1), help="How many pages; all of a recording, or one of the source.")
 @click.option("--levels", type=click.IntRange(2, 256), help="Level count; that of the recording or source by default.")
 @click.option("--out", type=OutputFile(), help="Write symbols and confidences to this HDF5 file.")
+@click.option("--force", is_flag=True, help="Overwrite a file that exists.")
 @JSON
 def decode(
     target: str,
@@ -57,6 +58,7 @@ def decode(
     pages: int | None,
     levels: int | None,
     out: Path | None,
+    force: bool,
     json_path: Path | None,
 ) -> None:
     """Decode a recording, or pages of the service's source.
@@ -67,6 +69,8 @@ def decode(
     if (recording is None) == (not source):
         came = "both --recording and --source" if source else "neither --recording nor --source"
         raise InvalidInputError("options", came, "one of them")
+    if out is not None and out.exists() and not force:
+        raise InvalidInputError(f"--out {out}", "a file that exists", "a new name, or --force")
     results: list[dict[str, Any]] = []
     refused: list[RefusedPage] = []
     with ExitStack() as stack:

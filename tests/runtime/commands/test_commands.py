@@ -265,6 +265,7 @@ def test_decode_sends_a_recording_and_keeps_the_symbols(
     assert [page["page"] for page in pages] == [0, 1, 2, 3]
     assert all(0 < page["air_bits_per_symbol"] <= 4 and page["total_s"] > 0 for page in pages)
     assert "carry nothing" not in capsys.readouterr().err
+    assert run(*where, "--out", out) == 2
     assert run(*where, "--pages", "5") == 2
     shuffle_data(recording[0])
     assert run(*where) == 0
@@ -324,7 +325,7 @@ def test_decode_uses_the_devices_own_pilots_and_refuses_pages_where_they_disagre
     bundle, out = toy.write_own_pilots_bundle(tmp_path / "own.zip"), tmp_path / "out.h5"
     service = start(bundle, source=open_source(f"recording:{path}"))
     for where in (["--recording", path], ["--source", "--pages", "2"]):
-        assert run("decode", "--target", service.server.target, *where, "--out", out) == 2
+        assert run("decode", "--target", service.server.target, *where, "--out", out, "--force") == 2
         with h5py.File(out) as file:
             assert (file["symbols"][0] == symbols[0])[~toy.OWN_MASK].all()
             assert list(file["pages"]) == [0]
