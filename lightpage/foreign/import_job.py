@@ -21,7 +21,7 @@ from lightpage.foreign.frames import Counts, Frames, Pages
 from lightpage.page.symbols import check_symbols
 from lightpage.progress import note, track, warn
 from lightpage.recording.black_level import without_black
-from lightpage.recording.exposure import check_light, unused_low_bits
+from lightpage.recording.exposure import check_different, check_light, unused_low_bits
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import MAX_BIT_DEPTH
 from lightpage.recording.writer import RecordingWriter
@@ -99,6 +99,7 @@ class Material:
 
         Raises:
             InvalidInputError: there are more of one than of another.
+            FrameError: both cameras have the same frame, or a frame has no counts.
         """
         first, second = self.frames
         if len(first) != len(second):
@@ -107,6 +108,9 @@ class Material:
         if self.symbols is not None and self.symbols.count != self.pages:
             got = f"{self.symbols.count} pages of symbols"
             raise InvalidInputError(self.symbols.subject, got, f"{self.pages}, as frames in {first.subject}")
+        for other, frames in (self.frames, self.references):
+            subject = f"{frames.subject}: frame 0"
+            check_different(subject, other.frame(0), frames.frame(0), f"{other.subject}: frame 0")
         for references in self.references:
             if len(references) > _MOST_REFERENCES:
                 expected = f"one, or up to {_MOST_REFERENCES} exposures whose mean is taken"

@@ -15,7 +15,7 @@ from lightpage.inspection.exposure import contrast, histogram, sampled
 from lightpage.inspection.finding import Finding, Picture, shape_text
 from lightpage.inspection.foreign_files import look_at_hdf5
 from lightpage.recording import decoded_file, layout, pages
-from lightpage.recording.exposure import check_pair_light
+from lightpage.recording.exposure import check_different, check_pair_light
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.hdf5 import find, open_hdf5, read_attribute
 from lightpage.recording.pages import Pages
@@ -27,6 +27,7 @@ from lightpage.waves.grid import check_camera
 _SAMPLE_BYTES = 1 << 26
 """Of frames that are read."""
 _MOST_PAGES = 8
+_DIFFERENT = "frames of two cameras"
 _NEEDED = "data as docs/reference/formats.md describes them"
 
 
@@ -139,6 +140,8 @@ def _exposure(found: Finding, recording: Recording) -> None:
     pair = recording.references()
     with found.trying("reference frames with light"):
         check_pair_light("reference: ", _sampled(pair), recording.bit_depth)
+    with found.trying(_DIFFERENT):
+        check_different("reference: quadrature", pair.in_phase, pair.quadrature, "in-phase")
     frame_bytes = 2 * pair.in_phase.nbytes
     looked_at = spread(recording.pages, max(1, min(_MOST_PAGES, _SAMPLE_BYTES // frame_bytes)))
     unlit, frames = [], []
@@ -148,6 +151,8 @@ def _exposure(found: Finding, recording: Recording) -> None:
             check_pair_light("", _sampled(frames[-1]), recording.bit_depth)
         except FrameError as error:
             unlit.append(f"page {page}: {error.subject} {error.got}")
+        with found.trying(_DIFFERENT):
+            check_different(f"page {page}: quadrature", frames[-1].in_phase, frames[-1].quadrature, "in-phase")
     found.facts["pages looked at"] = ", ".join(map(str, looked_at))
     found.problems += unlit
     for name, reference in zip(layout.FRAMES, (pair.in_phase, pair.quadrature), strict=True):

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.errors import BlackFrameError, FrameError, SaturatedFrameError
+from lightpage.errors import BlackFrameError, FrameError, FramesDisagreeError, SaturatedFrameError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import MIN_BIT_DEPTH
 
@@ -37,6 +37,22 @@ def check_pair_light(subject: str, pair: FramePair, bit_depth: int) -> None:
     """
     check_light(f"{subject}in-phase frame", pair.in_phase, bit_depth)
     check_light(f"{subject}quadrature frame", pair.quadrature, bit_depth)
+
+
+def check_different(name: str, first: Counts, second: Counts, other: str) -> None:
+    """Check that a frame is not the other camera's too: noise alone tells two exposures apart.
+
+    Args:
+        name: of the second frame, for the error.
+        first: counts [H, W] of one camera.
+        second: counts of the other one.
+        other: name of the first frame.
+
+    Raises:
+        FramesDisagreeError: all counts are equal, and not all the same.
+    """
+    if np.array_equal(first, second) and first.min() < first.max():
+        raise FramesDisagreeError(name, f"the same counts as {other}", "the other camera's")
 
 
 def check_light(name: str, frame: Counts, bit_depth: int) -> None:

@@ -20,8 +20,8 @@ from scipy.io import savemat
 
 from lightpage.calibration.calibrate import ORIENTATIONS
 from lightpage.cli.import_frames import import_frames
-from lightpage.cli.unpack import unpack
-from lightpage.errors import BlackFrameError, FrameError, InvalidInputError, PageError
+from lightpage.cli.main import lightpage
+from lightpage.errors import BlackFrameError, FrameError, FramesDisagreeError, InvalidInputError, PageError
 from lightpage.foreign import import_job
 from lightpage.foreign.frames import Arrangement, Pages, Upright, both_cameras
 from lightpage.foreign.opening import open_array
@@ -89,9 +89,8 @@ def test_a_recording_comes_back_from_every_form(
     form: Form, recording: Path, arrays: Arrays, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    told = (
-        CliRunner().invoke(unpack, [str(recording), "--out", "o", "--form", form.value], catch_exceptions=False).output
-    )
+    words = ["unpack", str(recording), "--out", form.value, "--form", form.value]
+    told = CliRunner().invoke(lightpage, words, catch_exceptions=False).output
     bring(told.splitlines()[-1].removeprefix("lightpage import"))
     check_same(tmp_path / "R.h5", arrays)
     assert contents(tmp_path / "R.h5")[1] == contents(recording)[1]
@@ -314,6 +313,21 @@ def test_an_interrupted_import_goes_on_with_the_same_files_alone(
     check_same(folder / "new.h5", arrays)
     assert [each["page"] for each in json.loads((folder / "J").read_text())["unlit"]] == [0]
     assert not list(folder.glob("*.partial*"))
+
+
+def test_a_refused_import_is_not_in_the_way_of_the_corrected_command(folder: Path, arrays: Arrays) -> None:
+    arrays["in_phase"][:] = np.load("in_phase.npy") * (np.arange(PAGES) != 1).astype(np.uint8)[:, None, None]
+    np.save("in_phase.npy", arrays["in_phase"])
+    with refused("page 1", "black"):
+        bring(f"{FRAMES} {REFERENCES} {REST}")
+    assert not list(folder.glob("new*"))
+    bring(f"{FRAMES} {REFERENCES} {REST} --keep-unlit")
+
+
+def test_equal_frames_of_both_cameras_are_refused(folder: Path) -> None:
+    shutil.copy("in_phase.npy", "quadrature.npy")
+    with refused("quadrature.npy", "in_phase.npy", kind=FramesDisagreeError):
+        bring(f"{FRAMES} {REFERENCES} {REST}")
 
 
 def test_a_recording_never_takes_the_place_of_its_source(folder: Path, recording: Path) -> None:
