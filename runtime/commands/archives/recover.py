@@ -18,6 +18,7 @@ from lightpage.runtime.archives.recordings.recovery import recover as recover_fi
 from lightpage.runtime.commands.execution import Load, decoder_options
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.decoding.tracking import NoTracker
+from lightpage.words import counted
 
 
 @click.command()
@@ -69,17 +70,20 @@ def describe(result: Recovery) -> str:
     air, share, margin = figures["air_bytes_per_page"], figures["share_of_air"], figures["margin_bits_least"]
     lost = f"data pages {ranges(result.lost)}" if result.lost else "none" if volume is not None else "all"
     restored = "none needed" if volume is not None and not result.lost else "none could be"
+    ranges_lost = ", ".join(f"{start} to {end - 1}" for start, end in figures["lost_bytes"])
+    rates = f"{figures['Q']:.3f} user bits a symbol, {figures['q']:.3f} of the raw bits"
+    too_many = ", more than these pages carry" if share is not None and share > 1 else ""
     rows = [
         ("code", result.code.describe()),
         ("recorded pages", f"{len(result.pages)}, of which {len(result.unread)} gave no bytes"),
         ("healed", _healed(result)),
         ("restored", f"data pages {ranges(result.restored)}" if result.restored else restored),
         ("lost", lost),
-        ("bytes lost", ", ".join(f"{start} to {end - 1}" for start, end in figures["lost_bytes"]) or "none"),
-        ("volume", "unknown" if volume is None else f"{volume.id}: {volume.file_bytes} bytes on {volume.pages} pages"),
+        ("bytes lost", ranges_lost or ("none" if volume is not None else "all")),
+        ("volume", _volume(result)),
         ("user bytes a page", f"{result.user_bytes_per_page}"),
-        ("of the AIR", "symbols unknown" if share is None else f"{share:.3f} of {air:.0f} bytes"),
-        ("Q, q", f"{figures['Q']:.3f} user bits a symbol, {figures['q']:.3f} of the raw bits"),
+        ("of the AIR", "symbols unknown" if share is None else f"{share:.3f} of {air:.0f} bytes{too_many}"),
+        ("Q, q", "none: no page was read" if volume is None else rates),
         ("margin", "none" if margin is None else f"at least {margin:.3f} bit a symbol"),
         ("corrected", f"{figures['corrected']} symbols by Reed-Solomon"),
         ("time", f"{1e3 * figures['seconds_per_page']:.1f} ms a page (median)"),
@@ -87,9 +91,17 @@ def describe(result: Recovery) -> str:
     return "\n".join(f"{name:<20} {value}" for name, value in rows)
 
 
+def _volume(result: Recovery) -> str:
+    """The volume that was read; of none, what the lost pages' headers claim."""
+    if (volume := result.volume) is not None:
+        return f"{volume.id}: {volume.file_bytes} bytes on {counted(volume.pages, 'page')}"
+    claimed = ranges(sorted({page.volume for page in result.unread if page.volume is not None}))
+    return f"{claimed}, as lost pages claim" if claimed else "unknown"
+
+
 def _healed(result: Recovery) -> str:
     """Which pages a re-fitted model has read."""
     if not result.healed:
         return "none"
-    rounds = ", ".join(str(each) for each in sorted({page.healed_rounds or 0 for page in result.healed}))
-    return f"recorded pages {ranges([page.page for page in result.healed])}, in {rounds} rounds"
+    most = max(page.healed_rounds or 0 for page in result.healed)
+    return f"recorded pages {ranges([page.page for page in result.healed])}, in up to {counted(most, 'round')}"
