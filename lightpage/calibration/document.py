@@ -88,7 +88,7 @@ class Calibration(TomlTable):
     cost: NonNegative
     significant: Share
     pages_used: Count
-    calibrated_pages: tuple[PageHash, ...]
+    calibrated_pages: Annotated[tuple[PageHash, ...], Field(strict=False)]  # TOML knows lists alone
     parameters: Annotated[dict[str, Finite], _just(NAMES)]
     deviations: Annotated[dict[str, NonNegative], _just(NAMES)]
     modulation: Annotated[dict[str, Finite], _just(modulations.NAMES)] = NOMINAL.as_dict()

@@ -35,6 +35,7 @@ _TYPES = {
     "dict_type": "a table",
 }
 _BOUNDS = {"greater_than": "gt", "greater_than_equal": "ge", "less_than": "lt", "less_than_equal": "le"}
+_UNITS = {"m": "m", "deg": "degree", "rad": "rad", "px": "px", "s": "s"}
 _SIDES = {"gt": "more than", "ge": "at least", "lt": "less than", "le": "at most"}
 
 
@@ -117,7 +118,8 @@ def problem_of(model: type[BaseModel], error: ErrorDetails) -> Problem:
         if wanted:
             return Problem(place, got, expected)
         return Problem(place, _short(error["input"]), expected, "value" if place else "wrong")
-    return Problem(place or "document", _short(error["input"]), expected_of(error), "value")
+    unit = unit_of(key) if kind in _BOUNDS else ""
+    return Problem(place or "document", _short(error["input"]), f"{expected_of(error)}{unit}", "value")
 
 
 def expected_of(error: ErrorDetails) -> str:
@@ -129,6 +131,11 @@ def expected_of(error: ErrorDetails) -> str:
     if kind == "literal_error":
         return str(context["expected"]).replace("'", "")
     return _TYPES.get(kind, error["msg"])
+
+
+def unit_of(key: str) -> str:
+    """Return the unit that the name of a key ends with, behind a blank; empty where it names none."""
+    return next((f" {unit}" for end, unit in _UNITS.items() if key.endswith(f"_{end}")), "")
 
 
 def _number(value: float) -> str:

@@ -18,8 +18,12 @@ from lightpage.errors import ProfileError
 from lightpage.files import read_text
 from lightpage.words import brief, sides
 
-Length = Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)]
+Wavelength = Annotated[float, Field(ge=1e-7, le=1e-4, allow_inf_nan=False)]
+"""Metres; these bounds and the next ones refuse a number in another unit."""
+Length = Annotated[float, Field(ge=1e-5, le=10, allow_inf_nan=False)]
 """Of a part of the device, metres."""
+Pitch = Annotated[float, Field(ge=1e-8, le=1e-3, allow_inf_nan=False)]
+"""Of pixels, metres."""
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Radians = Annotated[float, Field(ge=-50, le=50, allow_inf_nan=False)]
 """Of a term of a lens's path: more would take more memory to compute with than there is."""
@@ -33,18 +37,15 @@ SHIPPED = ("bench", "paper")
 
 
 class TomlTable(BaseModel):
-    """A checked TOML table: frozen, no unknown keys, no NaN or infinity."""
+    """A checked TOML table: frozen, no unknown keys, no NaN or infinity, and no text or truth value for a number."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
 
 class StrictTable(TomlTable):
-    """A table whose values are of the right type to begin with: no text stands for a number.
+    """A table in which the text below a key is its description."""
 
-    The text below a key is its description.
-    """
-
-    model_config = ConfigDict(strict=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(use_attribute_docstrings=True)
 
 
 T = TypeVar("T", bound=TomlTable)
@@ -53,7 +54,7 @@ T = TypeVar("T", bound=TomlTable)
 class Light(TomlTable):
     """The laser."""
 
-    wavelength_m: Length = Field(description="Wavelength in vacuum")
+    wavelength_m: Wavelength = Field(description="Wavelength in vacuum")
 
 
 class Lens(TomlTable):
@@ -115,7 +116,7 @@ class Pipe(TomlTable):
 class Slm(TomlTable):
     """The spatial light modulator."""
 
-    pitch_m: Length = Field(description="Distance from one pixel to the next")
+    pitch_m: Pitch = Field(description="Distance from one pixel to the next")
 
 
 class PageLayout(TomlTable):
@@ -133,7 +134,7 @@ class Camera(TomlTable):
 
     columns_px: Side = Field(description="Width of a frame")
     rows_px: Side = Field(description="Height of a frame")
-    pitch_m: Length = Field(description="Distance from one sensor pixel to the next")
+    pitch_m: Pitch = Field(description="Distance from one sensor pixel to the next")
 
 
 class Profile(TomlTable):

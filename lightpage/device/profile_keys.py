@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from lightpage.device.problems import tables_in
+from lightpage.device.problems import tables_in, unit_of
 from lightpage.device.profile import Profile, toml_value
 
 _BOUNDS = {"gt": "above", "ge": "from", "lt": "below", "le": "up to"}
@@ -78,7 +78,7 @@ def _key(table: str, name: str, field: FieldInfo) -> Key:
     return Key(
         table,
         name,
-        wanted(field.annotation, list(field.metadata)),
+        told if "," not in (told := wanted(field.annotation, list(field.metadata))) else told + unit_of(name),
         default_of(field),
         field.is_required(),
         field.description or "",

@@ -11,7 +11,6 @@ from typing import Annotated, Any, Self
 from pydantic import (
     AfterValidator,
     BeforeValidator,
-    ConfigDict,
     Field,
     ValidationError,
     WithJsonSchema,
@@ -39,9 +38,7 @@ Seconds = Annotated[float, Field(gt=0, le=31e6, allow_inf_nan=False)]
 
 
 class SettingsTable(TomlTable):
-    """A table of the service's settings, or all of them. Values are of the right type: no text stands for a number."""
-
-    model_config = ConfigDict(strict=True)
+    """A table of the service's settings, or all of them."""
 
     def rules(self) -> Iterator[Rule]:
         """Yield the rules among keys."""
