@@ -19,7 +19,7 @@ import click
 from click.shell_completion import CompletionItem, shell_complete
 
 from lightpage.cli.groups import help_at
-from lightpage.cli.options import alike
+from lightpage.cli.options import alike, completed
 from lightpage.cli.paths import check_outputs, writes_to_stdout
 from lightpage.cli.progress_bar import Bars
 from lightpage.cli.stand_ins import stand_ins
@@ -137,7 +137,7 @@ class LazyGroup(click.Group):
         if ctx.resilient_parsing:  # a shell asks what may follow, and somebody waits
             with stand_ins(LINUX_MODULES), stand_ins(EXTRA_MODULES | SLOW, even_installed=True):
                 found: click.Command = self.points[cmd_name].load()
-            return found
+            return completed(found)
         try:
             command = self.points[cmd_name].load()
         except ModuleNotFoundError as error:

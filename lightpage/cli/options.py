@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from copy import copy
 from typing import Any
 
 import click
+from click.shell_completion import CompletionItem
 
 from lightpage.cli.paths import NewPath, OutputFile, OutputFolder
-from lightpage.device.profile import Profile, load_profile
+from lightpage.device.profile import SHIPPED, Profile, load_profile
 from lightpage.errors import InvalidInputError
 
 JSON = click.option(
@@ -33,6 +35,47 @@ _NAMED = {
     "--version": "VERSION",
 }
 """Stand-ins for the value of an option of this name, whichever command has it."""
+
+
+_COMPLETED: dict[str, Sequence[str]] = {
+    "--bundle": SHIPPED[:1],
+    "--like": SHIPPED,
+    "--profile": SHIPPED,
+    "--provider": ("cpu", "cuda", "tensorrt"),
+    "--source": ("camera:", "recording:", "simulator:"),
+    **dict.fromkeys(("--symbols", "--pilots", "--frames", "--in-phase", "--quadrature"), ()),
+    **dict.fromkeys(("--references", "--reference-in-phase", "--reference-quadrature"), ()),
+}
+"""Names that an option of this name takes, beside files but for the provider."""
+
+
+class _FileOrName(click.types.StringParamType):
+    """A text that is one of some names, or a file.
+
+    Args:
+        names: the names.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.names = names
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        """Return the names that begin so, and whatever files the shell finds where there is none."""
+        scheme, colon, path = incomplete.partition(":")
+        if f"{scheme}:" in self.names and colon:
+            return [CompletionItem(path, type="file")]
+        names = [CompletionItem(name) for name in self.names if name.startswith(incomplete)]
+        return names if param.opts[0] == "--provider" else [CompletionItem(incomplete, type="file"), *names]
+
+
+def completed(command: click.Command) -> click.Command:
+    """Have a command that a shell asks for offer names and files for options that are texts; it comes back."""
+    for each in command.commands.values() if isinstance(command, click.Group) else ():
+        completed(each)
+    for param in command.params:
+        if type(param.type) is click.types.StringParamType and (names := _COMPLETED.get(param.opts[0])) is not None:
+            param.type = _FileOrName(names)
+    return command
 
 
 class FiniteRange(click.FloatRange):

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.shell_completion import CompletionItem
 
 from lightpage.errors import InvalidInputError
 from lightpage.failures import os_failure
@@ -20,7 +21,15 @@ else:
     _PathType = click.ParamType  # earlier versions of click have no type behind it
 
 
-class NewPath(_PathType):
+class _Completed(_PathType):
+    """An option whose value a shell completes as it does files."""
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        """See `click.ParamType.shell_complete`."""
+        return [CompletionItem(incomplete, type="file")]
+
+
+class NewPath(_Completed):
     """An option that names a new file or folder: known before the work begins to be one that can be made."""
 
     name = "path"
@@ -40,7 +49,7 @@ class NewPath(_PathType):
         return path
 
 
-class OutputFile(_PathType):
+class OutputFile(_Completed):
     """An option that names a file to write: known before the work begins to be one that `replace_text` can write.
 
     `--json` may name `STDOUT`.
@@ -64,7 +73,7 @@ class OutputFile(_PathType):
         return path
 
 
-class OutputFolder(_PathType):
+class OutputFolder(_Completed):
     """An option that names the folder that a command works in, there or yet to be made."""
 
     name = "folder"

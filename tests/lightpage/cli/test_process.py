@@ -130,6 +130,8 @@ assert {"simulate", "train"} <= set(commands)
 print(len([name for name in sys.modules if name.startswith("lightpage.runtime")]))
 for name in ("train", "export", "evaluate", "serve"):
     assert complete.get_completions([name], "-"), name
+for words in (["decode", "--out"], ["evaluate", "--bundle"], ["import", "--in-phase"], ["simulate", "--profile"]):
+    assert any(item.type == "file" for item in complete.get_completions(words, "")), words
 print("--holes" in [item.value for item in complete.get_completions(["bulk", "recover"], "--ho")])
 print([name for name in ("torch", "onnxruntime", "h5py") if hasattr(sys.modules.get(name), "__file__")])
 """
