@@ -61,7 +61,8 @@ def look_apart(
     try:
         process.send("look", path, profile, drawn)
         if not process.poll(longest_s):
-            got, expected = f"no end within {longest_s:g} s", "a file that is whole, on quick storage"
+            got = f"no end within {longest_s:g} s"
+            expected = "one that takes less: not damaged, not huge, not on slow storage"
             raise StorageError(subject, got, expected)
         found, pictures = process.answer()
         return found, pictures

@@ -37,10 +37,14 @@ def inspect(file: Path, profile_name: str | None, picture: Path | None, json_pat
         click.get_current_context().exit(EXIT_ERROR)
 
 
+def _told(value: object) -> str:
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
+
+
 def table(found: Finding) -> str:
     """Return what was found as lines for people."""
     rows = [f"{printable(str(found.path))}: {found.kind}"]
-    rows += [f"  {printable(name):<32} {printable(str(value))}" for name, value in found.facts.items()]
+    rows += [f"  {printable(name):<32} {printable(_told(value))}" for name, value in found.facts.items()]
     for name, each in found.histograms.items():
         rows += [f"counts of {name}, full scale {each.full_scale}, {each.saturated:.2%} there:", *bars(each)]
     rows += [f"problem: {printable(problem)}" for problem in found.problems]

@@ -14,7 +14,7 @@ from lightpage.device.state import Device, load_device
 from lightpage.errors import InvalidInputError
 from lightpage.files import read_text
 from lightpage.foreign.array import readable
-from lightpage.inspection.finding import Finding
+from lightpage.inspection.finding import Fact, Finding
 from lightpage.run_files import EVALUATE, RECOVER, REPORT_MARKS
 from lightpage.waves.consequences import consequences
 
@@ -71,7 +71,7 @@ def look_at_json(path: Path) -> Finding:
         told = json.loads(read_text(path, subject, "a JSON document"))
     found = Finding(path, "JSON")
     if isinstance(told, dict):
-        found.facts["keys"] = ", ".join(list(told)[:10])
+        found.facts["keys"] = Fact(list(told)[:10], ", ".join(list(told)[:10]))
         if any(REPORT_MARKS[command] <= told.keys() for command in (EVALUATE, RECOVER)):
             found.kind = "figures of an evaluation or a recovery"
             found.next.append(f"lightpage report {found.quoted} --out F.html")
@@ -100,11 +100,16 @@ def _calibration(path: Path, told: dict[str, Any], profile: Profile | None) -> F
         fitted = load_calibration(path)
         found.facts |= {
             "of profile": fitted.profile_name,
-            "coherence": f"{fitted.coherence_before:.3f} -> {fitted.coherence_after:.3f}",
+            "coherence": Fact(
+                {"before": fitted.coherence_before, "after": fitted.coherence_after},
+                f"{fitted.coherence_before:.3f} -> {fitted.coherence_after:.3f}",
+            ),
             "pages used": fitted.pages_used,
         }
         if fitted.goodness is not None:
-            found.facts["fit"] = f"{fitted.goodness.verdict}, about {fitted.goodness.bits_lost:.2f} bit a symbol lost"
+            verdict, lost = fitted.goodness.verdict, fitted.goodness.bits_lost
+            value = {"verdict": verdict, "bits_lost": lost}
+            found.facts["fit"] = Fact(value, f"{verdict}, about {lost:.2f} bit a symbol lost")
         if profile is not None:
             found.profile = profile
             found.facts["pipe angle, degree"] = round(fitted.angle_deg(profile), 4)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -35,6 +36,22 @@ class Histogram:
     shares: tuple[float, ...]
     full_scale: int
     saturated: float
+
+
+@dataclass(frozen=True)
+class Fact:
+    """A fact that people are told in other words than programs.
+
+    Attributes:
+        value: that JSON can hold.
+        text: for people.
+    """
+
+    value: object
+    text: str
+
+    def __str__(self) -> str:
+        return self.text
 
 
 @dataclass
@@ -82,7 +99,7 @@ class Finding:
         return {
             "path": printable(str(self.path)),
             "kind": self.kind,
-            "facts": self.facts,
+            "facts": {_key(name): each.value if isinstance(each, Fact) else each for name, each in self.facts.items()},
             "problems": self.problems,
             "next": self.next,
             "profile": None if self.profile is None else self.profile.name,
@@ -90,11 +107,21 @@ class Finding:
         }
 
 
+def _key(name: str) -> str:
+    """Return the name of a fact as programs read it, e.g. ``pages_looked_at``."""
+    return re.sub(r"\W+", "_", name).strip("_")
+
+
 def printable(text: str) -> str:
     """Return text for one line of a terminal: what is no character to be seen is escaped."""
     return "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in text)
 
 
+def shape_fact(shape: tuple[int, ...]) -> Fact:
+    """Return a shape as a fact."""
+    return Fact(list(shape), shape_text(shape))
+
+
 def shape_text(shape: tuple[int, ...]) -> str:
     """Return a shape for people."""
-    return " x ".join(map(str, shape))
+    return " x ".join(map(str, shape)) or "a single value"

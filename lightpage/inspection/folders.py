@@ -15,7 +15,7 @@ from lightpage.files import read_text
 from lightpage.foreign.array import readable
 from lightpage.foreign.pictures import SUFFIXES
 from lightpage.inspection.documents import MOST_BYTES
-from lightpage.inspection.finding import Finding, printable
+from lightpage.inspection.finding import Fact, Finding, printable
 from lightpage.inspection.foreign_files import look_at_array
 from lightpage.run_files import BEGUN, DESCRIPTION
 from lightpage.runtime.archives.run.job import FILE as JOB
@@ -47,7 +47,11 @@ def look_at_folder(path: Path, profile: Profile | None) -> Finding:
     if any(Path(name).suffix.lower() in SUFFIXES for name in names):
         return look_at_array(path, "folder of pictures", profile)
     told = ", ".join(map(printable, names[:_TOLD])) or "nothing"
-    expected = f"a bundle, a run, or pictures: lightpage inspect FILE for one of the {len(names)} in it"
+    expected = (
+        "a bundle, a run, or pictures: lightpage inspect FILE for one in it"
+        if names
+        else "a bundle, a run, or pictures"
+    )
     raise InvalidInputError(f"folder {path}", told, expected)
 
 
@@ -56,20 +60,24 @@ def look_at_bundle(path: Path) -> Finding:
     found = Finding(path, "bundle")
     with found.trying("a bundle that is whole"):
         size = path.stat().st_size if path.is_file() else sum(each.stat().st_size for each in path.iterdir())
-        found.facts["size"] = f"{size / 1e6:.1f} MB"
+        found.facts["size"] = Fact({"bytes": size}, f"{size / 1e6:.1f} MB")
         if size > _READ_WHOLE:
             found.facts["checked"] = "not whole: evaluate reads all of it"
             return found
         bundle = Bundle.open(path)
         manifest = bundle.manifest
         found.profile = bundle.profile
+        rows, columns = bundle.profile.frame_shape
         found.facts |= {
             "version": manifest.version,
             "made": manifest.created,
             "profile": bundle.profile.name,
-            "frames": f"{bundle.profile.camera.rows_px} x {bundle.profile.camera.columns_px}, {manifest.frame_dtype}",
+            "frames": Fact(
+                {"rows": rows, "columns": columns, "type": manifest.frame_dtype},
+                f"{rows} x {columns}, {manifest.frame_dtype}",
+            ),
             "code": "none" if bundle.code is None else bundle.code.describe(),
-            "files": ", ".join(sorted(manifest.files)),
+            "files": Fact(sorted(manifest.files), ", ".join(sorted(manifest.files))),
             **{name.replace("_", " "): value for name, value in list(manifest.metrics.items())[:_TOLD]},
         }
         golden = bundle.golden
@@ -96,8 +104,11 @@ def _run(path: Path, finished: bool) -> Finding:
             found.facts |= {
                 "localizer": told["localizer"],
                 "profile": "none" if found.profile is None else found.profile.name,
-                "pages": f"{trained} trained on, {validated} validated, {left} left for evaluate",
-                "validation AIR": f"{told['validation_air']:.3f} bit a symbol",
+                "pages": Fact(
+                    {"trained": trained, "validated": validated, "left": left},
+                    f"{trained} trained on, {validated} validated, {left} left for evaluate",
+                ),
+                "validation AIR": Fact(told["validation_air"], f"{told['validation_air']:.3f} bit a symbol"),
             }
     if finished:
         found.next += [

@@ -18,7 +18,7 @@ from lightpage.foreign.mat_file import mat_arrays
 from lightpage.foreign.numpy_file import arrays_of
 from lightpage.foreign.opening import open_array
 from lightpage.inspection.exposure import histogram, sampled
-from lightpage.inspection.finding import Finding, Picture, shape_text
+from lightpage.inspection.finding import Fact, Finding, Picture, shape_fact, shape_text
 from lightpage.recording.hdf5 import hdf, open_hdf5
 
 _SAMPLED = 4
@@ -72,7 +72,7 @@ def look_at_array(path: Path, kind: str, profile: Profile | None = None) -> Find
 
 def _several(found: Finding, arrays: dict[str, tuple[int, ...]], profile: Profile | None) -> None:
     for name, shape in list(arrays.items())[:_TOLD]:
-        found.facts[f"array {name}"] = shape_text(shape)
+        found.facts[f"array {name}"] = shape_fact(shape)
     if len(arrays) > _TOLD:
         found.facts["further arrays"] = len(arrays) - _TOLD
     if not arrays:
@@ -85,7 +85,7 @@ def _several(found: Finding, arrays: dict[str, tuple[int, ...]], profile: Profil
 
 def _one(found: Finding, array: ForeignArray, named: str, profile: Profile | None) -> None:
     """Tell of an array, how frames in it are exposed, and whether it fits a profile."""
-    found.facts |= {"shape": shape_text(array.shape), "type": str(array.dtype)}
+    found.facts |= {"shape": shape_fact(array.shape), "type": str(array.dtype)}
     if profile is not None:
         found.profile = profile
         _fits(found, array, profile)
@@ -142,7 +142,9 @@ def _values(found: Finding, pixels: list[NDArray[Any]]) -> None:
 def _counts(found: Finding, frames: list[NDArray[np.int64]]) -> None:
     peak = max(int(frame.max()) for frame in frames)
     bits = max(8, peak.bit_length())
-    found.facts["counts"] = f"{min(int(frame.min()) for frame in frames)} to {peak}, so at least {bits} bits"
+    least = min(int(frame.min()) for frame in frames)
+    value = {"least": least, "greatest": peak, "bits": bits}
+    found.facts["counts"] = Fact(value, f"{least} to {peak}, so at least {bits} bits")
     if peak == 0:
         found.problems.append("all that was looked at is black")
     found.histograms["frames"] = histogram(list(frames), bits)
@@ -151,7 +153,7 @@ def _counts(found: Finding, frames: list[NDArray[np.int64]]) -> None:
 def _fits(found: Finding, array: ForeignArray, profile: Profile) -> None:
     """Tell whether frames or symbols fit a profile."""
     if (kind := _kind(array.shape, profile)) != "neither":
-        found.facts["fits"] = f"{kind} of profile {profile.name}"
+        found.facts["fits"] = Fact({"kind": kind, "profile": profile.name}, f"{kind} of profile {profile.name}")
     else:
         wanted = f"{shape_text(profile.frame_shape)} pixels or {shape_text(profile.page_shape)} symbols"
         turned = profile.frame_shape[::-1] in (array.shape[-2:], array.shape[:2])

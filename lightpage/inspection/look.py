@@ -16,6 +16,7 @@ from lightpage.inspection.folders import look_at_bundle, look_at_folder
 from lightpage.inspection.foreign_files import look_at_archive, look_at_array, look_at_mat
 from lightpage.inspection.recordings import look_at as look_at_recording
 from lightpage.runtime.model.bundle.manifest import MANIFEST
+from lightpage.words import counted
 
 _HEAD = 4096
 _HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -23,6 +24,8 @@ _PLACES = (0, 512, 1024, 2048)
 """Offsets at which an HDF5 file may begin, behind a block of a user's."""
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _KNOWN = "a recording, pages, a bundle, a run, a calibration, a profile, or frames of another program"
+_LOOKING = ("lightpage profile check ", "lightpage report ")
+"""Beginnings of commands that are of use for what is wrong too."""
 _SPECIAL = {
     stat.S_IFIFO: "a pipe",
     stat.S_IFSOCK: "a socket",
@@ -42,6 +45,13 @@ def look(path: Path, profile: Profile | None = None) -> Finding:
         InvalidInputError: it is not there, cannot be read, or is nothing that is known here.
         StorageError, SurroundingsError: storage fails, or a resource is short.
     """
+    found = _look(path, profile)
+    if found.problems:  # what is refused here is refused there
+        found.next = [command for command in found.next if command.startswith(_LOOKING)]
+    return found
+
+
+def _look(path: Path, profile: Profile | None) -> Finding:
     subject = f"file {path}"
     with readable(subject, "a file that can be read"):
         status = os.stat(path)
@@ -89,7 +99,9 @@ def _zip(path: Path, profile: Profile | None) -> Finding:
     if names and all(name.endswith(".npy") for name in names):
         return look_at_archive(path, profile)
     told = ", ".join(names[:8]) or "nothing"
-    raise InvalidInputError(f"file {path}", f"a zip of {len(names)} files: {told}", f"a bundle, with its {MANIFEST}")
+    raise InvalidInputError(
+        f"file {path}", f"a zip of {counted(len(names), 'file')}: {told}", f"a bundle, with its {MANIFEST}"
+    )
 
 
 def _text(path: Path, head: bytes, size: int, profile: Profile | None) -> Finding:

@@ -34,8 +34,10 @@ def draw(found: Finding, pictures: list[Picture], out: Path) -> None:
     """Draw what was found to a PNG file.
 
     Raises:
-        InvalidInputError: there is nothing to draw, or the file cannot be written.
+        InvalidInputError: there is nothing to draw, the name is no PNG's, or the file cannot be written.
     """
+    if out.suffix.lower() not in ("", ".png"):
+        raise InvalidInputError(f"--picture {out}", f"a name that ends with '{out.suffix}'", "one that ends with .png")
     if not pictures:
         raise InvalidInputError(f"--picture {out}", found.kind, "a file with frames or symbols")
     panels = len(pictures) + bool(found.histograms)

@@ -12,7 +12,7 @@ from lightpage.device.profile import Profile
 from lightpage.errors import FrameError, InvalidInputError
 from lightpage.foreign.array import MOST_BYTES, spread
 from lightpage.inspection.exposure import contrast, histogram, sampled
-from lightpage.inspection.finding import Finding, Picture, shape_text
+from lightpage.inspection.finding import Fact, Finding, Picture, shape_fact, shape_text
 from lightpage.inspection.foreign_files import look_at_hdf5
 from lightpage.recording import decoded_file, layout, pages
 from lightpage.recording.exposure import check_different, check_pair_light
@@ -79,7 +79,7 @@ def _decoded(path: Path, file: h5py.File) -> Finding:
         symbols = arrays.array("symbols")
         if symbols is None or len(symbols.shape) != 3:
             raise InvalidInputError(f"file {path}: dataset 'symbols'", "no pages", "(pages, ny, nx)")
-        found.facts |= {"pages": symbols.shape[0], "symbols": shape_text(symbols.shape[1:])}
+        found.facts |= {"pages": symbols.shape[0], "symbols": shape_fact(symbols.shape[1:])}
         found.facts["levels"] = arrays.attribute("levels")
     return found
 
@@ -87,7 +87,7 @@ def _decoded(path: Path, file: h5py.File) -> Finding:
 def _pages(path: Path, profile: Profile | None) -> Finding:
     found = Finding(path, "pages to write")
     with found.trying(_NEEDED), Pages.open(path) as written:
-        found.facts |= {"pages": len(written), "symbols": shape_text(written.page_shape), "levels": written.levels}
+        found.facts |= {"pages": len(written), "symbols": shape_fact(written.page_shape), "levels": written.levels}
         _tell_code(found, written.code)
         found.profile = written.device(profile)
         first = written[0]
@@ -116,13 +116,13 @@ def _tell_code(found: Finding, text: str | None) -> bool:
 def _recording(path: Path, profile: Profile | None) -> Finding:
     found = Finding(path, "recording")
     with found.trying(_NEEDED), Recording.open(path) as recording:
-        header = recording.header
+        header, page = recording.header, recording.page_shape
         found.facts |= {
             "pages": recording.pages,
-            "frames": f"{shape_text(recording.frame_shape)} pixels, {recording.bit_depth} bits",
+            "frames": _frames(recording),
             "black level": header.black_level,
-            "symbols": f"known, {recording.levels} levels" if recording.has_symbols else "unknown",
-            "page": "the profile's" if recording.page_shape is None else f"{shape_text(recording.page_shape)} symbols",
+            "symbols": _symbols(recording),
+            "page": Fact(None, "the profile's") if page is None else Fact(list(page), f"{shape_text(page)} symbols"),
         }
         coded = _tell_code(found, header.code_text)
         with found.trying("a profile that fits"):
@@ -133,6 +133,18 @@ def _recording(path: Path, profile: Profile | None) -> Finding:
         found.pictures = lambda: _pictures(path)
         _next(found, recording, coded)
     return found
+
+
+def _frames(recording: Recording) -> Fact:
+    rows, columns = recording.frame_shape
+    value = {"rows": rows, "columns": columns, "bit_depth": recording.bit_depth}
+    return Fact(value, f"{rows} x {columns} pixels, {recording.bit_depth} bits")
+
+
+def _symbols(recording: Recording) -> Fact:
+    levels = recording.levels if recording.has_symbols else None
+    text = "unknown" if levels is None else f"known, {levels} levels"
+    return Fact({"known": levels is not None, "levels": levels}, text)
 
 
 def _exposure(found: Finding, recording: Recording) -> None:
@@ -153,13 +165,15 @@ def _exposure(found: Finding, recording: Recording) -> None:
             unlit.append(f"page {page}: {error.subject} {error.got}")
         with found.trying(_DIFFERENT):
             check_different(f"page {page}: quadrature", frames[-1].in_phase, frames[-1].quadrature, "in-phase")
-    found.facts["pages looked at"] = ", ".join(map(str, looked_at))
+    found.facts["pages looked at"] = Fact(looked_at, ", ".join(map(str, looked_at)))
     found.problems += unlit
     for name, reference in zip(layout.FRAMES, (pair.in_phase, pair.quadrature), strict=True):
         own = [getattr(each, name) for each in frames]
         found.histograms[name] = histogram(own, recording.bit_depth)
-        found.facts[f"{name}: saturated"] = f"{found.histograms[name].saturated:.2%} of the pixels"
-        found.facts[f"{name}: contrast of fringes"] = f"{np.mean([contrast(each, reference) for each in own]):.2f}"
+        saturated = found.histograms[name].saturated
+        found.facts[f"{name}: saturated"] = Fact(saturated, f"{saturated:.2%} of the pixels")
+        fringes = float(np.mean([contrast(each, reference) for each in own]))
+        found.facts[f"{name}: contrast of fringes"] = Fact(fringes, f"{fringes:.2f}")
 
 
 def _sampled(pair: FramePair) -> FramePair:

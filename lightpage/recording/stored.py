@@ -342,8 +342,15 @@ class StoredArray:
 
         patiently(look_at_all, self.subject)
         step = self.dataset.chunks[0]
-        if unwritten := [row for row in range(0, len(self) if across else 0, step) if seen.get(row, 0) < across]:
-            raise self._unwritten(range(unwritten[0], min(unwritten[-1] + step, len(self))))
+        rows = range(0, len(self) if across else 0, step)
+
+        def lacks(row: int) -> bool:
+            return seen.get(row, 0) < across
+
+        # from either end, since an array that nobody has written may say that it has any number of rows
+        if (first := next(filter(lacks, rows), None)) is not None:
+            last = next(filter(lacks, reversed(rows)))
+            raise self._unwritten(range(first, min(last + step, len(self))))
         for index, told in missing_filters:
             if seen and not skipped >> index & 1:
                 got = f"data compressed by the filter {told}, which HDF5 does not have here"

@@ -86,6 +86,11 @@ def pages(path: Path) -> None:
     (folder / "pages.h5").rename(path)
 
 
+def hollow(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file.create_dataset("x", (10**11, 1000, 1000), "u1", chunks=(1, 1000, 1000))
+
+
 SAVED = io.BytesIO()
 np.save(SAVED, FRAMES)
 PROFILE = small_profile().to_toml()
@@ -117,6 +122,7 @@ MADE: dict[str, tuple[str, int, Callable[[Path], object]]] = {
     "nan.npy": ("no numbers", 2, lambda path: np.save(path, np.full((2, 9, 9), np.nan))),
     "black.npy": ("black", 2, lambda path: np.save(path, np.zeros((2, 9, 9), np.uint16))),
     "empty": ("an empty file", 2, lambda path: path.touch()),
+    "hollow.h5": ("no data for page 0 to 99999999999", 2, hollow),
     "cut.h5": ("complete HDF5 file", 2, lambda path: path.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(200))),
     "pickle.npy": ("pickled", 2, lambda path: np.save(path, np.array([object, {}], object))),
     "negative.npy": ("shape (-5", 2, lambda path: npy_of(path, "(-5, 9, 9)")),
@@ -185,12 +191,17 @@ def test_a_recording_is_looked_at_and_drawn(small_device: list[str], tmp_path: P
     found = json.loads(told.read_text())
     assert (found["kind"], found["profile"]) == ("recording", "small")
     assert "lightpage calibrate --recording" in found["next"][0]
+    assert found["facts"]["frames"] == {"rows": 456, "columns": 684, "bit_depth": 8}
+    assert 0 < found["facts"]["in_phase_contrast_of_fringes"] < 1
     assert sum(found["histograms"]["in_phase"]["shares"]) == pytest.approx(1)
     with Image.open(tmp_path / "P.png") as drawn:
         assert np.asarray(drawn.convert("L")).std() > 10
     with h5py.File(recording, "r+") as file:
-        file["quadrature"][0] = 0
+        file["quadrature"][0], file["quadrature"][1] = 0, file["in_phase"][1]
     assert main.run(inspect, [str(recording), "--profile", "bench", "--json", str(told)]) == 2
-    fit, black = json.loads(told.read_text())["problems"]
+    found = json.loads(told.read_text())
+    fit, same, black = found["problems"]
+    assert found["next"] == []
+    assert "page 1" in same
     assert "bench" in fit
     assert "page 0" in black
