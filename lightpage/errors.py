@@ -189,6 +189,9 @@ class NotAllowedError(LightpageError):
 class CallerLeft(Exception):
     """The caller has gone away; the work is dropped."""
 
+    def __str__(self) -> str:
+        return "the caller has gone"
+
 
 class SlotsTakenError(BusyError):
     """The service does as much as it may at once, and did so until the caller's time was up.

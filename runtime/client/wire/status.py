@@ -142,7 +142,7 @@ def told(error: BaseException) -> str:
         detail = detail_of(error)
         return f"{detail.thing}: got {detail.got}, wanted {detail.wanted}"[:2000]
     if isinstance(error, CallerLeft):
-        return "the caller has gone"
+        return str(error)
     return f"{type(error).__name__} in the service; its log says more"
 
 
