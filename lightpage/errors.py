@@ -23,6 +23,11 @@ class Cause(StrEnum):
     """Things that the program needs to run: memory, threads, a worker, a provider."""
 
 
+def lowered(text: str) -> str:
+    """Return a text for the middle of a sentence, where its first word is no abbreviation."""
+    return text[:1].lower() + text[1:] if text[1:2].islower() or text[1:2] == " " else text
+
+
 class LightpageError(Exception):
     """Base of every error that Lightpage raises on purpose.
 
@@ -39,7 +44,7 @@ class LightpageError(Exception):
 
     def __init__(self, subject: str, got: object, expected: object) -> None:
         self.subject = subject
-        self.got = (isinstance(got, OSError) and got.strerror) or str(got)
+        self.got = lowered(got.strerror) if isinstance(got, OSError) and got.strerror else str(got)
         self.expected = str(expected)
         super().__init__(f"{subject}: got {self.got}, wanted {self.expected}")
 

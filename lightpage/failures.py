@@ -129,12 +129,12 @@ def os_failure(
     """
     number = error_number(error)
     if number is not None and number in _STORAGE:
-        return StorageError(subject, os.strerror(number), expected)
+        return StorageError(subject, OSError(number, os.strerror(number)), expected)
     if number is not None and number in _SHORT:
-        return _short_of(subject, os.strerror(number), number)
+        return _short_of(subject, OSError(number, os.strerror(number)), number)
     if number == errno.ENOLCK:
         remedy = "a file system with locks, or HDF5_USE_FILE_LOCKING=FALSE in the environment"
-        return SurroundingsError(subject, os.strerror(number), remedy)
+        return SurroundingsError(subject, OSError(number, os.strerror(number)), remedy)
     if (short := short_resource(subject, error)) is not None:
         return short
     if number is None:

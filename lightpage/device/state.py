@@ -204,7 +204,9 @@ class Device(TomlTable):
             path, separator, value = setting.partition("=")
             table, dot, key = path.strip().partition(".")
             if not separator or not dot or key not in known.get(table, {}):
-                raise ProfileError(f"--set {setting}", path, f"TABLE.KEY=VALUE, {_alike(path.strip(), known)}")
+                there = dot and key in known.get(table, {})
+                wanted = f"{path.strip()}=VALUE" if there else f"TABLE.KEY=VALUE, {_alike(path.strip(), known)}"
+                raise ProfileError(f"--set {setting}", path, wanted)
             try:
                 values[path.strip()] = tomllib.loads(f"value = {value}")["value"]
             except tomllib.TOMLDecodeError:

@@ -77,9 +77,7 @@ def readable(subject: str, expected: str) -> Iterator[None]:
         told = " ".join(str(error).split())[:200]
         if "imagecodecs" in told:
             expected = "one without compression, or the codecs: pip install imagecodecs"
-        raise InvalidInputError(
-            subject, f"data that cannot be read ({type(error).__name__}: {told})", expected
-        ) from None
+        raise InvalidInputError(subject, f"data that cannot be read ({told or 'damaged'})", expected) from None
 
 
 def chosen(subject: str, name: str | None, found: dict[str, tuple[int, ...]]) -> str:

@@ -162,7 +162,7 @@ def test_an_error_names_the_thing_what_came_and_what_was_wanted() -> None:
     assert str(InvalidInputError("--pages", 0, "at least 1")) == "--pages: got 0, wanted at least 1"
     assert InvalidInputError("file F", OSError("truncated file"), "a whole one").got == "truncated file"
     error = InvalidInputError("file F", FileNotFoundError(errno.ENOENT, "No such file", "F"), "a file")
-    assert error.got == "No such file"
+    assert error.got == "no such file"
 
 
 def test_no_folder_for_temporary_files_is_named_with_the_variable(monkeypatch: pytest.MonkeyPatch) -> None:

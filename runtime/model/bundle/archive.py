@@ -58,7 +58,7 @@ def read_files(path: Path, content: bytes | None = None) -> dict[str, bytes]:
             return _read_folder(path)
         if path.is_file():
             return _read_zip(path, path)
-    raise BundleError(f"bundle {path}", "nothing", expected)
+    raise BundleError(f"bundle {path}", "no such file", expected)
 
 
 def check_name(name: str, subject: str) -> None:

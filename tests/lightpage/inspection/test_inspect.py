@@ -136,7 +136,7 @@ MADE: dict[str, tuple[str, int, Callable[[Path], object]]] = {
     "folders": ("inner", 2, folder_loop),
     "new\nline": ("new\\nline", 2, lambda path: path.write_bytes(b"\0\1\2")),
     "zero": ("a device", 2, lambda path: path.symlink_to("/dev/zero")),
-    "none": ("No such file", 2, lambda path: None),
+    "none": ("no such file", 2, lambda path: None),
 }  # fmt: skip
 
 
