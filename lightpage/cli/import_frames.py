@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lightpage.cli.main import RESUME_KEY
 from lightpage.cli.options import JSON, named_profile
-from lightpage.cli.paths import NewPath
+from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import Profile
 from lightpage.errors import FrameError, InvalidInputError, PageError
 from lightpage.failures import os_errors
@@ -81,8 +81,8 @@ def _upright(camera: str) -> Decorator:
 @click.option("--black-level", type=click.IntRange(min=0), default=0, help="Counts of a camera in the dark.")
 @_upright("in-phase")
 @_upright("quadrature")
-@click.option("--keep-unlit", is_flag=True, help="Take black and saturated frames too, and tell of them.")
-@click.option("--out", required=True, type=NewPath(), help="The recording, R.h5.")
+@click.option("--keep-unlit", is_flag=True, help="Take black and saturated frames too, and list them.")
+@click.option("--out", required=True, type=OutputFile(), help="The recording, R.h5.")
 @click.option("--force", is_flag=True, help="Overwrite a recording that exists, or pages begun with other settings.")
 @JSON
 def import_frames(out: Path, force: bool, keep_unlit: bool, json_path: Path | None, **given: Any) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from lightpage.cli.options import JSON, named_profile
+from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import Profile
 from lightpage.device.state import Device, load_device
 from lightpage.errors import InvalidInputError
@@ -28,7 +29,7 @@ from lightpage.simulator.recording_job import RecordingJob
 )
 @click.option("--pages", type=click.IntRange(min=1), help="How many pages of random symbols.")
 @click.option("--symbols", type=click.Path(path_type=Path), help="Pages to write, PAGES.h5, as `encode` makes them.")
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="The recording, R.h5.")
+@click.option("--out", required=True, type=OutputFile(), help="The recording, R.h5.")
 @click.option(
     "--levels",
     type=click.IntRange(MIN_LEVELS, MAX_LEVELS),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from importlib.metadata import entry_points
 from typing import Any, Protocol, cast
@@ -59,6 +60,10 @@ class NumpyEngine(NumpyArrays):
 NUMPY = NumpyEngine()
 
 
+_TORCH = "pip install 'lightpage[train]'"
+_COMPUTE = re.compile(r"cuda(:\d+)?")
+
+
 def engine_on(compute: str) -> Engine:
     """The engine of a device: numpy's on `cpu`, that of an installed entry point on `cuda` or `cuda:N`.
 
@@ -67,11 +72,13 @@ def engine_on(compute: str) -> Engine:
     """
     if compute == CPU:
         return NUMPY
+    if not _COMPUTE.fullmatch(compute):
+        raise InvalidInputError("--compute", compute, f"{CPU}, cuda or cuda:N")
     found = next(iter(entry_points(group=_GROUP)), None)
     if found is None:
-        raise InvalidInputError("--compute", compute, f"{CPU}, or an installation with torch: pip install '.[train]'")
+        raise InvalidInputError("--compute", compute, f"{CPU}, or torch: {_TORCH}")
     try:
         make = found.load()
     except ImportError as error:
-        raise InvalidInputError("--compute", f"{compute} without {error.name}", "pip install '.[train]'") from error
+        raise InvalidInputError("--compute", f"{compute} without {error.name}", _TORCH) from error
     return cast(Engine, make(compute))

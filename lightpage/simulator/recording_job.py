@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import shutil
 from hashlib import file_digest
 from pathlib import Path
 
@@ -9,15 +11,18 @@ import numpy as np
 
 from lightpage.device.profile import Profile, to_toml
 from lightpage.device.state import Device
-from lightpage.errors import InvalidInputError, RecordingError
+from lightpage.errors import InvalidInputError, NoRoomError, RecordingError
+from lightpage.failures import os_errors
 from lightpage.page.symbols import random_symbols
 from lightpage.progress import track
 from lightpage.recording.hdf5 import patiently
+from lightpage.recording.layout import frame_type
 from lightpage.recording.pages import Pages
-from lightpage.recording.unfinished import claim, drop_claim
+from lightpage.recording.unfinished import claim, drop_claim, partial_path
 from lightpage.recording.writer import RecordingWriter
 from lightpage.simulator.engine import CPU, NUMPY, engine_on
 from lightpage.simulator.simulator import LIGHT, Simulator
+from lightpage.words import counted
 
 SYMBOLS = 3
 """Random stream of the pages' symbols, beside those of the simulator."""
@@ -85,7 +90,9 @@ class RecordingJob:
         Raises:
             InvalidInputError: more pages are there already.
             RecordingError: the file cannot be written.
+            NoRoomError: the disk has no room for the pages.
         """
+        self._check_room(pages)
         simulator = self._simulator
         bits = self.device.sensor.bit_depth
         code = None if self._written is None else self._written.code
@@ -101,6 +108,21 @@ class RecordingJob:
             for page in track(range(writer.pages, pages), "simulate", total=pages, done=writer.pages):
                 self._append(writer, simulator, page)
         drop_claim(self.out)
+
+    def _check_room(self, pages: int) -> None:
+        """Check that the frames of so many pages have room on the disk, but for those that are there already.
+
+        Raises:
+            NoRoomError: they have none.
+        """
+        frame = math.prod(self.profile.frame_shape) * frame_type(self.device.sensor.bit_depth).itemsize
+        partial = partial_path(self.out)
+        with os_errors(f"--out {self.out}", "a folder"):
+            there = partial.stat().st_size if partial.exists() else 0
+            free = shutil.disk_usage(self.out.absolute().parent).free
+        if (needed := 2 * frame * pages - there) > free:
+            told = counted(pages, "page")
+            raise NoRoomError(f"--out {self.out}", f"{free / 1e9:.3g} GB free", f"{needed / 1e9:.3g} GB for {told}")
 
     def _append(self, writer: RecordingWriter, simulator: Simulator, page: int) -> None:
         if self._written is None:
