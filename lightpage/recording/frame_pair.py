@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.errors import FrameError
 from lightpage.words import brief, sides
 
 
@@ -20,6 +21,16 @@ class FramePair:
 
     def __repr__(self) -> str:
         return brief(self, *(f"{name} {_counts(frame)}" for name, frame in vars(self).items()))
+
+
+def check_pair(pair: object, subject: str = "") -> None:
+    """Check that what a caller gives is a pair; `subject` goes before it in the error.
+
+    Raises:
+        FrameError: it has no frames of two cameras.
+    """
+    if not (hasattr(pair, "in_phase") and hasattr(pair, "quadrature")):
+        raise FrameError(f"{subject}frames", type(pair).__name__, "a FramePair of both cameras")
 
 
 def _counts(frame: NDArray[np.integer[Any]]) -> str:

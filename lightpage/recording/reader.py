@@ -11,6 +11,7 @@ Datasets: `in_phase` and `quadrature` [page, row, column], `reference_in_phase` 
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -83,6 +84,8 @@ class Recording(AbstractContextManager["Recording"]):
             RecordingError: missing, truncated, foreign, newer than this program, or inconsistent; the message names the
                 file, the dataset or attribute, what came and what was wanted.
         """
+        if not isinstance(path, str | os.PathLike):
+            raise RecordingError(f"recording {path!r}", type(path).__name__, "a path")
         path = Path(path)
         return cls(open_hdf5(path, f"recording {path}"), path)
 

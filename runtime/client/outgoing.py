@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lightpage.errors import FrameError, InvalidInputError, PageError
 from lightpage.page.levels import MAX_LEVELS
-from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.frame_pair import FramePair, check_pair
 from lightpage.runtime.client.connection import Connection
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import PIXEL_TYPES, message_of
@@ -122,6 +122,7 @@ def sent_frames(
     Raises:
         FrameError: they cannot be sent.
     """
+    check_pair(pair, subject)
     frames = [np.asarray(pair.in_phase), np.asarray(pair.quadrature)]
     first = frames[0] if like is None else like
     for name, frame in zip(("in-phase frame", "quadrature frame"), frames, strict=True):

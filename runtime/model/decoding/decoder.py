@@ -23,7 +23,7 @@ from lightpage.metrics.information import decide_with_confidence
 from lightpage.page.levels import MAX_LEVELS, check_levels
 from lightpage.page.pilots import Pilots, read_pilots, remove_piston, stroke_error
 from lightpage.recording.exposure import check_light
-from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.frame_pair import FramePair, check_pair
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import DECODER, FIELD
 from lightpage.runtime.model.decoding.batch_graph import REGISTRATION
@@ -198,6 +198,7 @@ class Decoder:
         Raises:
             FrameError: wrong size, type or bit depth, black or saturated.
         """
+        check_pair(pair, subject)
         shape, dtype = self.bundle.profile.frame_shape, self.bundle.manifest.frame_dtype
         for name, frame in (("in-phase frame", pair.in_phase), ("quadrature frame", pair.quadrature)):
             name = subject + name
