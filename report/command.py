@@ -14,7 +14,7 @@ from lightpage.report import recovery_figures
 from lightpage.report.contents.from_recovery import report_of_recovery
 from lightpage.report.json_file import EXPECTED, JsonFile
 from lightpage.report.page import render
-from lightpage.run_files import EVALUATE, RECOVER
+from lightpage.run_files import DESCRIPTION, EVALUATE, RECOVER
 from lightpage.runtime.archives.run.job import FILE as JOB
 
 
@@ -53,6 +53,8 @@ def _of_bulk(folder: Path, recording: Path | None) -> tuple[str, str, str]:
 
 
 def _of_run(folder: Path, recording: Path | None) -> tuple[str, str, str]:
+    if not (folder / DESCRIPTION).exists():
+        raise InvalidInputError(f"folder {folder}", f"no {DESCRIPTION}", "a finished training run, or a bulk run")
     from lightpage.report import decoder_page
     from lightpage.report.contents.from_run import report_of_run
 

@@ -48,7 +48,7 @@ RESUME_KEY = "lightpage.resume"
 HELP_KEY = "lightpage.help"
 """Whether help is asked for, in `meta` too."""
 
-RESUME = "run the same command again; nothing half-written was left under a final name"
+RESUME = "run the same command again; no file is half-written"
 
 EXIT_ERROR = 2
 EXIT_LOST = 3
@@ -82,7 +82,7 @@ SUMMARIES = {
     "code": "Choose how user bytes are protected on a device's pages.",
     "calibrate": "Find a device's geometry from nominal with a few known pages.",
     "decode": "Decode a recording, or pages of the service's source, with a running service.",
-    "demo": "See it all work on the simulated device.",
+    "demo": "Store, lose and heal a picture on the simulated device.",
     "encode": "Put a file on pages to write.",
     "evaluate": "Measure a bundle on a recording with known symbols.",
     "export": "Turn a training run into a bundle.",

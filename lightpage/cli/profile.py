@@ -64,18 +64,19 @@ def show(name: str, json_path: Path | None) -> None:
 @click.option("--recording", type=click.Path(path_type=Path), help="Whether it fits these frames too, R.h5.")
 @JSON
 def check(name: str, recording: Path | None, json_path: Path | None) -> None:
-    """Check a profile: its keys, whether its optics can be read, and what may cost information.
+    """Check keys and optics of a profile.
 
-    A device that cannot be read makes the exit status 2.
+    It says whether the device can be read, and what may cost information. A device that cannot be read makes the exit
+    status 2.
     """
     found = load_profile(name)
     told = _write(found, json_path)
-    click.echo(table(told))
     if recording is not None:
         with Recording.open(recording) as file:
             file.header.check_against(found)
     with raised_as(ProfileError, ProfileError, about=f"{name}: "):
         check_camera(found)
+    click.echo(table(told))
     for doubt in told.doubts:
         warn(f"profile {name}: {doubt}")
 
@@ -90,13 +91,13 @@ def _rows(told: Consequences) -> Iterator[tuple[str, str]]:
     yield "camera pixels a symbol", f"{told.pixels_per_symbol:.4g} along an edge"
     yield (
         "image on a camera",
-        f"{told.image_px[0]} x {told.image_px[1]} pixels, magnified {told.magnification:.4g} times",
+        f"{told.image_px[0]} x {told.image_px[1]} pixels, magnification {told.magnification:.4g}",
     )
     yield "aperture", f"{told.aperture:.4g} at the page's corner"
     yield "walls met", f"up to {told.walls_met[0]} along x, {told.walls_met[1]} along y"
     yield "modes of the pipe", f"{told.modes[0]} x {told.modes[1]} carry the page"
     yield "pipe's width", f"{told.carried:.3g} times what a symbol's first order needs"
-    yield "a frame pair", f"{told.pair_mb:.4g} MB of 8 bits, {2 * told.pair_mb:.4g} MB of more"
+    yield "a frame pair", f"{told.pair_mb:.3g} MB at 8 bits, {2 * told.pair_mb:.3g} MB above"
     for preset, cost in told.cost.items():
         yield f"decode, {preset}", f"about {cost.seconds:.2g} s a page on two cores, {cost.memory_gb:.2g} GB"
 

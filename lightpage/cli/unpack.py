@@ -14,6 +14,7 @@ from lightpage.files import write_json
 from lightpage.foreign.unpacking import Form
 from lightpage.foreign.unpacking import unpack as unpack_recording
 from lightpage.recording.reader import Recording
+from lightpage.words import counted
 
 
 @click.command()
@@ -37,4 +38,4 @@ def unpack(recording: Path, out: Path, form: str, json_path: Path | None) -> Non
         told = {"--profile": "P", **options, "--levels": str(file.levels), "--bit-depth": str(file.bit_depth)}
         words = [word for option in told.items() for word in option]
         command = shlex.join(["lightpage", "import", *words, "--out", "R.h5"])
-        click.echo(f"{out}: {file.pages} pages. They come back by:\n{command}")
+        click.echo(f"{out}: {counted(file.pages, 'page')}. To import them again:\n{command}")

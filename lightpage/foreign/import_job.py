@@ -177,7 +177,7 @@ def tell(exposure: Exposure, black_level: int) -> None:
         shifted = (
             f", without the lowest {exposure.unused_bits} bits, which are not used" if exposure.unused_bits else ""
         )
-        note(f"counts of {exposure.bit_depth} bits, up to {exposure.brightest}{shifted} (--bit-depth says otherwise)")
+        note(f"counts of {exposure.bit_depth} bits, up to {exposure.brightest}{shifted} (override with --bit-depth)")
     if not black_level and exposure.darkest > _PEDESTAL * 2**exposure.bit_depth:
         warn(
             f"no count of the frames looked at is below {exposure.darkest}: if the cameras count so in the dark, say "

@@ -136,8 +136,8 @@ def _device(change: Change) -> DeviceSigns:
     recalibrations = now.values("lightpage_recalibrations_total")
     return DeviceSigns(
         margin_bits=now.value("lightpage_margin_bits") if read else math.nan,
-        pilot_trust=now.value("lightpage_pilot_trust"),
-        air_share=now.value("lightpage_pilot_share"),
+        pilot_trust=now.value("lightpage_pilot_trust") or math.nan,
+        air_share=now.value("lightpage_pilot_share") or math.nan,
         air_bits=now.value("lightpage_monitor_sign", sign="air_bits"),
         image_shift_x_px=now.value("lightpage_image_shift_px", axis="x"),
         image_shift_y_px=now.value("lightpage_image_shift_px", axis="y"),

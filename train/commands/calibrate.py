@@ -145,6 +145,15 @@ def figures(calibration: Calibration, profile: Profile, seconds: float, lost: in
     }
 
 
+_UNITS = frozenset({"m", "rad", "px", "deg", "relative"})
+
+
+def _label(name: str) -> str:
+    """Return the name of a parameter for people, with its unit behind a comma."""
+    stem, _, unit = name.rpartition("_")
+    return f"{stem.replace('_', ' ')}, {unit}" if unit in _UNITS else name.replace("_", " ")
+
+
 def table(calibration: Calibration, profile: Profile) -> str:
     """Fitted values with their standard deviations beside the nominal ones, for people."""
     shown = {
@@ -157,12 +166,12 @@ def table(calibration: Calibration, profile: Profile) -> str:
     for name, value in calibration.parameters.items():
         if name not in calibration.fitted:
             continue
-        label, nominal, unit = shown.get(name, (name, 0.0, 1.0))
+        label, nominal, unit = shown.get(name, (_label(name), 0.0, 1.0))
         factor = nominal if unit is None else unit
         fitted, deviation = nominal + factor * value, factor * calibration.deviations[name]
         lines.append(f"{label:<32}{fitted:>12.6g}   {deviation:<10.2g}{nominal:>10.6g}")
     for name, value in calibration.modulation.items():
-        lines.append(f"{name:<32}{value:>12.6g}   {calibration.modulation_deviations[name]:<10.2g}{0:>10.6g}")
+        lines.append(f"{_label(name):<32}{value:>12.6g}   {calibration.modulation_deviations[name]:<10.2g}{0:>10.6g}")
     quadrature_phase = np.rad2deg(calibration.turn_rad)
     lines.append(f"{'between the arms, degree':<32}{quadrature_phase:>12.6g}   {'':<10}{'+90 or -90':>10}")
     return "\n".join(lines)
