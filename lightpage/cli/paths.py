@@ -106,7 +106,7 @@ def check_outputs(context: click.Context) -> None:
         InvalidInputError: the same file is to be read and written, or written twice.
     """
     given = [(param, context.params.get(param.name or "")) for param in context.command.params]
-    paths = [(param, Path(value)) for param, value in given if _names_file(param, value)]
+    paths = [(param, path) for param, value in given if (path := _named_file(param, value)) is not None]
     for param, path in paths:
         for other, there in paths:
             if param is other or not isinstance(param.type, NewPath | OutputFile):
@@ -116,11 +116,12 @@ def check_outputs(context: click.Context) -> None:
                 raise InvalidInputError(_option(path, param), f"the same file as {named}", "another name")
 
 
-def _names_file(param: click.Parameter, value: object) -> bool:
-    """Return whether the value of an option is a file; a bare text is one where there is a file of that name."""
+def _named_file(param: click.Parameter, value: object) -> Path | None:
+    """Return the file that the value of an option names; a bare text names one where there is a file of that name."""
     if isinstance(value, Path):
-        return bool(str(value))
-    return isinstance(value, str) and not isinstance(param.type, click.Choice) and os.path.exists(value)
+        return value
+    text = isinstance(value, str) and not isinstance(param.type, click.Choice) and os.path.exists(value)
+    return Path(str(value)) if text else None
 
 
 def _file(value: Any, param: click.Parameter | None) -> Path:
