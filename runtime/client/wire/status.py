@@ -59,11 +59,7 @@ _MEANINGS: tuple[tuple[type[BaseException], grpc.StatusCode, pb.ErrorReason], ..
 )
 """Of each error class its status and its reason; the first that fits counts."""
 
-_RETRY_S: dict[type[LightpageError], float] = {
-    errors.StorageError: 2.0,
-    errors.SurroundingsError: 5.0,
-    errors.NoRoomError: 5.0,
-}
+_RETRY_S = {errors.StorageError: 2.0, errors.SurroundingsError: 5.0, errors.NoRoomError: 5.0}
 """When to try again what failed by what passes, seconds: a disk that hiccups, and memory that others give back."""
 
 _UNSAID = {
