@@ -30,7 +30,6 @@ from lightpage.runtime.model.decoding.batch_graph import (
     REGISTRATION,
     BatchGraph,
     Constants,
-    FrameBuffer,
     with_proven_batches,
 )
 from lightpage.runtime.model.decoding.batches import Batches, Batching
@@ -44,7 +43,6 @@ from lightpage.train.models.network import SymbolUNet
 from lightpage.train.models.presets import ACCURATE, FAST, PRESETS, STANDARD
 from lightpage.train.models.twin import RayTwin, TorchTwin
 from tests.lightpage.small import small_profile
-from tests.runtime.model.execution.fake_cuda import FakeCuda
 
 PROFILE = small_profile()
 PAGES = 3
@@ -99,18 +97,6 @@ def test_pages_of_a_batch_are_read_as_each_alone_where_each_image_lies(
             for page in pages
         ]
         assert rates[1] == pytest.approx(rates[0], abs=0.01)
-
-
-def test_frames_that_lie_on_the_device_give_the_same_pages(
-    batches: BatchGraph, shown: list[tuple[FramePair, np.ndarray]]
-) -> None:
-    cuda, still = FakeCuda(), np.zeros((2, 2), np.float32)
-    buffers = FrameBuffer(2, PROFILE.frame_shape, "uint8", cuda.twins), batches.buffer()
-    for buffer in buffers:
-        buffer.put(1, shown[0][0], still)
-    there, here = (batches.run(batches.constants_of_bundle, buffer, slice(0, 2)) for buffer in buffers)
-    assert cuda.names("cudaMemcpyAsync") == ["cudaMemcpyAsync"] * 2
-    assert all(np.array_equal(a.p, b.p, equal_nan=True) for a, b in zip(there, here, strict=True))
 
 
 def test_constants_serve_shifts_within_reach_and_nothing_else(decoder: Decoder, batches: BatchGraph) -> None:

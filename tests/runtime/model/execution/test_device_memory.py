@@ -5,11 +5,14 @@ import gc
 import logging
 
 import numpy as np
+import onnx.parser
 import pytest
 
 from lightpage.errors import ProviderError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.decoding.batch_graph import FrameBuffer
+from lightpage.runtime.model.execution.providers import ON_CPU
+from lightpage.runtime.model.execution.session import BoundSession, open_session
 from tests.runtime.model.execution.fake_cuda import FakeCuda
 
 SHAPE, STILL = (3, 5), np.zeros((2, 2), np.float32)
@@ -35,6 +38,19 @@ def test_each_buffer_has_its_own_memory_on_the_device_and_releases_it() -> None:
     del buffer, buffers
     gc.collect()
     assert cuda.names() == ["cudaStreamDestroy", "cudaFree", "cudaHostUnregister"] * 2
+
+
+def test_a_graph_takes_what_lies_on_the_device() -> None:
+    array = np.zeros((2, 3), np.float32)
+    twin = FakeCuda().twins.of(array)
+    assert twin is not None
+    array[1] = 7
+    twin.send(array[1])
+    array[1] = 0  # it lies there by now
+    text = '<ir_version: 9, opset_import: ["" : 20]> g (float[1,3] x) => (float[1,3] y) {y = Add(x, x)}'
+    model = onnx.parser.parse_model(text).SerializeToString()
+    bound = BoundSession(open_session(model, "graph", 1), ON_CPU, {}, "graph")
+    assert bound.run(["y"], {"x": twin.of(array[1:])})[0].tolist() == [[14, 14, 14]]
 
 
 @pytest.mark.parametrize(
