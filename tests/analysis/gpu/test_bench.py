@@ -7,7 +7,7 @@ from click.testing import CliRunner
 
 from analysis.gpu.bench import main
 from analysis.gpu.kept_parts import Kept
-from analysis.gpu.targets import RATES, table, targets
+from analysis.gpu.targets import table, targets
 from lightpage.errors import InvalidInputError, ProviderError
 from tests.clock import HandClock
 
@@ -15,14 +15,12 @@ from tests.clock import HandClock
 def test_parts_are_kept_and_none_is_begun_that_ends_too_late(tmp_path: Path) -> None:
     clock, path = HandClock(), tmp_path / "gpu.json"
     kept = Kept(path, {"card": "A"}, 100, clock)
-    assert kept.part("fast, form", 10, lambda: clock.advance(30) or 1) == 1
-    assert kept.part("slow, form", 10, lambda: clock.advance(45) or 2) == 2  # 45 of 70 s are left
+    assert kept.part("a, form", 10, lambda: clock.advance(45) or 1) == 1
     assert kept.part("bundle", 20, lambda: 1 / 0) is None
-    assert kept.part("late, form", 10, lambda: 3) is None  # as long as others of its kind
-    assert kept.left_out == ["bundle", "late, form"]
+    assert kept.part("b, form", 10, lambda: 3) is None  # it may take longer than the one of its kind did
+    assert kept.left_out == ["bundle", "b, form"]
     again = Kept(path, {"card": "A"}, 100, clock)
-    assert again.part("slow, form", 1000, lambda: 0) == 2
-    assert again.part("bundle", 20, lambda: 4) == 4
+    assert [again.part(name, 20, lambda: 4) for name in ("a, form", "bundle")] == [1, 4]
     with pytest.raises(InvalidInputError):
         Kept(path, {"card": "B"}, 100)
 
@@ -34,16 +32,15 @@ def test_every_target_has_a_verdict() -> None:
         "standard, present": {"air": [4.8, 4.7]},
         "standard, floor": {"bytes_ms": 2.5},
     }
-    parts["service"] = {"in_process_pages_per_s": 100.0, "over_in_process": 0.96}
-    parts["page code"] = {"full size 4x4": {"compiled_ms": 7.0, "user_bytes": 50_000}}
+    parts |= {
+        "service": {"over_in_process": 0.96},
+        "page code": {"full size 4x4": {"compiled_ms": 7.0, "user_bytes": 5e4}},
+    }
     verdicts = [target.verdict for target in targets(parts, "full size 4x4")]
     assert [verdicts.count(name) for name in ("stretch met", "met", "missed", "not measured")] == [1, 5, 1, 11]
     assert len(table(parts, "full size 4x4")) == 6 + len(verdicts)
-    assert {target.verdict for target in targets({}, "bench 4x4")} == {"not measured"}
-    assert RATES["standard"][0] < batch["pages_per_s"] < RATES["standard"][1]
 
 
 def test_an_onnxruntime_without_the_gpu_is_refused_by_name(tmp_path: Path) -> None:
-    refused = CliRunner().invoke(main, ["--out", str(tmp_path / "out")])
-    assert isinstance(refused.exception, ProviderError)
+    assert isinstance(CliRunner().invoke(main, ["--out", str(tmp_path / "out")]).exception, ProviderError)
     assert not (tmp_path / "out").exists()
