@@ -15,18 +15,15 @@ import re
 import subprocess
 import sys
 import tempfile
-import threading
 import time
-import urllib.request
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import click
 
+from analysis.gpu.callers import Pages, rate
 from analysis.service.constant_bundle import constant_bundle
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
@@ -44,79 +41,25 @@ from lightpage.runtime.model.execution.memory import share_freed_memory
 from lightpage.runtime.model.execution.providers import Provider
 
 Figures = dict[str, Any]
-Pages = Callable[[str], Iterator[object]]
-"""Decodes pages for ever, for a caller of that name, and yields after each."""
-_WARM_S = 3.0
-"""Seconds before those that count: sizes of batches are met for the first time."""
 _STATES = {state.value: f'lightpage_device_seconds_total{{state="{state}"}}' for state in Device}
 _RUNS, _PAGES = "lightpage_batch_pages_count", "lightpage_batch_pages_sum"
 
 
 @contextmanager
-def served(arguments: Sequence[str]) -> Iterator[str]:
-    """A service in a process of its own; yields the address of its metrics."""
-    command = [sys.executable, "-m", "lightpage", "serve", "--metrics-port", "0", *arguments]
+def served(socket: Path, arguments: Sequence[str]) -> Iterator[str]:
+    """A service in a process of its own, that listens at a socket; yields the address of its metrics."""
+    where = "--address", f"unix:{socket}", "--health-address", "off", "--shared-memory"
+    command = [sys.executable, "-m", "lightpage", "serve", "--metrics-port", "0", *where, *arguments]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None  # asked for
             told = itertools.takewhile(lambda line: not line.startswith("serving"), process.stdout)
-            yield next(found[1] for line in told if (found := re.search(r"metrics at (\S+),", line)))
+            address = next(found[1] for line in told if (found := re.search(r"metrics at (\S+),", line)))
+            while not socket.exists():
+                time.sleep(0.1)
+            yield address
         finally:
             process.terminate()
-
-
-def metrics_of(address: str) -> dict[str, float]:
-    """The figures of a service, by name and labels; empty without an address."""
-    if not address:
-        return {}
-    with urllib.request.urlopen(address, timeout=20) as answer:
-        lines = (line.rpartition(" ") for line in answer.read().decode().splitlines() if not line.startswith("#"))
-        return {name: float(value) for name, _, value in lines}
-
-
-@dataclass
-class _Window:
-    """The time in which pages count."""
-
-    pages: int = 0
-    is_open: bool = False
-    over: threading.Event = field(default_factory=threading.Event)
-    lock: threading.Lock = field(default_factory=threading.Lock)
-
-    def count(self, pages: Iterator[object]) -> None:
-        """Count the pages that are decoded while the window is open."""
-        for _ in pages:
-            if self.over.is_set():
-                return
-            with self.lock:
-                self.pages += self.is_open
-
-
-def rate(pages: Pages, callers: int, seconds: float, address: str = "") -> tuple[float, dict[str, float]]:
-    """Pages a second of so many callers once all is warm, and by how much a service's figures grew in that time.
-
-    Args:
-        pages: decodes pages for each caller.
-        callers: how many there are.
-        seconds: that count.
-        address: of the service's metrics; none without.
-
-    Raises:
-        Exception: what ended a caller.
-    """
-    window = _Window()
-    with ThreadPoolExecutor(callers) as pool:
-        begun = [pool.submit(window.count, pages(f"caller {number}")) for number in range(callers)]
-        try:
-            window.over.wait(_WARM_S)
-            before, start, window.is_open = metrics_of(address), time.monotonic(), True
-            window.over.wait(seconds)
-            window.is_open, taken, after = False, time.monotonic() - start, metrics_of(address)
-        finally:
-            window.over.set()
-        for each in begun:
-            each.result()
-    return window.pages / taken, {name: value - before.get(name, 0.0) for name, value in after.items()}
 
 
 def in_process(decoder: Decoder, pairs: Sequence[FramePair], levels: int) -> Pages:
@@ -174,14 +117,15 @@ def measured(
     del decoder  # its memory of the device is the service's now
     found: Figures = {"callers": callers, "batches": largest, "in_process_pages_per_s": inside}
     with tempfile.TemporaryDirectory() as folder:
-        target, constant = f"unix:{folder}/service", Path(folder, "constant.zip")
-        where = "--address", target, "--health-address", "off", "--shared-memory"
-        own = "--bundle", str(bundle), "--provider", str(provider), "--batches", str(largest)
-        with served([*own, *where]) as address:
+        socket, constant = Path(folder, "service"), Path(folder, "constant.zip")
+        target = f"unix:{socket}"
+        with served(
+            socket, ["--bundle", str(bundle), "--provider", str(provider), "--batches", str(largest)]
+        ) as address:
             through, grown = rate(by_memory(target, pairs, levels), callers, seconds, address)
             stream, _ = rate(by_stream(target, pairs, levels), 1, seconds)
         sent = [constant_bundle(constant, opened.profile)]
-        with served(["--bundle", str(constant), "--no-tracking", *where]):
+        with served(socket, ["--bundle", str(constant), "--no-tracking"]):
             bare, _ = rate(by_stream(target, sent, 0), 1, seconds)
     runs = grown.get(_RUNS, 0.0)
     return found | {

@@ -18,7 +18,7 @@ from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from itertools import count as numbers
 from itertools import product
 from pathlib import Path
@@ -318,6 +318,7 @@ class StoredArray:
         self._path, self._name = Path(found.file.filename), found.name.strip("/")
         self._chain = chain or ((self._path, self._name),)
         self.dataset: Any = found
+        self._is_plain: bool | None = None
         self._parts: list[_Part] = []
         properties = found.id.get_create_plist()
         layout = properties.get_layout()
@@ -341,6 +342,8 @@ class StoredArray:
         Raises:
             OSError, KeyError, RuntimeError, ValueError: what HDF5 says.
         """
+        if self._is_plain is None:
+            self._is_plain = _is_plain(self.dataset)
         if not self._is_plain:
             return None
         size = math.prod(self.shape[1:]) * self.dtype.itemsize
@@ -350,19 +353,6 @@ class StoredArray:
             chunk = self.dataset.id.get_chunk_info_by_coord((row, *(0 for _ in self.shape[1:])))
             place = chunk.byte_offset if chunk.size == size else None
         return None if place is None else _Piece(os.dup(self.dataset.file.id.get_vfd_handle()), place)
-
-    @cached_property
-    def _is_plain(self) -> bool:
-        """Whether each row lies in the file in one piece, unfiltered, in the type that numpy has for it."""
-        found, properties = self.dataset, self.dataset.id.get_create_plist()
-        if self.dtype.kind not in "ui" or len(self.shape) < 2 or not all(self.shape):
-            return False
-        if found.chunks is None:
-            in_one = not properties.get_external_count() and found.id.get_offset() is not None
-        else:
-            in_one = found.chunks == (1, *self.shape[1:]) and not properties.get_nfilters()
-        in_file = hasattr(os, "preadv") and found.file.driver == "sec2" and not found.file.userblock_size
-        return in_one and in_file and found.id.get_type() == hdf.h5t.py_create(self.dtype)
 
     def rows(self, start: int, stop: int) -> NDArray[Any]:
         """The array from `start` to `stop` along its first axis.
@@ -624,6 +614,19 @@ def _moved(indices: Indices, by: int) -> Indices:
     if isinstance(indices, range):
         return range(indices.start + by, indices.stop + by, indices.step)
     return np.asarray(indices) + by
+
+
+def _is_plain(found: Any) -> bool:
+    """Return whether each row of a dataset lies in its file in one piece, as numpy has it in memory."""
+    properties, shape = found.id.get_create_plist(), found.shape
+    if found.dtype.kind not in "ui" or len(shape) < 2 or not all(shape):
+        return False
+    if found.chunks is None:
+        in_one = not properties.get_external_count() and found.id.get_offset() is not None
+    else:
+        in_one = found.chunks == (1, *shape[1:]) and not properties.get_nfilters()
+    in_file = hasattr(os, "preadv") and found.file.driver == "sec2" and not found.file.userblock_size
+    return in_one and in_file and found.id.get_type() == hdf.h5t.py_create(found.dtype)
 
 
 def _at(axes: Sequence[Indices]) -> Any:

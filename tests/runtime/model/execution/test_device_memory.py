@@ -34,7 +34,7 @@ class FakeCuda:
             self.names.append(name)
             if name == "cudaMalloc":
                 self._held.append(ctypes.create_string_buffer(given[1].value))
-                given[0]._obj.value = ctypes.addressof(self._held[-1])
+                ctypes.cast(given[0], ctypes.POINTER(ctypes.c_void_p))[0] = ctypes.addressof(self._held[-1])
             elif name == "cudaMemcpyAsync":
                 ctypes.memmove(*given[:3])
             return b"out of memory" if name == "cudaGetErrorString" else 2 * (name == self.failing)
