@@ -27,8 +27,8 @@ from lightpage.train.models.presets import PRESETS
 from lightpage.train.runs import GOLDEN, REFERENCES, Run, save_arrays, save_weights
 
 PRESET = "standard"
-_RECORDED = 96
-"""Pages of the recording: three ranges of bulk, of which the first, behind which all is warm, does not count."""
+_RANGE, _RANGES = 32, 3
+"""Ranges of the recording; the first, behind which bulk is warm, does not count."""
 _CODE_ROUNDS = 3
 
 
@@ -86,7 +86,7 @@ class Served:
             run.save(Path(name))
             export_run(Path(name), path, name=self.folder.name, version="kept", batches=True)
         with RecordingWriter(self._recording, scene.profile, LEVELS, bits, scene.references) as writer:
-            for page in range(_RECORDED):
+            for page in range(_RANGE * _RANGES):
                 writer.append(scene.symbols[page % len(scene.pairs)], scene.pairs[page % len(scene.pairs)])
         return {"bytes": path.stat().st_size}
 
@@ -103,8 +103,8 @@ class Served:
         """Pages a second of one worker of `lightpage bulk decode` once it is warm."""
         folder = self.out / "bulk"
         shutil.rmtree(folder, ignore_errors=True)
-        asked = ["lightpage", "bulk", "decode", folder, *self._asked, "--recordings", self._recording, "--workers", "1"]
-        self._run(asked, left_s)
+        asked = ["lightpage", "bulk", "decode", folder, *self._asked, "--recordings", self._recording]
+        self._run([*asked, "--workers", "1", "--range-pages", str(_RANGE)], left_s)
         records = [ShardRecord.read(path.with_suffix("")) for path in records_of(folder)]
         warm = sorted(records, key=lambda record: record.finished_s)[1:]
         shutil.rmtree(folder)
