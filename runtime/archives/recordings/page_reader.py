@@ -106,7 +106,7 @@ class PageReader:
         """Read with this model from now on."""
         self._decoder, self._tracker, code = decoder, tracker, self._code
         self._levels, self._pilots = decoder.bundle.levels(code.levels), decoder.written_pilots(code.levels)
-        self.codec = PageCodec(code, decoder.bundle.pilot_mask, self._levels)
+        self.codec = PageCodec(code, decoder.bundle.pilot_mask, self._levels, decoder.code_threads)
 
     def read(self, pages: Sequence[int], take: Take, *, heals: bool = True) -> Iterator[RecoveredPage]:
         """Read pages, and heal the model by those that it does not read.
