@@ -73,7 +73,7 @@ def assembled(settings: ServiceSettings, observer: Observer) -> Iterator[Assembl
     together, codes = settings.batches.batching(), service.code_threads
     base = Decoder(bundle, service.threads, provider=provider, code_threads=codes, batching=together)
     metrics = ServiceMetrics()
-    if base.batches.largest > 1:
+    if together.largest > 1:  # another model may have them
         metrics.watch_batches(together.pages)
     monitor = Monitor(metrics=metrics)
     own = settings.self_calibration

@@ -37,6 +37,20 @@ def test_first_come_is_first_served() -> None:
     assert (slots.busy, slots.queued) == (0, 0)
 
 
+def test_more_slots_serve_those_who_wait_and_fewer_nobody_until_enough_are_back() -> None:
+    slots = Slots(1, "tests", 60.0)
+    with ThreadPoolExecutor(3) as pool:
+        taken = [pool.submit(slots.take, Caller()) for _ in range(3)]
+        eventually(lambda: slots.queued == 2)
+        slots.resize(2)
+        eventually(lambda: sum(each.done() for each in taken) == 2)
+        slots.resize(1)
+        slots.give_back()
+        assert (slots.busy, slots.queued) == (1, 1)
+        slots.give_back()
+        assert slots.queued == 0
+
+
 def test_one_who_leaves_the_queue_is_gone_at_once() -> None:
     slots, caller = Slots(1, "tests", math.inf, HandClock()), Caller()
     slots.take(Caller())

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
+from unittest.mock import Mock
 
 import grpc
 import numpy as np
@@ -12,9 +13,12 @@ import pytest
 from lightpage.errors import FrameError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.answers import RemotePage
+from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.batches import Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.under_way import Phase
+from lightpage.runtime.service.assembly import assembled
+from lightpage.runtime.service.settings import ServiceSettings
 from tests.runtime import toy
 from tests.runtime.conftest import begun
 from tests.runtime.held_graph import LARGEST, HeldGraph
@@ -99,11 +103,26 @@ def test_a_caller_whose_time_is_up_holds_nobody_up(stage: Stage) -> None:
 
 
 def test_a_page_in_a_run_ends_with_the_model_that_it_began_with(stage: Stage, decoder: Decoder) -> None:
-    plane = stage.service.plane
+    plane, slots = stage.service.plane, [stage.service.plane.decodes.count]
     with stage.held():
         begun_before = stage.decode(a_page()[1])
         eventually(lambda: stage.count(Phase.WAITING) == 1)
-        manifest = decoder.bundle.manifest.model_copy(update={"version": "toy-2"})
-        plane.models.adopt(decoder.of_bundle(replace(decoder.bundle, manifest=manifest)))
+        plane.models.adopt(decoder.of_bundle(renamed(decoder, "toy-2")))  # it has no batches
+        slots.append(plane.decodes.count)
     assert begun_before.result(LIMIT_S).model_version == decoder.version
     assert stage.decode(a_page()[1]).result(LIMIT_S).model_version == "toy-2"
+    assert plane.decodes.busy == 0
+    plane.models.adopt(stage.graph.gathering(stage.batching).of_bundle(renamed(decoder, "toy-3")))
+    assert [*slots, plane.decodes.count] == [2 * LARGEST, plane.limits.concurrent_decodes, 2 * LARGEST]
+    assert (plane.together, plane.ahead()) == (LARGEST, 2 * LARGEST)
+
+
+def test_batches_are_told_of_before_a_model_has_them(decoder: Decoder) -> None:
+    wanted = {"service": {"bundle": str(decoder.bundle.path), "tracking": False}, "batches": {"largest": LARGEST}}
+    with assembled(ServiceSettings.model_validate(wanted), Mock()) as service:
+        assert service.plane.metrics.registry.get_sample_value("lightpage_batch_pages_count") == 0
+
+
+def renamed(decoder: Decoder, version: str) -> Bundle:
+    manifest = decoder.bundle.manifest.model_copy(update={"version": version})
+    return replace(decoder.bundle, manifest=manifest)
