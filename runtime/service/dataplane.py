@@ -342,7 +342,7 @@ def _inferred(page: DecodedPage, stages: Stages) -> None:
 
     The graph may run more than once, with post-processing between: all its runs count as if they were the first part.
     """
-    inferred_s, waited_s = page.timings.check_s + page.timings.inference_s, page.timings.waiting_s
+    inferred_s, waited_s = page.timings.check_s + page.timings.inference_s, page.timings.waited_s
     if waited_s >= _LEAST_WAIT_S:
         stages.begin(Stage.QUEUE, inferred_s)
         inferred_s = waited_s

@@ -254,7 +254,7 @@ class ImageTracker:
             shown = self._decoder.bundle.levels(levels)
             if self._in_batches:
                 turn.wait(lambda before: before < self._ahead)
-                clock.add("waiting_s")
+                clock.add("turn_s")
             with self._decoder.batches.under_way():
                 self._decoder.check(pair)
                 pilots = pilots or self._decoder.pilots(levels)
@@ -284,7 +284,7 @@ class ImageTracker:
                 inference = state.decoder.infer(pair, state.table)
                 clock.add("inference_s", inference.waited_s)
             is_next = turn.wait(partial(self._has_left, state))
-            clock.add("waiting_s")
+            clock.add("turn_s")
             if is_next and not self._has_left(state):
                 return replace(self.state, table=state.table, looked_px=state.looked_px), inference
 

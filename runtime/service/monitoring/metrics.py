@@ -143,7 +143,7 @@ class ServiceMetrics:
         with self._naming:
             if version in self._versions:
                 self.pages.labels(version).inc()
-        self.decode.observe(page.timings.total_s)
+        self.decode.observe(page.timings.worked_s)
         if not shown:
             return
         self.confidence.set(float(page.confidence.mean()))

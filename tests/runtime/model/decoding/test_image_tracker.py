@@ -344,6 +344,7 @@ def test_pages_decoded_at_the_same_time_are_taken_in_their_order(device: FakeDev
         eventually(lambda: len(device.decodes) == 1)
         image = tracker.decode(device.page(1), 16, None, first).image
         assert behind.result().image is not None
+    assert behind.result().timings.turn_s > 0
     assert image is not None
     assert image.shift_x_px == pytest.approx(0.5, abs=0.01)
     assert [round(float(held[0]), 1) for held in device.decodes] == [0.0, 0.0, 0.5, 0.5]
