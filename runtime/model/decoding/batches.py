@@ -9,7 +9,9 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
+from weakref import ref
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,24 +94,32 @@ class _Ticket:
 class _Held:
     """Constants with the table that they follow from, and when they were last asked for."""
 
-    graph: TableGraph
+    graph: ref[TableGraph]
     own: NDArray[np.float32]
     constants: Constants
     asked: int = 0
 
 
+def _beside(work: Callable[[], None]) -> None:
+    """Have something done on a thread of its own."""
+    threading.Thread(target=work, name="lightpage-constants").start()
+
+
 class HeldConstants:
-    """Constants of the tables in use, a few of them.
+    """Constants of the tables in use, a few of them; those of a table that nothing decodes with any more are let go.
 
     Args:
         graph: that runs with them.
         table: whose constants it has already.
+        beside: has constants made, which takes as long as some pages do, while pages go on.
     """
 
-    def __init__(self, graph: BatchGraph, table: TableGraph) -> None:
-        self._graph, self._lock, self._asked = graph, threading.Lock(), 0
+    def __init__(
+        self, graph: BatchGraph, table: TableGraph, beside: Callable[[Callable[[], None]], None] = _beside
+    ) -> None:
+        self._graph, self._beside, self._lock, self._asked = graph, beside, threading.Lock(), 0
         first = graph.constants_of_bundle
-        self._held = [_Held(table, first.registration, first)]
+        self._held = [_Held(ref(table), first.registration, first)]
         self._making: set[TableGraph] = set()
 
     def of(
@@ -117,7 +127,7 @@ class HeldConstants:
     ) -> tuple[Constants, NDArray[np.float32]] | None:
         """Constants of a table, and by how much an image lies elsewhere than they have it, [2, 2] pixels.
 
-        None where there is no room for them, or they are being made for another page.
+        None where there is no room for them, or they are being made from now on.
 
         Args:
             table: which.
@@ -125,23 +135,37 @@ class HeldConstants:
         """
         with self._lock:
             self._asked += 1
-            for held in self._held:
-                shift = held.constants.shift_of(held.own if registration is None else registration)
-                if held.graph is table and shift is not None:
-                    held.asked = self._asked
-                    return held.constants, shift
-            if table in self._making or not self._has_room():
-                return None
+            self._held = [held for held in self._held if held.graph() is not None]
+            if (found := self._found(table, registration)) or table in self._making or not self._has_room():
+                return found
             self._making.add(table)
+        self._beside(partial(self._make, table, registration))
+        with self._lock:
+            return self._found(table, registration)
+
+    def _found(
+        self, table: TableGraph, registration: NDArray[np.float32] | None
+    ) -> tuple[Constants, NDArray[np.float32]] | None:
+        """See `of`: what is held."""
+        for held in self._held:
+            shift = held.constants.shift_of(held.own if registration is None else registration)
+            if held.graph() is table and shift is not None:
+                held.asked = self._asked
+                return held.constants, shift
+        return None
+
+    def _make(self, table: TableGraph, registration: NDArray[np.float32] | None) -> None:
+        """Make constants, and hold them in place of those that were not asked for the longest."""
+        made = list[_Held]()
         try:
             own = table.value(REGISTRATION)
-            made = _Held(table, own, self._graph.constants(table, registration), self._asked)
+            made.append(_Held(ref(table), own, self._graph.constants(table, registration), self._asked))
+        except Exception:  # its pages go one by one until it works
+            _log.exception("%s: no constants of a table", self._graph.subject)
         finally:
             with self._lock:
                 self._making.discard(table)
-        with self._lock:
-            self._held = [*sorted(self._held, key=lambda held: held.asked)[1 - KEPT :], made]
-        return made.constants, np.zeros((2, 2), np.float32)
+                self._held = [*sorted(self._held, key=lambda held: held.asked), *made][-KEPT:]
 
     def _has_room(self) -> bool:
         """Return whether there is room for one more, beside those that are being made."""

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any, cast
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -71,14 +72,14 @@ class Stage:
         self.batches = Batches(graph, table, Batching(8, 0.005, self.pages), self.clock)
         self.pool = ThreadPoolExecutor(10)
 
-    def infer(self, number: int, table: Table | None = None) -> int:
+    def infer(self, number: int, table: Table | None = None) -> int | None:
+        """The number, None of a page that is to be computed alone."""
         frame = np.full((1, 1), number, np.uint8)
         found = self.batches.infer(cast(TableGraph, table or self.table), FramePair(frame, frame))
-        assert found is not None
-        return int(found.p[0])
+        return None if found is None else int(found.p[0])
 
     @contextmanager
-    def held(self, *numbers: int) -> Iterator[list[Future[int]]]:
+    def held(self, *numbers: int) -> Iterator[list[Future[int | None]]]:
         """Page 0 runs while these others come; they are computed behind the `with` statement."""
         self.graph.may_run.clear()
         first = self.pool.submit(self.infer, 0)
@@ -158,6 +159,8 @@ def test_where_memory_is_short_runs_are_smaller_from_then_on(stage: Stage, caplo
 
 def test_only_pages_of_the_same_constants_are_computed_together(stage: Stage) -> None:
     other = Table(shift=9.0)
+    eventually(lambda: stage.infer(1, other) == 1)  # alone until its constants are made
+    stage.graph.runs.clear()
     stage.graph.may_run.clear()
     pages = [stage.pool.submit(stage.infer, number, table) for number, table in enumerate([None, other, None, other])]
     eventually(lambda: stage.pages.count(Phase.WAITING) + stage.pages.count(Phase.RUNNING) == 4)
@@ -166,9 +169,14 @@ def test_only_pages_of_the_same_constants_are_computed_together(stage: Stage) ->
     assert all(len({number % 2 for number in run}) == 1 for run in stage.graph.runs)
 
 
+def holding(table: Any) -> HeldConstants:
+    """Constants, each made before anything else goes on."""
+    return HeldConstants(cast(BatchGraph, Graph(table)), table, lambda work: work())
+
+
 def test_few_constants_are_held_and_those_in_use_stay() -> None:
     tables: Any = [Table(9.0 * number) for number in range(KEPT + 1)]
-    held = HeldConstants(cast(BatchGraph, Graph(tables[0])), tables[0])
+    held = holding(tables[0])
     found = [held.of(table, None) for table in tables]
     assert [each is None for each in found] == [*[False] * KEPT, True]
     for _ in range(100):
@@ -177,9 +185,34 @@ def test_few_constants_are_held_and_those_in_use_stay() -> None:
     assert held.of(tables[1], None) is not None  # made again
 
 
+def test_constants_of_tables_that_are_gone_take_no_place() -> None:
+    tables: Any = [Table(9.0 * number) for number in range(2 * KEPT)]
+    held = holding(tables[0])
+    for table in tables[:KEPT]:
+        assert held.of(table, None) is not None
+    del tables[1:KEPT], table
+    assert all(held.of(table, None) is not None for table in tables[1:KEPT])
+
+
+def test_pages_go_one_by_one_until_their_constants_are_made(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    table, other, work = Table(), cast(Any, Table(9.0)), list[Callable[[], None]]()
+    graph = Graph(table)
+    held = HeldConstants(cast(BatchGraph, graph), cast(TableGraph, table), work.append)
+    assert [held.of(other, None) for _ in range(2)] == [None, None]
+    graph.constants = Mock(side_effect=[MemoryError, graph.constants(other)])  # type: ignore[method-assign]
+    work.pop()()
+    assert caplog.records
+    assert held.of(other, None) is None
+    work.pop()()
+    assert held.of(other, None) is not None
+    assert not work
+
+
 def test_constants_that_are_being_made_take_room(monkeypatch: pytest.MonkeyPatch) -> None:
     tables: Any = [Table(9.0 * number) for number in range(KEPT + 1)]
-    held, make, found = HeldConstants(cast(BatchGraph, Graph(tables[0])), tables[0]), Graph.constants, list[Any]()
+    held, make, found = holding(tables[0]), Graph.constants, list[Any]()
 
     def constants(graph: Graph, table: Table, _: None) -> Constants:
         found.append(held.of(tables[tables.index(table) + 1], None))
@@ -192,7 +225,7 @@ def test_constants_that_are_being_made_take_room(monkeypatch: pytest.MonkeyPatch
 
 def test_constants_follow_an_image_that_leaves_their_reach() -> None:
     table: Any = Table()
-    held = HeldConstants(cast(BatchGraph, Graph(table)), table)
+    held = holding(table)
     near, far = (np.zeros((2, 2, 10), np.float32) for _ in range(2))
     near[..., 0], far[..., 0] = 2, 20
     first, second = held.of(table, near), held.of(table, far)
