@@ -11,12 +11,13 @@ from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
-from weakref import ref
+from weakref import finalize, ref
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.clock import SYSTEM, Clock
+from lightpage.errors import LightpageError
 from lightpage.failures import lacks_memory
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.bundle import Bundle
@@ -26,6 +27,7 @@ from lightpage.runtime.model.decoding.batch_graph import (
     BatchGraph,
     Constants,
     FrameBuffer,
+    fewer,
     holds_batches,
 )
 from lightpage.runtime.model.decoding.page import Inference
@@ -224,8 +226,9 @@ class Batches(OneByOne):
         self._clock = clock
         self._graph, self._batching, self._constants = graph, batching, HeldConstants(graph, table)
         self.largest = min(batching.largest, graph.pages)
-        """Pages of a run, at most; fewer once memory was short."""
-        self._pages = batching.pages
+        """Pages of a run, at most; fewer once memory was short, until another model is gone."""
+        self._pages, self._gone = batching.pages, batching.pages.gone
+        finalize(self, batching.pages.let_go).atexit = False
         self._changed = threading.Condition()
         """Held while runs are looked at or changed, and never while anything is copied or computed."""
         self._free = [graph.buffer() for _ in range(_BUFFERS)]
@@ -294,7 +297,7 @@ class Batches(OneByOne):
             try:
                 self._wait_for(lambda: bool(self._open(constants) or (self._free and self._queue[0] is ticket)))
                 if (run := self._open(constants)) is None:
-                    run = _Run(constants, self._free.pop(), self._clock.now())
+                    run = _Run(constants, self._buffer(), self._clock.now())
                     self._gathering.append(run)
                 run.threads.append(thread)
                 return run, len(run.threads) - 1
@@ -304,8 +307,16 @@ class Batches(OneByOne):
 
     def _open(self, constants: Constants) -> _Run | None:
         """A run that takes one more page with these constants."""
-        same = (run for run in self._gathering if run.constants is constants and len(run.threads) < self.largest)
+        same = (run for run in self._gathering if run.constants is constants and not self._is_full(run))
         return next(same, None)
+
+    def _is_full(self, run: _Run) -> bool:
+        return len(run.threads) >= min(self.largest, run.buffer.pages)
+
+    def _buffer(self) -> FrameBuffer:
+        """Memory that is free; there is more of it where runs are larger now."""
+        buffer = self._free.pop()
+        return buffer if buffer.pages >= self._graph.pages else self._graph.buffer()
 
     def _see_to(self, run: _Run) -> None:
         """Wait until a run is done, in which one more page is there; run it if nobody else does once it may begin."""
@@ -319,6 +330,7 @@ class Batches(OneByOne):
             self._is_running, run.begun = True, self._clock.now()
         inferences, failure = None, None
         try:
+            self._grow()
             self._pages.move(Phase.RUNNING, *run.threads)
             inferences = self._computed(run)
         except BaseException as error:  # an interrupt too: others wait
@@ -350,24 +362,36 @@ class Batches(OneByOne):
         """Return whether it is a run's turn, and nothing is to be waited for."""
         if self._is_running or [run] != self._gathering[:1] or run.written < len(run.threads):
             return False
-        if len(run.threads) >= self.largest:
+        if self._is_full(run):
             return True
         if any(ticket.constants is run.constants for ticket in self._queue):  # which has been told that there is room
             return False
         return not run.is_patient or not self._pages.count(Phase.COMING)
 
+    def _grow(self) -> None:
+        """Have runs of as many pages as are wanted once more, where a model is gone since memory was short."""
+        if self.largest == self._batching.largest or self._gone == self._pages.gone:
+            return
+        self._gone, before = self._pages.gone, self._graph.pages
+        try:
+            self._graph.fit(self._batching.largest)
+        except LightpageError as error:
+            self._graph.pages = before
+            _log.warning("batches stay as they are: %s", error)
+        self.largest = self._graph.pages
+
     def _computed(self, run: _Run) -> list[Inference]:
         """The graph's answers to a run's pages; in smaller runs from now on where there was no memory for so many."""
         pages, found = len(run.threads), list[Inference]()
-        size = pages
+        size = min(pages, self.largest)
         while (first := len(found)) < pages:
             part = slice(first, min(first + size, pages))
             try:
                 found += self._graph.run(run.constants, run.buffer, part)
             except Exception as error:
-                if size == 1 or not lacks_memory(error):
+                if (ran := part.stop - first) == 1 or not lacks_memory(error):
                     raise
-                self.largest = size = (size + 1) // 2
+                self.largest, self._gone = (size := fewer(ran)), self._pages.gone
                 told = "%s: batches of %d pages from now on, since memory was short: %s"
                 _log.warning(told, self._graph.subject, size, error)
             else:

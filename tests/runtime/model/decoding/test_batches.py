@@ -47,6 +47,9 @@ class Graph:
         self.may_run.set()
         self.fails: Callable[[list[int]], None] = lambda numbers: None
 
+    def fit(self, pages: int) -> None:
+        self.pages = 4
+
     def constants(self, table: Table, registration: np.ndarray | None = None) -> Constants:
         own = table.registration if registration is None else registration
         return Constants(own, cast(BoundSession, None), reach_px=5.0)
@@ -155,6 +158,13 @@ def test_where_memory_is_short_runs_are_smaller_from_then_on(stage: Stage, caplo
     assert stage.batches.largest == 1
     assert stage.pages.runs == {1: 5}
     assert "memory" in caplog.text
+    stage.graph.fails = lambda numbers: None
+    assert stage.infer(5) == 5
+    assert stage.batches.largest == 1
+    another = Stage()
+    Batches(cast(BatchGraph, another.graph), cast(TableGraph, another.table), Batching(8, 0.005, stage.pages))  # gone
+    assert stage.infer(6) == 6
+    assert stage.batches.largest == 4
 
 
 def test_only_pages_of_the_same_constants_are_computed_together(stage: Stage) -> None:

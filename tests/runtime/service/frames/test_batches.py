@@ -32,7 +32,7 @@ class Stage:
     def __init__(self, decoder: Decoder) -> None:
         self.graph, self.batching = HeldGraph(decoder), Batching(LARGEST)
         self.service: Running = begun(self.graph.gathering(self.batching))
-        self.service.plane.metrics.watch_batches(self.batching.pages)
+        self.service.plane.metrics.watch_batches(self.batching.pages, lambda: self.service.plane.together)
         self.pool = ThreadPoolExecutor(8)
 
     def count(self, phase: Phase) -> int:
