@@ -32,6 +32,7 @@ from lightpage.runtime.model.decoding.batch_graph import (
 )
 from lightpage.runtime.model.decoding.page import Inference
 from lightpage.runtime.model.decoding.under_way import Phase, UnderWay
+from lightpage.runtime.model.execution.providers import ON_CPU
 from lightpage.runtime.model.execution.table_graph import TableGraph
 
 _log = logging.getLogger(__name__)
@@ -192,6 +193,9 @@ class OneByOne:
         """A page is decoded within the `with` statement; until it is inferred, a batch may wait for it."""
         return nullcontext()
 
+    def put_off(self) -> None:
+        """Have no batch wait for the caller's page until it is inferred: that waits for something else."""
+
     def infer(
         self, table: TableGraph, pair: FramePair, registration: NDArray[np.float32] | None = None
     ) -> Inference | None:
@@ -250,6 +254,8 @@ class Batches(OneByOne):
                 "%s: no %s, so pages are computed one by one (lightpage export --batches)", bundle.subject, BATCH
             )
             return OneByOne(_ALONE)
+        if table.provider == ON_CPU:
+            _log.warning("%s: batches on a CPU take longer than pages one by one", bundle.subject)
         return cls(BatchGraph(bundle, table, batching.largest, threads), table, batching)
 
     @contextmanager
@@ -267,14 +273,12 @@ class Batches(OneByOne):
         self, table: TableGraph, pair: FramePair, registration: NDArray[np.float32] | None = None
     ) -> Inference | None:
         """See `OneByOne`."""
-        thread = threading.get_ident()
-        behind = Phase.BEHIND if self._pages.knows(thread) else None
         if (found := self._constants.of(table, registration)) is None:
-            self._pages.move(behind, thread)
-            with self._changed:  # a run may have waited for it
-                self._changed.notify_all()
+            self._pages.went_alone()
+            self.put_off()
             return None
-        came = self._clock.now()
+        came, thread = self._clock.now(), threading.get_ident()
+        behind = self._behind(thread)
         self._pages.move(Phase.WAITING, thread)
         try:
             run, place = self._joined(found[0], thread)
@@ -288,6 +292,15 @@ class Batches(OneByOne):
             assert run.error is not None
             raise copy(run.error) from run.error  # each caller's own: callers add to errors
         return replace(run.inferences[place], waited_s=run.begun - came)
+
+    def put_off(self) -> None:
+        """See `OneByOne`."""
+        self._pages.move(self._behind(thread := threading.get_ident()), thread)
+        with self._changed:
+            self._changed.notify_all()
+
+    def _behind(self, thread: int) -> Phase | None:
+        return Phase.BEHIND if self._pages.knows(thread) else None
 
     def _joined(self, constants: Constants, thread: int) -> tuple[_Run, int]:
         """A run that is gathered with these constants, and the page's place in it."""

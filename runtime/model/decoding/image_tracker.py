@@ -283,6 +283,8 @@ class ImageTracker:
             if state.settled:
                 inference = state.decoder.infer(pair, state.table)
                 clock.add("inference_s", inference.waited_s)
+            else:
+                state.decoder.batches.put_off()
             is_next = turn.wait(partial(self._has_left, state))
             clock.add("turn_s")
             if is_next and not self._has_left(state):

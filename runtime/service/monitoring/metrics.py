@@ -239,6 +239,7 @@ def _batches(pages: UnderWay, largest: Callable[[], int]) -> Iterator[Metric]:
     total = sum(size * count for size, count in runs.items())
     yield HistogramMetricFamily("lightpage_batch_pages", "Pages of a batch.", buckets=buckets, sum_value=total)
     yield GaugeMetricFamily("lightpage_batch_largest", "Pages of a batch, at most, as memory allows.", value=largest())
+    yield CounterMetricFamily("lightpage_pages_alone", "Pages computed by themselves in place of a batch.", pages.alone)
     spent = CounterMetricFamily("lightpage_device_seconds", "What computes batches, by state.", labels=["state"])
     for state, seconds in pages.seconds().items():
         spent.add_metric([state.value], seconds)

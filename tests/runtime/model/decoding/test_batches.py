@@ -12,10 +12,12 @@ import pytest
 
 from lightpage.errors import BundleError
 from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.model.decoding import batches
 from lightpage.runtime.model.decoding.batch_graph import REGISTRATION, BatchGraph, Constants, FrameBuffer
 from lightpage.runtime.model.decoding.batches import KEPT, Batches, Batching, HeldConstants
 from lightpage.runtime.model.decoding.page import Inference
 from lightpage.runtime.model.decoding.under_way import Device, Phase, UnderWay
+from lightpage.runtime.model.execution.providers import Provider
 from lightpage.runtime.model.execution.session import BoundSession
 from lightpage.runtime.model.execution.table_graph import TableGraph
 from tests.clock import HandClock
@@ -123,6 +125,12 @@ def test_a_run_waits_for_a_page_whose_frames_are_being_checked(stage: Stage) -> 
     assert [sorted(run) for run in stage.graph.runs] == [[1, 2]]
 
 
+def test_a_run_waits_for_no_page_that_waits_for_something_else(stage: Stage) -> None:
+    with stage.batches.under_way():
+        stage.batches.put_off()
+        assert stage.pool.submit(stage.infer, 1).result(PATIENT) == 1
+
+
 def test_a_run_waits_no_longer_than_is_set(stage: Stage) -> None:
     with stage.batches.under_way():
         page = stage.pool.submit(stage.infer, 1)
@@ -179,9 +187,27 @@ def test_only_pages_of_the_same_constants_are_computed_together(stage: Stage) ->
     assert all(len({number % 2 for number in run}) == 1 for run in stage.graph.runs)
 
 
+@pytest.mark.parametrize(("provider", "told"), [("cpu", True), ("cuda", False)])
+def test_batches_on_a_cpu_are_warned_of(
+    provider: str, told: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(batches, "holds_batches", lambda bundle: True)
+    monkeypatch.setattr(batches, "BatchGraph", lambda bundle, table, *_: Graph(table))
+    table: Any = Table()
+    table.provider = Provider.parse(provider)
+    assert Batches.opened(Mock(), table, Batching(4), None).largest == 4
+    assert bool(caplog.records) is told
+
+
 def holding(table: Any) -> HeldConstants:
     """Constants, each made before anything else goes on."""
     return HeldConstants(cast(BatchGraph, Graph(table)), table, lambda work: work())
+
+
+def test_pages_without_constants_are_counted(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(HeldConstants, "of", lambda *_: None)
+    assert stage.infer(1) is None
+    assert stage.pages.alone == 1
 
 
 def test_few_constants_are_held_and_those_in_use_stay() -> None:

@@ -350,6 +350,15 @@ def test_pages_decoded_at_the_same_time_are_taken_in_their_order(device: FakeDev
     assert [round(float(held[0]), 1) for held in device.decodes] == [0.0, 0.0, 0.5, 0.5]
 
 
+def test_no_batch_waits_for_a_page_whose_image_is_looked_for_first(device: FakeDevice, monkeypatch: Any) -> None:
+    device.together = 2
+    monkeypatch.setattr(OneByOne, "put_off", put_off := Mock())
+    tracker = device.tracker()
+    for seed in (1, 2):
+        tracker.decode(device.page(seed), 16)
+        put_off.assert_called_once()
+
+
 def test_without_batches_pages_wait_for_none_and_teach_once(device: FakeDevice, monkeypatch: Any) -> None:
     tracker, learnt = settled(device), list[ImageState]()
     device.drift[SHIFT] = (0.5, 0.0)
