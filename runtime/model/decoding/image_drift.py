@@ -155,7 +155,8 @@ class DriftModel:
         concentration /= coarse.over_claim
         freed = phase - coarse.constant_rad - np.tensordot(coarse.drift, slopes, 1)
         safe = SAFE_DEVIATIONS / np.sqrt(np.maximum(concentration, 1e-9)) < levels.half_way(freed)
-        decided = np.where(at, known, levels.nearest_phases(freed))
+        decided = levels.nearest_phases(freed)
+        decided[at] = known[at]
         chosen = safe | at
         weight = np.minimum(concentration[chosen], _CAP)
         fine = _solve(wrapped(phase - decided)[chosen], slopes[:, chosen], weight, prior)
