@@ -17,8 +17,12 @@ from lightpage.runtime.archives.run.shard import PageState, ShardRecord, record_
 from lightpage.runtime.archives.run.task import Choices, Done, Failed, Operation, Task
 from lightpage.runtime.archives.workers.device import EVERY_S, StepLog
 from lightpage.runtime.archives.workers.work import Worker
+from lightpage.runtime.model.decoding.batches import Batching
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.execution.providers import Provider
 from tests.clock import HandClock
 from tests.runtime import coded, toy
+from tests.runtime.held_graph import LARGEST, HeldGraph
 
 OPERATIONS = [Operation.DECODE, Operation.EVALUATE, Operation.RECOVER]
 PAGES = 3
@@ -58,6 +62,22 @@ def test_a_range_is_read_and_its_record_says_what_it_was(operation: Operation, a
     assert (record.model.version, done.lost, done.left_out, done.seconds) == ("toy-1", {}, 0, record.seconds)
     assert record.pages[0].figures["air_bits_per_symbol"] == pytest.approx(5, abs=0.5)
     assert bool(record.confidence_bins) == (operation is Operation.EVALUATE)
+
+
+def test_a_range_is_read_in_batches(asked: Callable[..., Task], monkeypatch: pytest.MonkeyPatch) -> None:
+    load, seen = Decoder.load, list[Batching]()
+
+    def gathering(path: Path, threads: int, provider: Provider, batching: Batching) -> Decoder:
+        graph = HeldGraph(load(path, threads, provider))
+        graph.run_together(batching)
+        seen.append(batching)
+        return graph.gathering(batching)
+
+    monkeypatch.setattr(Decoder, "load", gathering)
+    choices = Choices(operation=Operation.DECODE, tracking=False, batches=LARGEST)
+    assert isinstance(Worker(1).work(task := asked(choices=choices)), Done)
+    assert [page.state for page in ShardRecord.read(task.shard).pages] == [PageState.READ] * PAGES
+    assert (seen[0].largest, max(seen[0].pages.runs) > 1) == (LARGEST, True)
 
 
 @pytest.mark.parametrize("operation", OPERATIONS)

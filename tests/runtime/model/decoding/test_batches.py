@@ -5,19 +5,17 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any, cast
-from unittest.mock import Mock
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 from lightpage.errors import BundleError
 from lightpage.recording.frame_pair import FramePair
-from lightpage.runtime.model.decoding import batches
 from lightpage.runtime.model.decoding.batch_graph import REGISTRATION, BatchGraph, Constants, FrameBuffer
 from lightpage.runtime.model.decoding.batches import KEPT, Batches, Batching, HeldConstants
 from lightpage.runtime.model.decoding.page import Inference
 from lightpage.runtime.model.decoding.under_way import Device, Phase, UnderWay
-from lightpage.runtime.model.execution.providers import Provider
 from lightpage.runtime.model.execution.session import BoundSession
 from lightpage.runtime.model.execution.table_graph import TableGraph
 from tests.clock import HandClock
@@ -73,9 +71,12 @@ class Stage:
     def __init__(self) -> None:
         self.table, self.pages, self.clock = Table(), UnderWay(), HandClock()
         self.graph = Graph(self.table)
-        graph, table = cast(BatchGraph, self.graph), cast(TableGraph, self.table)
-        self.batches = Batches(graph, table, Batching(8, 0.005, self.pages), self.clock)
+        self.batches = self.gathering()
         self.pool = ThreadPoolExecutor(10)
+
+    def gathering(self) -> Batches:
+        graph, table = cast(BatchGraph, self.graph), cast(TableGraph, self.table)
+        return Batches(graph, table, Batching(8, 0.005, self.pages), self.clock)
 
     def infer(self, number: int, table: Table | None = None) -> int | None:
         """The number, None of a page that is to be computed alone."""
@@ -167,10 +168,7 @@ def test_where_memory_is_short_runs_are_smaller_from_then_on(stage: Stage, caplo
     assert stage.pages.runs == {1: 5}
     assert "memory" in caplog.text
     stage.graph.fails = lambda numbers: None
-    assert stage.infer(5) == 5
-    assert stage.batches.largest == 1
-    another = Stage()
-    Batches(cast(BatchGraph, another.graph), cast(TableGraph, another.table), Batching(8, 0.005, stage.pages))  # gone
+    stage.gathering()  # another model comes and goes
     assert stage.infer(6) == 6
     assert stage.batches.largest == 4
 
@@ -187,27 +185,9 @@ def test_only_pages_of_the_same_constants_are_computed_together(stage: Stage) ->
     assert all(len({number % 2 for number in run}) == 1 for run in stage.graph.runs)
 
 
-@pytest.mark.parametrize(("provider", "told"), [("cpu", True), ("cuda", False)])
-def test_batches_on_a_cpu_are_warned_of(
-    provider: str, told: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setattr(batches, "holds_batches", lambda bundle: True)
-    monkeypatch.setattr(batches, "BatchGraph", lambda bundle, table, *_: Graph(table))
-    table: Any = Table()
-    table.provider = Provider.parse(provider)
-    assert Batches.opened(Mock(), table, Batching(4), None).largest == 4
-    assert bool(caplog.records) is told
-
-
 def holding(table: Any) -> HeldConstants:
     """Constants, each made before anything else goes on."""
     return HeldConstants(cast(BatchGraph, Graph(table)), table, lambda work: work())
-
-
-def test_pages_without_constants_are_counted(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(HeldConstants, "of", lambda *_: None)
-    assert stage.infer(1) is None
-    assert stage.pages.alone == 1
 
 
 def test_few_constants_are_held_and_those_in_use_stay() -> None:
@@ -230,33 +210,20 @@ def test_constants_of_tables_that_are_gone_take_no_place() -> None:
     assert all(held.of(table, None) is not None for table in tables[1:KEPT])
 
 
-def test_pages_go_one_by_one_until_their_constants_are_made(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    table, other, work = Table(), cast(Any, Table(9.0)), list[Callable[[], None]]()
-    graph = Graph(table)
-    held = HeldConstants(cast(BatchGraph, graph), cast(TableGraph, table), work.append)
-    assert [held.of(other, None) for _ in range(2)] == [None, None]
-    graph.constants = Mock(side_effect=[MemoryError, graph.constants(other)])  # type: ignore[method-assign]
-    work.pop()()
+def test_pages_go_alone_until_their_constants_are_made(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
+    tables, work = cast(Any, [Table(9.0 * number) for number in range(KEPT + 1)]), list[Callable[[], None]]()
+    held = HeldConstants(cast(BatchGraph, Graph(tables[0])), tables[0], work.append)
+    assert [held.of(table, None) for table in tables[1:] * 2] == [None] * 2 * KEPT
+    assert len(work) == KEPT - 1  # those that are being made take room
+    with patch.object(Graph, "constants", side_effect=MemoryError):
+        work.pop(0)()
     assert caplog.records
-    assert held.of(other, None) is None
-    work.pop()()
-    assert held.of(other, None) is not None
-    assert not work
-
-
-def test_constants_that_are_being_made_take_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    tables: Any = [Table(9.0 * number) for number in range(KEPT + 1)]
-    held, make, found = holding(tables[0]), Graph.constants, list[Any]()
-
-    def constants(graph: Graph, table: Table, _: None) -> Constants:
-        found.append(held.of(tables[tables.index(table) + 1], None))
-        return make(graph, table)
-
-    monkeypatch.setattr(Graph, "constants", constants)
-    found.append(held.of(tables[1], None))
-    assert [each is None for each in found] == [True, *[False] * (KEPT - 1)]
+    for made in work:
+        made()
+    assert [held.of(table, None) is None for table in tables] == [False, True, False, False, True]
+    with patch.object(HeldConstants, "of", return_value=None):
+        assert stage.infer(1) is None
+    assert stage.pages.alone == 1
 
 
 def test_constants_follow_an_image_that_leaves_their_reach() -> None:

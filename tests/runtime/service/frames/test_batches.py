@@ -13,6 +13,7 @@ import pytest
 from lightpage.errors import FrameError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.answers import RemotePage
+from lightpage.runtime.client.pb.inference import open_inference_pb2_grpc as oip_grpc
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.batches import Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
@@ -22,6 +23,7 @@ from lightpage.runtime.service.settings import ServiceSettings
 from tests.runtime import toy
 from tests.runtime.conftest import begun
 from tests.runtime.held_graph import LARGEST, HeldGraph
+from tests.runtime.service.frames.test_inference import arrays, request_of
 from tests.runtime.service.stage import Running, a_page, parts, refused
 from tests.waiting import LIMIT_S, eventually
 
@@ -37,6 +39,11 @@ class Stage:
 
     def count(self, phase: Phase) -> int:
         return self.batching.pages.count(phase)
+
+    def inferred(self, pair: FramePair) -> np.ndarray:
+        """The symbols, by the Open Inference Protocol."""
+        stub = oip_grpc.GRPCInferenceServiceStub(self.service.channel())
+        return arrays(stub.ModelInfer(request_of(pair, levels=16)))["symbols"]
 
     def decode(self, pair: FramePair) -> Future[RemotePage]:
         return self.pool.submit(self.service.client.frames.decode, pair, 16)
@@ -65,17 +72,19 @@ def test_pages_of_concurrent_calls_are_computed_together_and_one_is_refused_alon
     shown = [pair for _, pair in pages]
     shown[2] = FramePair(shown[2].quadrature, shown[2].in_phase)
     with stage.held():
+        other = stage.pool.submit(stage.inferred, shown.pop())
         replies = [stage.decode(pair) for pair in shown]
         eventually(lambda: stage.count(Phase.WAITING) == 7)
     assert isinstance(replies.pop(2).exception(LIMIT_S), FrameError)
     del pages[2]
+    assert np.mean(other.result(LIMIT_S) == pages.pop()[0]) > 0.9
     for reply, (symbols, _) in zip(replies, pages, strict=True):
         assert np.mean(reply.result().symbols == symbols) > 0.9
     assert stage.batching.pages.runs == {1: 1, LARGEST: 1, 3: 1}
     assert stage.service.count("lightpage_batch_pages_bucket", le="2") == 1
     assert stage.service.count("lightpage_batch_pages_sum") == 8
     assert stage.service.count("lightpage_device_seconds_total", state="running") > 0
-    assert stage.service.count("lightpage_stage_seconds_count", method="DecodeFrames", stage="queue") == 8
+    assert stage.service.count("lightpage_stage_seconds_count", method="DecodeFrames", stage="queue") == 7
 
 
 @pytest.mark.parametrize("call", ["a stream", "a range"])
