@@ -16,7 +16,15 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.decoding.batches import OneByOne
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate
-from lightpage.runtime.model.decoding.image_tracker import CORRECTIONS, RETRACE_RAD, WALK, ImageState, ImageTracker
+from lightpage.runtime.model.decoding.image_tracker import (
+    CORRECTIONS,
+    MOST_STALE_PX,
+    RETRACE_RAD,
+    STALE_PX,
+    WALK,
+    ImageState,
+    ImageTracker,
+)
 from lightpage.runtime.model.decoding.page import Inference
 from lightpage.runtime.model.decoding.tracking import TrackerMemory
 from tests.runtime import toy
@@ -348,6 +356,20 @@ def test_pages_decoded_at_the_same_time_are_taken_in_their_order(device: FakeDev
     assert image is not None
     assert image.shift_x_px == pytest.approx(0.5, abs=0.01)
     assert [round(float(held[0]), 1) for held in device.decodes] == [0.0, 0.0, 0.5, 0.5]
+
+
+@pytest.mark.parametrize(("error", "most"), [(1e-6, STALE_PX), (0.14, MOST_STALE_PX)])
+def test_in_batches_no_page_is_read_far_from_where_it_was_looked_at(
+    device: FakeDevice, error: float, most: float
+) -> None:
+    device.together, device.error = 2, error
+    tracker, away = settled(device), list[float]()
+    for _ in range(24):
+        device.drift[SHIFT] += 0.008
+        tracker.decode(device.page(), 16)
+        away.append(float(np.abs(tracker.state.untraced[SHIFT]).max()))
+    assert most / 2 < max(away) <= most
+    assert away.count(0) < 12  # the others stay where they are computed
 
 
 def test_no_batch_waits_for_a_page_whose_image_is_looked_for_first(device: FakeDevice, monkeypatch: Any) -> None:
