@@ -51,7 +51,7 @@ WIDEST = np.array([3.0, 3.0, 0.03, 0.03])
 
 STALE_PX, MOST_STALE_PX = 0.03, 0.05
 """Distance from where an image was looked at, up to which pages behind are read from there, computed before this one
-was read: the first, or what is not known of the place, and the second at most. It costs 0.003 bit in bright light, where
+was read: the first, or what is not known of the place, and the second at most. It costs 0.003 bit in bright light;
 0.04 px cost 0.006. Of a device that walks as `WALK`, a page is computed 2.8 times, and 2.6 times at 0.04 px."""
 
 MOST_AHEAD, FEWEST_AHEAD = 64, 4

@@ -40,7 +40,7 @@ def test_first_come_is_first_served() -> None:
 def test_more_slots_serve_those_who_wait_and_fewer_nobody_until_enough_are_back() -> None:
     slots = Slots(1, "tests", 60.0)
     with ThreadPoolExecutor(2) as pool:
-        _ = [pool.submit(slots.take, Caller()) for _ in range(2)]
+        pool.map(slots.take, [Caller(), Caller()])
         eventually(lambda: slots.queued == 1)
         slots.resize(2)
     slots.resize(1)

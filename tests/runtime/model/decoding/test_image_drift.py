@@ -69,7 +69,6 @@ def test_safe_decisions_count_beside_the_pilots_and_unsafe_ones_do_not() -> None
 
 
 def test_a_large_page_shows_its_drift_by_some_of_its_symbols(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pages of a device wait for each other's drift."""
     seen, few = page((0.1, -0.05, 0.01, 0.02), kappa=1e9)
     noise = np.random.default_rng(1).normal(0, 0.05, (20 * NY, 20 * NX))
     large = inference(np.tile(seen.phase, (20, 20)) + noise, 400)
@@ -79,7 +78,6 @@ def test_a_large_page_shows_its_drift_by_some_of_its_symbols(monkeypatch: pytest
     found = DriftModel(np.tile(SLOPES, (1, 20, 20))).estimate(large, 16, Pilots(mask, few.phases), ANYTHING)
     assert found is not None
     assert np.abs(found.drift[SHIFT] - (0.1, -0.05)).max() < 0.01
-    assert found.deviations[SHIFT].max() < 0.005
     assert 5000 < symbols[0] <= len(few.phases) + 10_000 < 0.1 * mask.size
 
 

@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
-from unittest.mock import Mock
 
 import grpc
 import numpy as np
@@ -18,8 +17,6 @@ from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.batches import Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.under_way import Phase
-from lightpage.runtime.service.assembly import assembled
-from lightpage.runtime.service.settings import ServiceSettings
 from tests.runtime import toy
 from tests.runtime.conftest import begun
 from tests.runtime.held_graph import LARGEST, HeldGraph
@@ -124,12 +121,6 @@ def test_a_page_in_a_run_ends_with_the_model_that_it_began_with(stage: Stage, de
     plane.models.adopt(stage.graph.gathering(stage.batching).of_bundle(renamed(decoder, "toy-3")))
     assert [*slots, plane.decodes.count] == [2 * LARGEST, plane.limits.concurrent_decodes, 2 * LARGEST]
     assert (plane.together, plane.ahead()) == (LARGEST, 2 * LARGEST)
-
-
-def test_batches_are_told_of_before_a_model_has_them(decoder: Decoder) -> None:
-    wanted = {"service": {"bundle": str(decoder.bundle.path), "tracking": False}, "batches": {"largest": LARGEST}}
-    with assembled(ServiceSettings.model_validate(wanted), Mock()) as service:
-        assert service.plane.metrics.registry.get_sample_value("lightpage_batch_pages_count") == 0
 
 
 def renamed(decoder: Decoder, version: str) -> Bundle:
