@@ -12,7 +12,7 @@ import pytest
 
 from lightpage.errors import BundleError
 from lightpage.recording.frame_pair import FramePair
-from lightpage.runtime.model.decoding.batch_graph import REGISTRATION, BatchGraph, Constants, FrameBuffer
+from lightpage.runtime.model.decoding.batch_graph import REGISTRATION, BatchGraph, Constants, FrameBuffer, fewer
 from lightpage.runtime.model.decoding.batches import KEPT, Batches, Batching, HeldConstants
 from lightpage.runtime.model.decoding.page import Inference
 from lightpage.runtime.model.decoding.under_way import Device, Phase, UnderWay
@@ -167,6 +167,7 @@ def test_where_memory_is_short_runs_are_smaller_from_then_on(stage: Stage, caplo
     assert stage.batches.largest == 1
     assert stage.pages.runs == {1: 5}
     assert "memory" in caplog.text
+    assert [fewer(pages) for pages in (16, 12, 6, 5, 3, 2)] == [8, 8, 4, 4, 2, 1]
     stage.graph.fails = lambda numbers: None
     stage.gathering()  # another model comes and goes
     assert stage.infer(6) == 6
