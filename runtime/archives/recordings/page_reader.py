@@ -55,7 +55,7 @@ class RecoveredPage:
         failed_blocks: LDPC blocks that did not converge.
         iterations: mean of the LDPC blocks.
         air_bits: AIR of the page as delivered, bits a data symbol; None where its symbols are not known.
-        seconds: of the optical decode.
+        seconds: of the optical decode, without waiting for other pages.
         code_seconds: of the code.
         healed_rounds: rounds of the healing before which it gave no bytes; None where it needed none.
     """
@@ -193,7 +193,7 @@ class PageReader:
             start = time.perf_counter()
             pair = narrow(frames, self._recording.bit_depth)
             found = page.tracker.decode(pair, self._levels.count, self._pilots, page.turn)
-            return found, time.perf_counter() - start
+            return found, time.perf_counter() - start - found.timings.waited_s
 
         return decoded_ahead(self._recording, pages, lambda: self._tracker, self._decoder.batches.largest, decode)
 

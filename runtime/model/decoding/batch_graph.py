@@ -67,7 +67,7 @@ class FrameBuffer:
 
     def __init__(self, pages: int, frame_shape: tuple[int, int], dtype: str, twins: DeviceTwins = ON_NO_DEVICE) -> None:
         both = np.zeros((2, pages, *frame_shape), dtype)
-        self.frames = dict(zip(("in_phase", "quadrature"), both, strict=True))
+        self.pages, self.frames = pages, dict(zip(("in_phase", "quadrature"), both, strict=True))
         self.shift = np.zeros((pages, 2, 2), np.float32)
         self._twin = twins.of(both)
 
@@ -111,7 +111,7 @@ class BatchGraph:
     """
 
     def __init__(self, bundle: Bundle, graph: TableGraph, pages: int, threads: int | None = None) -> None:
-        self.subject, self.pages = f"{bundle.subject}: {BATCH}", pages
+        self.subject = f"{bundle.subject}: {BATCH}"
         if missing := _FILES - bundle.files.keys():
             raise BundleError(f"{bundle.subject}: files", f"no {', '.join(sorted(missing))}", "a graph for batches")
         self._bundle, self._provider, self._twins = bundle, graph.provider, DeviceTwins(graph.provider)
@@ -121,8 +121,13 @@ class BatchGraph:
         # stays open, since opening it takes longer than running it; `once` has it keep no memory
         self._first = open_session(bundle.files[CONSTANTS], f"{bundle.subject}: {CONSTANTS}", threads, once=True)
         self.constants_of_bundle = self.constants(graph)
+        self.fit(pages)
+
+    def fit(self, pages: int) -> None:
+        """Have so many pages a run, or as many as there is memory for; raises as the constructor does."""
+        self.pages = pages
         while not self._has_room():
-            self.pages = (self.pages + 1) // 2
+            self.pages = fewer(self.pages)
             _log.warning("%s: batches of %d pages, since memory is short", self.subject, self.pages)
 
     def _has_room(self) -> bool:
@@ -168,7 +173,7 @@ class BatchGraph:
         """
         count = pages.stop - pages.start
         # of few sizes, since a GPU looks for kernels at each: others are computed beside them, whatever they are
-        size = min(self.pages - pages.start, 1 << (count - 1).bit_length())
+        size = min(buffer.pages - pages.start, 1 << (count - 1).bit_length())
         feeds = buffer.feeds(slice(pages.start, pages.start + size))
         answers = list(zip(*constants.bound.run([*OUTPUTS, "residual"], feeds), strict=True))
         if len(answers) != size:
@@ -181,6 +186,11 @@ class BatchGraph:
             frames = pair if number == place else FramePair(pair.quadrature, pair.in_phase)
             buffer.put(number, frames, np.zeros((2, 2), np.float32))
         return self.run(self.constants_of_bundle, buffer, slice(0, pages))[place].p
+
+
+def fewer(pages: int) -> int:
+    """The next smaller size of a run."""
+    return 1 << ((pages - 1).bit_length() - 1)
 
 
 def with_proven_batches(bundle: Bundle, graph: TableGraph) -> Bundle:
