@@ -1,7 +1,5 @@
 """Frames that a caller has, sent or shared, and decoded by the service."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Unpack
 

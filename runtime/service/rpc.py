@@ -1,7 +1,5 @@
 """Facts of an RPC that the server needs before its handler runs, written at the handler."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar

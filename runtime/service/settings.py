@@ -1,7 +1,5 @@
 """The service's settings: one TOML file, above it the environment, above both the options of the command line."""
 
-from __future__ import annotations
-
 import os
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping

@@ -1,7 +1,5 @@
 """`lightpage jobs`: the recalibrations of a running service."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, replace
 from datetime import datetime
 from pathlib import Path

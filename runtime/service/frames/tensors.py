@@ -1,7 +1,5 @@
 """Tensors and parameters of the Open Inference Protocol: requests to arrays, a decoded page to tensors."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice

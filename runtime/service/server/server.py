@@ -1,7 +1,5 @@
 """The server: gRPC, its health and reflection on an address, a graceful end, and nothing left behind."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import threading
