@@ -30,9 +30,6 @@ JOBS = [name for name, manifest in ALL.items() if manifest["kind"] == "Job"]
 PODS = [name for name, manifest in ALL.items() if list(manifests.templates(manifest))]
 
 
-# ---- the files ------------------------------------------------------------------------------------------------------
-
-
 def test_every_file_is_used_and_what_is_used_is_there() -> None:
     used: set[Path] = set()
     for kustomization in manifests.kustomizations():
@@ -63,9 +60,6 @@ def test_what_kustomize_makes_of_the_folders_is_valid() -> None:
         made = list(yaml.safe_load_all(kubectl("kustomize", kustomization.parent)))
         assert made
         assert [problem for each in made for problem in manifests.problems(each)] == []
-
-
-# ---- what belongs together ------------------------------------------------------------------------------------------
 
 
 def selects(selector: dict[str, str], labels: dict[str, str]) -> bool:
@@ -134,9 +128,6 @@ def test_a_pod_has_what_it_mounts_and_no_more_rights_than_it_needs(name: str) ->
             assert all((probe.get("grpc") or probe["httpGet"])["port"] in ports for probe in probes)
 
 
-# ---- the service ----------------------------------------------------------------------------------------------------
-
-
 def pod_settings() -> ServiceSettings:
     return service_settings(SETTINGS, {"LIGHTPAGE_STORE": "/state/models", "LIGHTPAGE_SERVICE__THREADS": "4"}).settings
 
@@ -173,9 +164,6 @@ def test_kubelet_waits_until_calls_in_flight_have_ended() -> None:
     before = manifests.container(whole)["lifecycle"]["preStop"]["sleep"]["seconds"]
     given = whole["spec"]["template"]["spec"]["terminationGracePeriodSeconds"]
     assert given >= before + pod_settings().limits.grace_s + 10  # for the rest to end: calls, health checks, the store
-
-
-# ---- the jobs -------------------------------------------------------------------------------------------------------
 
 
 def parsed(words: Sequence[str]) -> dict[str, Any]:

@@ -77,9 +77,6 @@ def succeeds(program: Path, target: str, *words: object) -> str:
     return done.stdout
 
 
-# ---- against a service --------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def service(decoder: Decoder) -> Iterator[Running]:
     running = begun(decoder)
@@ -127,9 +124,6 @@ def test_it_recalibrates_a_service(program: Path, service: Running) -> None:
     assert service.version == "toy-1+r1"
     assert "toy-1+r1" in said
     assert "toy-1+r1" in succeeds(program, service.server.target, "watch", said.split()[1])
-
-
-# ---- against services that answer as told -------------------------------------------------------------------------
 
 
 class Told(pb_grpc.LightpageServicer):

@@ -1,7 +1,5 @@
 """Claims about the simulated device: its light, its frames, its drift, and the truth that it tells of itself."""
 
-from __future__ import annotations
-
 from functools import cache
 from itertools import product
 

@@ -83,9 +83,6 @@ def test_an_ipv6_address_goes_into_brackets() -> None:
         assert host_and_port(host, 5) == told
 
 
-# ---- channels -------------------------------------------------------------------------------------------------------
-
-
 class Failing(pb_grpc.LightpageServicer):
     """Is unavailable so many times at first."""
 

@@ -79,9 +79,6 @@ def fails(service: Running, request: oip.ModelInferRequest) -> Refused:
     return refused(lambda: infer(service, request))
 
 
-# ---- answers ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("typed", [False, True])
 def test_a_pair_gives_the_same_page_as_by_decode_frames(service: Running, typed: bool) -> None:
     own = service.client.frames.decode(PAIR, 16, stateless=True, want_phase=True, want_concentration=True)
@@ -211,9 +208,6 @@ def test_sessions_are_those_of_the_own_contract(start: Start) -> None:
 
     assert service.client.frames.decode(PAIR, 16, session="mine").piston_rad == 1
     assert [piston(session="mine"), piston(), piston(), piston(stateless=True)] == [2, 1, 2, 1]
-
-
-# ---- refusals -----------------------------------------------------------------------------------------------------
 
 
 def with_pilots(request: oip.ModelInferRequest, mask: np.ndarray, symbols: np.ndarray | None) -> None:

@@ -1,7 +1,5 @@
 """What is known of a page: observers are told of each and cost nobody one; figures; the stages of its whole way."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

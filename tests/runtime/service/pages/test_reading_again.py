@@ -1,7 +1,5 @@
 """Pages that came to nothing get a second look where there is room, time and a code for it; else all ends well."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Claims about pages of a range that came to nothing: which of them are worth another look."""
 
-from __future__ import annotations
-
 from lightpage.codec.page_bytes import FileFacts, Header, Loss, PageBytes
 from lightpage.codec.volume import Volume
 from lightpage.runtime.service.pages.reading import DataPage, Unread
