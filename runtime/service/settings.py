@@ -73,8 +73,7 @@ class ServiceTable(SettingsTable):
     )
     shared_memory: bool = Field(False, description="Share memory with clients at the service's Unix socket.")
     store: Folder | None = Field(
-        None,
-        description=f"Folder of recalibrated and uploaded bundles; it remembers which one serves. {_STORE} too.",
+        None, description=f"Folder of recalibrated and uploaded bundles; it remembers which one serves. {_STORE} too."
     )
     incoming: Folder | None = Field(None, description="Folder whose bundles are taken into the store, as uploads are.")
     recordings: Folder | None = Field(

@@ -35,12 +35,7 @@ from lightpage.runtime.commands.client.recalibrate import summary, table, watche
 )
 @JSON
 def jobs(
-    target: str,
-    tls: TlsFiles | None,
-    watch: str | None,
-    cancel: str | None,
-    timeout_s: float,
-    json_path: Path | None,
+    target: str, tls: TlsFiles | None, watch: str | None, cancel: str | None, timeout_s: float, json_path: Path | None
 ) -> None:
     """Show, follow or cancel the recalibrations of a service; without an option all that it remembers, newest first."""
     if watch is not None and cancel is not None:

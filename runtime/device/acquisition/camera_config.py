@@ -49,8 +49,7 @@ def _kind_of_camera(table: object) -> object:
 
 
 AnyCameraTable = Annotated[
-    Annotated[CameraTable, Tag("genicam")] | Annotated[PluginCameraTable, Tag("plugin")],
-    Discriminator(_kind_of_camera),
+    Annotated[CameraTable, Tag("genicam")] | Annotated[PluginCameraTable, Tag("plugin")], Discriminator(_kind_of_camera)
 ]
 
 
