@@ -178,11 +178,6 @@ def parsed(words: Sequence[str]) -> dict[str, Any]:
     return command.make_context(name, list(arguments)).params
 
 
-def words_of(name: str) -> list[str]:
-    container = manifests.container(ALL[name])
-    return [*container["command"], *container["args"]]
-
-
 def test_the_service_understands_its_command_line() -> None:
     arguments = manifests.container(manifests.manifest("StatefulSet", "lightpage"))["args"]
     assert parsed(["lightpage", "serve", *arguments])["config"] == Path("/settings/service.toml")
@@ -194,7 +189,8 @@ def test_every_index_of_a_job_does_its_part_and_they_are_all(name: str) -> None:
     assert spec["completionMode"] == "Indexed"
     parts = []
     for index in range(spec["completions"]):
-        options = parsed([word.replace(INDEX, str(index)) for word in words_of(name)])
+        words = (*container["command"], *container["args"])
+        options = parsed([word.replace(INDEX, str(index)) for word in words])
         parts.append(Part.parse(options["part"]))
         assert options["workers"] * options["threads"] == container["resources"]["limits"]["cpu"]
     assert parts == [Part(index=index, count=len(parts)) for index in range(len(parts))]

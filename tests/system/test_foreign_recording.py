@@ -13,7 +13,7 @@ import pytest
 
 from analysis.foreign_device import BENCH, HALF, Design, ForeignDevice
 from lightpage.cli import main
-from lightpage.device.profile import Profile, load_profile
+from lightpage.device.profile import load_profile
 from tests.lightpage.small import small_profile
 
 JUMPS = {0: (-6.0, 8.0), 2: (9.0, -5.0)}
@@ -37,12 +37,6 @@ def figures_of(folder: Path, *arguments: object) -> dict[str, Any]:
     return dict(json.loads((folder / "figures.json").read_text()))
 
 
-def half_profile() -> Profile:
-    """The small profile with as many pilots as a page of the bench device has."""
-    small = small_profile()
-    return small.model_copy(update={"page": small.page.model_copy(update={"pilot_fraction": 0.05})})
-
-
 @pytest.mark.timeout(20 * 60)
 @pytest.mark.parametrize(
     ("design", "pages", "choices", "synthetic", "size"),
@@ -57,7 +51,9 @@ def test_a_device_that_nobody_here_made_is_calibrated_trained_exported_and_decod
     tmp_path: Path, design: Design, pages: int, choices: str, synthetic: int, size: int, request: pytest.FixtureRequest
 ) -> None:
     if design is HALF:
-        profile, drawn = half_profile(), 1
+        profile, drawn = small_profile(), 1
+        page = profile.page.model_copy(update={"pilot_fraction": 0.05})  # as many as a page of the bench device has
+        profile = profile.model_copy(update={"page": page})
         request.getfixturevalue("ready_twin")
     else:
         profile, drawn = load_profile("bench"), np.random.SeedSequence().generate_state(1)[0]

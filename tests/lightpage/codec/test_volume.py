@@ -56,7 +56,6 @@ class TestNumbers:
         ("change", "subject", "got"),
         [
             ({"id": -1}, "volume id", -1),
-            ({"file_bytes": MOST_BYTES + 1}, "file", MOST_BYTES + 1),
             ({"data_pages": 0}, "group of pages", "0 data and 3 parity"),
             # 2^24 pages in groups of 8 hold 5 x 2^21 data pages
             ({"file_bytes": 10 * 5 * (1 << 21) + 1}, "file", (1 << 24) + 8),

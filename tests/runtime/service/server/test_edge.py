@@ -38,16 +38,6 @@ def health_of(service: Running) -> Any:
     return health_pb2_grpc.HealthStub(service.channel())
 
 
-def test_messages_that_cannot_be_parsed_are_the_callers_fault(service: Running) -> None:
-    channel, name = service.channel(), SERVICE.full_name
-    for method in (m.name for m in SERVICE.methods if not m.client_streaming):
-        answer = refused(lambda method=method: channel.unary_stream(f"/{name}/{method}")(b"\xff\xff\xff", timeout=20))  # type: ignore[misc]
-        assert (answer.code, answer.reason) == (INVALID, "MALFORMED"), method
-    for messages in ([b"\xff\xff"], [pb.DecodeFramesRequest(header=header()).SerializeToString(), b"\xff\xff"]):
-        answer = refused(lambda sent=messages: channel.stream_unary(f"/{name}/DecodeFrames")(iter(sent), timeout=20))  # type: ignore[misc]
-        assert answer.code is INVALID
-
-
 def test_a_deadline_that_is_too_short_is_told_so(start: Start) -> None:
     service = start(limits=Limits(concurrent_decodes=1))
     service.plane.decodes.took(15.0)
