@@ -39,13 +39,3 @@ def rpc(role: Role, **served: bool) -> Callable[[F], F]:
         return handler
 
     return mark
-
-
-def rpc_of(handler: Callable[..., Any]) -> Rpc:
-    """Return what a handler was marked with.
-
-    Raises:
-        AttributeError: it was not marked.
-    """
-    found: Rpc = handler.rpc  # type: ignore[attr-defined]
-    return found

@@ -3,7 +3,6 @@
 from dataclasses import asdict, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -51,13 +50,9 @@ def jobs(
             click.echo(table(data))
         else:
             found = client.jobs.list() if cancel is None else [client.jobs.cancel(cancel)]
-            write_json(json_path, {"jobs": list(map(_figures, found))})
+            told = [{**asdict(replace(job, error=None)), "error": job.error and str(job.error)} for job in found]
+            write_json(json_path, {"jobs": told})
             click.echo("\n".join(map(_line, found)) if found else "no jobs")
-
-
-def _figures(job: JobInfo) -> dict[str, Any]:
-    """Return a job under the names that other programs read."""
-    return {**asdict(replace(job, error=None)), "error": job.error and str(job.error)}
 
 
 def _line(job: JobInfo) -> str:
