@@ -1,7 +1,5 @@
 """Answers of a service, as its callers see them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import StrEnum
 

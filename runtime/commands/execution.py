@@ -1,7 +1,5 @@
 """Options of commands that decode: bundle, threads, execution provider, batches, and where TensorRT keeps engines."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Options that say what computes pages, for commands that decode, and for those that have others decode."""
 
-from __future__ import annotations
-
 import click
 
 from lightpage.runtime.model.execution.providers import CPU, WANTED

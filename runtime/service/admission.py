@@ -1,7 +1,5 @@
 """Limits on work under way: slots, first come, first served; bytes of received frames; decodes that hang."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import time

@@ -1,7 +1,5 @@
 """Builds what a service decodes with from its settings: models, source, data plane and recalibrator."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager

@@ -1,7 +1,5 @@
 """The result of `lightpage bulk`: figures for programs, a table for people, and the error that it ends with."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

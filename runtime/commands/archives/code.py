@@ -1,7 +1,5 @@
 """`lightpage code`: chooses how user bytes are protected on a device's pages."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`lightpage recover`: reads a file back from recorded pages."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

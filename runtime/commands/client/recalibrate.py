@@ -1,7 +1,5 @@
 """`lightpage recalibrate` and `lightpage rollback`: a bundle offline, or a running service's model."""
 
-from __future__ import annotations
-
 import time
 from contextlib import suppress
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """Pages of a recording as a source."""
 
-from __future__ import annotations
-
 import threading
 from pathlib import Path
 

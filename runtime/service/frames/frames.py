@@ -1,7 +1,5 @@
 """Frames that callers send: checked against the camera, received, decoded with the model in service, and answered."""
 
-from __future__ import annotations
-
 import threading
 import time
 

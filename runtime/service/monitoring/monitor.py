@@ -1,7 +1,5 @@
 """Says whether the device has changed so far that a recalibration pays, from many pages and not from one."""
 
-from __future__ import annotations
-
 import logging
 import math
 import statistics

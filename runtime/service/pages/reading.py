@@ -1,7 +1,5 @@
 """Reads pages of the service's own source: one as symbols, or a range for its bytes, lost ones restored from parity."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace

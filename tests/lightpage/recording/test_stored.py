@@ -22,6 +22,7 @@ from tests.clock import HandClock
 from tests.lightpage.recording.test_recording import LEVELS, PAGES, write_foreign
 from tests.lightpage.refused import refused
 from tests.runtime import toy
+from tests.told import Told
 
 UNLIMITED = h5py.h5s.UNLIMITED
 FRAME = (14, 20)
@@ -364,17 +365,10 @@ class TestChunkMemory:
     def test_chunks_beyond_the_memory_are_told_of(self, foreign: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.shared(foreign, FRAME[0])
         monkeypatch.setattr(stored, "CACHE_BYTES", 1000)
-        notes: list[str] = []
-
-        class Watcher:
-            def track(self, items: object, *_: object) -> object:
-                return items
-
-            note = staticmethod(notes.append)
-
-        with reporting(Watcher()), Recording.open(foreign) as recording:
+        told = Told()
+        with reporting(told), Recording.open(foreign) as recording:
             recording.frames(0)
-        assert any("h5repack -l in_phase:CHUNK=1x14x20" in note for note in notes)
+        assert any("h5repack -l in_phase:CHUNK=1x14x20" in note for note in told.notes)
 
 
 class TestUnfinishedFiles:
