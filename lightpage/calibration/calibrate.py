@@ -113,6 +113,7 @@ class Registered:
         modulation: light that the modulator makes of its levels.
         modulation_deviations: standard deviations of its coefficients.
         goodness: how well all that explains the first page's light; None where that was not measured.
+        quadrature_deviation: standard deviation of the angle between the arms, radians; None where it was not fitted.
     """
 
     parameters: Real
@@ -125,6 +126,7 @@ class Registered:
     modulation: Modulation = NOMINAL
     modulation_deviations: tuple[float, ...] = NOMINAL.coefficients
     goodness: Goodness | None = None
+    quadrature_deviation: float | None = None
 
 
 @dataclass(frozen=True)
@@ -366,6 +368,7 @@ class _Registration:
         self.any_orientation, self.orientations, self.rough = False, tuple[str, ...](), False
         self.deviations = np.zeros_like(self.parameters)
         self.quadrature_phase = np.pi / 2
+        self.quadrature_deviation: float | None = None
         self.levels = LevelPrior()
         self.modulation, self.modulation_deviations = NOMINAL, NOMINAL.coefficients
         self.fit: PatchFit | None = None
@@ -486,7 +489,7 @@ class _Registration:
             rough=self.rough,
         )
         self.parameters, self.deviations = found.parameters, found.deviations
-        self.quadrature_phase = found.quadrature_phase
+        self.quadrature_phase, self.quadrature_deviation = found.quadrature_phase, found.quadrature_deviation
         self.modulation, self.modulation_deviations = found.modulation, found.modulation_deviations
         self.illumination = found.illumination
 
@@ -517,6 +520,7 @@ class _Registration:
             modulation=self.modulation,
             modulation_deviations=self.modulation_deviations,
             goodness=self._goodness(),
+            quadrature_deviation=self.quadrature_deviation,
         )
 
     def _goodness(self) -> Goodness | None:

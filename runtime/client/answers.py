@@ -252,7 +252,7 @@ class Recalibrated:
     service, does not say.
 
     `air_limit` is the least `air_after` that would have been accepted, `air_standard_error` that of the difference.
-    `rounds` are those of a healing, None where the pages were known. `verdict`, `bits_lost` and `cause` say how well the
+    `rounds` are those of a healing, None where pages were known. `verdict`, `bits_lost` and `cause` say how well the
     geometry explains the light.
     """
 

@@ -237,7 +237,7 @@ class _Healing:
         pages = self._read(model)
         lacking = max(0.0, min(-page.margin_bits for page in pages))
         told = f"the nearest lacks {lacking:.2f} bit a symbol by its own claims"
-        if not lacking:
+        if lacking < 0.005:
             told = "one claims enough, and no checksum holds"
         if decoded := sum(page.loss is Loss.CHECKSUM for page in pages):
             told = f"{decoded} fail in bits that their LDPC blocks, which all converge, leave out"

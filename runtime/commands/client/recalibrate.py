@@ -46,7 +46,13 @@ DEFAULT_PAGES = 2
 @click.option("--out", type=NewPath(), help="Offline: where the new bundle goes; a zip where it ends in .zip.")
 @target_option(required=False, help="Recalibrate this running service instead of a bundle.")
 @with_tls
-@click.option("--pages", default=DEFAULT_PAGES, show_default=True, type=click.IntRange(2), help="Known pages to use.")
+@click.option(
+    "--pages",
+    default=DEFAULT_PAGES,
+    show_default=True,
+    type=click.IntRange(2),
+    help="Known pages to use. Of user data six are, with --other-device eight.",
+)
 @click.option(
     "--timeout",
     "timeout_s",
