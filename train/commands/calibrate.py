@@ -166,6 +166,6 @@ def table(calibration: Calibration, profile: Profile) -> str:
     for name, value in calibration.modulation.items():
         lines.append(f"{name:<32}{value:>12.6g}   {calibration.modulation_deviations[name]:<10.2g}{0:>10.6g}")
     turn, known = math.degrees(calibration.turn_rad), calibration.turn_deviation_rad
-    deviation = "" if known is None else f"{math.degrees(known):.2g}"
-    lines.append(f"{'between the arms, degree':<32}{turn:>12.6g}   {deviation:<10}{'+90 or -90':>10}")
+    told = "" if known is None else f"{math.degrees(known):.2g}"
+    lines.append(f"{'between the arms, degree':<32}{turn:>12.6g}   {told:<10}{'+90 or -90':>10}")
     return "\n".join(lines)
