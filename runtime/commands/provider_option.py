@@ -14,6 +14,14 @@ PROVIDER = click.option(
     help=f"What computes pages: {WANTED}.",
 )
 
+CODE_THREADS = click.option(
+    "--code-threads",
+    type=click.IntRange(1, 64),
+    envvar="LIGHTPAGE_SERVICE__CODE_THREADS",
+    show_envvar=True,
+    help="Threads that share the code of a page, where it is compiled; 1 by default.",
+)
+
 BATCHES = click.option(
     "--batches",
     type=click.IntRange(1, 64),

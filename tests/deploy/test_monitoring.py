@@ -73,7 +73,7 @@ def shown(toy_zip: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
     monitor, models = Monitor(metrics=metrics), Models(Decoder(bundle, threads=1), store)
     plane = DataPlane(models, source, metrics=metrics, observers=[last_pages], monitor=monitor)
     metrics.watch_certificates(lambda: 2e9)
-    metrics.watch_batches(UnderWay())
+    metrics.watch_batches(UnderWay(), lambda: 1)
     for _ in range(3):
         stages = Stages()
         read_page(plane, None, None, Caller(), stages=stages)

@@ -55,7 +55,7 @@ class RecoveredPage:
         failed_blocks: LDPC blocks that did not converge.
         iterations: mean of the LDPC blocks.
         air_bits: AIR of the page as delivered, bits a data symbol; None where its symbols are not known.
-        seconds: of the optical decode.
+        seconds: of the optical decode, without waiting for other pages.
         code_seconds: of the code.
         healed_rounds: rounds of the healing before which it gave no bytes; None where it needed none.
     """
@@ -106,7 +106,7 @@ class PageReader:
         """Read with this model from now on."""
         self._decoder, self._tracker, code = decoder, tracker, self._code
         self._levels, self._pilots = decoder.bundle.levels(code.levels), decoder.written_pilots(code.levels)
-        self.codec = PageCodec(code, decoder.bundle.pilot_mask, self._levels)
+        self.codec = PageCodec(code, decoder.bundle.pilot_mask, self._levels, decoder.code_threads)
 
     def read(self, pages: Sequence[int], take: Take, *, heals: bool = True) -> Iterator[RecoveredPage]:
         """Read pages, and heal the model by those that it does not read.
@@ -193,7 +193,7 @@ class PageReader:
             start = time.perf_counter()
             pair = narrow(frames, self._recording.bit_depth)
             found = page.tracker.decode(pair, self._levels.count, self._pilots, page.turn)
-            return found, time.perf_counter() - start
+            return found, time.perf_counter() - start - found.timings.waited_s
 
         return decoded_ahead(self._recording, pages, lambda: self._tracker, self._decoder.batches.largest, decode)
 

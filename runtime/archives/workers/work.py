@@ -94,7 +94,8 @@ class Worker:
             self._warm = None
             if (found := bundle_sha256(bundle.path)) != bundle.sha256:
                 raise BundleError(f"bundle {bundle.path}", f"SHA-256 {found}", f"{bundle.sha256}, as at the start")
-            self._warm = bundle, choices, _Warm(Decoder.load(bundle.path, self._threads, provider, batching))
+            decoder = Decoder.load(bundle.path, self._threads, provider, batching, choices.code_threads)
+            self._warm = bundle, choices, _Warm(decoder)
         return self._warm[2]
 
 

@@ -16,12 +16,14 @@ from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.recovery import Recovery, code_of, lost_data, told_losses
 from lightpage.runtime.archives.recordings.recovery import recover as recover_file
 from lightpage.runtime.commands.execution import Load, decoder_options
+from lightpage.runtime.commands.provider_option import CODE_THREADS
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.decoding.tracking import NoTracker
 
 
 @click.command()
 @decoder_options
+@CODE_THREADS
 @click.option("--recording", required=True, type=click.Path(), help="HDF5 recording of the file's pages.")
 @click.option("--code", "code_path", type=click.Path(path_type=Path), help="Code; the recording's or the bundle's.")
 @click.option("--out", required=True, type=OutputFile(), help="The file.")
@@ -33,6 +35,7 @@ from lightpage.runtime.model.decoding.tracking import NoTracker
 @click.option("--tracking/--no-tracking", default=True, show_default=True, help="Follow the image, and find it again.")
 def recover(
     load: Load,
+    code_threads: int | None,
     recording: str,
     code_path: Path | None,
     out: Path,
@@ -50,7 +53,7 @@ def recover(
     lost, each is named, no file is written and the exit status is 3. Where storage did not give some of them, it is 75:
     the same command tries again.
     """
-    decoder = load()
+    decoder = load(code_threads or 1)
     with Recording.open(recording) as pages:
         code = code_of(pages, decoder.bundle) if code_path is None else load_code(code_path)
         tracker = tracker_for(decoder) if tracking else NoTracker(decoder)

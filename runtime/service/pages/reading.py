@@ -151,7 +151,7 @@ def read_page(
                     decoded = plane.decode(model, place, found.pair, levels, pilots, subject, stages, monitor)
             data = plane.user_data(model, decoded, stages, monitor, expected) if user_data else None
             seen.note(page=decoded, user_data=data)
-        plane.decodes.took(time.perf_counter() - begun)
+        plane.decodes.took(time.perf_counter() - begun - decoded.timings.turn_s)
     return ReadAnswer(plane.answer(decoded, model, stages, data, monitor), found, mask, model)
 
 

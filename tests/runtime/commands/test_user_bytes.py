@@ -43,7 +43,7 @@ def recovered(bundle: Path, recording: Path, *more: str) -> tuple[Result, dict]:
 
 def test_a_file_comes_back_and_the_figures_say_what_it_cost(bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
     assert len(pages) == 9 + 3 * 2  # 9 data pages in groups of three, two parity pages each
-    result, figures = recovered(bundle, coded.recording(tmp_path / "R.h5", pages))
+    result, figures = recovered(bundle, coded.recording(tmp_path / "R.h5", pages), "--code-threads", "2")
     assert result.exception is None
     assert (tmp_path / "read.bin").read_bytes() == coded.CONTENT
     assert {key: figures[key] for key in ("pages", "pages_unread", "pages_lost", "user_bytes")} == {

@@ -4,6 +4,7 @@ import errno
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import h5py
@@ -17,6 +18,7 @@ from lightpage.runtime.archives.run.shard import PageState, ShardRecord, record_
 from lightpage.runtime.archives.run.task import Choices, Done, Failed, Operation, Task
 from lightpage.runtime.archives.workers.device import EVERY_S, StepLog
 from lightpage.runtime.archives.workers.work import Worker
+from lightpage.runtime.model.decoding.decoder import Decoder
 from tests.clock import HandClock
 from tests.runtime import coded, toy
 
@@ -58,6 +60,13 @@ def test_a_range_is_read_and_its_record_says_what_it_was(operation: Operation, a
     assert (record.model.version, done.lost, done.left_out, done.seconds) == ("toy-1", {}, 0, record.seconds)
     assert record.pages[0].figures["air_bits_per_symbol"] == pytest.approx(5, abs=0.5)
     assert bool(record.confidence_bins) == (operation is Operation.EVALUATE)
+
+
+def test_a_range_is_read_in_batches_of_the_size_that_is_asked_for(asked: Callable[..., Task], monkeypatch: Any) -> None:
+    monkeypatch.setattr(Decoder, "load", opened := Mock(wraps=Decoder.load))
+    choices = Choices(operation=Operation.DECODE, tracking=False, batches=4)
+    assert isinstance(Worker(1).work(asked(choices=choices)), Done)
+    assert opened.call_args.args[-1].largest == 4
 
 
 @pytest.mark.parametrize("operation", OPERATIONS)
