@@ -103,12 +103,12 @@ def refit(
 
 
 def check_as_good(earlier: Calibration, fitted: Calibration) -> None:
-    """Check that a re-fit is not wrong, where the calibration that it started from is known not to be.
+    """Check that a fit is not wrong, unless the calibration that it started from is known to be.
 
     Raises:
         CalibrationError: it is wrong.
     """
-    if earlier.goodness is not None and not earlier.is_wrong:
+    if not earlier.is_wrong:
         fitted.check_good("re-fit, outcome", ": else calibrate anew")
 
 

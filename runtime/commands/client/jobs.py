@@ -61,7 +61,7 @@ def _line(job: JobInfo) -> str:
     if job.state is JobState.RUNNING:
         told = f"{job.fraction:.0%} {job.step}"
     elif job.result is not None:
-        told = f"{job.result.model_version} in service instead of {job.result.previous_version}"
+        told = job.result.told
     else:
         told = str(job.error or "")
     return "  ".join(filter(None, [job.id, f"{job.state.lower():<11}", begun, job.pages_of, job.correlation_id, told]))
