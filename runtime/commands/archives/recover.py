@@ -31,8 +31,7 @@ from lightpage.runtime.model.decoding.tracking import NoTracker
 @click.option(
     "--known-out",
     type=OutputFile(),
-    help="Write the pages that are read as a recording with known symbols; --recording, which has the frames, must stay "
-    "where it is.",
+    help="Write the pages that are read as a recording with known symbols; its frames stay in --recording.",
 )
 @click.option("--heal/--no-heal", default=True, show_default=True, help="Re-fit by pages that are not read.")
 @JSON

@@ -4,17 +4,21 @@ import errno
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import NoReturn
 from unittest.mock import Mock
 
 import h5py
+import numpy as np
 import pytest
 
-from lightpage.errors import StorageError
+from lightpage.errors import RecalibrationRefusedError, StorageError
+from lightpage.recording.pages import Pages
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.run.ledger import Ledger
 from lightpage.runtime.archives.run.question import of_recordings
 from lightpage.runtime.archives.run.shard import PageState, ShardRecord, record_of
-from lightpage.runtime.archives.run.task import Choices, Done, Failed, Operation, Task
+from lightpage.runtime.archives.run.task import Choices, Done, Failed, FineTuning, Operation, RecordedFile, Stamp, Task
+from lightpage.runtime.archives.workers import device
 from lightpage.runtime.archives.workers.device import EVERY_S, StepLog
 from lightpage.runtime.archives.workers.work import Worker
 from tests.clock import HandClock
@@ -134,6 +138,31 @@ def test_an_evaluation_needs_symbols(asked: Callable[..., Task], tmp_path: Path)
     failed = failure(asked(Operation.EVALUATE))
     assert (failed.problem.got, failed.whole_recording) == ("no symbols", True)
     assert isinstance(Worker(1).work(asked(Operation.DECODE)), Done)
+
+
+def test_a_deep_recalibration_is_given_the_pages_of_user_data_that_were_read(
+    asked: Callable[..., Task], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Pages.open(tmp_path / "pages.h5") as written:
+        sent, seen, deep = np.stack(list(written)), list[np.ndarray](), Mock()
+    paths = [tmp_path / "b.h5", tmp_path / "c.h5"]
+    for path, part, spoilt in zip(paths, (sent[:4], sent[4:8]), ({1: coded.half_lost}, {}), strict=True):
+        coded.recording(path, part, spoilt, known=False)
+    files = tuple(RecordedFile(path=path, stamp=Stamp.of(path)) for path in paths)
+    choices = Choices(operation=Operation.RECALIBRATE, fine_tuning=FineTuning())
+    task = asked(choices=choices, files=files, pages=tuple(range(5)), run=tmp_path)
+
+    def recalibrate(decoder: object, recording: Recording, *_: object) -> NoReturn:
+        assert len(recording) == 5  # as many as are wanted
+        seen.extend(symbols for page in range(5) if (symbols := recording.symbols(page)) is not None)
+        assert recording.frames(4).in_phase.any()
+        raise RecalibrationRefusedError("model", "worse", "better")
+
+    deep.recalibrate = recalibrate
+    for _ in range(2):
+        assert isinstance(Worker(1, deep=lambda: deep).work(task), Done)
+        monkeypatch.setattr(device, "write_read_pages", Mock(side_effect=ZeroDivisionError))  # it is not read again
+    np.testing.assert_array_equal(seen, [*sent[[0, 2, 3, 4, 5]]] * 2)
 
 
 def test_steps_are_told_when_they_begin_and_then_now_and_then(tmp_path: Path) -> None:
