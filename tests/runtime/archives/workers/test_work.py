@@ -11,9 +11,11 @@ import h5py
 import numpy as np
 import pytest
 
-from lightpage.errors import RecalibrationRefusedError, StorageError
+from lightpage.errors import LostPageError, RecalibrationRefusedError, StorageError
 from lightpage.recording.pages import Pages
 from lightpage.recording.reader import Recording
+from lightpage.runtime.archives.recordings import page_reader
+from lightpage.runtime.archives.recordings.page_reader import Healings, PageReader
 from lightpage.runtime.archives.run.ledger import Ledger
 from lightpage.runtime.archives.run.question import of_recordings
 from lightpage.runtime.archives.run.shard import PageState, ShardRecord, record_of
@@ -21,6 +23,8 @@ from lightpage.runtime.archives.run.task import Choices, Done, Failed, FineTunin
 from lightpage.runtime.archives.workers import device
 from lightpage.runtime.archives.workers.device import EVERY_S, StepLog
 from lightpage.runtime.archives.workers.work import Worker
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.tracking import NoTracker
 from tests.clock import HandClock
 from tests.runtime import coded, toy
 
@@ -163,6 +167,42 @@ def test_a_deep_recalibration_is_given_the_pages_of_user_data_that_were_read(
         assert isinstance(Worker(1, deep=lambda: deep).work(task), Done)
         monkeypatch.setattr(device, "write_read_pages", Mock(side_effect=ZeroDivisionError))  # it is not read again
     np.testing.assert_array_equal(seen, [*sent[[0, 2, 3, 4, 5]]] * 2)
+
+
+def test_ranges_that_nothing_heals_are_tried_ever_less_often(
+    asked: Callable[..., Task], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    worker, tries = Worker(1), list[int]()
+    refuse = Mock(side_effect=RecalibrationRefusedError("healing", "nothing", "pages"))
+    monkeypatch.setattr(page_reader, "heal", refuse)
+    sent = toy.symbols_of(coded.CODE.levels, 1, PAGES)
+    coded.recording(tmp_path / "a.h5", sent, dict.fromkeys(range(PAGES), coded.dark))
+    for _ in range(9):  # of three pages each
+        done = worker.work(asked(Operation.RECOVER))
+        assert isinstance(done, Done)
+        assert done.lost == {"optics": PAGES}
+        tries.append(refuse.call_count)
+        record_of(done.task.shard).unlink()
+    assert tries == [1, 1, 1, 1, 2, 2, 2, 2, 2]  # for any, then for twelve, then for 24
+
+
+@pytest.mark.parametrize("own", [False, True], ids=["healed", "own"])
+def test_a_range_begins_with_the_model_that_an_earlier_one_healed_or_falls_back_to_its_own(
+    own: bool, asked: Callable[..., Task], tmp_path: Path
+) -> None:
+    class Blind(NoTracker):
+        def decode(self, *_: object) -> NoReturn:
+            raise LostPageError("page", "nothing", "a page")
+
+    decoder = Decoder.load(asked().bundle.path, threads=1)
+    trackers = [NoTracker(decoder), Blind(decoder)]
+    bundles, earlier = trackers if own else reversed(trackers)
+    healings = Healings((decoder, earlier), together=12)
+    with Recording.open(tmp_path / "a.h5") as recording:
+        reader = PageReader(decoder, recording, bundles, coded.CODE, healings=healings)
+        pages = [*reader.read(range(PAGES), lambda page, found: None)]
+    assert [page.loss for page in pages] == [None] * PAGES
+    assert (healings.model is None) == own
 
 
 def test_steps_are_told_when_they_begin_and_then_now_and_then(tmp_path: Path) -> None:
