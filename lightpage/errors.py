@@ -190,7 +190,9 @@ class SlotsTakenError(BusyError):
     """The service does as much as it may at once, and did so until the caller's time was up.
 
     Args:
-        subject, got, expected: see `LightpageError`.
+        subject: as of `LightpageError`.
+        got: as of `LightpageError`.
+        expected: as of `LightpageError`.
         retry_s: seconds after which to try again; None where that is of no use.
     """
 
@@ -270,7 +272,9 @@ class LostPageError(LightpageError):
     """A page could not be read, and nothing that the caller sent need be wrong: write or read it again.
 
     Args:
-        subject, got, expected: see `LightpageError`.
+        subject: as of `LightpageError`.
+        got: as of `LightpageError`.
+        expected: as of `LightpageError`.
         reason: why.
         recalibration_due: whether the device has changed since it was calibrated, as far as this page shows.
     """

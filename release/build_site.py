@@ -19,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
+from copy import copy
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -29,10 +30,11 @@ from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto
 from grpc_tools import protoc
 from pydantic import BaseModel
 
-from lightpage import _HOMES
+from lightpage import _HOMES, errors
 from lightpage.cli.main import lightpage as program
 from lightpage.device.problems import tables_in, tag_of
 from lightpage.device.profile_keys import default_of, key_table, wanted
+from lightpage.errors import LightpageError
 from lightpage.runtime.device.acquisition.camera_config import DeviceTable
 from lightpage.runtime.service.settings import TABLES
 
@@ -41,6 +43,29 @@ DOCS, PAGES, SITE = ROOT / "docs", ROOT / "build" / "pages", ROOT / "build" / "s
 MADE = "<!-- Made of the code by release/build_site.py. -->\n\n"
 TOP = {"README.md": "index.md", "CONTRIBUTING.md": "CONTRIBUTING.md", "CHANGELOG.md": "CHANGELOG.md"}
 """Pages at the top of the repository, and what they are called in the site."""
+PARTS = {
+    "Parts of the client": {
+        "client.frames": "FramesClient",
+        "client.pages": "PagesClient",
+        "client.display": "DisplayClient",
+        "client.jobs": "JobsClient",
+        "client.models": "ModelsClient",
+        "client.shared_memory": "SharedMemory",
+    },
+    "What they take and return": {
+        "client.outgoing": "PageOptions FrameOptions KnownPilots",
+        "client.jobs": "RecalibrationOptions",
+        "client.answers": "RemotePage RemoteFrame RemoteTimings RemoteData Description ServiceLimits ModelInfo "
+        "ModelOrigin JobInfo JobState Recalibrated DisplayOrder",
+    },
+    "Interfaces of drivers": {
+        "device.cameras.camera": "Camera Frame BrokenFrame",
+        "device.trigger.trigger": "Trigger",
+        "device.modulator.modulator": "Modulator",
+        "device.acquisition.source": "FrameSource Shot",
+    },
+}
+"""Chapters behind the public names on the page of Python: names by their module in `lightpage.runtime`."""
 METRICS = {"counter", "gauge", "histogram"}
 """Kinds of metrics, as functions and classes that make them are called, `MetricFamily` at the end left out."""
 
@@ -54,13 +79,26 @@ def _command(command: click.Command, path: str) -> Iterator[str]:
     context = click.Context(command, info_name=path)
     usage = " ".join([path, *command.collect_usage_pieces(context)])
     yield f"## {path}\n\n```\n{usage}\n```\n\n{_paragraphs(command.help or '')}\n"
-    records = [record for one in command.params if (record := one.get_help_record(context))]
-    if records:
-        yield _table(("option", "meaning"), [(f"`{name}`", text) for name, text in records])
+    left_out = [one for one in command.params if getattr(one, "hidden", False)]
+    yield _options([one for one in command.params if one not in left_out], context)
+    if left_out:
+        yield "`--help` leaves out these options, which another one sets:\n"
+        yield _options([_shown(one) for one in left_out], context)
     if isinstance(command, click.Group):
         for name in command.list_commands(context):
             if (inner := command.get_command(context, name)) is not None and not inner.hidden:
                 yield from _command(inner, f"{path} {name}")
+
+
+def _options(params: Sequence[click.Parameter], context: click.Context) -> str:
+    records = [record for one in params if (record := one.get_help_record(context))]
+    return _table(("option", "meaning"), [(f"`{name}`", text) for name, text in records]) if records else ""
+
+
+def _shown(one: click.Parameter) -> click.Parameter:
+    shown = copy(one)
+    shown.hidden = False  # type: ignore[attr-defined]  # an option has it
+    return shown
 
 
 def settings() -> str:
@@ -75,20 +113,20 @@ def settings() -> str:
 
 def camera_keys() -> str:
     """Return every key of the file behind `camera:CONFIG.toml`."""
-    told, parts = set[type[BaseModel]](), ["# Keys of a camera file\n"]
+    tables = dict[type[BaseModel], list[str]]()
     waiting: list[tuple[str, type[BaseModel]]] = [("", DeviceTable)]
     while waiting:
         name, model = waiting.pop(0)
-        if model in told:
-            continue
-        told.add(model)
-        of_kind = f", kind = {kind}" if (kind := tag_of(model)) else ""
-        parts.append(
-            f"## {f'[{name}]{of_kind}' if name else 'The file'}\n\n{_first_paragraph(model)}\n\n{_keys(model)}"
-        )
-        for key, field in model.model_fields.items():
+        tables.setdefault(model, []).append(name)
+        for key, field in model.model_fields.items() if len(tables[model]) == 1 else ():
             waiting += [(f"{name}.{key}" if name else key, inner) for inner in tables_in(field.annotation)]
-    return "\n".join(parts)
+    return "# Keys of a camera file\n\n" + "\n".join(_camera_table(*each) for each in tables.items())
+
+
+def _camera_table(model: type[BaseModel], names: list[str]) -> str:
+    of_kind = f", kind = {kind}" if (kind := tag_of(model)) else ""
+    heading = f"{' and '.join(f'[{name}]' for name in names)}{of_kind}" if names[0] else "The file"
+    return f"## {heading}\n\n{_first_paragraph(model)}\n\n{_keys(model)}"
 
 
 def profile_keys() -> str:
@@ -104,7 +142,14 @@ def metrics() -> str:
         for name, kind, labels, text in _metrics_of(path)
     ]
     table = _table(("name", "type", "labels", "meaning"), sorted(rows))
-    return f"# Metrics\n\nMetrics of `lightpage bulk` also have the labels `run` and `part`.\n\n{table}"
+    told = (
+        "Gauges of the last page show the device: where the service has a source, frames of callers' own sessions "
+        "do not set them, nor do lost pages that came with a caller's own pilots. Without a source there is no "
+        "`lightpage_source_ok`, without TLS no `lightpage_certificate_ends_seconds`. Counters of reasons begin at "
+        "0. What a fit in a process of its own takes is in none. Metrics of `lightpage bulk` also have the labels "
+        "`run` and `part`."
+    )
+    return f"# Metrics\n\n{told}\n\n{table}"
 
 
 def _metrics_of(path: Path) -> Iterator[tuple[str, str, list[str], str]]:
@@ -180,8 +225,15 @@ def _type(field: FieldDescriptorProto) -> str:
 
 
 def python() -> str:
-    """Return the page of the package's public names, which mkdocstrings fills in."""
-    return "# Python\n\n" + "\n".join(f"::: {home}.{name}\n" for name, home in sorted(_HOMES.items()))
+    """Return the page of the package's public names, errors, parts and interfaces, which mkdocstrings fills in."""
+    chapters = {"# Python": [f"{home}.{name}" for name, home in sorted(_HOMES.items())]}
+    kinds = [each for each in vars(errors).values() if isinstance(each, type) and issubclass(each, LightpageError)]
+    chapters["## Errors"] = [f"{errors.__name__}.{each.__name__}" for each in kinds if each is not LightpageError]
+    for told, modules in PARTS.items():
+        chapters[f"## {told}"] = [
+            f"lightpage.runtime.{module}.{name}" for module, names in modules.items() for name in names.split()
+        ]
+    return "\n".join("\n\n".join((told, *(f"::: {name}" for name in names))) + "\n" for told, names in chapters.items())
 
 
 def notebook(path: Path, images: Path) -> str:

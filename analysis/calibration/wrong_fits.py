@@ -89,6 +89,8 @@ def wrong_fits(profile: Profile, seed: int) -> Iterator[tuple[str, Taken]]:
         "a third of the symbols wrong",
         with_symbols(lambda page: np.where(rng.random(page.shape) < 1 / 3, other, page)),
     )
+    foreign = KnownPage(right.pages[1].pair, other)
+    yield "symbols of the second page foreign", replace(right, pages=[right.pages[0], foreign])
     yield "symbols a column to the right", with_symbols(lambda page: np.roll(page, 1, axis=1))
     pairs = [page.pair for page in right.pages]
     mirrored = [FramePair(pair.in_phase, np.ascontiguousarray(pair.quadrature[:, ::-1])) for pair in pairs]

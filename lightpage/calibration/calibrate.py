@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.coherence import COHERENT_BRANCHES, page_coherence
 from lightpage.calibration.goodness.measure import measure_goodness
+from lightpage.calibration.goodness.suspects import LEVELS, NEIGHBOURS
 from lightpage.calibration.goodness.verdict import USABLE, Goodness
 from lightpage.calibration.interfaces import FieldSolver, RememberingTwin, Twin
 from lightpage.calibration.parameters import NAMES, PARAMETERS, indices, nominal
@@ -113,6 +114,7 @@ class Registered:
         modulation: light that the modulator makes of its levels.
         modulation_deviations: standard deviations of its coefficients.
         goodness: how well all that explains the first page's light; None where that was not measured.
+        coherences: of each page, at the fitted geometry.
     """
 
     parameters: Real
@@ -125,6 +127,7 @@ class Registered:
     modulation: Modulation = NOMINAL
     modulation_deviations: tuple[float, ...] = NOMINAL.coefficients
     goodness: Goodness | None = None
+    coherences: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -161,6 +164,9 @@ _DRIFT_SHARES = {"angle": 1.0, "lengths": 0.2, "in_phase": 0.3, "quadrature": 0.
 _DRIFT_SCALE: Real = np.array([_DRIFT_SHARES.get(parameter.group, 0.05) for parameter in PARAMETERS])
 """Drift of a device, as a share of the prior about nominal. What a fit cannot tell well stays as it was: a decoder
 has learned the earlier calibration's errors, and loses 0.1 bit a symbol where a re-fit draws others."""
+
+_LEAST_OF_BEST = 0.8
+"""Share of the best page's coherence that every page must have: a fifth of its symbols may be others."""
 
 _HELD = 1e-6
 """Share of a prior that leaves a parameter where it is."""
@@ -210,7 +216,7 @@ def calibrate(
     except CalibrationError as error:
         failure = error
     for axis in (0, 1):
-        if found and min(map(_bits_lost, found)) <= USABLE:
+        if found and (min(map(_bits_lost, found)) <= USABLE or _by_modulator(found[0])):
             break
         work.parameters, work.quadrature_phase, work.modulation = before
         work.total += 4
@@ -220,7 +226,9 @@ def calibrate(
             found.append(work.result())
     if failure is not None and not found:
         raise failure
-    return min(found, key=_bits_lost)
+    best = min(found, key=_bits_lost)
+    check_agreement(best.coherences)
+    return best
 
 
 def _relate_apart(work: _Registration, axis: int) -> None:
@@ -228,6 +236,26 @@ def _relate_apart(work: _Registration, axis: int) -> None:
     work.begin("relation of cameras apart")
     found = related_apart(work.wave_fit(), work.parameters, work.quadrature_phase, work.modulation, axis, work.tell)
     work.parameters, work.quadrature_phase = found.parameters, found.quadrature_phase
+
+
+def check_agreement(coherences: Sequence[float]) -> None:
+    """Check that every page shows what the others show of the device.
+
+    Raises:
+        CalibrationError: a page whose coherence is far below the best one's.
+    """
+    for number, coherence in enumerate(coherences):
+        if not coherence >= _LEAST_OF_BEST * max(coherences):
+            raise CalibrationError(
+                f"calibration, known page {number}",
+                f"a coherence of {coherence:.3f} where another has {max(coherences):.3f}",
+                f"at least {_LEAST_OF_BEST:.0%} of that: its frames, and the symbols that they show",
+            )
+
+
+def _by_modulator(found: Registered) -> bool:
+    """Return whether bits are lost by what the modulator shows: no other place of the cameras explains that."""
+    return found.goodness is not None and found.goodness.cause in (LEVELS, NEIGHBOURS)
 
 
 def _bits_lost(found: Registered) -> float:
@@ -495,7 +523,8 @@ class _Registration:
         if self.fit is None:
             raise CalibrationError("calibration", "no fit", "at least one stage")
         self.begin("coherence")
-        after = self._coherence(self.parameters, self.modulation)
+        coherences = self._coherences(self.parameters, self.modulation)
+        after = float(np.mean(coherences))
         significant = len(self._found) / len(self._looked)
         reflected = {branch: self._share(branch) for branch in _REFLECTED}
         check_found(after, significant, self.pages[0].symbols.size, reflected)
@@ -510,13 +539,14 @@ class _Registration:
             parameters=self.parameters,
             deviations=self.deviations,
             quadrature_phase=self.quadrature_phase,
-            coherence_before=self._coherence(self.centre, self.levels.centre, 0.5),
+            coherence_before=float(np.mean(self._coherences(self.centre, self.levels.centre, 0.5))),
             coherence_after=after,
             cost=self.fit.cost,
             significant=significant,
             modulation=self.modulation,
             modulation_deviations=self.modulation_deviations,
             goodness=self._goodness(),
+            coherences=tuple(coherences),
         )
 
     def _goodness(self) -> Goodness | None:
@@ -535,15 +565,15 @@ class _Registration:
         looked, found = (sum(m.branch == branch for m in part) for part in (self._looked, self._found))
         return found / looked if looked else 0.0
 
-    def _coherence(self, parameters: Real, modulation: Modulation, begun: float = 0.0) -> float:
-        """Mean over the pages; takes half of the stage, of which the share `begun` is behind."""
+    def _coherences(self, parameters: Real, modulation: Modulation, begun: float = 0.0) -> list[float]:
+        """Coherence of each page; takes half of the stage, of which the share `begun` is behind."""
         found = []
         for number, page in enumerate(self.pages):
             self.tell(begun + number / len(self.pages) / 2)
             sampler = FieldSampler(self._field(page, parameters)[0], self.grid)
             light = page.light(modulation)
             found.append(page_coherence(sampler, self.twin, parameters, self.profile, light))
-        return float(np.mean(found))
+        return found
 
     def _field(
         self, page: KnownPage, parameters: Real | None = None, quadrature_phase: float | None = None

@@ -47,7 +47,8 @@ class FramesClient(SubClient):
             pair: both frames, uint8 or uint16.
             levels: M, 2..256; 0 for the default of the service, `Description.default_levels`, or that of the model's
                 code where user bytes are asked for.
-            frame_id, captured_s: the caller's own; the page has them too.
+            frame_id: the caller's number of the pair; the page has it too.
+            captured_s: the caller's time of the exposure; the page has it too.
             memory: where the pair goes in place of being sent; it may be there already, as `SharedMemory.frames`.
             options: what the frames are, what to get, and whose pages the page is followed with; see `FrameOptions`
                 and `PageOptions`.
@@ -80,7 +81,8 @@ class FramesClient(SubClient):
         Args:
             pairs: taken as fast as the service reads them.
             timeout_s: for all of them.
-            levels, options: of every pair, as for `decode`.
+            levels: of every pair, as for `decode`.
+            options: of every pair, as for `decode`.
 
         Raises:
             FrameError: frames that cannot be sent.

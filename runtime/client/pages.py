@@ -78,7 +78,9 @@ class PagesClient(SubClient):
         Args:
             pages: their numbers; none for the next `count`.
             timeout_s: for all of them.
-            levels, want_written, options: of every page, as for `read`.
+            levels: of every page, as for `read`.
+            want_written: of every page, as for `read`.
+            options: of every page, as for `read`.
 
         Raises:
             SourceError: the service has no source.

@@ -14,12 +14,12 @@ def test_the_site_builds_and_its_links_lead_somewhere() -> None:
     reference = site.SITE / "reference"
     assert "<Figure" not in (site.SITE / "notebooks" / "decode-a-recording.html").read_text("utf-8")
     for page, named in {
-        "commands": "lightpage bulk decode",
+        "commands": "--refinements",
         "settings": "longest_wait_ms",
         "metrics": "lightpage_margin_bits",
-        "camera-keys": "trigger_activation",
+        "camera-keys": "[trigger] and [modulator], kind = plugin",
         "calls": "DecodeFrames",
-        "python": "decode_recording",
+        "python": "ModelsClient.roll_back",
     }.items():
         assert named in (reference / f"{page}.html").read_text("utf-8")
 

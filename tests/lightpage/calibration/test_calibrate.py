@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lightpage.calibration.calibrate import KnownPage, calibrate, refine
+from lightpage.calibration.calibrate import KnownPage, calibrate, check_agreement, refine
 from lightpage.calibration.parameters import as_dict
 from lightpage.device.profile import PageLayout, load_profile
 from lightpage.device.state import Device, draw_device
@@ -53,6 +53,12 @@ def test_a_re_fit_tells_which_share_is_behind_when_its_first_stage_fails() -> No
         begin(lambda stage, share: shares.append(share), again=True)
     assert shares == sorted(shares)
     assert 0 < shares[-1] < 0.5
+
+
+def test_a_page_that_shows_nothing_of_what_the_others_show_is_named() -> None:
+    check_agreement([0.5, 0.45])
+    with refused("known page 1", kind=CalibrationError):
+        check_agreement([0.5, 0.02, 0.49])
 
 
 @pytest.mark.long
