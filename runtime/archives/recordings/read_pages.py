@@ -67,7 +67,7 @@ def write_read_pages(decoder: Decoder, recording: Recording, code: Code, out: Pa
         recording: of the pages.
         code: of the pages.
         out: the new recording.
-        most: pages that are wanted; None for all.
+        most: pages that are enough; None for all.
 
     Raises:
         RecordingError: another device's recording, or one of other levels or pilots, or see `ReadPages.write`.
@@ -82,10 +82,10 @@ def write_read_pages(decoder: Decoder, recording: Recording, code: Code, out: Pa
     pages = PageReader(decoder, recording, tracker_for(decoder), code).read(range(recording.pages), take)
     for page in track(pages, "read", total=recording.pages):
         lost += page.loss is not None
-        if len(read.symbols) == most:
+        if most is not None and len(read.symbols) >= most:
             break
     if lost:
-        warn(f"recording {recording.path}: {lost} pages gave no bytes; they do not count")
+        warn(f"recording {recording.path}: {lost} pages gave no bytes: what is found holds for the others")
     read.write(out)
 
 
@@ -106,4 +106,5 @@ def known_pages_of(decoder: Decoder, recording: Recording, code: Callable[[], Co
     with temporary_folder("symbols of pages that were read") as folder:
         write_read_pages(decoder, recording, code(), out := Path(folder) / "known.h5")
         with Recording.open(out) as known:
+            known.path = recording.path  # which errors name
             yield known
