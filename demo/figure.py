@@ -8,18 +8,17 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 
 from lightpage.demo.result import DemoResult, Phase
+from lightpage.metrics.measures import SMOOTH, smoothed
 from lightpage.pictures import write_figure_png
 
 _LOWEST_PERCENT = 2
 """Share of symbols below the scale of AIR: its few worst symbols would hide what differs."""
-_BRIGHTEST_PERCENT = 99
-"""Share of pixels that the scale of frames shows: a few bright ones would leave the others dark."""
+_GREY_PERCENT = (1, 98)
+"""Percentiles of a frame that are black and white: a few bright pixels would leave the others dark."""
 _SHADES = 32
 """Shades of a map or frame: few colours make a small file."""
-_PILOTS = "white"
 
 
 def write_figure(result: DemoResult, path: Path) -> None:
@@ -30,7 +29,8 @@ def write_figure(result: DemoResult, path: Path) -> None:
     levels = result.code.levels
     frames = (("in-phase frame", result.frames.in_phase), ("quadrature frame", result.frames.quadrature))
     for axis, (name, frame) in zip(axes[0], frames, strict=False):
-        axis.imshow(frame, cmap=colormaps["gray"].resampled(_SHADES), vmax=np.percentile(frame, _BRIGHTEST_PERCENT))
+        black, white = np.percentile(frame, _GREY_PERCENT)
+        axis.imshow(frame, cmap=colormaps["gray"].resampled(_SHADES), vmin=black, vmax=white)
         axis.set_title(name)
     shown = axes[0, 2].imshow(
         result.symbols,
@@ -48,16 +48,20 @@ def write_figure(result: DemoResult, path: Path) -> None:
         if phase.lost == result.volume.file_pages:
             middle = np.array(phase.picture.shape[::-1]) / 2
             axis.text(*middle, "nothing of the picture", color="white", ha="center", va="center", fontsize=14)
-    maps = [phase.air for phase in result.phases]
+    maps = [smoothed(phase.air) for phase in result.phases]
     # an unlikely symbol costs many bits; the colour tells losses apart, not their depth
-    least, most = np.nanpercentile(maps, _LOWEST_PERCENT), np.nanmax(maps)
-    colours = colormaps["magma"].resampled(_SHADES).with_extremes(bad=_PILOTS)
-    for axis, phase in zip(axes[2], result.phases, strict=True):
-        axis.imshow(phase.air, vmin=least, vmax=most, cmap=colours, interpolation="nearest")
+    least, most = np.percentile(maps, _LOWEST_PERCENT), np.max(maps)
+    colours = colormaps["magma"].resampled(_SHADES)
+    for axis, phase, shown in zip(axes[2], result.phases, maps, strict=True):
+        axis.imshow(shown, vmin=least, vmax=most, cmap=colours, interpolation="nearest")
         axis.set_title(f"{phase.name}: AIR {phase.air_bits_per_symbol:.2f} bit/symbol")
-    pilots = Patch(facecolor=_PILOTS, edgecolor="black", label="pilots: known symbols, not counted")
-    figure.legend(handles=[pilots], loc="outside lower right")
-    figure.colorbar(axes[2, 0].images[0], ax=axes[2, :], shrink=0.8, label="AIR, bit/symbol", extend="min")
+    figure.colorbar(
+        axes[2, 0].images[0],
+        ax=axes[2, :],
+        shrink=0.8,
+        label=f"AIR, bit/symbol, mean of {SMOOTH} x {SMOOTH}",
+        extend="min",
+    )
     figure.suptitle("\n".join(result.story()), fontsize=13)
     for axis in axes.ravel():
         axis.set_xticks([])

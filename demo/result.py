@@ -109,13 +109,13 @@ class DemoResult:
     def story(self) -> tuple[str, str, str]:
         """Return the story of the demo for people, in lines of some 120 characters."""
         fresh, lost, again = (phase.air_bits_per_symbol for phase in self.phases)
-        margin, healed = self.phases[0].margin_bits, self.healed
+        margin, healed, volume = self.phases[0].margin_bits, self.healed, self.volume
         spare = "" if margin is None else f" Their code has a margin of {margin:.2f} bit a symbol."
         angle = healed.report.angle_deg
         found = "" if angle is None else f" It found the pipe's angle: {angle:.3f} degree."
         rounds = f"{healed.rounds} round{'' if healed.rounds == 1 else 's'}"
         return (
-            f"A picture of {self.volume.file_bytes} bytes lies on {self.volume.pages} pages, one spoilt.{spare}",
+            f"A picture of {volume.file_bytes} bytes lies on {volume.pages} pages, one spoilt on purpose.{spare}",
             f"The device drifts, AIR falls from {fresh:.2f} to {lost:.2f} bit a symbol, and no known page is shown.",
             f"The model heals by lost pages of user data: {rounds}, AIR {again:.2f} again.{found}",
         )

@@ -137,7 +137,7 @@ def profile_keys() -> str:
 def metrics() -> str:
     """Return every metric that the code names, with its labels."""
     rows = [
-        (f"`{name}`", kind, ", ".join(f"`{label}`" for label in labels), text)
+        (f"<code>{name.replace('_', '_<wbr>')}</code>", kind, ", ".join(f"`{label}`" for label in labels), text)
         for path in sorted((ROOT / "lightpage" / "runtime").rglob("*metrics.py"))
         for name, kind, labels, text in _metrics_of(path)
     ]

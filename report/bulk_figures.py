@@ -132,7 +132,7 @@ def losses(causes: Sequence[tuple[str, int, float, str]], unit: str, lost: str) 
 
 
 def by_device(devices: Sequence[Device], measure: str, fleet: bool) -> Picture:
-    """A measure of each: the mean of its pages, and down to the least."""
+    """A measure of each: the mean of its pages, and down to the least; coloured by what the pilots say."""
     known = [device for device in devices if device.group.figures[measure].value is not None][::-1]
     figure, axis = one_axis()
     for row, device in enumerate(known):
@@ -141,15 +141,26 @@ def by_device(devices: Sequence[Device], measure: str, fleet: bool) -> Picture:
             continue
         axis.plot([least, mean], [row, row], color=GREY, linewidth=1)
         axis.plot(least, row, "|", color=GREY, markersize=8, label=None if row else "worst page")
-        axis.plot(mean, row, "o", color=BLUE, markersize=4, label=None if row else "mean")
+        changed = _changed(device)
+        axis.plot(mean, row, "D" if changed else "o", color=ORANGE if changed else BLUE, markersize=5)
+    axis.plot([], [], "o", color=BLUE, markersize=5, label="mean")
+    if any(_changed(device) for device in known):
+        axis.plot([], [], "D", color=ORANGE, markersize=5, label="mean, device changed")
     _name_rows(axis, known)
     axis.set(xlabel=f"{MEASURES[measure]}, bit/symbol")
     if measure == "margin_bits":
-        axis.axvline(0, color=GREY, linestyle="dashed", linewidth=1)
-    figure.legend(frameon=False, loc="outside upper center", ncols=2)
+        axis.axvline(0, color=GREY, linestyle="dashed", linewidth=1, label="what the code needs")
+    figure.legend(frameon=False, loc="outside upper center", ncols=3)
     who = "device" if fleet else "recording"
-    caption = f"{MEASURES[measure][0].upper()}{MEASURES[measure][1:]}, by {who}: mean of the pages that were read."
-    return as_picture(figure, f"{caption[:-1]}, {len(known)} of them.", caption)
+    name = f"{MEASURES[measure][0].upper()}{MEASURES[measure][1:]}, by {who}"
+    caption = f"{name}: mean of the pages that were read."
+    if any(_changed(device) for device in known):
+        caption += " Orange: the pilots of most pages show that the device is no longer as it was calibrated."
+    return as_picture(figure, f"{name}, {len(known)} of them.", caption)
+
+
+def _changed(device: Device) -> bool:
+    return 2 * device.group.recalibration_due > device.group.read
 
 
 def recalibrations(known: Sequence[Recalibration]) -> Picture:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from lightpage.metrics.measures import SMOOTH
 from lightpage.report import figures
 from lightpage.report.contents.data import ReportData
 from lightpage.report.tables import geometry, zones
@@ -22,6 +23,7 @@ def shown(data: ReportData) -> dict[str, Any]:
         from lightpage.report.traced import exit_centroids, ray_paths
 
         centroids, paths = exit_centroids(data.profile, data.calibration), ray_paths(data)
+    curves = data.curves
     return {
         "measures": data.measures,
         "calibration": data.calibration,
@@ -29,9 +31,10 @@ def shown(data: ReportData) -> dict[str, Any]:
         "geometry": geometry(data),
         "goodness": figures.goodness(data),
         "zones": NOT_TRACED if centroids is None else zones(data, centroids),
+        "smooth": SMOOTH,
         "maps": figures.maps(data, centroids),
         "reliability": [figures.reliability(data), figures.concentration(data)],
-        "training": data.curves if isinstance(data.curves, str) else figures.training(data.curves),
+        "training": curves if curves is None or isinstance(curves, str) else figures.training(curves),
         "page": data.golden if isinstance(data.golden, str) else figures.page(data.golden),
         "rays": NOT_TRACED if paths is None else figures.rays(data, paths),
     }

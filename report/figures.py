@@ -13,6 +13,7 @@ from matplotlib.colors import Colormap
 from numpy.typing import NDArray
 
 from lightpage.calibration.goodness.figure import goodness_figure
+from lightpage.metrics.measures import smoothed
 from lightpage.report.contents.data import Golden, Real, ReportData
 from lightpage.report.drawing import BLUE, GREEN, GREY, ORANGE, Picture, as_picture, new_figure, one_axis
 from lightpage.report.words import number, signed
@@ -20,7 +21,6 @@ from lightpage.report.words import number, signed
 if TYPE_CHECKING:
     from lightpage.train.fitting.curves import Curve
 
-_MISSING = "#bbbbbb"
 _TRIMMED = 1.0
 """Per cent at either end that do not stretch a colour scale."""
 _BRIGHTEST = 99.8
@@ -30,13 +30,12 @@ _LEAST_KAPPA = 1e-2
 
 def maps(data: ReportData, centroids: Real | None) -> list[Picture]:
     """AIR, own-MI, over-claim and phase error over the page, with the borders of the zones where `centroids` tell."""
-    air, own = data.maps.air, data.maps.own_mi
-    low, high = np.nanpercentile([air, own], [_TRIMMED, 100 - _TRIMMED])
+    air, own, error = (smoothed(each) for each in (data.maps.air, data.maps.own_mi, np.rad2deg(data.maps.error_rad)))
+    low, high = np.percentile([air, own], [_TRIMMED, 100 - _TRIMMED])
     claim = own - air
-    most = float(np.nanpercentile(np.abs(claim), 100 - _TRIMMED)) or 1.0
-    error = np.rad2deg(data.maps.error_rad)
-    error_high = float(np.nanpercentile(error, 100 - _TRIMMED))
-    mean = data.measures
+    most = float(np.percentile(np.abs(claim), 100 - _TRIMMED)) or 1.0
+    error_low, error_high = np.percentile(error, [_TRIMMED, 100 - _TRIMMED]).tolist()
+    mean, mean_error = data.measures, np.rad2deg(np.nanmean(data.maps.error_rad))
     claimed = number(mean.over_claim_bits_per_symbol, 3)
     rows = (
         ("AIR, bit/symbol", air, "viridis", (low, high), f"AIR, mean {mean.air_bits_per_symbol:.3f} bit/symbol."),
@@ -58,8 +57,8 @@ def maps(data: ReportData, centroids: Real | None) -> list[Picture]:
             "mean |phase error|, degree",
             error,
             "cividis",
-            (0.0, error_high),
-            f"Mean magnitude of the phase error, {np.nanmean(error):.2f} degrees over the page.",
+            (error_low, error_high),
+            f"Mean magnitude of the phase error, {mean_error:.2f} degrees over the page.",
         ),
     )
     return [
@@ -84,7 +83,7 @@ def _map(
     label: str, values: Real, colours: Colormap, limits: tuple[float, float], centroids: Real | None, caption: str
 ) -> Picture:
     figure, axis = one_axis(image=True)
-    shown = axis.imshow(values, cmap=colours.with_extremes(bad=_MISSING), vmin=limits[0], vmax=limits[1])
+    shown = axis.imshow(values, cmap=colours, vmin=limits[0], vmax=limits[1])
     figure.colorbar(shown, ax=axis, label=label, extend="both", orientation="horizontal", aspect=35)
     for centroid, style in zip(() if centroids is None else centroids, ("solid", "dashed"), strict=False):
         borders = np.arange(np.floor(centroid.min()) + 0.5, centroid.max())

@@ -29,13 +29,16 @@ def shown(data: RecoveryData) -> dict[str, Any]:
     """The pictures, as the template takes them."""
     if not data.pages:
         return {"pictures": []}
-    return {"pictures": [margins(data.pages), failed_codewords(data.pages, data.blocks_per_page)]}
+    pictures = [margins(data.pages)]
+    if any(page.failed_blocks or page.loss in UNDECODED for page in data.pages):
+        pictures.append(failed_codewords(data.pages, data.blocks_per_page))
+    return {"pictures": pictures}
 
 
 def margins(pages: Sequence[PageResult]) -> Picture:
     """Margin over the recorded pages; those that gave no bytes are marked with their cause."""
     figure, axis = one_axis()
-    axis.axhline(0, color=GREY, linestyle="dashed", linewidth=1)
+    axis.axhline(0, color=GREY, linestyle="dashed", linewidth=1, label="what the code needs")
     known = [page for page in pages if page.loss is None and page.margin_bits is not None]
     axis.plot(*_margins(known), "o", color=BLUE, markersize=3, label=f"read ({len(known):,})")
     for loss, marker in _MARKERS.items():
@@ -73,12 +76,13 @@ def failed_codewords(pages: Sequence[PageResult], blocks: int) -> Picture:
         ("page read all the same", BLUE, read),
         ("page lost", ORANGE, [page for page in decoded if page.loss is not None]),
     ):
-        failed = [page for page in some if page.failed_blocks]
+        if not (failed := [page for page in some if page.failed_blocks]):
+            continue
         numbers, counts = [page.page for page in failed], [page.failed_blocks for page in failed]
         axis.vlines(numbers, 0, counts, color=colour, linewidth=1.5)
         axis.plot(numbers, counts, "o", color=colour, markersize=3, label=f"{name} ({len(failed):,})")
-    skipped = [page.page for page in pages if page.loss in UNDECODED]
-    axis.plot(skipped, [0] * len(skipped), "x", color=GREY, clip_on=False, label=f"not decoded ({len(skipped):,})")
+    if skipped := [page.page for page in pages if page.loss in UNDECODED]:
+        axis.plot(skipped, [0] * len(skipped), "x", color=GREY, clip_on=False, label=f"not decoded ({len(skipped):,})")
     axis.set(ylabel="failed codewords", ylim=(0, 1.05 * blocks))
     axis.yaxis.set_major_locator(MaxNLocator(integer=True))
     failures, whole = sum(page.failed_blocks for page in decoded), blocks * len(decoded)

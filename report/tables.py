@@ -105,9 +105,7 @@ def _fitted(parameter: Parameter, data: ReportData) -> Fitted:
 
 
 def _words(name: str, suffix: str) -> str:
-    for camera in ("in_phase_", "quadrature_"):
-        name = name.removeprefix(camera)
-    return name.removesuffix(suffix).replace("_", " ")
+    return name.removesuffix(suffix).replace("in_phase", "in-phase").replace("_", " ")
 
 
 def _with_deviation(value: float, deviation: float) -> tuple[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +11,27 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from lightpage.pictures import write_figure_png
-from lightpage.train.published.localizers import NAMES as PUBLISHED
 
+LABELS = {
+    "ray": "published, ray localizer",
+    "mode": "published, mode localizer",
+    "fast": "`--preset fast`",
+    "coherent": "one pass, coherent",
+    "wave": "`--preset standard`: one pass, wave",
+    "refined": "`--preset accurate`: two passes, coherent",
+    "wave-refined": "two passes, wave",
+    "oracle": "oracle, one pass",
+    "oracle-refined": "oracle, two passes",
+}
+"""Methods by the names that pages use, in the order of their table."""
 MAP = "air_map.npy"
 """File of a method's run: AIR of each symbol, mean over the held-out pages, [ny, nx]."""
 _BRIGHT = 99.0
 """Percentile of the symbols' rates at which the colours of the maps end."""
 _DOTS = 110
 _WIDTH_IN, _DATA_SET_IN = 14.0, 5.2
+_TITLE_LETTERS = 26
+"""Letters of a line above a map."""
 
 
 def draw(data_sets: list[dict[str, Any]], out: Path) -> None:
@@ -57,7 +71,7 @@ def _bars(axis: Any, outcomes: list[dict[str, Any]], top: float) -> None:
     for place, outcome in zip(places, outcomes, strict=True):
         says = f"{outcome['air']:.2f} bit, {outcome['page_kB']:.2f} kB"
         axis.text(max(outcome["air"], outcome["own_mi"], 0) + 0.03 * top, place, says, va="center", fontsize=8)
-    axis.set_yticks(places, [_name(outcome) for outcome in outcomes])
+    axis.set_yticks(places, [method_label(outcome) for outcome in outcomes], fontsize=8)
     axis.set_xlim(0, 1.45 * top)
     axis.set_xlabel("AIR of held-out pages, bit/symbol; black: what is claimed (own-MI)", fontsize=8)
 
@@ -84,7 +98,7 @@ def _maps(part: Any, outcomes: list[dict[str, Any]], out: Path) -> None:
         axis.set_axis_off()
     for axis, outcome, rates in zip(axes.flat, outcomes, maps, strict=False):
         axis.imshow(rates, vmin=0, vmax=top, cmap="viridis")
-        axis.set_title(f"{_name(outcome)}: {outcome['air']:.2f}", fontsize=9)
+        axis.set_title(textwrap.fill(f"{method_label(outcome)}: {outcome['air']:.2f}", _TITLE_LETTERS), fontsize=8)
     part.colorbar(
         axes.flat[0].images[0],
         ax=axes,
@@ -96,7 +110,12 @@ def _maps(part: Any, outcomes: list[dict[str, Any]], out: Path) -> None:
     )
 
 
-def _name(outcome: dict[str, Any]) -> str:
-    """A method, without the number of its refinements if that is one; published ones are marked."""
-    method = str(outcome["method"]).removesuffix(" 1")
-    return f"{method} (published)" if method in PUBLISHED else method
+def method_name(outcome: dict[str, Any]) -> str:
+    """Return the name of a method without the number of its refinements, which is one."""
+    return str(outcome["method"]).removesuffix(" 1")
+
+
+def method_label(outcome: dict[str, Any]) -> str:
+    """Return the name of a method as pages have it, without marks of code."""
+    name = method_name(outcome)
+    return LABELS.get(name, name).replace("`", "")

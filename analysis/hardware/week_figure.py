@@ -28,11 +28,12 @@ def draw(rows: list[dict[str, Any]], path: Path, knock: int, page_s: float) -> N
     shift.set_ylabel("shift of the image, camera pixels")
     shift.set_xlabel("days")
     for each in (air, shift):
+        told = set[str]()
         for number, end in [(n, end) for n, row in enumerate(rows) for end in row["ended"]]:
-            good = end == "done"
-            each.axvline(days[number], color="tab:green" if good else "tab:red", linewidth=0.6, zorder=0)
+            label, colour = ("recalibrated", "tab:green") if end == "done" else ("refused or failed", "tab:red")
+            each.axvline(days[number], color=colour, linewidth=0.6, zorder=0, label=None if label in told else label)
+            told.add(label)
         each.axvline(knock * page_s / 86_400, color="black", linestyle="--", linewidth=0.8, label="knock")
         each.legend(loc="lower right")
-    air.set_title("recalibrations: green, refused or failed: red")
     write_figure_png(path, figure, dpi=130)
     plt.close(figure)

@@ -1,4 +1,4 @@
-"""Writes docs/results/index.md from the figures in analysis/results, after collecting newer ones if asked to.
+"""Writes docs/results/index.md and its picture from the figures in analysis/results; collects newer ones if asked to.
 
     python -m analysis.results.page --from runs/bench-decoders
 
@@ -17,6 +17,7 @@ from pathlib import Path
 import click
 from jinja2 import Environment, StrictUndefined
 
+from analysis.comparison.decoders_figure import LABELS
 from analysis.comparison.outcome import SETTLED_BITS
 from analysis.results.measurements import (
     BOUND,
@@ -35,11 +36,12 @@ from analysis.results.measurements import (
     read_object,
     slim,
 )
+from analysis.results.picture import draw
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device
-from lightpage.files import replace_file, replace_text
+from lightpage.files import replace_text
 
 _DATA_SET = ("angle_deg", "full_well_e", "exposure", "symbol_size_px")
 """Keys of a data set that tell its light."""
@@ -159,6 +161,7 @@ def render(results: Results) -> str:
         device=Device(),
         symbols=symbols,
         learning_bits=SETTLED_BITS,
+        LABELS=LABELS,
         LEDGER_LABELS=LEDGER_LABELS,
         SPEED_LABELS=SPEED_LABELS,
     )
@@ -189,17 +192,6 @@ def bound_name(figures: Figures) -> str:
     """Return the name under which a bound is kept."""
     angle, well, exposure, size = (f"{figures[key]:g}" for key in _DATA_SET)
     return f"{BOUND}{figures['profile']}_{angle}deg_{well}e_{exposure}x_{size}px"
-
-
-def copy_picture(path: Path, to: Path) -> None:
-    """Copy a picture whole, into a folder that is made if it is not there.
-
-    Raises:
-        InvalidInputError: it cannot be written.
-    """
-    picture = path.read_bytes()
-    to.parent.mkdir(exist_ok=True)
-    replace_file(to, lambda file: file.write(picture), "picture")
 
 
 @click.command()
@@ -246,7 +238,7 @@ def main(
     kept: Path,
     out: Path,
 ) -> None:
-    """Write docs/results/index.md from the kept figures."""
+    """Write docs/results/index.md and its picture from the kept figures."""
     given = {EVALUATION: evaluation, DEMO: demo, IMAGE_SEARCH: image_search, LEDGER: ledger}
     found = {name: path for name, path in given.items() if path is not None}
     found |= {bound_name(slim(BOUND, read_object(path))): path for path in bounds}
@@ -265,10 +257,12 @@ def main(
             continue
         measurement.write(kept / f"{name}.json")
         click.echo(f"{name}: {measurement.provenance.time}, commit {measurement.provenance.commit[:7]}")
-        if name == PICTURED and (drawn := path.with_name("figure.png")).exists():
-            copy_picture(drawn, out.absolute().parents[1] / PICTURE)
     results = Results(kept_measurements(kept))
     replace_text(out, render(results), "page")
+    if pictured := results.figures(PICTURED):
+        (data_set,) = pictured["data_sets"]
+        light = results.bound(PICTURED, data_set)
+        draw(data_set, None if light is None else float(light["bits"]), out.absolute().parents[1] / PICTURE)
     for what in results.missing:
         click.echo(f"left out, no figures: {what}")
     click.echo(f"written to {out}")

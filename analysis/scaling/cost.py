@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import click
 import numpy as np
@@ -164,13 +164,19 @@ def picture(curves: dict[str, list[Rate]], limits: dict[str, dict[str, float]], 
         left.plot(nodes, ideal, color=colour, linewidth=0.8, linestyle="dashed")
         left.plot(nodes, [rate.pages_per_s for rate in rates], "o-", color=colour, markersize=4, label=name)
         right.plot(nodes, [rate.efficiency for rate in rates], "o-", color=colour, markersize=4, label=name)
+        side: Literal["left", "right"] = "left" if colour is ORANGE else "right"
         for (part, at), style in zip(sorted(limits[name].items()), (":", "-."), strict=False):
             if at <= 2 * nodes[-1]:
                 right.axvline(at, color=colour, linestyle=style, linewidth=1)
-                told = f"{part} full, {name} "
-                right.annotate(told, (at, 0.03), rotation=90, va="bottom", ha="right", fontsize=7, color=colour)
+                told = f"{part} full, {name}"
+                right.annotate(told, (at, 0.03), rotation=90, va="bottom", ha=side, fontsize=7, color=colour)
     left.set(xlabel="nodes", ylabel="pages/s", xscale="log", yscale="log")
-    right.set(xlabel="nodes", ylabel="of what workers that never wait would read", xscale="log", ylim=(0, 1.05))
+    right.set(
+        xlabel="nodes",
+        ylabel="efficiency, of workers that never wait",
+        xscale="log",
+        ylim=(0, 1.05),
+    )
     left.legend(frameon=False)
     out.parent.mkdir(parents=True, exist_ok=True)
     write_figure_png(out, figure, dpi=110)

@@ -14,12 +14,20 @@ from lightpage.inspection.exposure import sampled
 from lightpage.inspection.finding import Finding, Picture, printable
 from lightpage.pictures import write_figure_png
 
-_COLUMNS = 3
+_COLUMNS = 2
+"""Frames of both cameras stand side by side."""
 _SIDE_PX = 1800
 """Pixels of a frame's longer side that are drawn."""
 _SHADES = (0.2, 99.5)
 """Percentiles of the counts that are black and white: single bright pixels would leave the rest in the dark."""
 _DOTS = 110
+
+
+def _exposure(found: Finding, name: str) -> str:
+    """Describe how a camera is exposed."""
+    told = f"{name.replace('_', '-')}, saturated: {found.histograms[name].saturated:.2%}"
+    contrast = found.facts.get(f"{name}: contrast of fringes")
+    return told if contrast is None else f"{told}, contrast of fringes: {contrast}"
 
 
 def draw(found: Finding, pictures: list[Picture], out: Path) -> None:
@@ -45,10 +53,12 @@ def draw(found: Finding, pictures: list[Picture], out: Path) -> None:
         axis.set_yticks([])
         figure.colorbar(image, ax=axis, shrink=0.8)
     if found.histograms:
-        axis = figure.add_subplot(rows, _COLUMNS, panels)
+        axis = figure.add_subplot(rows, _COLUMNS, (panels, rows * _COLUMNS))
         for name, each in found.histograms.items():
-            axis.stairs([max(share, 1e-6) for share in each.shares], each.edges, label=name.replace("_", "-"))
+            axis.stairs([max(share, 1e-6) for share in each.shares], each.edges, label=_exposure(found, name))
         axis.set(xlabel="count", ylabel="share of the pixels", yscale="log")
+        full_scale = max(each.full_scale for each in found.histograms.values())
+        axis.axvline(full_scale, color="black", linestyle="dashed", linewidth=1, label=f"full scale, {full_scale}")
         axis.set_title("exposure", fontsize=9)
-        axis.legend()
+        axis.legend(fontsize=8)
     replace_file(out, lambda file: write_figure_png(file, figure, dpi=_DOTS), "picture")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from lightpage.errors import PageError
@@ -18,6 +19,9 @@ from lightpage.metrics.information import (
 )
 from lightpage.metrics.reliability import expected_calibration_error
 from lightpage.page.levels import Levels
+
+SMOOTH = 5
+"""Symbols along each side of the square over which maps are smoothed."""
 
 
 @dataclass(frozen=True)
@@ -110,3 +114,9 @@ def symbol_maps(
     turned = m.phases[s] - phase
     error = np.abs(turned - 2 * np.pi * np.rint(turned / (2 * np.pi)))
     return SymbolMaps(spread(achievable_rate(phase, k, s, m)), spread(own_information(phase, k, m)), spread(error))
+
+
+def smoothed(values: Floats) -> Floats:
+    """Return the means of a map [ny, nx] over `SMOOTH` x `SMOOTH` symbols around each, without what is NaN."""
+    padded = np.pad(values, SMOOTH // 2, constant_values=np.nan)
+    return np.asarray(np.nanmean(sliding_window_view(padded, (SMOOTH, SMOOTH)), axis=(2, 3)), np.float64)

@@ -61,7 +61,7 @@ class ReportData:
         measures: over the data symbols of all pages together.
         maps: means over the pages at every place.
         confidence_bins, concentration_bins: claims against results.
-        curves: curves of the training, by TensorBoard's tag, for each validation at the light.
+        curves: curves of the training, by TensorBoard's tag, for each validation at the light; None of an evaluation.
         golden: golden page with its decoded phase.
     """
 
@@ -75,7 +75,7 @@ class ReportData:
     maps: SymbolMaps
     confidence_bins: list[ConfidenceBin]
     concentration_bins: list[ConcentrationBin]
-    curves: Sequence[Mapping[str, Curve]] | str
+    curves: Sequence[Mapping[str, Curve]] | str | None
     golden: Golden | str
 
     @property

@@ -23,6 +23,7 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.report.contents.data import Golden, Rays, ReportData
 from lightpage.report.json_file import Bits, JsonFile, Part, Seconds, Share
 from lightpage.report.words import how_long
+from lightpage.words import counted
 
 Rows = list[list[float | None]]
 
@@ -81,13 +82,10 @@ def report_of_evaluation(file: JsonFile) -> ReportData:
     bundle = found.bundle
     profile = parse_profile(bundle.profile, f"evaluation {path}: profile")
     calibration = parse_calibration(bundle.calibration, f"evaluation {path}: calibration")
-    refused = len(found.refused_pages) or "none"
     maps = SymbolMaps(*(_page(path, rows, profile.page_shape) for rows in vars(found.maps).values()))
     return ReportData(
         title=f"Evaluation of bundle {bundle.name}, version {found.bundle_version}",
-        pages=f"All figures are of {found.pages} pages that the bundle was neither calibrated nor trained on. Of the "
-        f"same recording, {found.pages_left_out} pages that it has seen were left out, and {refused} could not be "
-        "decoded or were not confirmed by their pilots.",
+        pages=_pages(found),
         facts=_facts(found),
         profile=profile,
         calibration=calibration,
@@ -104,10 +102,19 @@ def report_of_evaluation(file: JsonFile) -> ReportData:
         maps=maps,
         confidence_bins=found.confidence_bins,
         concentration_bins=found.concentration_bins,
-        curves="There are no curves: an evaluation does not hold how its decoder was trained. The report of the "
-        "training run shows them.",
+        curves=None,
         golden=_golden(bundle),
     )
+
+
+def _pages(found: _Evaluation) -> str:
+    told = f"All figures are of {counted(found.pages, 'page')} that the bundle was neither calibrated nor trained on."
+    if found.pages_left_out:
+        told += f" Of the same recording, {counted(found.pages_left_out, 'page')} that it has seen are left out."
+    if found.refused_pages:
+        refused = counted(len(found.refused_pages), "page")
+        told += f" Also left out: {refused} that could not be decoded or were not confirmed by the pilots."
+    return told
 
 
 def _checked(file: JsonFile) -> _Evaluation:
@@ -144,7 +151,6 @@ def _facts(found: _Evaluation) -> list[tuple[str, str]]:
     seconds, provenance = found.bundle.metrics.get("training_seconds"), found.bundle.provenance
     return [
         ("Bundle", f"{Path(found.bundle.path).name}, version {found.bundle_version}"),
-        ("Decoder", "localizer and network are not noted in a bundle; see the command that trained it"),
         ("Training", how_long(seconds) if isinstance(seconds, int | float) else "time not noted"),
         ("Decoding", f"{1e3 * found.seconds_per_page:.0f} ms a page, median"),
         ("Trained by", str(provenance.get("command", "")) or "not noted"),

@@ -27,6 +27,7 @@ _LISTED = 200
 """Unread pages that are listed with their reasons."""
 _NAMED = 20
 """Parts of an enumeration."""
+_OF_VOLUME = " of the volume, parity included"
 _UNKNOWN, _NO_SYMBOLS = "unknown: no page of it could be read", "unknown: the recording has no symbols"
 
 
@@ -113,6 +114,7 @@ class RecoveryData:
         facts: the others, (name, value).
         pages: every recorded page.
         blocks_per_page: LDPC blocks that each of them holds.
+        missing: pages of the volume that gave no bytes, recorded or not, for people; empty where all did.
         causes: causes of pages without bytes: cause, what it means, how many, their share of all.
         unread: pages that gave no bytes, the first ones only.
         more_unread: how many there are besides.
@@ -124,6 +126,7 @@ class RecoveryData:
     facts: list[tuple[str, str]]
     pages: Sequence[PageResult]
     blocks_per_page: int
+    missing: str
     causes: list[tuple[str, str, int, float]]
     unread: Sequence[PageResult]
     more_unread: int
@@ -151,6 +154,7 @@ def report_of_recovery(file: JsonFile) -> RecoveryData:
         facts=_facts(found),
         pages=found.page_results,
         blocks_per_page=found.blocks_per_page,
+        missing=_numbered(found.missing, "page", _OF_VOLUME) if found.missing else "",
         causes=[
             (loss.value, meaning, counts[loss], counts[loss] / found.pages)
             for loss, meaning in LOSSES.items()
@@ -175,6 +179,7 @@ def _cards(found: _Recovery) -> list[tuple[str, str, str]]:
     share, margin = found.share_of_air, found.margin_bits_least
     return [
         ("Unread", f"{found.pages_unread:,}", f"of {found.pages:,} pages"),
+        ("Missing", f"{len(found.missing):,}", "pages of the volume"),
         ("Restored", f"{len(found.restored):,}", "data pages"),
         ("Lost", f"{len(found.lost):,}", "data pages"),
         ("Least margin", _told_if(margin, ".3f"), "bit/symbol"),
@@ -195,7 +200,7 @@ def _facts(found: _Recovery) -> list[tuple[str, str]]:
         ("Unread", f"{found.pages_unread:,} of the recorded pages"),
         ("Repeated", f"{found.pages_repeated:,} of the recorded pages"),
         ("Pages of other volumes", _few([f"{count:,} of volume {other}" for other, count in others.most_common()])),
-        ("Missing", _numbered(found.missing, "page", " of the volume, parity included")),
+        ("Missing", _numbered(found.missing, "page", _OF_VOLUME)),
         ("Restored", _numbered(found.restored, "data page")),
         ("Lost", _numbered(found.lost, "data page")),
         ("User bytes a page", f"{found.user_bytes_per_page:,}"),

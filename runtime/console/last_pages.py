@@ -81,7 +81,7 @@ class LastPages:
         self._losses: dict[str, Losses] = {}
         self._pages = 0
         self._pair: FramePair | None = None
-        self._confidence: NDArray[np.float32] | None = None
+        self._concentration: NDArray[np.float32] | None = None
         self._shown = 0
         """Raised with each page whose pictures are new."""
 
@@ -98,7 +98,7 @@ class LastPages:
                 self._losses[reason] = Losses(reason, count, observation.detail or row.subject, row.time_s)
             if observation.pair is not None:
                 self._pair, self._shown = observation.pair, self._shown + 1
-                self._confidence = None if observation.page is None else observation.page.confidence
+                self._concentration = None if observation.page is None else observation.page.concentration
 
     @property
     def pages(self) -> int:
@@ -117,9 +117,9 @@ class LastPages:
             return sorted(self._losses.values(), key=lambda one: -one.count)
 
     def pictures(self) -> tuple[int, FramePair | None, NDArray[np.float32] | None]:
-        """Return the number of the last page with frames, its frames, and its confidence [ny, nx] if it was decoded."""
+        """Return the number of the last page with frames, these, and its concentration [ny, nx] if it was decoded."""
         with self._lock:
-            return self._shown, self._pair, self._confidence
+            return self._shown, self._pair, self._concentration
 
 
 def _row(observation: Observation) -> PageRow:

@@ -9,11 +9,11 @@ from typing import Any
 
 from lightpage.runtime.console.actions import ROLE, Actions
 from lightpage.runtime.console.last_pages import LastPages, PageRow
-from lightpage.runtime.console.pictures import confidence_png, frame_png
+from lightpage.runtime.console.pictures import air_png, frame_png
 from lightpage.runtime.service.caller import Identity
 from lightpage.runtime.service.models.loader import Model
 from lightpage.runtime.service.models.models import Models
-from lightpage.runtime.service.monitoring.monitor import Monitor
+from lightpage.runtime.service.monitoring.monitor import AIR, Monitor
 
 POINTS = 600
 """Most points of a series."""
@@ -56,7 +56,7 @@ class ConsoleState:
         if rows and thinned[-1] is not rows[-1]:
             thinned.append(rows[-1])
         told = [row.to_json() for row in thinned]
-        number, pair, confidence = self._last_pages.pictures()
+        number, pair, concentration = self._last_pages.pictures()
         monitor = self._monitor.state()
         return {
             "time_s": now,
@@ -65,8 +65,9 @@ class ConsoleState:
             "condition": _condition(rows, monitor.due, now),
             "reasons": list(monitor.reasons),
             "pages": self._last_pages.pages,
-            "picture": {"number": number, "frames": pair is not None, "confidence": confidence is not None},
-            "series": {name: [row[name] for row in told] for name in ("time_s", *_SERIES)},
+            "picture": {"number": number, "frames": pair is not None, "air": concentration is not None},
+            "series": {name: [row[name] for row in told] for name in ("time_s", "lost", "unread", *_SERIES)},
+            "signs": {sign.name: vars(sign) for sign in monitor.signs},
             "losses": [vars(loss) for loss in self._last_pages.losses()],
             "models": [_model(model, model is self._models.current) for model in self._models.loaded],
             "caller": "" if identity is None else identity.name,
@@ -77,9 +78,9 @@ class ConsoleState:
 
     def picture(self, path: str) -> bytes | None:
         """Return a picture of the last page, as PNG; None where there is none of this path."""
-        _, pair, confidence = self._last_pages.pictures()
-        if path == "/confidence.png" and confidence is not None:
-            return confidence_png(confidence)
+        _, pair, concentration = self._last_pages.pictures()
+        if path == "/air.png" and concentration is not None:
+            return air_png(concentration, next(s.baseline for s in self._monitor.state().signs if s.name == AIR.name))
         if path not in ("/frames/in_phase.png", "/frames/quadrature.png") or pair is None:
             return None
         depth = self._models.current.decoder.bundle.manifest.camera_bit_depth
@@ -105,5 +106,5 @@ def _model(model: Model, current: bool) -> dict[str, Any]:
         "created": manifest.created,
         "current": current,
         "air_before": metrics.get("recalibration_air_bits_per_symbol_before"),
-        "air_after": metrics.get("recalibration_air_bits_per_symbol"),
+        "air": metrics.get("recalibration_air_bits_per_symbol", metrics.get("validation_air_bits_per_symbol")),
     }

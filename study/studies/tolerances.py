@@ -53,10 +53,12 @@ _QUICK_KNOBS = ("stroke", "modulator-axial", "keystone", "phase-noise")
 _QUICK_VALUES = (2, -1)
 """Places of a knob's values."""
 _ANEW_VALUES = 3
-_COLUMNS, _TITLE, _MOST_BITS, _TICKS = 5, 32, 8, 5
+_COLUMNS, _TITLE, _TICKS = 5, 32, 5
+_LOSSES = (0.0, LOSS, 0.3, 1.0, 3.0)
+"""Losses that are named at the axis, which is linear up to `LOSS` and logarithmic beyond."""
 _CURVES = {
     "air": ("re-fitted", "o-", "tab:blue"),
-    "told": ("told", ".--", "tab:orange"),
+    "told": ("told the true state", ".--", "tab:orange"),
     "anew": ("trained anew", "^", "tab:green"),
 }
 """Curves of a picture, by the names of results: label, style, colour."""
@@ -270,27 +272,31 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
     axes = figure.subplots(lines, columns, squeeze=False, sharey=True)
     for axis, curve in zip(axes.flat, curves, strict=False):
         _draw(axis, curve)
+    axes[0, 0].invert_yaxis()  # of all: up is better
     for axis in axes.flat[len(curves) :]:
         axis.set_visible(False)
     for row in axes:
-        row[0].set_ylabel("AIR, bits a symbol")
+        row[0].set_ylabel("AIR lost, bits a symbol")
     named = {
         label: handle for axis in axes.flat for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
     }
-    columns = min(columns + 1, len(_CURVES) + 2)
+    columns = min(columns + 1, len(_CURVES) + 3)
     figure.legend(named.values(), named.keys(), loc="outside upper center", ncols=columns, fontsize="small")
     return figure
 
 
 def _draw(axis: Axes, curve: _Curve) -> None:
-    """Draw AIR over a knob's values, the range shaded within which `LOSS` is lost."""
+    """Draw what a knob's values cost of the AIR, the range shaded within which that is no more than `LOSS`."""
+    trained = int(np.argmin(np.abs(curve.values - curve.at)))
     within = curve.within("air")
     if within is not None:
-        axis.axvspan(within.low, within.high, color="tab:blue", alpha=0.12, label=f"{LOSS:g} bit lost within")
+        axis.axvspan(within.low, within.high, color="tab:blue", alpha=0.12, label=f"at most {LOSS:g} bit lost")
     for name, (label, style, colour) in _CURVES.items():
         if not curve.measured(name):
             continue
-        axis.plot(curve.values, curve.airs(name), style, color=colour, markersize=4, linewidth=1.2, label=label)
+        lost = curve.airs("air")[trained] - curve.airs(name)
+        axis.plot(curve.values, lost, style, color=colour, markersize=4, linewidth=1.2, label=label)
+    axis.axhline(LOSS, color="tab:red", linestyle="--", linewidth=0.8, label=f"{LOSS:g} bit")
     axis.axvline(curve.at, color="0.6", linestyle=":", linewidth=1, label="trained at")
     if curve.knob.logarithmic:
         axis.set_xscale("log")
@@ -298,7 +304,9 @@ def _draw(axis: Axes, curve: _Curve) -> None:
         axis.locator_params(axis="x", nbins=_TICKS)
     axis.set_title(textwrap.fill(curve.knob.title, _TITLE), fontsize="small")
     axis.set_xlabel(curve.knob.unit, fontsize="small")
-    axis.set_ylim(0, _MOST_BITS)
+    axis.set_yscale("symlog", linthresh=LOSS)
+    axis.set_yticks(_LOSSES, [f"{loss:g}" for loss in _LOSSES])
+    axis.minorticks_off()
     axis.tick_params(labelsize="small")
 
 

@@ -16,7 +16,7 @@ def test_the_site_builds_and_its_links_lead_somewhere() -> None:
     for page, named in {
         "commands": "--refinements",
         "settings": "longest_wait_ms",
-        "metrics": "lightpage_margin_bits",
+        "metrics": "lightpage_<wbr>margin_<wbr>bits",
         "camera-keys": "[trigger] and [modulator], kind = plugin",
         "calls": "DecodeFrames",
         "python": "ModelsClient.roll_back",

@@ -24,7 +24,9 @@ def goodness_figure(goodness: Goodness) -> Figure:
     page, facet = figure.subplots(1, 2, width_ratios=(1.5, 1))
     _draw(page, goodness.by_page, "over the page", None)
     shown = _draw(facet, goodness.by_facet, "over the exit facet", 1.0)
-    figure.colorbar(shown, ax=[page, facet], label="light that is left, over noise", extend="max")
+    bar = figure.colorbar(shown, ax=[page, facet], label="light that is left, over noise", extend="max")
+    bar.set_ticks([1, 3, 10, _MOST], labels=["1, noise", "3", "10", f"{_MOST:g}"])
+    bar.ax.minorticks_off()
     what = f"{goodness.verdict}: about {goodness.bits_lost:.2f} bit a symbol lost"
     figure.suptitle("\n".join(line for line in (what, goodness.cause) if line), fontsize=9)
     return figure

@@ -1,24 +1,27 @@
 "use strict";
 // Asks for /state.json about once a second and shows it. Administrators may recalibrate and roll back; else it changes nothing.
 
+// `span`: the least range of values that is drawn, so that noise does not look like a crash. `signs`: the monitor's signs
+// whose usual and alarm values are drawn, one for each line.
 const CHARTS = [
-  { title: "Margin", unit: "bit a symbol", digits: 3, lines: [["margin_bits", "margin"]], limit: 0, zero: true,
+  { title: "Margin", unit: "bit a symbol", digits: 3, lines: [["margin_bits", "margin"]], signs: ["margin_bits"], span: 0.15, limit: 0, need: "the code needs",
     about: "Information beyond what a page's code needs. At 0 pages are lost." },
-  { title: "AIR, estimated", unit: "bit a symbol", digits: 3, lines: [["air_bits", "AIR"]],
+  { title: "AIR, estimated", unit: "bit a symbol", digits: 3, lines: [["air_bits", "AIR"]], signs: ["air_bits"], span: 0.5, calibrated: true,
     about: "Information that a symbol is claimed to carry, as far as the pilots bear it out." },
-  { title: "Pilots", unit: "share", digits: 3, lines: [["trust", "trust"], ["share", "confirmed"]],
+  { title: "Pilots", unit: "share", digits: 3, lines: [["trust", "trust"], ["share", "confirmed"]], signs: ["trust", "share"], span: 0.25,
     about: "What the pilots bear out of the claimed concentration, and of the claimed information." },
-  { title: "Image shift", unit: "camera px", digits: 2, lines: [["shift_x_px", "x"], ["shift_y_px", "y"]],
+  { title: "Image shift", unit: "camera px", digits: 2, lines: [["shift_x_px", "x"], ["shift_y_px", "y"]], signs: ["shift_px"], either: true, span: 1,
     about: "Where the image lies, against where calibration saw it." },
-  { title: "Piston", unit: "rad", digits: 2, lines: [["piston_rad", "piston"]],
+  { title: "Piston", unit: "rad", digits: 2, lines: [["piston_rad", "piston"]], signs: [], span: 2 * Math.PI, turns: true,
     about: "Common phase of a page, which is taken off. It wanders by itself." },
-  { title: "Phase residual", unit: "rad", digits: 4, lines: [["residual_rad", "residual"]], zero: true,
+  { title: "Phase residual", unit: "rad", digits: 4, lines: [["residual_rad", "residual"]], signs: ["residual_rad"], span: 0.01, limit: 0,
     about: "Smooth phase error that was taken off, root mean square." },
-  { title: "Modulator's stroke", unit: "relative", digits: 4, lines: [["stroke_relative", "stroke"]],
+  { title: "Modulator's stroke", unit: "relative", digits: 4, lines: [["stroke_relative", "stroke"]], signs: ["stroke_relative"], either: true, span: 0.002,
     about: "Its change since calibration, as the pilots show it. It goes with temperature." },
 ];
 const CONDITIONS = { reading: "good", idle: "", "no page yet": "", "recalibration is due": "warn", "pages are being lost": "bad" };
-const W = 420, H = 150, LEFT = 46, RIGHT = 8, TOP = 10, BOTTOM = 22;
+const H = 150, LEFT = 46, RIGHT = 8, TOP = 14, BOTTOM = 22;
+const IDLE = 8, IDLE_S = 20; // times the usual step between pages, and seconds, beyond which a pause is cut short
 const at = (id) => document.getElementById(id);
 const clock = (s) => new Date(1000 * s).toLocaleTimeString("en-GB");
 const shown = (value, digits) => (value === null || value === undefined ? "–" : value.toFixed(digits));
@@ -31,7 +34,7 @@ function element(name, attributes = {}, text) {
   if (text !== undefined) made.textContent = text;
   return made;
 }
-element.svg = new Set(["line", "path", "text"]);
+element.svg = new Set(["line", "path", "text", "title"]);
 
 function ticks(low, high) {
   const step = 10 ** Math.floor(Math.log10((high - low) / 3));
@@ -41,43 +44,96 @@ function ticks(low, high) {
   return [found, Math.max(0, -Math.floor(Math.log10(best)))];
 }
 
-function draw(chart, series) {
-  const { svg, now } = chart;
+// Places of pages along the axis, 0 to 1: by time, with idle times cut short, since they would press the pages into spikes.
+function places(times) {
+  const steps = times.slice(1).map((t, i) => Math.max(0, t - times[i]));
+  const longest = Math.max(IDLE_S, IDLE * (steps.slice().sort((a, b) => a - b)[steps.length >> 1] || 0));
+  const at = [0];
+  steps.forEach((step) => at.push(at[at.length - 1] + Math.min(step, longest)));
+  const whole = at[at.length - 1];
+  return [at.map((place) => (whole > 0 ? place / whole : 0.5)), steps.map((step) => step > longest)];
+}
+
+// What to compare a chart's values with: [values, words, kind].
+function marksOf(chart, state) {
+  const marks = [];
+  chart.signs.forEach((name, k) => {
+    const { baseline: usual, raise_at: alarm } = state.signs[name], whose = chart.signs.length > 1 ? `${chart.lines[k][1]} ` : "";
+    if (usual === null) return;
+    const far = Math.abs(alarm - usual), about = chart.either ? "±" : "";
+    if (!chart.either) marks.push([[usual], `${whose}usual ${shown(usual, chart.digits)}`, "usual"]);
+    marks.push([chart.either ? [usual - far, usual + far] : [alarm], `${whose}alarm ${about}${shown(chart.either ? far : alarm, chart.digits)}`, "alarm"]);
+  });
+  const current = state.models.find((model) => model.current);
+  if (chart.calibrated && current && current.air !== null) marks.push([[current.air], `calibrated ${shown(current.air, chart.digits)}`, "calibrated"]);
+  if (chart.need) marks.push([[0], `${chart.need} 0`, "limit"]);
+  return marks;
+}
+
+// The range of a chart: that of its values, widened to `span` and by marks that do not lie far off.
+function rangeOf(chart, values, marks) {
+  let low = Math.min(...values), high = Math.max(...values);
+  if (chart.limit !== undefined) { low = Math.min(low, chart.limit); high = Math.max(high, chart.limit); }
+  if (chart.turns) { low = -Math.PI; high = Math.PI; }
+  const lacks = Math.max(0, chart.span - (high - low)) / 2;
+  low -= lacks; high += lacks;
+  if (chart.limit !== undefined && low < chart.limit && lacks) { high += chart.limit - low; low = chart.limit; }
+  const far = 1.5 * (high - low), [first, last] = [low - far, high + far];
+  for (const value of marks.flatMap(([values]) => values)) if (value > first && value < last) { low = Math.min(low, value); high = Math.max(high, value); }
+  const room = 0.06 * (high - low);
+  return [low - room, high + room];
+}
+
+function draw(chart, state) {
+  const { svg, now, told } = chart, series = state.series, W = svg.clientWidth || 420;
   const times = series.time_s, values = chart.lines.map(([name]) => series[name]);
   const all = values.flat().filter((v) => v !== null);
   svg.replaceChildren();
+  svg.setAttribute("viewBox", `0 0 ${W} ${H}`);
   if (!all.length) {
     svg.append(element("text", { x: W / 2, y: H / 2, "text-anchor": "middle" }, "no figures yet"));
     now.textContent = "–";
+    told.replaceChildren();
     return;
   }
-  let low = Math.min(...all, ...(chart.zero ? [0] : [])), high = Math.max(...all, ...(chart.zero ? [0] : []));
-  const room = (high - low || Math.abs(high) || 1) * 0.08;
-  low -= room; high += room;
-  const first = times[0], last = times[times.length - 1];
-  const x = (t) => (last > first ? LEFT + ((t - first) / (last - first)) * (W - LEFT - RIGHT) : (LEFT + W - RIGHT) / 2);
+  const marks = marksOf(chart, state), [low, high] = rangeOf(chart, all, marks);
+  const [place, idle] = places(times);
+  const x = (i) => LEFT + place[i] * (W - LEFT - RIGHT);
   const y = (v) => TOP + ((high - v) / (high - low)) * (H - TOP - BOTTOM);
-  const [marks, digits] = ticks(low, high);
-  for (const mark of marks) {
-    svg.append(element("line", { class: "grid", x1: LEFT, x2: W - RIGHT, y1: y(mark), y2: y(mark) }));
-    svg.append(element("text", { x: LEFT - 6, y: y(mark) + 4, "text-anchor": "end" }, mark.toFixed(digits)));
+  const [ruled, digits] = ticks(low, high);
+  for (const value of ruled) {
+    svg.append(element("line", { class: "grid", x1: LEFT, x2: W - RIGHT, y1: y(value), y2: y(value) }));
+    svg.append(element("text", { x: LEFT - 6, y: y(value) + 4, "text-anchor": "end" }, value.toFixed(digits)));
   }
-  svg.append(element("text", { x: LEFT, y: H - 5 }, clock(first)));
-  svg.append(element("text", { x: W - RIGHT, y: H - 5, "text-anchor": "end" }, clock(last)));
-  if (chart.limit !== undefined && chart.limit > low && chart.limit < high)
-    svg.append(element("line", { class: "limit", x1: LEFT, x2: W - RIGHT, y1: y(chart.limit), y2: y(chart.limit) }));
+  svg.append(element("text", { x: LEFT, y: H - 5 }, clock(times[0])));
+  svg.append(element("text", { x: W - RIGHT, y: H - 5, "text-anchor": "end" }, clock(times[times.length - 1])));
+  idle.forEach((pause, i) => {
+    if (!pause) return;
+    const middle = (x(i) + x(i + 1)) / 2, line = element("line", { class: "idle", x1: middle, x2: middle, y1: TOP, y2: H - BOTTOM });
+    line.append(element("title", {}, `idle for ${span(times[i + 1] - times[i])}`));
+    svg.append(line);
+  });
+  const lost = times.map((_, i) => i).filter((i) => series.lost[i] || series.unread[i]);
+  if (lost.length) svg.append(element("path", { class: "lost", d: lost.map((i) => `M${x(i).toFixed(1)} ${H - BOTTOM}v-6`).join("") }));
+  told.replaceChildren();
+  for (const [compared, words, kind] of marks) {
+    const seen = compared.filter((value) => value > low && value < high);
+    for (const value of seen) svg.append(element("line", { class: kind, x1: LEFT, x2: W - RIGHT, y1: y(value), y2: y(value) }));
+    told.append(element("span", { class: kind }, `${words}${seen.length ? "" : " (beyond the scale)"}`), " ");
+  }
   values.forEach((line, k) => {
-    let path = "", pen = false;
+    let path = "", before = null;
     line.forEach((value, i) => {
-      if (value === null) { pen = false; return; }
-      path += `${pen ? "L" : "M"}${x(times[i]).toFixed(1)} ${y(value).toFixed(1)}`;
-      if (!pen) path += "h0.01";
-      pen = true;
+      if (value === null) { before = null; return; }
+      const joined = before !== null && !idle[i - 1] && !(chart.turns && Math.abs(value - before) > Math.PI);
+      path += `${joined ? "L" : "M"}${x(i).toFixed(1)} ${y(value).toFixed(1)}${joined ? "" : "h0.01"}`;
+      before = value;
     });
     svg.append(element("path", { class: `line ${"ab"[k]}`, d: path, "stroke-linecap": "round" }));
   });
   const cursor = element("line", { class: "cursor", y1: TOP, y2: H - BOTTOM, x1: -9, x2: -9 });
   svg.append(cursor);
+  const raised = chart.signs.map((name) => state.signs[name].raised);
   const tell = (i, when) => {
     now.replaceChildren();
     chart.lines.forEach(([, label], k) => {
@@ -85,13 +141,14 @@ function draw(chart, series) {
       now.append(value);
     });
     now.append(`${chart.unit}${when ? ` at ${clock(times[i])}` : ""}`);
+    if (!when && raised.some((each) => each)) now.append(element("span", { class: "raised" }, " alarm"));
   };
   const newest = () => { let i = times.length - 1; while (i > 0 && values.every((v) => v[i] === null)) i--; tell(i, false); cursor.setAttribute("x1", -9); cursor.setAttribute("x2", -9); };
   svg.onpointermove = (event) => {
-    const box = svg.getBoundingClientRect(), px = ((event.clientX - box.left) / box.width) * W;
+    const px = event.clientX - svg.getBoundingClientRect().left;
     let best = 0;
-    times.forEach((t, i) => { if (Math.abs(x(t) - px) < Math.abs(x(times[best]) - px)) best = i; });
-    cursor.setAttribute("x1", x(times[best])); cursor.setAttribute("x2", x(times[best]));
+    times.forEach((_, i) => { if (Math.abs(x(i) - px) < Math.abs(x(best) - px)) best = i; });
+    cursor.setAttribute("x1", x(best)); cursor.setAttribute("x2", x(best));
     tell(best, true);
   };
   svg.onpointerleave = newest;
@@ -132,16 +189,16 @@ function show(state) {
   if (state.picture.number !== picture) {
     picture = state.picture.number;
     for (const [id, path, there] of [["in_phase", "/frames/in_phase.png", state.picture.frames],
-      ["quadrature", "/frames/quadrature.png", state.picture.frames], ["confidence", "/confidence.png", state.picture.confidence]]) {
+      ["quadrature", "/frames/quadrature.png", state.picture.frames], ["air", "/air.png", state.picture.air]]) {
       at(id).hidden = !there;
       if (there) at(id).src = `${path}?${picture}`;
     }
   }
-  charts.forEach((chart) => draw(chart, state.series));
+  charts.forEach((chart) => draw(chart, state));
   rows("losses", state.losses.map((loss) => [[loss.reason, "bad"], [String(loss.count), "number"],
     [`${((100 * loss.count) / Math.max(1, state.pages)).toFixed(1)}%`, "number"], [`${clock(loss.time_s)}  ${loss.detail}`, "long"]]), "none so far", 4);
   rows("models", state.models.slice().reverse().map((model) => [[`${model.version}${model.current ? " (in service)" : ""}`],
-    [model.created], [shown(model.air_before, 3), "number"], [shown(model.air_after, 3), "number"]]), "none", 4);
+    [model.created], [shown(model.air_before, 3), "number"], [shown(model.air, 3), "number"]]), "none", 4);
   rows("recent", state.recent.map((page) => [[clock(page.time_s)], [page.page_index === null ? page.subject : String(page.page_index)],
     page.lost || page.unread ? [page.lost || page.unread, "bad"] : [page.recalibration_due ? "read, recalibration due" : "read"],
     [shown(page.margin_bits, 3), "number"], [shown(page.air_bits, 3), "number"], [shown(1000 * page.seconds, 0), "number"]]), "none yet", 6);
@@ -194,11 +251,12 @@ async function turn() {
 const charts = CHARTS.map((chart) => {
   const card = element("div", { class: "chart" }), title = element("h3", { title: chart.about }, chart.title);
   const now = element("span", { class: "now" }, "–");
-  const svg = element("svg", { viewBox: `0 0 ${W} ${H}`, preserveAspectRatio: "none", role: "img", "aria-label": `${chart.title}, ${chart.unit}, over time` });
+  const svg = element("svg", { role: "img", "aria-label": `${chart.title}, ${chart.unit}, over time` });
   title.append(now);
-  card.append(title, svg);
+  const told = element("p", { class: "told" });
+  card.append(title, told, svg);
   at("charts").append(card);
-  return { ...chart, svg, now };
+  return { ...chart, svg, now, told };
 });
 at("recalibrate").onclick = () => act("recalibrate", (version) => `Recalibrate ${version} with the source's next two known pages?`);
 at("roll-back").onclick = () => act("roll back", (version) => `Take ${version} out of service, and put the model before back?`);

@@ -60,7 +60,7 @@ def test_a_browser_shows_pages_and_losses_acts_for_administrators_and_says_when_
         watcher.sees("losses", "MISSING_FRAME")
         watcher.sees("models", "toy-2 (in service)")
         expect(watcher.page.locator("#actions")).to_be_hidden()
-        for name in ("in_phase", "quadrature", "confidence"):
+        for name in ("in_phase", "quadrature", "air"):
             expect(watcher.page.locator(f"#{name}")).not_to_have_js_property("naturalWidth", 0, timeout=_WAIT_MS)
         assert watcher.page.locator(".chart path.line").count() >= 5
         running.read(3)

@@ -30,7 +30,7 @@ from lightpage.errors import InvalidInputError, Reason
 from lightpage.runtime.console.actions import Actions
 from lightpage.runtime.console.application import console_routes
 from lightpage.runtime.console.last_pages import LastPages
-from lightpage.runtime.console.pictures import SIDE_PX, confidence_png, frame_png
+from lightpage.runtime.console.pictures import SIDE_PX, air_png, frame_png
 from lightpage.runtime.console.scrapes import fetch
 from lightpage.runtime.console.server import serving
 from lightpage.runtime.console.state import POINTS, RECENT, ConsoleState
@@ -86,9 +86,10 @@ def test_the_state_is_that_of_the_pages(decoder: Decoder) -> None:
         assert [(loss["reason"], loss["count"]) for loss in state["losses"]] == [("MISSING_FRAME", 2)]
         assert state["recent"][2]["lost"] == "MISSING_FRAME"
         assert state["series"]["air_bits"][0] > 0
-        assert state["series"]["air_bits"][4] is None
+        assert (state["series"]["air_bits"][4], state["series"]["lost"][4]) == (None, "MISSING_FRAME")
+        assert state["signs"]["shift_px"]["raise_at"] == 4.0
         assert [model["version"] for model in state["models"]] == ["toy-1"]
-        for name in ("frames/in_phase", "frames/quadrature", "confidence"):
+        for name in ("frames/in_phase", "frames/quadrature", "air"):
             status, picture, headers = fetched(f"{running.url}/{name}.png")
             assert (status, headers["Content-Type"]) == (200, "image/png")
             assert Image.open(io.BytesIO(picture)).size[0] >= 1
@@ -155,15 +156,17 @@ def test_the_condition_is_that_of_the_last_pages(decoder: Decoder) -> None:
     assert state.to_json()["uptime_s"] == pytest.approx(30.1)
 
 
-def test_pictures_are_thinned_and_show_saturation() -> None:
+def test_pictures_are_thinned_brightened_and_show_saturation_and_what_falls_below_the_usual() -> None:
     frame = np.zeros((2000, 3000), np.uint16)
     frame[::4, ::4] = 4095
     picture = np.asarray(Image.open(io.BytesIO(frame_png(frame, 12))))
     assert max(picture.shape) <= SIDE_PX
     assert tuple(picture[0, 0]) == (230, 60, 30)
-    grid = np.asarray(Image.open(io.BytesIO(confidence_png(np.linspace(0, 1, 12).reshape(3, 4)))))
+    dark, dim = (np.asarray(Image.open(io.BytesIO(frame_png(np.full((9, 9), n, np.uint16), 12)))) for n in (4, 400))
+    assert (dark.max() < 10, dim.min() > 250) == (True, True)
+    grid = np.asarray(Image.open(io.BytesIO(air_png(np.linspace(0, 1000, 12).reshape(3, 4), usual=5.0))))
     assert grid.shape == (3 * 80, 4 * 80, 3)
-    assert grid[-1, -1].sum() > grid[0, 0].sum()
+    assert grid[0, 0, 0] > 160 > grid[-1, -1, 0], "red below the usual, blue at it"
 
 
 def test_the_command_finds_a_console_or_says_what_it_lacks(
