@@ -28,6 +28,11 @@ from lightpage.runtime.model.decoding.tracking import NoTracker
 @click.option("--volume", metavar="ID[:CHECKSUM]", help="Which volume, where the recording holds several.")
 @click.option("--holes", is_flag=True, help="Write zeros where data are lost, in place of no file.")
 @click.option("--give-up", is_flag=True, help="Take pages that storage does not give for lost.")
+@click.option(
+    "--known-out",
+    type=OutputFile(),
+    help="Write the pages that are read as a recording with known symbols; its frames stay in --recording.",
+)
 @click.option("--heal/--no-heal", default=True, show_default=True, help="Re-fit by pages that are not read.")
 @JSON
 @click.option("--tracking/--no-tracking", default=True, show_default=True, help="Follow the image, and find it again.")
@@ -41,6 +46,7 @@ def recover(
     holes: bool,
     json_path: Path | None,
     give_up: bool,
+    known_out: Path | None,
     heal: bool,
     tracking: bool,
 ) -> None:
@@ -55,7 +61,8 @@ def recover(
     with Recording.open(recording) as pages:
         code = code_of(pages, decoder.bundle) if code_path is None else load_code(code_path)
         tracker = tracker_for(decoder) if tracking else NoTracker(decoder)
-        result = recover_file(decoder, pages, tracker, code, out, *parse_volume(volume), holes=holes, heals=heal)
+        asked = parse_volume(volume)
+        result = recover_file(decoder, pages, tracker, code, out, *asked, holes=holes, heals=heal, known_out=known_out)
     write_json(json_path, result.to_json())
     click.echo(describe(result))
     for line in told_losses(result.unread) if not result.lost and result.volume is not None else ():
