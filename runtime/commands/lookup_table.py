@@ -1,7 +1,5 @@
 """`lightpage lookup-table`: corrects a modulator's lookup table by what a calibration has found of its levels."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

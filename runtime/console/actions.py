@@ -1,7 +1,5 @@
 """Actions of a person on the console: recalibrate, and go back to the model before."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Literal
 

@@ -1,7 +1,5 @@
 """Re-fits the device's geometry with the exported twin and re-traces the sampling table."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lightpage.calibration.calibrate import LEAST_KEPT, KnownPage, refine

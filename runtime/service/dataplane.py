@@ -1,7 +1,5 @@
 """The data plane that all calls share, without a word of gRPC: models, source, decoding, and observers of pages."""
 
-from __future__ import annotations
-
 import logging
 import math
 import time

@@ -1,7 +1,5 @@
 """Pages of a recording, decoded in their order: several at a time where they are computed together."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import closing

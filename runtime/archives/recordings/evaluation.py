@@ -1,7 +1,5 @@
 """Measures a decoder on a recording with known symbols, on pages that it has not seen."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Reads recorded pages for their user bytes, and heals the model where it no longer reads them."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Working ahead: pages are read while others are decoded, or several are decoded at a time."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor

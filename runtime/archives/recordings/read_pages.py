@@ -1,7 +1,5 @@
 """Pages that were read, as known ones: their bytes, encoded again, are the symbols that were written."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path

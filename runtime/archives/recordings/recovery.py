@@ -1,7 +1,5 @@
 """Reads a file back from recorded pages: frames to symbols, symbols to bytes, parity for what is lost."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass

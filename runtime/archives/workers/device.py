@@ -1,7 +1,5 @@
 """A device that a worker recalibrates: re-fitted, or trained on too, from known pages of its own."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack

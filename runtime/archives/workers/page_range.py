@@ -1,7 +1,5 @@
 """The pages of a range on their way: decoded, measured or read for their user bytes; each is a finding, or lost."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The lookup table of a phase modulator: which grey value shows which level."""
 
-from __future__ import annotations
-
 import math
 import re
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """A bundle's graph for batches, opened; the constants of a table that it runs with, and the memory of its frames."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass, replace
 from functools import partial

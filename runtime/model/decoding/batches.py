@@ -1,7 +1,5 @@
 """Dynamic batching: pages that are inferred at the same time are computed in one run of a graph for batches."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections import deque

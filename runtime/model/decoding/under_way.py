@@ -1,7 +1,5 @@
 """Pages that are under way to a batch or behind one, and what the device that computes batches does meanwhile."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import Counter

@@ -1,7 +1,5 @@
 """Recalibrations as jobs: the one that runs, and those that have ended, which the store remembers."""
 
-from __future__ import annotations
-
 import logging
 import secrets
 import threading

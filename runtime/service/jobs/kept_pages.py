@@ -1,7 +1,5 @@
 """Keeps the last pages of the device, to recalibrate by: no page need be shown for that whose symbols are known."""
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Recalibrations as messages."""
 
-from __future__ import annotations
-
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import message_of
 from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome
