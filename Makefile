@@ -122,8 +122,17 @@ train-decoders: $(STAMP)  ## every decoder on every data set at quarter scale, t
 # Of kept full-size decoders, on pages simulated there. It needs no bundle, and a machine with a GPU needs no environment of
 # its own: `python3 -m analysis.gpu.bench --out FOLDER` with this folder and an ONNX Runtime for CUDA on its path.
 GPU_ARGS ?=
-bench-gpu: $(STAMP)  ## pages in batches on a GPU: rates, floors, where time goes; in 8 minutes, resumed when run again
-	$(BIN)/python -m analysis.gpu.bench --out runs/bench-gpu $(GPU_ARGS)
+# onnxruntime for GPUs and that for CPUs exclude each other, so this environment is another than that of `make setup`.
+GPU_VENV ?= .venv-gpu
+GPU_STAMP := $(GPU_VENV)/.installed
+$(GPU_STAMP): pyproject.toml constraints.txt setup.py
+	@command -v nvidia-smi >/dev/null || { echo "make: no nvidia-smi: bench-gpu needs an NVIDIA GPU and its driver" >&2; exit 1; }
+	@test -x $(GPU_VENV)/bin/pip || $(PYTHON) -m venv $(GPU_VENV)
+	$(GPU_VENV)/bin/pip install --quiet --constraint constraints.txt --editable '.[gpu,train]'
+	@touch $@
+
+bench-gpu: $(GPU_STAMP)  ## pages in batches on a GPU: every target with its verdict; in 8 minutes, resumed when run again
+	$(GPU_VENV)/bin/python -m analysis.gpu.bench --out runs/bench-gpu $(GPU_ARGS)
 
 SPEED_ARGS ?= --decoder fast --decoder coherent --decoder wave --decoder refined --decoder "ray 32/64"
 bench-speed: $(STAMP)  ## time decoders side by side in one run: SPEED_ARGS chooses them

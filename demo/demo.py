@@ -25,12 +25,16 @@ from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.kept_pages import KeptPages
 from lightpage.runtime.service.jobs.recalibrator import Recalibrator
+from lightpage.runtime.service.limits import Limits
 from lightpage.runtime.service.models.loader import Loader
 from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.monitoring.observation import Observation
 from lightpage.runtime.service.server.server import LightpageServer
 
 _KEPT_BYTES = 1 << 28
+_CALL_S = 600.0
+_LIMITS = Limits(deadline_s=_CALL_S, recalibration_s=6 * _CALL_S)
+"""Times above a service's own, since the machine may be busy with other things."""
 
 
 class UserPages(KeptPages):
@@ -68,10 +72,10 @@ def run_demo(
         source, drift = simulated_device(spec, decoder.bundle.profile, out / "pages.h5")
         stack.enter_context(source)
         kept = UserPages(_KEPT_BYTES)
-        plane = DataPlane(Models(decoder, loader=Loader(tracker_for)), source, observers=(kept,))
+        plane = DataPlane(Models(decoder, loader=Loader(tracker_for)), source, observers=(kept,), limits=_LIMITS)
         recalibrator = Recalibrator(plane)
         server = stack.enter_context(LightpageServer(plane, recalibrator, "127.0.0.1:0"))
-        client = stack.enter_context(LightpageClient(server.target))
+        client = stack.enter_context(LightpageClient(server.target, _CALL_S))
         frames = source.shot(source.shot_s, 0).pair
         levels = decoder.page_codec.code.levels
         symbols = client.frames.decode(frames, levels).symbols

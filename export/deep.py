@@ -101,7 +101,10 @@ class TorchRecalibration:
             version=version,
             previous_version=decoder.version,
             report=RefitReport(
-                calibration.angle_deg(bundle.profile), calibration.coherence_before, calibration.coherence_after
+                calibration.angle_deg(bundle.profile),
+                calibration.coherence_before,
+                calibration.coherence_after,
+                goodness=calibration.goodness,
             ),
             air_before=verdict.before,
             air_after=verdict.after,

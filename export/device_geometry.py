@@ -12,7 +12,7 @@ from lightpage.progress import Progress, note
 from lightpage.recording.reader import Recording
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.known_pages import read_recorded
-from lightpage.runtime.recalibration.refit import refit
+from lightpage.runtime.recalibration.refit import check_as_good, refit
 from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
 from lightpage.train.models.twin import RayTwin, TorchTwin
 
@@ -23,7 +23,7 @@ def device_geometry(
     """The device's geometry by these pages: kept from before, near the bundle's, or else found from nominal.
 
     Raises:
-        CalibrationError: the pages fit no geometry.
+        CalibrationError: the pages fit no geometry, or a wrong one where the bundle's is not.
     """
     hashes = tuple(recording.page_hash(page) for page in pages)
     if kept.exists() and (before := load_calibration(kept)).calibrated_pages[-len(hashes) :] == hashes:
@@ -38,5 +38,6 @@ def device_geometry(
         known = known_pages(recording, profile, pages)
         anew = calibrate(twin, solve_field, profile, recording.references(), known, progress)
         found = Calibration.from_registered(anew, profile, hashes)
+        check_as_good(decoder.bundle.calibration, found)
     found.save(kept)
     return found

@@ -2,7 +2,7 @@
 
     python release/build_site.py
 
-What the code lists is written here and kept nowhere else: commands with their options, settings, metrics, keys of
+What the code lists is written here and kept nowhere else: commands with their options, settings, metrics, alerts, keys of
 profiles and of camera files, calls of the service, and names of the Python package. A broken link ends the build.
 """
 
@@ -26,6 +26,7 @@ from typing import Any
 
 import click
 import griffe
+import yaml
 from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
 from grpc_tools import protoc
 from pydantic import BaseModel
@@ -150,6 +151,17 @@ def metrics() -> str:
         "`run` and `part`."
     )
     return f"# Metrics\n\n{told}\n\n{table}"
+
+
+def alerts() -> str:
+    """Return every alert that the service comes with, with its severity, what it means and what to do."""
+    (group,) = yaml.safe_load((ROOT / "deploy" / "prometheus" / "rules.yml").read_text("utf-8"))["groups"]
+    rows = [
+        (f"`{rule['alert']}`", rule["labels"]["severity"], rule.get("for", ""), rule["annotations"]["description"])
+        for rule in group["rules"]
+    ]
+    told = "`deploy/prometheus/rules.yml` has the expressions, with reasons for their thresholds."
+    return f"# Alerts\n\n{told}\n\n{_table(('alert', 'severity', 'after', 'meaning, and what to do'), rows)}"
 
 
 def _metrics_of(path: Path) -> Iterator[tuple[str, str, list[str], str]]:
@@ -317,6 +329,7 @@ GENERATED = {
     "camera-keys": camera_keys,
     "profile-keys": profile_keys,
     "metrics": metrics,
+    "alerts": alerts,
     "calls": calls,
     "python": python,
 }

@@ -8,6 +8,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/uio.h>
 #include <unistd.h>
 
 static int failing(const char *path) {
@@ -37,6 +38,18 @@ static int reading(int file, size_t bytes) {
 READ(read, (int file, void *to, size_t bytes), file, to, bytes)
 READ(pread, (int file, void *to, size_t bytes, off_t from), file, to, bytes, from)
 READ(pread64, (int file, void *to, size_t bytes, off64_t from), file, to, bytes, from)
+
+static size_t total(const struct iovec *to, int count) { return count ? to->iov_len + total(to + 1, count - 1) : 0; }
+
+/* Python's os.preadv calls the second form. */
+#define READV(NAME, OFFSET)                                                               \
+  ssize_t NAME(int file, const struct iovec *to, int count, OFFSET from, int how) {       \
+    static ssize_t (*real)(int, const struct iovec *, int, OFFSET, int);                  \
+    if (!real) real = dlsym(RTLD_NEXT, #NAME);                                            \
+    return reading(file, total(to, count)) ? -1 : real(file, to, count, from, how);       \
+  }
+READV(preadv2, off_t)
+READV(preadv64v2, off64_t)
 
 #define OPEN(NAME)                                              \
   int NAME(const char *path, int how, ...) {                    \

@@ -2,334 +2,66 @@
 
     python -m analysis.gpu.bench --out runs/bench-gpu
 
-Kept decoders of the full-size page are put into their batched form, and decode pages that are simulated here. What is
-measured is kept part by part in `gpu.json`, with the card's name; when run again, it goes on behind the last part. It
-needs torch, and an ONNX Runtime that has the provider.
+Kept decoders of the full-size page are put into their batched form, and decode pages that are simulated here. One of
+them becomes a bundle, which a service and `lightpage bulk` read pages with. What is measured is kept part by part in
+`gpu.json`, with the card's name; no part is begun that would end behind `--seconds`, and the same command goes on with
+the next. The table has every target with its verdict; that of two CPU cores is `python -m analysis.speed.speed`'s.
 """
 
 from __future__ import annotations
 
-import json
-import math
-import re
-import time
-import traceback
-from collections import defaultdict
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import partial
+import sys
 from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
-import torch
-from numpy.typing import NDArray
 
-from analysis.gpu.kept_form import Form, Scene, form_of, scene_of
-from lightpage.errors import InvalidInputError
-from lightpage.export.operators.batches import BatchFile
-from lightpage.files import write_json
-from lightpage.metrics.provenance import PROVENANCE, commit, provenance
-from lightpage.runtime.model.decoding.batch_graph import SHIFT
-from lightpage.runtime.model.execution.providers import Provider
-from lightpage.runtime.model.execution.session import BoundSession, open_session
+from analysis.gpu.kept_parts import Kept
+from analysis.gpu.targets import TRAVELS_MB, table
+from lightpage.cli.main import run
+from lightpage.errors import ProviderError
+from lightpage.metrics.provenance import PROVENANCE, provenance
+from lightpage.runtime.model.execution.providers import CPU, CUDA, Provider
+from lightpage.runtime.model.execution.session import check_provider
 
-CUDA = "cuda"
-PARTS = "parts"
-_REPEATS = 9
-_WANTED = {"standard": (150, 250), "fast": (400, 1000), "accurate": (60, 120)}
-"""Pages a second of each preset at the full size: what is aimed at, and what would be better still."""
-_GROUPS = {
-    "copies": r"memcpy|memset",
-    "sampling": r"gridsample|grid_sample",
-    "layout in and out of convolutions": r"nchwtonhwc|nhwctonchw|tensortransform",
-    "convolutions": r"conv|cudnn|fprop|implicit",
-    "products": r"gemm|cutlass|nvjet|cublas|splitk|gemv|dot_kernel",
-    "transposes": r"transpose",
-    "pads, slices, joins, splits": r"pad|slice|concat|split|gather",
-    "casts": r"cast|convert",
-    "products and sums by element": r"elementwise|_mul|_add|_sub|_div|binary|unary|vectorized",
-    "reductions": r"reduce|softmax",
-}
-"""Kernels by what their names hold; the first that fits counts."""
+_ROOT = Path(__file__).resolve().parents[2]
+_SOURCES = ("lightpage", "runtime", "train", "export", "analysis", "proto")
+_ENVIRONMENT = "an environment of its own with `pip install '.[gpu,train]'`, which `make bench-gpu` makes"
 
 
-class Kept:
-    """Results in a file, part by part: what is there is not measured again.
+def check_machine(provider: Provider) -> str:
+    """Check that onnxruntime and torch have the provider, and return the card's name.
 
-    Args:
-        path: of the file.
-        head: what is said once.
+    Raises:
+        ProviderError: one of them has it not.
     """
+    try:
+        check_provider(provider)
+    except ProviderError as error:
+        raise ProviderError(error.subject, error.got, _ENVIRONMENT) from None
+    import torch  # behind the first check, which says more where both are missing
 
-    def __init__(self, path: Path, head: Mapping[str, Any]) -> None:
-        self.path = path
-        self.whole: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {PARTS: {}}
-        for name, now in (("card", head["card"]), ("commit", commit())):  # of two cards or programs nothing is mixed
-            before = (self.whole if name in head else self.whole.get(PROVENANCE, {})).get(name, now)
-            if before != now:
-                raise InvalidInputError(f"{path}: {name}", before, f"{now}, or another folder")
-        self.whole |= dict(head)
-
-    def part(self, name: str, measure: Callable[[], Any]) -> Any:
-        """A part, measured now unless it is there; a failure is told and tried again the next time."""
-        if name in self.whole[PARTS]:
-            return self.whole[PARTS][name]
-        start = time.perf_counter()
-        try:
-            found = measure()
-        except Exception as error:
-            traceback.print_exc(limit=5)
-            click.echo(f"{name}: failed, {error}"[:300], err=True)
-            return None
-        self.whole[PARTS][name] = found
-        write_json(self.path, self.whole)
-        click.echo(f"{name} ({time.perf_counter() - start:.1f} s): {json.dumps(found)[:2000]}", err=True)
-        return found
+    if provider.name == CPU:
+        return CPU
+    if not torch.cuda.is_available():
+        got = f"torch {torch.__version__}, which sees no GPU"
+        raise ProviderError(f"provider {provider}", got, f"an NVIDIA GPU, its driver, and {_ENVIRONMENT}")
+    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
+    return torch.cuda.get_device_name(provider.device)
 
 
-@dataclass(frozen=True)
-class Machine:
-    """A machine that decodes.
-
-    Attributes:
-        device: torch's.
-        provider: ONNX Runtime's.
-    """
-
-    device: torch.device
-    provider: Provider
-
-    @classmethod
-    def of(cls, name: str) -> Machine:
-        """The machine of a provider's name, `cuda` or `cpu`."""
-        return cls(torch.device(name), Provider.parse(name))
-
-    def wait(self) -> None:
-        """Wait until all is computed."""
-        if self.device.type == CUDA:
-            torch.cuda.synchronize()
-
-
-def ceilings(machine: Machine) -> dict[str, float]:
-    """Measure what the card can do at most: bytes of a copy, flops of a product, bytes over the bus, a second."""
-    device, found = machine.device, {}
-
-    def rate(work: Callable[[], Any], amount: float) -> float:
-        work()
-        machine.wait()
-        start = time.perf_counter()
-        for _ in range(5):
-            work()
-        machine.wait()
-        return amount * 5 / (time.perf_counter() - start)
-
-    count, side = (1 << 28, 8192) if device.type == CUDA else (1 << 22, 256)
-    source = torch.randn(count, device=device)
-    target = torch.empty_like(source)
-    found["copy_bytes_per_s"] = rate(lambda: target.copy_(source), 8.0 * count)
-    left, right = (torch.randn(side, side, device=device).half() for _ in range(2))
-    found["float16_flops"] = rate(lambda: left @ right, 2.0 * side**3)
-    if device.type == CUDA:
-        pinned = torch.empty(1 << 26, dtype=torch.uint8).pin_memory()
-        there = torch.empty(1 << 26, dtype=torch.uint8, device=device)
-        found["pinned_bytes_per_s"] = rate(lambda: there.copy_(pinned, non_blocking=True), float(1 << 26))
-    return found
-
-
-class Batches:
-    """A batch graph opened for so many pages, with its constants where it computes."""
-
-    def __init__(self, machine: Machine, form: Form, constants: Mapping[str, NDArray[Any]], pages: int) -> None:
-        self.machine, self.pages, device = machine, pages, machine.device
-        self.session = open_session(form.batch, form.name, provider=machine.provider, rounded=True)
-        self._held = BoundSession(self.session, machine.provider, constants, form.name)
-        self.frames = [torch.zeros((pages, *form.frame_shape), dtype=torch.uint8, device=device) for _ in range(2)]
-        self.shift = torch.zeros((pages, 2, 2), dtype=torch.float32, device=device)
-        self.p = torch.zeros((pages, 2, *form.page_shape), dtype=torch.float32, device=device)
-        self.residual = torch.zeros(pages, dtype=torch.float32, device=device)
-
-    def bound(self, frames: list[torch.Tensor]) -> Any:
-        """A binding of two stacks of frames and of the outputs."""
-        binding, kind = self._held.binding(), self.machine.device.type
-        for name, tensor, dtype in (("in_phase", frames[0], np.uint8), ("quadrature", frames[1], np.uint8)):
-            binding.bind_input(name, kind, 0, dtype, tuple(tensor.shape), tensor.data_ptr())
-        binding.bind_input(SHIFT, kind, 0, np.float32, tuple(self.shift.shape), self.shift.data_ptr())
-        for name, tensor in (("p", self.p), ("residual", self.residual)):
-            binding.bind_output(name, kind, 0, np.float32, tuple(tensor.shape), tensor.data_ptr())
-        return binding
-
-    def filled(self, scene: Scene) -> list[torch.Tensor]:
-        """Frames of the scene's pages in turn, on the host."""
-        count = len(scene.pairs)
-        stacks = [
-            torch.from_numpy(np.stack([getattr(scene.pairs[page % count], name) for page in range(self.pages)]))
-            for name in ("in_phase", "quadrature")
-        ]
-        return [stack.pin_memory() for stack in stacks] if self.machine.device.type == CUDA else stacks
-
-
-def _name(preset: str, pages: int) -> str:
-    return f"{preset}, {pages} a batch"
-
-
-def decoded(
-    machine: Machine, form: Form, constants: Mapping[str, NDArray[Any]], pages: int, scene: Scene
-) -> dict[str, Any]:
-    """Rates of a graph alone and from pinned frames to p, and what its answers are worth."""
-    batches = Batches(machine, form, constants, pages)
-    host = batches.filled(scene)
-    for there, here in zip(batches.frames, host, strict=True):
-        there.copy_(here)
-    machine.wait()
-    binding = batches.bound(batches.frames)
-    taken = []
-    for _ in range(_REPEATS if machine.device.type == CUDA else 2):
-        start = time.perf_counter()
-        batches.session.run_with_iobinding(binding)
-        machine.wait()
-        taken.append(time.perf_counter() - start)
-    p = batches.p.cpu().numpy()
-    found: dict[str, Any] = {
-        "pages": batches.pages,
-        "graph_ms_a_page": 1e3 * float(np.median(taken[1:])) / batches.pages,
-        "residual": [float(each) for each in batches.residual.cpu()[:2]],
-        "air": [scene.air(p[page], page % len(scene.pairs)) for page in range(min(2, batches.pages))],
-        "deviation": [scene.deviation(form.expected[page], p[page]) for page in range(min(2, batches.pages))],
-    }
-    if machine.device.type == CUDA:
-        found["end_to_end_ms_a_page"] = 1e3 * _end_to_end(batches, host) / batches.pages
-        found["alone_ms"] = 1e3 * _alone(batches, host)
-        free, total = torch.cuda.mem_get_info()
-        found["memory_gb"] = (total - free) / 1e9
-        found |= kernels(batches, binding)
-    found["pages_per_s"] = 1e3 / found.get("end_to_end_ms_a_page", found["graph_ms_a_page"])
-    return found
-
-
-def _end_to_end(batches: Batches, host: list[torch.Tensor], runs: int = 12) -> float:
-    """Seconds a batch from pinned frames to p in pinned memory: the next batch is copied while one is computed."""
-    other = [torch.empty_like(each) for each in batches.frames]
-    slots = [batches.frames, other]
-    bindings = [batches.bound(slot) for slot in slots]
-    answers = torch.empty(batches.p.shape, dtype=torch.float32).pin_memory()
-    copies = torch.cuda.Stream()  # type: ignore[no-untyped-call]
-
-    def sent(slot: int) -> None:
-        with torch.cuda.stream(copies):
-            for there, here in zip(slots[slot], host, strict=True):
-                there.copy_(here, non_blocking=True)
-
-    sent(0)
-    copies.synchronize()
-    start = 0.0
-    for batch in range(runs + 2):
-        if batch == 2:
-            start = time.perf_counter()
-        sent((batch + 1) % 2)
-        batches.session.run_with_iobinding(bindings[batch % 2])
-        answers.copy_(batches.p, non_blocking=True)
-        torch.cuda.current_stream().synchronize()
-        copies.synchronize()
-    return (time.perf_counter() - start) / runs
-
-
-def _alone(batches: Batches, host: list[torch.Tensor]) -> float:
-    """Median seconds of a batch that nothing overlaps with, from pinned frames to p in pinned memory."""
-    binding = batches.bound(batches.frames)
-    answers, taken = torch.empty(batches.p.shape, dtype=torch.float32).pin_memory(), []
-    for _ in range(_REPEATS):
-        start = time.perf_counter()
-        for there, here in zip(batches.frames, host, strict=True):
-            there.copy_(here, non_blocking=True)
-        torch.cuda.synchronize()
-        batches.session.run_with_iobinding(binding)
-        answers.copy_(batches.p, non_blocking=True)
-        torch.cuda.synchronize()
-        taken.append(time.perf_counter() - start)
-    return float(np.median(taken))
-
-
-def kernels(batches: Batches, binding: Any) -> dict[str, Any]:
-    """Kernels of a batch, and the GPU's time a page in each group of them, ms."""
-    from torch.profiler import ProfilerActivity, profile
-
-    with profile(activities=[ProfilerActivity.CUDA]) as watched:
-        batches.session.run_with_iobinding(binding)
-        torch.cuda.synchronize()
-    events = [event for event in watched.key_averages() if event.self_device_time_total > 0]
-    groups: dict[str, float] = defaultdict(float)
-    for event in events:
-        name = event.key.lower()
-        group = next((group for group, pattern in _GROUPS.items() if re.search(pattern, name)), "other")
-        groups[group] += event.self_device_time_total / 1e3 / batches.pages
-    longest = sorted(events, key=lambda event: -event.self_device_time_total)[:26]
-    return {
-        "kernels": sum(event.count for event in events),
-        "busy_ms_a_page": sum(groups.values()),
-        "groups_ms_a_page": {name: round(value, 4) for name, value in sorted(groups.items(), key=lambda g: -g[1])},
-        "longest": [
-            [round(event.self_device_time_total / 1e3 / batches.pages, 4), event.count, event.key[:110]]
-            for event in longest
-        ],
-    }
-
-
-def constants_of(form: Form) -> dict[str, NDArray[Any]]:
-    """The constants of a form, evaluated on the CPU."""
-    first = open_session(form.constants, form.name, once=True)
-    names = [output.name for output in first.get_outputs()]
-    table = {entry.name: form.defaults[entry.name] for entry in first.get_inputs()}
-    return dict(zip(names, first.run(names, table), strict=True))
-
-
-def floor(form: Form, pages: int, most: Mapping[str, float]) -> dict[str, float]:
-    """The least time that a page can take, ms: its bytes at the rate of a copy, its flops at that of a product."""
-    cost = BatchFile(form.batch, pages).cost()
-    found = {"kernels": cost.kernels, "gigabytes": cost.bytes_a_page / 1e9, "gigaflops": cost.flops_a_page / 1e9}
-    found["bytes_ms"] = 1e3 * cost.bytes_a_page / most["copy_bytes_per_s"]
-    found["flops_ms"] = 1e3 * cost.flops_a_page / most["float16_flops"]
-    if bus := most.get("pinned_bytes_per_s"):
-        found["bus_ms"] = 2e3 * math.prod(form.frame_shape) / bus
-    return found
-
-
-def table(parts: Mapping[str, Any]) -> list[str]:
-    """Return the parts for people: rates beside what is wanted, floors, and where time goes."""
-    told = [
-        "| preset | a batch | pages/s | target, stretch | graph, ms | batch alone, ms | floors, ms | AIR, today's |"
+def travels(kept: Path, library: Path | None) -> dict[str, Any]:
+    """Megabytes that a bare machine must be sent; there is a sum if ONNX Runtime's archive is among them."""
+    sources = [
+        path for name in _SOURCES for path in (_ROOT / name).rglob("*") if path.suffix in (".py", ".toml", ".c", ".h")
     ]
-    told.append("|---" * 8 + "|")
-    groups = []
-    for preset, (target, stretch) in _WANTED.items():
-        least, present = parts.get(f"{preset}, floor"), parts.get(f"{preset}, present")
-        for name, part in parts.items():
-            if name.startswith(f"{preset}, ") and name.endswith(" a batch") and least and present:
-                floors = ", ".join(f"{least[key]:.2f}" for key in ("bytes_ms", "flops_ms", "bus_ms") if key in least)
-                air = f"{np.mean(part['air']):.4f}, {np.mean(present['air'][: len(part['air'])]):.4f}"
-                wanted = f"{target}, {stretch}" if part["pages"] > 1 else "1 page in 30 ms, 12"
-                told.append(
-                    f"| {preset} | {part['pages']} | {part['pages_per_s']:.1f} | {wanted} | "
-                    f"{part['graph_ms_a_page']:.2f} | {part.get('alone_ms', math.nan):.1f} | {floors} | {air} |"
-                )
-                split = ", ".join(f"{group} {ms:.2f}" for group, ms in part.get("groups_ms_a_page", {}).items())
-                if split:
-                    groups.append(f"{preset}, {part['pages']} a batch, {part['kernels']} kernels, ms a page: {split}")
-    return [*told, *groups]
-
-
-def measured(kept: Kept, machine: Machine, form: Form, scene: Scene, batches: tuple[int, ...]) -> None:
-    """All parts of one form."""
-    start = time.perf_counter()
-    constants = constants_of(form)
-    size = sum(value.nbytes for value in constants.values())
-    files = {"constants": len(form.constants), "batch": len(form.batch)}
-    told = {"files": files, "bytes": size, "seconds": time.perf_counter() - start}
-    kept.part(f"{form.name}, constants", partial(dict, told))
-    kept.part(f"{form.name}, floor", lambda: floor(form, max(batches), kept.whole[PARTS]["ceilings"]))
-    for pages in batches:
-        kept.part(_name(form.name, pages), partial(decoded, machine, form, constants, pages, scene))
+    files = {path.resolve(): path.stat().st_size for path in (*sources, *kept.rglob("*")) if path.is_file()}
+    found: dict[str, Any] = {"program_and_weights": sum(files.values()) / 1e6}
+    if library is not None:
+        found["library"] = library.stat().st_size / 1e6
+        found["megabytes"] = sum(found.values())
+        found["most"] = TRAVELS_MB
+    return found
 
 
 @click.command()
@@ -344,9 +76,11 @@ def measured(kept: Kept, machine: Machine, form: Form, scene: Scene, batches: tu
 @click.option("--preset", "presets", multiple=True, default=("standard", "fast", "accurate"), show_default=True)
 @click.option("--reflections", default=4, show_default=True, help="Rounds to the field of the slower presets.")
 @click.option("--batch", "batches", multiple=True, type=int, default=(8, 1), show_default=True, help="Pages a batch.")
-@click.option("--provider", default=CUDA, show_default=True, type=click.Choice([CUDA, "cpu"]))
-@click.option("--seconds", default=480.0, show_default=True, help="No form is begun after that time.")
+@click.option("--provider", default=CUDA, show_default=True, type=click.Choice([CUDA, CPU]))
+@click.option("--seconds", default=480.0, show_default=True, help="All of it takes no longer.")
+@click.option("--served", default=16, show_default=True, help="Pages a batch of the service and of bulk.")
 @click.option("--pages", "simulated", type=click.Path(path_type=Path), help="Folder for simulated pages; --out's.")
+@click.option("--library", type=click.Path(path_type=Path, exists=True), help="ONNX Runtime's archive, if it is sent.")
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="Folder for gpu.json.")
 def main(
     folder: Path,
@@ -355,30 +89,29 @@ def main(
     batches: tuple[int, ...],
     provider: str,
     seconds: float,
+    served: int,
     simulated: Path | None,
+    library: Path | None,
     out: Path,
 ) -> None:
     """Measure the batched forms of kept decoders."""
-    begun = time.perf_counter()
-    out.mkdir(parents=True, exist_ok=True)
-    (simulated or out).mkdir(parents=True, exist_ok=True)
-    machine = Machine.of(provider)
-    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
-    card = torch.cuda.get_device_name(0) if provider == CUDA else "cpu"
-    kept = Kept(out / "gpu.json", {"card": card, PROVENANCE: provenance(weights=folder).to_json()})
-    kept.part("ceilings", lambda: ceilings(machine))
-    scene = scene_of(folder, simulated or out)
+    chosen = Provider.parse(provider)
+    card = check_machine(chosen)
+    from analysis.gpu.course import Course  # it needs torch, which has just been looked for
+
+    for path in (out, simulated or out):
+        path.mkdir(parents=True, exist_ok=True)
+    kept = Kept(out / "gpu.json", {"card": card, PROVENANCE: provenance(weights=folder).to_json()}, seconds)
+    kept.parts["travels"] = travels(folder, library)
+    course = Course(kept, folder, chosen, reflections, simulated or out)
     for preset in presets:
-        if all(_name(preset, pages) in kept.whole[PARTS] for pages in batches):
-            continue
-        if time.perf_counter() - begun > seconds:
-            break
-        form = form_of(folder, scene, preset, reflections, machine.device)
-        kept.part(f"{preset}, present", partial(dict, form.told))
-        measured(kept, machine, form, scene, batches)
-    click.echo("\n".join(table(kept.whole[PARTS])))
-    click.echo(f"{kept.path}: {time.perf_counter() - begun:.0f} s")
+        course.measure(preset, batches)
+    course.measure_product(served, out)
+    click.echo("\n".join(table(kept.parts, course.page)))
+    click.echo(f"{kept.path}: {seconds - kept.left_s:.0f} s")
+    if kept.left_out:
+        click.echo(f"left for another run of the same command: {'; '.join(kept.left_out)}")
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run(main, name="python -m analysis.gpu.bench"))

@@ -114,6 +114,7 @@ class Registered:
         modulation: light that the modulator makes of its levels.
         modulation_deviations: standard deviations of its coefficients.
         goodness: how well all that explains the first page's light; None where that was not measured.
+        quadrature_deviation: standard deviation of the angle between the arms, radians; None where it was not fitted.
         coherences: of each page, at the fitted geometry.
     """
 
@@ -127,6 +128,7 @@ class Registered:
     modulation: Modulation = NOMINAL
     modulation_deviations: tuple[float, ...] = NOMINAL.coefficients
     goodness: Goodness | None = None
+    quadrature_deviation: float | None = None
     coherences: tuple[float, ...] = ()
 
 
@@ -394,6 +396,7 @@ class _Registration:
         self.any_orientation, self.orientations, self.rough = False, tuple[str, ...](), False
         self.deviations = np.zeros_like(self.parameters)
         self.quadrature_phase = np.pi / 2
+        self.quadrature_deviation: float | None = None
         self.levels = LevelPrior()
         self.modulation, self.modulation_deviations = NOMINAL, NOMINAL.coefficients
         self.fit: PatchFit | None = None
@@ -514,7 +517,7 @@ class _Registration:
             rough=self.rough,
         )
         self.parameters, self.deviations = found.parameters, found.deviations
-        self.quadrature_phase = found.quadrature_phase
+        self.quadrature_phase, self.quadrature_deviation = found.quadrature_phase, found.quadrature_deviation
         self.modulation, self.modulation_deviations = found.modulation, found.modulation_deviations
         self.illumination = found.illumination
 
@@ -546,6 +549,7 @@ class _Registration:
             modulation=self.modulation,
             modulation_deviations=self.modulation_deviations,
             goodness=self._goodness(),
+            quadrature_deviation=self.quadrature_deviation,
             coherences=tuple(coherences),
         )
 

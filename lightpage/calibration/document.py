@@ -36,7 +36,7 @@ _ADDED = {
 """Fields that older documents lack: they took lenses for ideal, and planes for those of the profile."""
 
 
-_OPTIONAL = ("coherence_at_first", "goodness")
+_OPTIONAL = ("turn_deviation_rad", "coherence_at_first", "goodness")
 
 
 def _names_problem(values: dict[str, Any], names: tuple[str, ...] = NAMES) -> str:
@@ -65,6 +65,7 @@ class Calibration(TomlTable):
         schema_version: 1.
         profile_name: name of the nominal profile that the numbers deviate from.
         turn_rad: angle between the homodyne arms, radians: 90 degrees plus error, negative when Q is inverted.
+        turn_deviation_rad: standard deviation of that angle; None in documents of before.
         coherence_before, coherence_after: coherence of the known pages at nominal and at fitted geometry, 0 to 1.
         coherence_at_first: `coherence_after` of the calibration from nominal, where this is a re-fit that followed it.
         cost: mean squared normalised residual of the fit, about 1 when the twin explains the measurements.
@@ -82,6 +83,7 @@ class Calibration(TomlTable):
     schema_version: Literal[1] = 1
     profile_name: Annotated[str, Field(min_length=1)]
     turn_rad: Finite
+    turn_deviation_rad: NonNegative | None = None
     coherence_before: Share
     coherence_after: Share
     coherence_at_first: Share | None = None
@@ -118,6 +120,7 @@ class Calibration(TomlTable):
         return cls(
             profile_name=profile.name,
             turn_rad=float(registered.quadrature_phase),
+            turn_deviation_rad=registered.quadrature_deviation,
             coherence_before=float(registered.coherence_before),
             coherence_after=float(registered.coherence_after),
             cost=float(registered.cost),

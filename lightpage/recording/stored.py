@@ -2,7 +2,8 @@
 
 HDF5 reads zeros, and says nothing, where a chunk was never written, an external file is cut short, or the source of a
 virtual dataset is missing or cannot be opened for a moment. So what is stored is looked at before anything is read, and
-virtual datasets are read from their sources here.
+virtual datasets are read from their sources here. A page that lies in the file in one piece, as it is, is read without
+HDF5, which has one lock for all that a process reads by it.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import threading
 from bisect import bisect_left
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count as numbers
@@ -29,7 +30,17 @@ from numpy.typing import NDArray
 
 from lightpage.errors import RecordingError, StorageError
 from lightpage.progress import warn
-from lightpage.recording.hdf5 import READABLE, find, hdf, open_named, open_once, patiently, read_attribute, resolved
+from lightpage.recording.hdf5 import (
+    DATA,
+    READABLE,
+    find,
+    hdf,
+    open_named,
+    open_once,
+    patiently,
+    read_attribute,
+    resolved,
+)
 from lightpage.words import counted
 
 CACHE_BYTES = 1 << 30
@@ -41,6 +52,9 @@ OPEN_SOURCES = 16
 _UNLIMITED = hdf.h5s.UNLIMITED
 _EXTFILE_PREFIX = os.environ.get("HDF5_EXTFILE_PREFIX", "")
 """HDF5 looks at it once, when it is loaded."""
+
+_HDF5_ERRORS = OSError, KeyError, RuntimeError, ValueError
+"""What h5py raises, the last of a file that is closed."""
 
 _FILTERS = {
     4: "szip",
@@ -169,8 +183,28 @@ class ArrayFile:
         pages = 0 if (array := self.array(name)) is None else len(array)
         if not 0 <= page < pages:
             raise RecordingError(f"{self.subject}: page", page, f"0 to {pages - 1}")
-        row: NDArray[Any] = self.rows(name, page, page + 1)[0]
-        return row
+        row = self._without_hdf5(name, page)
+        return self.rows(name, page, page + 1)[0] if row is None else row
+
+    def _without_hdf5(self, name: str, page: int) -> NDArray[Any] | None:
+        """The same, if the row lies in the file as it is and can be read; what is wrong otherwise, HDF5 says.
+
+        Raises:
+            StorageError: the file ends before the row does, which HDF5 fills with zeros.
+        """
+        array, piece = None, None
+        with self._lock, suppress(*_HDF5_ERRORS):
+            array = None if self._gone else self.array(name)
+            piece = None if array is None else array.piece(page)
+        if array is None or piece is None:
+            return None
+        row = np.empty(array.shape[1:], array.dtype)
+        with closing(piece), suppress(OSError):
+            if not piece.read_into(row):
+                subject = f"{self.subject}: dataset '{name}' page {page}"
+                raise StorageError(subject, "the end of the file", DATA)
+            return row.astype(row.dtype.newbyteorder("="), copy=False)
+        return None
 
     def attribute(self, name: str, default: object = None, group: str = "") -> Any:
         """An attribute of the file or of a group in it; see `read_attribute`."""
@@ -208,6 +242,34 @@ class ArrayFile:
     def _be_open(self) -> None:
         if self._gone:
             patiently(self._open_again, self.subject, READABLE)
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """A piece of an open file.
+
+    Attributes:
+        file: a descriptor of its own, so that the file may be closed meanwhile.
+        place: of the first byte.
+    """
+
+    file: int
+    place: int
+
+    def read_into(self, array: NDArray[Any]) -> bool:
+        """Fill an array, and return whether the file had so many bytes.
+
+        Raises:
+            OSError: the system cannot read it.
+        """
+        left, place = array.reshape(-1).data.cast("B"), self.place
+        while left and (count := os.preadv(self.file, [left], place)):
+            left, place = left[count:], place + count
+        return not left
+
+    def close(self) -> None:
+        """Let the file go."""
+        os.close(self.file)
 
 
 @dataclass(frozen=True)
@@ -256,6 +318,7 @@ class StoredArray:
         self._path, self._name = Path(found.file.filename), found.name.strip("/")
         self._chain = chain or ((self._path, self._name),)
         self.dataset: Any = found
+        self._is_plain: bool | None = None
         self._parts: list[_Part] = []
         properties = found.id.get_create_plist()
         layout = properties.get_layout()
@@ -272,6 +335,24 @@ class StoredArray:
 
     def __len__(self) -> int:
         return self.shape[0] if self.shape else 1
+
+    def piece(self, row: int) -> _Piece | None:
+        """The piece of the file that is a row, byte for byte, to be closed; None where HDF5 must read the row.
+
+        Raises:
+            OSError, KeyError, RuntimeError, ValueError: what HDF5 says.
+        """
+        if self._is_plain is None:
+            self._is_plain = _is_plain(self.dataset)
+        if not self._is_plain:
+            return None
+        size = math.prod(self.shape[1:]) * self.dtype.itemsize
+        if self.dataset.chunks is None:
+            place = self.dataset.id.get_offset() + row * size
+        else:
+            chunk = self.dataset.id.get_chunk_info_by_coord((row, *(0 for _ in self.shape[1:])))
+            place = chunk.byte_offset if chunk.size == size else None
+        return None if place is None else _Piece(os.dup(self.dataset.file.id.get_vfd_handle()), place)
 
     def rows(self, start: int, stop: int) -> NDArray[Any]:
         """The array from `start` to `stop` along its first axis.
@@ -540,6 +621,19 @@ def _moved(indices: Indices, by: int) -> Indices:
     if isinstance(indices, range):
         return range(indices.start + by, indices.stop + by, indices.step)
     return np.asarray(indices) + by
+
+
+def _is_plain(found: Any) -> bool:
+    """Return whether each row of a dataset lies in its file in one piece, as numpy has it in memory."""
+    properties, shape = found.id.get_create_plist(), found.shape
+    if found.dtype.kind not in "ui" or len(shape) < 2 or not all(shape):
+        return False
+    if found.chunks is None:
+        in_one = not properties.get_external_count() and found.id.get_offset() is not None
+    else:
+        in_one = found.chunks == (1, *shape[1:]) and not properties.get_nfilters()
+    in_file = hasattr(os, "preadv") and found.file.driver == "sec2" and not found.file.userblock_size
+    return in_one and in_file and found.id.get_type() == hdf.h5t.py_create(found.dtype)
 
 
 def _at(axes: Sequence[Indices]) -> Any:

@@ -137,10 +137,10 @@ def _doubts(profile: Profile, order_m: float, steps: list[float]) -> list[str]:
             f"{own:.3g} camera pixels a symbol, never tried below {_FEW_PIXELS:g}: "
             f"relay.magnification {profile.relay.magnification * _FEW_PIXELS / own:.3g}, or a smaller camera.pitch_m"
         )
-    if max(_walls(step, pipe.width_m) for step in steps) == 0:
-        least_m = pipe.length_m * pipe.width_m / 2 / max(steps)
-        told.append(
-            "no light meets a wall, and calibration needs some that does: a wider page, or pipe.length_m from "
-            f"{least_m:.4g}"
-        )
+    for axis, size, step in zip("xy", ("columns", "rows"), steps, strict=True):
+        if _walls(step, pipe.width_m) == 0:
+            told.append(
+                f"no light meets a wall along {axis}, and calibration needs some that does along both axes: more "
+                f"page.{size}, or pipe.length_m from {pipe.length_m * pipe.width_m / 2 / step:.4g}"
+            )
     return told

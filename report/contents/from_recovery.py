@@ -41,6 +41,7 @@ class PageResult(Part):
     reason: str
     margin_bits: Margin | None
     failed_blocks: Count
+    healed_rounds: Count | None = None
 
 
 class _Volume(Part):
@@ -198,6 +199,7 @@ def _facts(found: _Recovery) -> list[tuple[str, str]]:
         ("File size", _UNKNOWN if volume is None else f"{volume.file_bytes:,} bytes"),
         ("Recorded pages", f"{found.pages:,}"),
         ("Unread", f"{found.pages_unread:,} of the recorded pages"),
+        ("Healed", _healed([page for page in found.page_results if page.healed_rounds is not None])),
         ("Repeated", f"{found.pages_repeated:,} of the recorded pages"),
         ("Pages of other volumes", _few([f"{count:,} of volume {other}" for other, count in others.most_common()])),
         ("Missing", _numbered(found.missing, "page", _OF_VOLUME)),
@@ -225,6 +227,14 @@ def _facts(found: _Recovery) -> list[tuple[str, str]]:
             f"{_told_if(found.code_seconds_per_page, '.3f', ' s')}; medians",
         ),
     ]
+
+
+def _healed(pages: list[PageResult]) -> str:
+    """Which recorded pages the model read only once it was healed, and after how many rounds of fits to decisions."""
+    if not pages:
+        return "none"
+    rounds = ranges(sorted({page.healed_rounds or 0 for page in pages}))
+    return f"{_numbered([page.page for page in pages], 'recorded page')}; the model was healed in {rounds} rounds"
 
 
 def _shape(volume: Volume) -> str:

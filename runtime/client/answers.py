@@ -1,7 +1,5 @@
 """Answers of a service, as its callers see them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -252,6 +250,8 @@ class Recalibrated:
     service, does not say.
 
     `air_limit` is the least `air_after` that would have been accepted, `air_standard_error` that of the difference.
+    `rounds` are those of a healing, None where pages were known. `verdict`, `bits_lost` and `cause` say how well the
+    geometry explains the light.
     """
 
     model_version: str
@@ -268,6 +268,17 @@ class Recalibrated:
     air_standard_error: float | None
     pages_lost_before: int
     image: ImagePosition | None
+    rounds: int | None = None
+    verdict: str | None = None
+    bits_lost: float | None = None
+    cause: str | None = None
+
+    @property
+    def told(self) -> str:
+        """Return which model took over, whether it was healed, and how good its fit is, for people."""
+        healed = "" if self.rounds is None else f", healed in {self.rounds} rounds"
+        fit = "" if self.verdict is None else f", a {self.verdict} fit"
+        return f"{self.model_version} in service instead of {self.previous_version}{healed}{fit}"
 
 
 class JobState(StrEnum):

@@ -1,7 +1,5 @@
 """A Python client of the service; its errors are of the same classes that the service raised."""
 
-from __future__ import annotations
-
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Self
 from warnings import warn

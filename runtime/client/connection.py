@@ -1,7 +1,5 @@
 """A connection to a service: its deadlines, and errors of the classes that the service raised."""
 
-from __future__ import annotations
-
 import secrets
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager

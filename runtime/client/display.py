@@ -1,7 +1,5 @@
 """Calls of a controller that shows pages, or moves shutters, for the service's source."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Frames that a caller has, sent or shared, and decoded by the service."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Unpack
 
@@ -67,12 +65,7 @@ class FramesClient(SubClient):
         return remote_page(self._ask("DecodeFrames", header=header))  # one message needs no sending thread
 
     def decode_many(
-        self,
-        pairs: Iterable[FramePair],
-        levels: int = 0,
-        *,
-        timeout_s: float = DATA_S,
-        **options: Unpack[FrameOptions],
+        self, pairs: Iterable[FramePair], levels: int = 0, *, timeout_s: float = DATA_S, **options: Unpack[FrameOptions]
     ) -> Iterator[RemotePage | LightpageError]:
         """Send frame pairs one after another in one call; yield each one's page, or why there is none, in their order.
 

@@ -1,7 +1,5 @@
 """The recalibrations of a service, each of them a job."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypedDict, Unpack
 

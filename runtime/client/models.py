@@ -1,7 +1,5 @@
 """The models of a service: which there are, and which of them decodes."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Iterator, Sequence

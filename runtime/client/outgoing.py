@@ -1,7 +1,5 @@
 """Requests of a caller: options of a page, and the messages of its frames and symbols."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches

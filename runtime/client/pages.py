@@ -1,7 +1,5 @@
 """Pages that the service reads from its own source."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import Unpack
 

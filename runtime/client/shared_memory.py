@@ -5,8 +5,6 @@ little-endian. The answer is a byte: 0, then the region's handle, with a file de
 (SCM_RIGHTS); or 1, then why there is none, in UTF-8. The region lives until the connection ends.
 """
 
-from __future__ import annotations
-
 import mmap
 import os
 import socket

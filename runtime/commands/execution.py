@@ -1,11 +1,9 @@
 """Options of commands that decode: bundle, threads, execution provider, batches, and where TensorRT keeps engines."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import click
 
@@ -15,8 +13,14 @@ from lightpage.runtime.model.decoding.batches import Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.execution.providers import CPU, Provider
 
-Load = Callable[[], Decoder]
-"""Opens the decoder that the options name; raises as `Decoder.load` does."""
+
+class Load(Protocol):
+    """Opens the decoder that the options name."""
+
+    def __call__(self, code_threads: int = 1) -> Decoder:
+        """Open it; raises as `Decoder.load` does."""
+
+
 THREADS = click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
 ENGINE_CACHE = click.option(
     "--engine-cache",
@@ -47,6 +51,10 @@ def decoder_options(command: Callable[..., Any]) -> Callable[..., Any]:
     ) -> Any:
         chosen = Provider.parse(CPU if provider is None else provider, engine_cache)
         batching = Batching(batches or 1)
-        return command(load=lambda: Decoder.load(bundle_path(bundle), threads, chosen, batching), **others)
+
+        def load(code_threads: int = 1) -> Decoder:
+            return Decoder.load(bundle_path(bundle), threads, chosen, batching, code_threads)
+
+        return command(load=load, **others)
 
     return with_decoder

@@ -1,7 +1,5 @@
 """`lightpage lookup-table`: corrects a modulator's lookup table by what a calibration has found of its levels."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click
@@ -13,7 +11,14 @@ from lightpage.errors import InvalidInputError
 from lightpage.files import replace_text, write_json
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 from lightpage.page.symbols import symbol_phases
-from lightpage.runtime.device.modulator.lookup_table import GREYS, calibration_text, levels_text, read_table
+from lightpage.progress import note
+from lightpage.runtime.device.modulator.lookup_table import (
+    GREYS,
+    calibration_text,
+    levels_text,
+    most_levels,
+    read_table,
+)
 
 
 @click.command("lookup-table")
@@ -37,8 +42,8 @@ def lookup_table(
 ) -> None:
     """Write a lookup table with which the modulator's levels are even.
 
-    It has the phase of each grey value, which serves pages of any levels; with --levels, the grey value of each level.
-    Calibrate anew once it is in use.
+    It has the phase of each grey value, for pages of different levels; with --levels, the grey value of each level.
+    Where the stroke is a little short, the levels share what there is. Calibrate anew once it is in use.
     """
     if (calibration is None) == (bundle is None):
         got = "neither --calibration nor --bundle" if bundle is None else "both --calibration and --bundle"
@@ -60,6 +65,10 @@ def lookup_table(
     count = GREYS if in_use is None else int(levels or 0)
     greys = np.arange(GREYS) if in_use is None else read_table(in_use, count).astype(np.int64)
     curve = dict(zip(greys.tolist(), modulation.phase(symbol_phases(np.arange(count), count)).tolist(), strict=True))
-    text = calibration_text(curve) if levels is None else levels_text(curve, levels, f"modulator of {subject}")
-    replace_text(out, text, "lookup table")
-    write_json(json_path, {"table": str(out), "of": subject, "levels": levels, "modulation": modulation.as_dict()})
+    most = most_levels(curve, f"modulator of {subject}")
+    even = levels_text(curve, levels or most, f"modulator of {subject}")
+    if levels is None and most < MAX_LEVELS:
+        note(f"the table makes at most {most} levels even; more would share grey values")
+    replace_text(out, calibration_text(curve) if levels is None else even, "lookup table")
+    written = {"table": str(out), "of": subject, "levels": levels, "most_levels": most}
+    write_json(json_path, {**written, "modulation": modulation.as_dict()})

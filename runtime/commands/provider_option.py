@@ -1,7 +1,5 @@
 """Options that say what computes pages, for commands that decode, and for those that have others decode."""
 
-from __future__ import annotations
-
 import click
 
 from lightpage.runtime.model.execution.providers import CPU, WANTED
@@ -12,6 +10,14 @@ PROVIDER = click.option(
     show_envvar=True,
     show_default=CPU,
     help=f"What computes pages: {WANTED}.",
+)
+
+CODE_THREADS = click.option(
+    "--code-threads",
+    type=click.IntRange(1, 64),
+    envvar="LIGHTPAGE_SERVICE__CODE_THREADS",
+    show_envvar=True,
+    help="Threads that share the code of a page, where it is compiled; 1 by default.",
 )
 
 BATCHES = click.option(

@@ -1,7 +1,5 @@
 """Actions of a person on the console: recalibrate, and go back to the model before."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -50,7 +48,9 @@ class Actions:
         if not jobs:
             return None
         job = job_info(jobs[0])
-        told = job.step if job.error is None else without_folders(str(job.error))
+        told = job.step if job.result is None else job.result.told
+        if job.error is not None:
+            told = without_folders(str(job.error))
         return {"id": job.id, "state": job.state, "fraction": job.fraction, "told": told}
 
     def do(self, content: bytes, actor: Actor) -> str:

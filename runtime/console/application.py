@@ -1,7 +1,5 @@
 """The HTTP application of a service: console, actions, and metrics for Prometheus."""
 
-from __future__ import annotations
-
 import asyncio
 import gzip
 import json

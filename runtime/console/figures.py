@@ -1,7 +1,5 @@
 """Figures of a running service between two scrapes of its metrics: for a terminal, and as JSON."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Mapping

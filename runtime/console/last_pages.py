@@ -1,7 +1,5 @@
 """The last pages on the console: their figures, the losses, and the last frames."""
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from dataclasses import dataclass

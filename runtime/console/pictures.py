@@ -1,7 +1,5 @@
 """Frames and estimated AIR as PNG."""
 
-from __future__ import annotations
-
 import io
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The HTTP server of a service, by Tornado: whom it answers, how many at once, and for how long."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import logging

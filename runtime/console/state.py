@@ -1,7 +1,5 @@
 """The state of a service as the console shows it."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import fields

@@ -1,7 +1,5 @@
 """Drivers that other packages bring, as entry points: sources, cameras, triggers and modulators."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from importlib.metadata import entry_points
 from typing import Any, TypeVar, cast

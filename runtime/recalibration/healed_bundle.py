@@ -1,7 +1,5 @@
 """Recalibrates by pages that a model has lost, or by recorded ones: heals it, and writes what was found as a bundle."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice

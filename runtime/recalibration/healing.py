@@ -130,8 +130,6 @@ def heal(
         try:
             result = fit(decoder.bundle, known.part(slice(1)), told, decoder)
         except CalibrationError:
-            if not rounds:
-                raise
             model = work.judged(model, known, told)
         else:
             by_known = model.by(known.pairs[0], decoder.of_bundle(refitted_bundle(decoder.bundle, result)), result)
@@ -237,7 +235,10 @@ class _Healing:
     def unread(self, model: _Model) -> str:
         """Return that no page is read, and how far the one is from it that is nearest."""
         pages = self._read(model)
-        told = f"the nearest lacks {min(-page.margin_bits for page in pages):.2f} bit a symbol by its own claims"
+        lacking = max(0.0, min(-page.margin_bits for page in pages))
+        told = f"the nearest lacks {lacking:.2f} bit a symbol by its own claims"
+        if lacking < 0.005:
+            told = "one claims enough, and no checksum holds"
         if decoded := sum(page.loss is Loss.CHECKSUM for page in pages):
             told = f"{decoded} fail in bits that their LDPC blocks, which all converge, leave out"
         return f"{len(pages)} pages of which none is read after {MOST_ROUNDS} rounds; {told}"
@@ -288,9 +289,8 @@ class _Healing:
         """The model with the verdict on its geometry, by the light of the first known page.
 
         A fit to decisions gives none: those that are wrong would count as light that the geometry does not explain.
+        That of a geometry that has only been moved is of before.
         """
-        if not model.fitted:
-            return model
         bundle, symbols = model.decoder.bundle, np.exp(1j * symbol_phases(known.symbols[0], self._levels))
         page = KnownPage(known.pairs[0], symbols)
         goodness = goodness_of(self._twin, self._near(model), page, lambda _: progress("unexplained light", 1.0))

@@ -1,7 +1,5 @@
 """Judgement of a re-fitted model against the one in service."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

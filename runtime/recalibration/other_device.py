@@ -1,7 +1,5 @@
 """Finds the geometry of a drive that a model was never calibrated for, by pages of user data written for its make."""
 
-from __future__ import annotations
-
 from lightpage.calibration.parameters import as_dict
 from lightpage.calibration.unknown_pages.device_search import find_device
 from lightpage.errors import CalibrationError, RecalibrationRefusedError, raised_as

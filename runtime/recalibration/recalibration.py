@@ -1,7 +1,5 @@
 """Recalibration: re-fit the geometry on known pages, judge it on held-back ones, write a new bundle or refuse."""
 
-from __future__ import annotations
-
 import re
 import time
 from collections.abc import Sequence

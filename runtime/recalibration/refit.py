@@ -1,7 +1,5 @@
 """Re-fits the device's geometry with the exported twin and re-traces the sampling table."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lightpage.calibration.calibrate import LEAST_KEPT, KnownPage, refine
@@ -103,12 +101,12 @@ def refit(
 
 
 def check_as_good(earlier: Calibration, fitted: Calibration) -> None:
-    """Check that a re-fit is not wrong, where the calibration that it started from is known not to be.
+    """Check that a fit is not wrong, unless the calibration that it started from is known to be.
 
     Raises:
         CalibrationError: it is wrong.
     """
-    if earlier.goodness is not None and not earlier.is_wrong:
+    if not earlier.is_wrong:
         fitted.check_good("re-fit, outcome", ": else calibrate anew")
 
 

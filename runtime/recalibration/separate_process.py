@@ -1,7 +1,5 @@
 """Recalibration in a process of its own, at a low priority: reads go on as if nobody recalibrated."""
 
-from __future__ import annotations
-
 import glob
 import logging
 import os

@@ -1,7 +1,5 @@
 """Pages of user data that nobody knows, as models read and decide them that come nearer to their device."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """The work of a recalibration's process, which `separate_process` starts."""
 
-from __future__ import annotations
-
 import os
 import threading
 import time

@@ -1,7 +1,5 @@
 """Limits on work under way: slots, first come, first served; bytes of received frames; decodes that hang."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import time
@@ -91,7 +89,7 @@ class Slots:
     def expected_wait_s(self) -> float:
         """Return how long whoever comes now will wait for a slot, seconds."""
         with self._lock:
-            ahead = len(self._queue) + (0 if self._free else 1)
+            ahead = len(self._queue) + (0 if self._free > 0 else 1)
         return self.usual_s * ahead / self.count
 
     def check(self, caller: Caller) -> None:
@@ -115,7 +113,7 @@ class Slots:
         caller.check()
         ticket = _Ticket()
         with self._lock:
-            if self._free:  # then nobody waits
+            if self._free > 0:  # then nobody waits
                 self._free -= 1
                 ticket.has_slot = True
             else:
@@ -130,12 +128,23 @@ class Slots:
     def give_back(self) -> None:
         """Give back a slot that was taken: whoever has waited longest gets it."""
         with self._lock:
-            if self._queue:
-                ticket = self._queue.popleft()
-                ticket.has_slot = True
-                ticket.told.set()
-            else:
-                self._free += 1
+            self._free += 1
+            self._hand_out()
+
+    def resize(self, count: int) -> None:
+        """Have so many slots from now on; where they are fewer, those that are taken are not given to others."""
+        with self._lock:
+            self._free += count - self.count
+            self.count = count
+            self._hand_out()
+
+    def _hand_out(self) -> None:
+        """Give free slots to those who wait; with the lock held."""
+        while self._queue and self._free > 0:
+            self._free -= 1
+            ticket = self._queue.popleft()
+            ticket.has_slot = True
+            ticket.told.set()
 
     @contextmanager
     def held(self, caller: Caller) -> Iterator[None]:
@@ -154,7 +163,7 @@ class Slots:
             SlotsTakenError: there is none.
         """
         with self._lock:
-            if not self._free:
+            if self._free <= 0:
                 raise SlotsTakenError(self._what, "all taken", f"at most {self.count} at once", retry_s=1.0)
             self._free -= 1
         try:
@@ -292,6 +301,11 @@ class ReceiveBudget:
                     return self._spares.popleft()
                 self._spares.rotate(-1)
         return np.empty(size, np.uint8)
+
+    def keep(self, spares: int) -> None:
+        """Have memory of so many pairs kept from now on, see the constructor."""
+        with self._lock:
+            self._spares = deque(self._spares, maxlen=spares)
 
     def spare(self, memory: Bytes) -> None:
         """Leave memory of a pair to a later one; the last ones are kept."""

@@ -1,7 +1,5 @@
 """Builds what a service decodes with from its settings: models, source, data plane and recalibrator."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -73,8 +71,6 @@ def assembled(settings: ServiceSettings, observer: Observer) -> Iterator[Assembl
     together, codes = settings.batches.batching(), service.code_threads
     base = Decoder(bundle, service.threads, provider=provider, code_threads=codes, batching=together)
     metrics = ServiceMetrics()
-    if base.batches.largest > 1:
-        metrics.watch_batches(together.pages)
     monitor = Monitor(metrics=metrics)
     own = settings.self_calibration
     kept = KeptPages(settings.limits.kept_bytes) if own.is_on and not own.pages else None
@@ -100,6 +96,8 @@ def assembled(settings: ServiceSettings, observer: Observer) -> Iterator[Assembl
             device_sessions=settings.device_sessions,
         )
         together.pages.waits = plane.heart.waits
+        if together.largest > 1:  # another model may have batches
+            metrics.watch_batches(together.pages, lambda: plane.together)
         recalibrator = Recalibrator(plane, recordings=service.recordings)
         try:
             recalibrator.check_start()

@@ -1,7 +1,5 @@
 """The data plane that all calls share, without a word of gRPC: models, source, decoding, and observers of pages."""
 
-from __future__ import annotations
-
 import logging
 import math
 import time
@@ -188,11 +186,8 @@ class DataPlane:
         self.heal: Callable[[Caller, str, int], bool] | None = None
         """Makes the model fit the device again and waits for that, see `SelfCalibration.heal`; None where none does."""
         self.heart = Heart(self.limits.decode_s, clock.now)
-        self.together = models.current.decoder.batches.largest
-        """Pages that may be computed together, 1 for none."""
-        both = 2 * self.together if self.together > 1 else 1  # a batch runs while the next one is gathered
-        self.received, slots = ReceiveBudget(self.limits.receive_bytes, both), max(self.limits.concurrent_decodes, both)
-        self.decodes = Slots(slots, "decodes", self.limits.deadline_s, clock)
+        self.received = ReceiveBudget(self.limits.receive_bytes)
+        self.decodes = Slots(self.limits.concurrent_decodes, "decodes", self.limits.deadline_s, clock)
         self.ranges = Slots(self.limits.concurrent_ranges, "ranges of pages", self.limits.deadline_s, clock)
         self.watches = Slots(self.limits.concurrent_watches, "watches of the display", self.limits.deadline_s, clock)
         self.uploads = Slots(1, "uploads of models", self.limits.deadline_s, clock)
@@ -222,16 +217,21 @@ class DataPlane:
         """Return whether `read_page` can work."""
         return self._source is not None
 
+    @property
+    def together(self) -> int:
+        """Pages that the model in service may compute together, 1 for none."""
+        return self.models.current.decoder.batches.largest
+
     def ahead(self, alone: int = 1) -> int:
         """Pages of one call that are on their way at a time: so many `alone`, or else a batch and the next one.
 
         As many at most as their frames fill half of the memory for what is received.
         """
-        if self.together == 1:
+        if (together := self.together) == 1:
             return alone
         frames = self.models.current.decoder.bundle
         pair = 2 * math.prod(frames.profile.frame_shape) * np.dtype(frames.manifest.frame_dtype).itemsize
-        return max(alone, min(2 * self.together, self.received.size // (2 * pair)))
+        return max(alone, min(2 * together, self.received.size // (2 * pair)))
 
     @property
     def default_levels(self) -> int:
@@ -273,6 +273,10 @@ class DataPlane:
         return self.heart.trouble() or (self._source.trouble() if self._source is not None else "")
 
     def _in_service(self, model: Model) -> None:
+        together = model.decoder.batches.largest
+        both = 2 * together if together > 1 else 1  # a batch runs while the next one is gathered
+        self.decodes.resize(max(self.limits.concurrent_decodes, both))
+        self.received.keep(both)
         self.metrics.in_service(model.version)
         self.monitors.begin(model.version)
 
@@ -336,7 +340,7 @@ def _inferred(page: DecodedPage, stages: Stages) -> None:
 
     The graph may run more than once, with post-processing between: all its runs count as if they were the first part.
     """
-    inferred_s, waited_s = page.timings.check_s + page.timings.inference_s, page.timings.waiting_s
+    inferred_s, waited_s = page.timings.check_s + page.timings.inference_s, page.timings.waited_s
     if waited_s >= _LEAST_WAIT_S:
         stages.begin(Stage.QUEUE, inferred_s)
         inferred_s = waited_s

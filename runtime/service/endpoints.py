@@ -1,7 +1,5 @@
 """Lets callers in: the endpoint of a service, the memory that it shares, its health, and what begins work by itself."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The limits of the service, each with its reason."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Facts of an RPC that the server needs before its handler runs, written at the handler."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -41,13 +39,3 @@ def rpc(role: Role, **served: bool) -> Callable[[F], F]:
         return handler
 
     return mark
-
-
-def rpc_of(handler: Callable[..., Any]) -> Rpc:
-    """Return what a handler was marked with.
-
-    Raises:
-        AttributeError: it was not marked.
-    """
-    found: Rpc = handler.rpc  # type: ignore[attr-defined]
-    return found

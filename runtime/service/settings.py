@@ -1,7 +1,5 @@
 """The service's settings: one TOML file, above it the environment, above both the options of the command line."""
 
-from __future__ import annotations
-
 import os
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
@@ -75,8 +73,7 @@ class ServiceTable(SettingsTable):
     )
     shared_memory: bool = Field(False, description="Share memory with clients at the service's Unix socket.")
     store: Folder | None = Field(
-        None,
-        description=f"Folder of recalibrated and uploaded bundles; it remembers which one serves. {_STORE} too.",
+        None, description=f"Folder of recalibrated and uploaded bundles; it remembers which one serves. {_STORE} too."
     )
     incoming: Folder | None = Field(None, description="Folder whose bundles are taken into the store, as uploads are.")
     recordings: Folder | None = Field(

@@ -110,6 +110,7 @@ class _Server(socketserver.ThreadingMixIn, _UnixServer):
     """Listens for clients, each of which has a thread for as long as it is connected."""
 
     daemon_threads, block_on_close = True, False
+    request_queue_size = 128  # of five, which is the default, the sixth of those that come at once is refused
     memory: SharedMemory
 
     def get_request(self) -> tuple[Any, Any]:

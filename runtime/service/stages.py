@@ -1,7 +1,5 @@
 """Stages of a page's way: exactly one runs at every moment, so that their times add up to the whole."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

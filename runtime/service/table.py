@@ -1,7 +1,5 @@
 """Base class of the service's settings tables: checked TOML, with rules among its keys."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from functools import reduce
 from operator import getitem

@@ -20,14 +20,9 @@ _registry: Registry[Any] = Registry().with_resources(
 _files = {kind: name for name, schema in _schemas.items() for kind in schema["kinds"]}
 
 
-def kind_of(manifest: dict[str, Any]) -> str:
-    """Return `apiVersion kind` of a manifest, as the schemas name it."""
-    return f"{manifest['apiVersion']} {manifest['kind']}"
-
-
 def problems(manifest: dict[str, Any]) -> list[str]:
     """List a manifest's violations of the schema of its kind."""
-    kind = kind_of(manifest)
+    kind = f"{manifest['apiVersion']} {manifest['kind']}"  # as the schemas name it
     place = kind.replace("~", "~0").replace("/", "~1").replace(" ", "%20")
     validator = Draft202012Validator({"$ref": f"{_files[kind]}#/kinds/{place}"}, registry=_registry)
     return [f"{error.json_path}: {error.message}" for error in validator.iter_errors(manifest)]

@@ -30,9 +30,6 @@ JOBS = [name for name, manifest in ALL.items() if manifest["kind"] == "Job"]
 PODS = [name for name, manifest in ALL.items() if list(manifests.templates(manifest))]
 
 
-# ---- the files ------------------------------------------------------------------------------------------------------
-
-
 def test_every_file_is_used_and_what_is_used_is_there() -> None:
     used: set[Path] = set()
     for kustomization in manifests.kustomizations():
@@ -63,9 +60,6 @@ def test_what_kustomize_makes_of_the_folders_is_valid() -> None:
         made = list(yaml.safe_load_all(kubectl("kustomize", kustomization.parent)))
         assert made
         assert [problem for each in made for problem in manifests.problems(each)] == []
-
-
-# ---- what belongs together ------------------------------------------------------------------------------------------
 
 
 def selects(selector: dict[str, str], labels: dict[str, str]) -> bool:
@@ -134,9 +128,6 @@ def test_a_pod_has_what_it_mounts_and_no_more_rights_than_it_needs(name: str) ->
             assert all((probe.get("grpc") or probe["httpGet"])["port"] in ports for probe in probes)
 
 
-# ---- the service ----------------------------------------------------------------------------------------------------
-
-
 def pod_settings() -> ServiceSettings:
     return service_settings(SETTINGS, {"LIGHTPAGE_STORE": "/state/models", "LIGHTPAGE_SERVICE__THREADS": "4"}).settings
 
@@ -175,9 +166,6 @@ def test_kubelet_waits_until_calls_in_flight_have_ended() -> None:
     assert given >= before + pod_settings().limits.grace_s + 10  # for the rest to end: calls, health checks, the store
 
 
-# ---- the jobs -------------------------------------------------------------------------------------------------------
-
-
 def parsed(words: Sequence[str]) -> dict[str, Any]:
     """Return the parameters that a command line sets; the command is found as `lightpage` finds it, and not run."""
     program, name, *arguments = words
@@ -188,11 +176,6 @@ def parsed(words: Sequence[str]) -> dict[str, Any]:
         name, *arguments = arguments
         command = command.commands[name]
     return command.make_context(name, list(arguments)).params
-
-
-def words_of(name: str) -> list[str]:
-    container = manifests.container(ALL[name])
-    return [*container["command"], *container["args"]]
 
 
 def test_the_service_understands_its_command_line() -> None:
@@ -206,7 +189,8 @@ def test_every_index_of_a_job_does_its_part_and_they_are_all(name: str) -> None:
     assert spec["completionMode"] == "Indexed"
     parts = []
     for index in range(spec["completions"]):
-        options = parsed([word.replace(INDEX, str(index)) for word in words_of(name)])
+        words = (*container["command"], *container["args"])
+        options = parsed([word.replace(INDEX, str(index)) for word in words])
         parts.append(Part.parse(options["part"]))
         assert options["workers"] * options["threads"] == container["resources"]["limits"]["cpu"]
     assert parts == [Part(index=index, count=len(parts)) for index in range(len(parts))]

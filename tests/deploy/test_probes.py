@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import grpc
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from tests.deploy import manifests
+from tests.runtime.service.models.test_taken_in import Signer
 from tests.runtime.service.server.authority import Authority
 from tests.waiting import eventually
 
@@ -58,11 +57,7 @@ class Pod:
             (folder / name).mkdir()
         for path, name in zip(vars(authority.service()).values(), ("ca.crt", "tls.crt", "tls.key"), strict=True):
             shutil.copy(path, folder / "tls" / name)
-        key = ec.generate_private_key(ec.SECP256R1())
-        content = shutil.copy(bundle, folder / "bundles" / "device.zip").read_bytes()
-        (folder / "bundles" / "device.zip.sig").write_bytes(key.sign(content, ec.ECDSA(hashes.SHA256())))
-        public = (serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
-        (folder / "bundle-key" / "signing.pem").write_bytes(key.public_key().public_bytes(*public))
+        Signer(folder / "bundle-key").sign(shutil.copy(bundle, folder / "bundles" / "device.zip"))
 
     @contextmanager
     def running(self) -> Iterator[subprocess.Popen[str]]:

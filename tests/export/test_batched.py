@@ -11,6 +11,9 @@ import torch
 from torch import nn
 
 from lightpage.calibration.sampling_table import sampling_table, shifted
+from lightpage.codec.code import Code
+from lightpage.codec.page_bytes import FileFacts, Header
+from lightpage.codec.page_codec import PageCodec
 from lightpage.device.state import Device
 from lightpage.errors import BundleError, UnconfirmedPageError
 from lightpage.export.batched import batched_onnx, traced
@@ -96,7 +99,7 @@ def test_pages_of_a_batch_are_read_as_each_alone_where_each_image_lies(
             measure(page.phase[~mask], page.concentration[~mask], symbols[~mask], 256).air_bits_per_symbol
             for page in pages
         ]
-        assert rates[1] == pytest.approx(rates[0], abs=0.01)
+        assert rates[1] > rates[0] - 0.005
 
 
 def test_constants_serve_shifts_within_reach_and_nothing_else(decoder: Decoder, batches: BatchGraph) -> None:
@@ -112,6 +115,19 @@ def test_fewer_pages_are_read_as_all(batches: BatchGraph, shown: list[tuple[Fram
     pairs, constants = [pair for pair, _ in shown], batches.constants_of_bundle
     (alone,), together = (read(batches, constants, some, np.zeros((len(some), 2))) for some in (pairs[1:2], pairs))
     np.testing.assert_allclose(alone.p, together[1].p, rtol=1e-3, atol=1e-3 * float(np.abs(alone.p).max()))
+
+
+def test_user_bytes_are_read_of_a_batch(decoder: Decoder, batches: BatchGraph) -> None:
+    rng, mask = np.random.default_rng(2), decoder.bundle.pilot_mask
+    codec = PageCodec(Code(levels=16, coded_bits=2, rate_per_mille=400, corrections=4, needed_information=0.6), mask)
+    headers = [Header(codec.code.id, 1, page, 1) for page in range(2)]
+    sent = rng.integers(256, size=(2, codec.user_bytes), dtype=np.uint8)
+    symbols = codec.encode(headers, sent, FileFacts(1, 1, 0), rng.integers(16, size=mask.sum(), dtype=np.uint8))
+    simulator = Simulator(PROFILE, Device(), 16, seed=2)
+    found = read(batches, batches.constants_of_bundle, [simulator.page(page) for page in symbols], np.zeros((2, 2)))
+    for page, inference, known in zip(sent, found, symbols, strict=True):
+        decoded = decoder.post_process(inference, 16, Pilots.of_symbols(mask, known, 16))
+        assert codec.decode(decoded.phase, decoded.concentration).data == page.tobytes()
 
 
 def test_other_numbers_in_the_table_reach_both_forms(decoder: Decoder, batches: BatchGraph) -> None:
@@ -166,23 +182,26 @@ def test_a_stream_is_read_in_batches_as_page_by_page(
     tracker, batching = tracker_for(decoder), Batching(PAGES)
     gathering = Decoder(decoder.bundle, None, decoder.graph, batches=Batches(batches, decoder.graph, batching))
     trackers, rates = (tracker, tracker.refitted(gathering)), []
-    for each, threads in zip(trackers, (1, 7), strict=True):
-        with ThreadPoolExecutor(threads) as pool:
-            read = [
-                pool.submit(each.decode, pair, 256, pilots, each.turn())
+    with ThreadPoolExecutor(1) as alone, ThreadPoolExecutor(14) as pool:  # two sessions of the second one
+        asked = [
+            [
+                threads.submit(each.decode, pair, 256, pilots, each.turn())
                 for pair, pilots in zip(pairs, known, strict=True)
             ]
+            for each, threads in ((trackers[0], alone), (trackers[1], pool), (trackers[1].anew(), pool))
+        ]
+    for read in asked:
         assert [page for page, one in enumerate(read) if isinstance(one.exception(), UnconfirmedPageError)] == [lost]
         right = [(one.result(), symbols) for one, (_, symbols) in zip(read, pages, strict=True) if not one.exception()]
         read_well = [(page.phase[~mask], page.concentration[~mask], symbols[~mask]) for page, symbols in right]
         rates.append(np.mean([measure(*page, 256).air_bits_per_symbol for page in read_well]))
     assert max(batching.pages.runs) > 1
-    assert rates[1] == pytest.approx(rates[0], abs=0.005)
+    assert rates[1:] == pytest.approx([rates[0]] * 2, abs=0.005)
     with Recording.open(small_device[3]) as recording:
         decoders = zip((decoder, gathering), trackers, strict=True)
         both = [evaluate(one, recording, each.anew()).to_json() for one, each in decoders]
     names = "pages", "pages_left_out", "symbol_error_rate", "air_bits_per_symbol"
-    assert [both[1][name] for name in names] == pytest.approx([both[0][name] for name in names], abs=0.01)
+    assert [both[1][name] for name in names] == pytest.approx([both[0][name] for name in names], abs=0.005)
     assert trackers[1].image_px == pytest.approx(trackers[0].image_px, abs=0.02)
 
 

@@ -4,21 +4,25 @@ import json
 import tomllib
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from click.testing import CliRunner
 
+from lightpage.calibration.document import Calibration
 from lightpage.cli.main import run as run_command
 from lightpage.cli.simulate import simulate
-from lightpage.errors import InvalidInputError
+from lightpage.errors import CalibrationError, InvalidInputError
+from lightpage.export import device_geometry
 from lightpage.export.deep import DEEP
 from lightpage.runtime.archives.workers.fine_tuning import GROUP, deep_recalibration
 from lightpage.runtime.commands.archives.bulk import bulk
 from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.train.commands.train import train
 from lightpage.train.models.hyperparameters import Hyperparameters
 from lightpage.train.runs import WEIGHTS, Run
-from tests.lightpage.small import small_profile
+from tests.lightpage.small import UNEXPLAINED, small_profile
 from tests.runtime import toy
 
 TRAINED = ("1" * 64,)
@@ -52,6 +56,20 @@ def test_a_device_without_what_it_needs_is_told(tmp_path: Path) -> None:
     ):
         with pytest.raises(InvalidInputError, match=told):
             DEEP.check(model, run, pages)
+
+
+def test_a_wrong_geometry_found_from_nominal_is_refused(
+    small_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoder = Decoder.load(small_bundle, threads=1)
+    wrong = decoder.bundle.calibration.model_copy(update={"goodness": UNEXPLAINED})
+    for name in ("calibrate", "known_pages", "read_recorded"):
+        monkeypatch.setattr(device_geometry, name, Mock())
+    monkeypatch.setattr(device_geometry, "refit", Mock(side_effect=CalibrationError("re-fit", "wrong", "good")))
+    monkeypatch.setattr(Calibration, "from_registered", Mock(return_value=wrong))
+    with pytest.raises(CalibrationError):
+        device_geometry.device_geometry(decoder, Mock(), [0], tmp_path / "kept", lambda what, share: None)
+    assert not (tmp_path / "kept").exists()
 
 
 @pytest.mark.long  # trains twice and exports twice; what it is made of is tested by itself

@@ -62,9 +62,6 @@ def test_the_base_is_an_argument_and_no_stage_names_another() -> None:
     assert set(re.findall(r"^FROM (\S+)", text, re.MULTILINE)) - stages == {"scratch", "${BASE}"}
 
 
-# ---- images that were built -----------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def tree(tmp_path: Path) -> Path:
     """A work tree that has the scripts, committed."""

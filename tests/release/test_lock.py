@@ -121,9 +121,6 @@ def test_every_locked_package_has_a_licence_that_is_allowed(target: str) -> None
     assert {name: licence for name, licence in found.items() if licence is None or licences.refused(licence)} == {}
 
 
-# ---- what is wrong is seen ------------------------------------------------------------------------------------------
-
-
 def spoiled(folder: Path, old: str, new: str) -> Path:
     """The lock of `runtime`, changed at its first match."""
     text = (LOCKS / "runtime.txt").read_text()

@@ -230,9 +230,6 @@ def test_an_image_of_another_lock_is_found(root: Path, lock: Path, old: str, new
     assert any(line.startswith(f"{name}: ") for line in found)
 
 
-# ---- licences -------------------------------------------------------------------------------------------------------
-
-
 def test_licences_of_an_image_are_judged_by_its_sbom(document: dict[str, Any]) -> None:
     assert licences.judged(document) == [
         ("click 8.5.1", "BSD-3-Clause", ""),

@@ -36,7 +36,11 @@ LOST = [
 WHOLE = Recovery(
     code=CODE,
     volume=VOLUME,
-    pages=(*(replace(READ, page=page, number=page) for page in range(4)), *LOST, replace(READ, page=7, volume=9)),
+    pages=(
+        *(replace(READ, page=page, number=page) for page in range(4)),
+        *LOST,
+        replace(READ, page=7, volume=9, healed_rounds=2),
+    ),
     restored=(3,),
     lost=(),
     missing=(3, 5, 6),
@@ -82,6 +86,7 @@ def test_the_facts_of_a_recovery_and_its_losses_by_cause(tmp_path: Path) -> None
         "Unread": "3",
         "Pages of other volumes": "1 of volume 9",
         "Missing": "3, 5-6",
+        "Healed": "7",
         "Restored": "3",
         "AIR bytes a page": "880",  # 3.2 bits of 2200 symbols
         "Share of the AIR": "1.136",

@@ -1,7 +1,5 @@
 """`lightpage study`: every study makes its table and picture, is gone on with, and says what arithmetic says."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -121,9 +119,6 @@ def test_the_paper_is_done_in_the_order_of_worth() -> None:
     order = [names.index(name) for name in ("ray-4x4", "ray-2x2", "rays", "ray-16x16", "mode-75mm", "drift")]
     assert order == sorted(order)
     assert len(set(names)) == len(names)
-
-
-# ---- what they say --------------------------------------------------------------------------------------------------
 
 
 def test_enlarged_and_shortened_devices_have_the_zones_of_the_full_one() -> None:

@@ -5,8 +5,6 @@ import shutil
 import subprocess
 import threading
 from collections.abc import Iterator
-from concurrent import futures
-from contextlib import contextmanager
 from pathlib import Path
 
 import grpc
@@ -22,7 +20,7 @@ from lightpage.runtime.service.server.certificates import Certificates
 from tests.runtime import toy
 from tests.runtime.conftest import begun
 from tests.runtime.service.server.authority import Authority
-from tests.runtime.service.stage import Running
+from tests.runtime.service.stage import Running, served
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = (*sorted((ROOT / "clients/cpp").iterdir()), ROOT / "proto/lightpage/v1/lightpage.proto")
@@ -77,9 +75,6 @@ def succeeds(program: Path, target: str, *words: object) -> str:
     return done.stdout
 
 
-# ---- against a service --------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def service(decoder: Decoder) -> Iterator[Running]:
     running = begun(decoder)
@@ -127,9 +122,6 @@ def test_it_recalibrates_a_service(program: Path, service: Running) -> None:
     assert service.version == "toy-1+r1"
     assert "toy-1+r1" in said
     assert "toy-1+r1" in succeeds(program, service.server.target, "watch", said.split()[1])
-
-
-# ---- against services that answer as told -------------------------------------------------------------------------
 
 
 class Told(pb_grpc.LightpageServicer):
@@ -180,41 +172,31 @@ class Told(pb_grpc.LightpageServicer):
         return pb.ReadPageReply(page=request.page, replayed=True)
 
 
-@contextmanager
-def served(servicer: Told) -> Iterator[str]:
-    server = grpc.server(futures.ThreadPoolExecutor(max_workers=4))
-    pb_grpc.add_LightpageServicer_to_server(servicer, server)  # type: ignore[no-untyped-call]
-    port = server.add_insecure_port("127.0.0.1:0")
-    server.start()
-    yield f"127.0.0.1:{port}"
-    server.stop(grace=None).wait(60)
-
-
 def test_it_comes_back_when_the_service_says_and_follows_the_job(program: Path) -> None:
-    with served(service := Told(refusals=2)) as target:
-        said = succeeds(program, target, "recalibrate", "--pages", 4)
+    with served(service := Told(refusals=2)) as port:
+        said = succeeds(program, f"127.0.0.1:{port}", "recalibrate", "--pages", 4)
     assert said.splitlines() == [
         *(f"job job-1 RUNNING: fit {percent}%" for percent in (10, 20, 30)),
         "job job-1 DONE: model toy-2, bits a symbol 2.5 -> 3.5",
     ]
     assert service.asked == [*["start 4"] * 3, "watch"]
-    with served(service := Told(refusals=3)) as target:  # later than its deadline
-        assert run(program, target, "recalibrate", "--pages", 4).returncode == 2
+    with served(service := Told(refusals=3)) as port:  # later than its deadline
+        assert run(program, f"127.0.0.1:{port}", "recalibrate", "--pages", 4).returncode == 2
     assert service.asked == ["start 4"]
 
 
 def test_it_cancels_a_job_and_a_watch_goes_on_after_a_lost_connection(program: Path) -> None:
-    with served(Told(steps=None)) as target:
-        done = run(program, target, "recalibrate", "--pages", 4, "--cancel-after", 0.2)
+    with served(Told(steps=None)) as port:
+        done = run(program, f"127.0.0.1:{port}", "recalibrate", "--pages", 4, "--cancel-after", 0.2)
     assert done.returncode == 1, done.stderr
     assert done.stdout.splitlines()[-1] == "job job-1 CANCELLED"
-    with served(service := Told(steps=1, breaks=2)) as target:
-        assert succeeds(program, target, "watch", "job-1").count("RUNNING") == 3
+    with served(service := Told(steps=1, breaks=2)) as port:
+        assert succeeds(program, f"127.0.0.1:{port}", "watch", "job-1").count("RUNNING") == 3
     assert service.asked == ["watch"] * 3
 
 
 def test_a_page_whose_answer_is_late_or_lost_is_asked_for_again_by_the_same_id(program: Path) -> None:
-    with served(service := Told()) as target:
-        said = succeeds(program, target, "read", 7, "--request-id", "mine", "--attempt", 0.5)
+    with served(service := Told()) as port:
+        said = succeeds(program, f"127.0.0.1:{port}", "read", 7, "--request-id", "mine", "--attempt", 0.5)
     assert service.asked == ["mine"] * 3
     assert said.startswith("page 7, the answer of an earlier call\n")

@@ -46,9 +46,6 @@ def test_scripts_parse() -> None:
         assert run(["bash", "-n", path]).stderr == ""
 
 
-# ---- commands -----------------------------------------------------------------------------------------------------
-
-
 def defined(module: str) -> set[str]:
     """Names that a module defines, read from its text: some take seconds to import."""
     names = set()
@@ -74,9 +71,6 @@ def test_data_files_of_the_packages_travel_with_the_wheel() -> None:
                 assert any(path.match(str(pattern)) for pattern in patterns), path
 
 
-# ---- image --------------------------------------------------------------------------------------------------------
-
-
 def stages() -> dict[str, str]:
     """The Dockerfile's named stages: name to text."""
     pattern = re.compile(r"^FROM \S+ AS (?P<name>\S+)\n(?P<text>.*?)(?=^FROM |\Z)", re.MULTILINE | re.DOTALL)
@@ -100,9 +94,6 @@ def test_the_image_is_built_of_what_the_wheel_is_built_of() -> None:
     assert sorted(" ".join(copied).split()) == sorted((*SOURCES, "release"))
     let_through = [line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")]
     assert sorted(let_through) == sorted((*SOURCES, "release"))
-
-
-# ---- what the image build is lent ---------------------------------------------------------------------------------
 
 
 def lend(listing: str, out: Path) -> tuple[str, list[str]]:
@@ -134,9 +125,6 @@ def test_settings_of_pip_are_lent_to_the_build_of_an_image(tmp_path: Path) -> No
     listing = [f"{where}.index-url='https://{host}.example/simple'" for where, host in ((":env:", 1), ("global", 2))]
     for order in ([*listing, "WARNING: chatter"], listing[::-1]):
         assert lend("\n".join(order), tmp_path)[0] == "[global]\nindex-url = https://1.example/simple\n"
-
-
-# ---- an environment without torch ---------------------------------------------------------------------------------
 
 
 NEED_AN_EXTRA = {"lightpage.runtime.device.modulator.screen.x_window": "xcffib"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -138,6 +139,7 @@ def figures(calibration: Calibration, profile: Profile, seconds: float, lost: in
         "coherence_before": calibration.coherence_before,
         "coherence_after": calibration.coherence_after,
         "turn_deg": float(np.rad2deg(calibration.turn_rad)),
+        "turn_deviation_deg": calibration.turn_deviation_rad and math.degrees(calibration.turn_deviation_rad),
         "parameters": calibration.parameters,
         "modulation": calibration.modulation,
         "symbols_beside_cameras": lost,
@@ -172,6 +174,7 @@ def table(calibration: Calibration, profile: Profile) -> str:
         lines.append(f"{label:<32}{fitted:>12.6g}   {deviation:<10.2g}{nominal:>10.6g}")
     for name, value in calibration.modulation.items():
         lines.append(f"{_label(name):<32}{value:>12.6g}   {calibration.modulation_deviations[name]:<10.2g}{0:>10.6g}")
-    quadrature_phase = np.rad2deg(calibration.turn_rad)
-    lines.append(f"{'between the arms, degree':<32}{quadrature_phase:>12.6g}   {'':<10}{'+90 or -90':>10}")
+    turn, known = math.degrees(calibration.turn_rad), calibration.turn_deviation_rad
+    told = "" if known is None else f"{math.degrees(known):.2g}"
+    lines.append(f"{'between the arms, degree':<32}{turn:>12.6g}   {told:<10}{'+90 or -90':>10}")
     return "\n".join(lines)

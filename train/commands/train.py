@@ -88,7 +88,8 @@ def train(
     with Recording.open(recording_path) as recording:
         profile = recording.header.device(named_profile(profile_name))
         if not recording.has_symbols:
-            raise RecordingError(f"recording {recording_path}", "no dataset 'symbols'", "known symbols to train on")
+            expected = "known symbols to train on; of user data, recover --known-out makes them"
+            raise RecordingError(f"recording {recording_path}", "no dataset 'symbols'", expected)
         context.with_resource(sole_writer(out))
         usable = usable_pages(recording)
         split = Split.of(recording, list(usable), validation_share, test_share)

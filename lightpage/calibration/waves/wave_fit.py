@@ -77,6 +77,7 @@ class WaveFitted:
             that.
         modulation_deviations: standard deviations of its coefficients, zero where held.
         illumination: coefficients [T] of the terms of the page's illumination.
+        quadrature_deviation: standard deviation of the angle between the arms, radians.
     """
 
     parameters: Real
@@ -86,6 +87,7 @@ class WaveFitted:
     modulation: Modulation = NOMINAL
     modulation_deviations: tuple[float, ...] = (0.0,) * len(modulations.NAMES)
     illumination: Complex | None = None
+    quadrature_deviation: float | None = None
 
 
 class LevelPrior(NamedTuple):
@@ -242,6 +244,7 @@ class WaveFit:
                 Modulation(tuple(state.levels.tolist())),
                 tuple(known[fitted_levels].tolist()) if levels else best.modulation_deviations,
                 state.light,
+                float(known[len(directions)]),
             )
             state = self._moved(state, covariance @ pull, directions, fitted_levels, free, bends=bends)
         return best if levels is None else _told_apart(best, levels.centre)

@@ -1,7 +1,5 @@
 """Decodes a recording page by page, for who calls it from Python."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 from lightpage.errors import InvalidInputError, LostPageError, StorageError

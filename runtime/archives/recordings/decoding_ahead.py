@@ -1,7 +1,5 @@
 """Pages of a recording, decoded in their order: several at a time where they are computed together."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import closing
@@ -16,6 +14,10 @@ from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.read_ahead import beside, read_ahead
 from lightpage.runtime.model.decoding.tracking import Tracker
 from lightpage.runtime.model.decoding.turns import Turn
+from lightpage.runtime.model.execution.cpus import available_cpus
+
+_READERS = 4
+"""Threads that read pages for batches: one reads some 100 full-size pages a second out of the page cache."""
 
 T = TypeVar("T")
 Symbols = NDArray[np.uint8] | None
@@ -62,7 +64,7 @@ def decoded_ahead(
         return decode(page, frames, symbols), symbols
 
     def begun(now: Tracker) -> Iterator[Shown]:
-        with closing(read_ahead(recording.shown, pages[done:])) as shown:
+        with closing(read_ahead(recording.shown, pages[done:], readers)) as shown:
             for index, read in shown:
                 if tracker() is not now:
                     return
@@ -72,6 +74,7 @@ def decoded_ahead(
         page.turn.close()
 
     done, threads = 0, 2 * together if together > 1 else 1
+    readers = min(_READERS, available_cpus()) if together > 1 else 1
     while done < len(pages):
         with closing(beside(decoded, begun(now := tracker()), threads, over)) as ahead:
             for page, result in ahead:

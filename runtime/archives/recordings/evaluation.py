@@ -1,7 +1,5 @@
 """Measures a decoder on a recording with known symbols, on pages that it has not seen."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -43,7 +41,7 @@ class Evaluation:
         pages: how many were measured.
         pages_left_out: how many the bundle was calibrated or trained on.
         symbols_per_page: data symbols, pilots not counted.
-        seconds_per_page: median of the whole decode.
+        seconds_per_page: median of the whole decode, without waiting for other pages.
         inference_seconds_per_page: median of the inference alone.
         air_per_page: AIR of each page, bits per symbol.
         concentration_bins: what concentrations promise against what happened.
@@ -250,7 +248,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
         pages=len(timings),
         pages_left_out=recording.pages - len(timings) - len(refused),
         symbols_per_page=int(np.count_nonzero(data)),
-        seconds_per_page=float(np.median([t.total_s for t in timings])),
+        seconds_per_page=float(np.median([t.worked_s for t in timings])),
         inference_seconds_per_page=float(np.median([t.inference_s for t in timings])),
         air_per_page=tuple(page.air_bits_per_symbol for page in accumulator.pages),
         concentration_bins=tuple(accumulator.concentration_bins()),

@@ -1,7 +1,5 @@
 """Reads recorded pages for their user bytes, and heals the model where it no longer reads them."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -35,6 +33,7 @@ from lightpage.runtime.recalibration.healing import TOGETHER, LostPages, heal
 Decoded = tuple[tuple[DecodedPage, float], Symbols]
 """A page with the seconds that it took, and its symbols where they are known."""
 Take = Callable[[int, PageBytes], Volume | None]
+Model = tuple[Decoder, Tracker]
 
 _CURABLE = frozenset({Loss.OPTICS, Loss.HEADER, Loss.BODY, Loss.CHECKSUM})
 """Losses that a model which fits the device may mend."""
@@ -55,7 +54,7 @@ class RecoveredPage:
         failed_blocks: LDPC blocks that did not converge.
         iterations: mean of the LDPC blocks.
         air_bits: AIR of the page as delivered, bits a data symbol; None where its symbols are not known.
-        seconds: of the optical decode.
+        seconds: of the optical decode, without waiting for other pages.
         code_seconds: of the code.
         healed_rounds: rounds of the healing before which it gave no bytes; None where it needed none.
     """
@@ -75,12 +74,42 @@ class RecoveredPage:
     healed_rounds: int | None = None
 
 
+@dataclass
+class Healings:
+    """What healings have come to, for pages of the same device that are read later.
+
+    Attributes:
+        model: decoder of the last healed model and its tracker; None for the bundle's own.
+        together: pages that are not read for which the next healing waits: the more, the more have brought nothing.
+        passed: those of earlier readings, which were not tried.
+    """
+
+    model: Model | None = None
+    together: int = TOGETHER
+    passed: int = 0
+
+    def healed(self, decoder: Decoder, tracker: Tracker) -> None:
+        """Take note of a model that reads pages."""
+        self.model, self.together, self.passed = (decoder, tracker), TOGETHER, 0
+
+    def failed(self) -> None:
+        """Take note of a healing that brought no page."""
+        self.together, self.passed = 2 * self.together, 0
+
+
+Unread = tuple[RecoveredPage, Header | None]
+"""A page that was not read, and the page of its volume that it should be."""
+Waiting = Sequence[Unread]
+
+
 class PageReader:
     """Reads pages of a recording, mostly one after the other; knows which page of its volume should come next.
 
     Args:
         decoder, recording, tracker, code: see `lightpage.runtime.archives.recordings.recovery.recover`.
         give_up: whether pages that storage does not give are unread, as those that are lost.
+        healings: of earlier readings of pages of this device, and for later ones; None where there are none, and the
+            last pages are tried whatever was tried before.
 
     Attributes:
         codec: of the pages.
@@ -90,7 +119,14 @@ class PageReader:
     """
 
     def __init__(
-        self, decoder: Decoder, recording: Recording, tracker: Tracker, code: Code, *, give_up: bool = True
+        self,
+        decoder: Decoder,
+        recording: Recording,
+        tracker: Tracker,
+        code: Code,
+        *,
+        give_up: bool = True,
+        healings: Healings | None = None,
     ) -> None:
         check_recording(decoder, recording)
         subject, mask = f"recording {recording.path}", decoder.bundle.pilot_mask
@@ -100,20 +136,28 @@ class PageReader:
             raise RecordingError(f"{subject}: pilots", "other places", "those of the bundle")
         self._recording, self._code, self._give_up = recording, code, give_up
         self._next = Successor()
-        self._use(decoder, tracker)
+        self._healings, self._ends = healings or Healings(), healings is None
+        self._own: Model | None = None
+        """The bundle's own model, as long as an earlier healing's is in use and has read nothing."""
+        if self._healings.model is None:
+            self._use(decoder, tracker)
+        else:
+            self._own, (healed, following) = (decoder, tracker), self._healings.model
+            self._use(healed, following.anew())
 
     def _use(self, decoder: Decoder, tracker: Tracker) -> None:
         """Read with this model from now on."""
         self._decoder, self._tracker, code = decoder, tracker, self._code
         self._levels, self._pilots = decoder.bundle.levels(code.levels), decoder.written_pilots(code.levels)
-        self.codec = PageCodec(code, decoder.bundle.pilot_mask, self._levels)
+        self.codec = PageCodec(code, decoder.bundle.pilot_mask, self._levels, decoder.code_threads)
 
     def read(self, pages: Sequence[int], take: Take, *, heals: bool = True) -> Iterator[RecoveredPage]:
         """Read pages, and heal the model by those that it does not read.
 
         A page that is not read waits until `TOGETHER` of them do, or all others are read; then the model is re-fitted
         by them, and by the last page that was read among them, and they are read again. The re-fitted model reads the
-        pages behind them. Where it reads no more than before, the next pages wait for twice as many.
+        pages behind them. Where it reads no more than before, the next pages wait for twice as many, in later
+        readings too.
 
         Args:
             pages: their numbers in the recording.
@@ -126,28 +170,47 @@ class PageReader:
         Raises:
             StorageError: frames could not be read, which says nothing of the page, and it is not given up.
         """
-        waiting, right, together = list[tuple[RecoveredPage, Header | None]](), None, TOGETHER
+        waiting, right, healings = list[Unread](), None, self._healings
         for index, result in self._decoded(pages):
             expected = self._next.header
             page = self._read(index, result, expected, take)
-            if page.loss is None and waiting:  # one from before may be from before a knock
-                right = index
+            if page.loss is None:
+                self._own = None
+                if waiting:  # one from before may be from before a knock
+                    right = index
             if heals and page.loss in _CURABLE:
                 waiting.append((page, expected))
             else:
                 yield page
-            if len(waiting) == together:
-                found = self._healed(waiting, right, take)
-                together = TOGETHER if any(one.loss is None for one in found) else 2 * together
-                yield from found
+            if waiting and len(waiting) + healings.passed >= healings.together:
+                yield from self._tried(waiting, right, take)
                 waiting.clear()
                 right = None
-        yield from self._healed(waiting, right, take) if waiting else ()
+        if not waiting:
+            return
+        if self._ends or healings.together == TOGETHER:
+            yield from self._tried(waiting, right, take)
+        else:
+            healings.passed += len(waiting)
+            yield from self._by_own(waiting, take) or [page for page, _ in waiting]
 
-    def _healed(
-        self, waiting: Sequence[tuple[RecoveredPage, Header | None]], right: int | None, take: Take
-    ) -> list[RecoveredPage]:
-        """Pages that were not read, as a model reads them that is healed by them, or as they were if there is none."""
+    def _tried(self, waiting: Waiting, right: int | None, take: Take) -> list[RecoveredPage]:
+        """Pages that were not read, by the model that reads some of them, or as they were if none does."""
+        found = self._by_own(waiting, take) or self._healed(waiting, right, take)
+        if not found:
+            self._healings.failed()
+        return found or [page for page, _ in waiting]
+
+    def _by_own(self, waiting: Waiting, take: Take) -> list[RecoveredPage] | None:
+        """Pages that an earlier healing's model does not read, by the bundle's own; None where that reads none."""
+        own, self._own = self._own, None
+        found = None if own is None else self._again(waiting, own, None, take)
+        if found is not None:
+            self._healings.model = None
+        return found
+
+    def _healed(self, waiting: Waiting, right: int | None, take: Take) -> list[RecoveredPage] | None:
+        """Pages that were not read, as a model reads them that is healed by them; None where none reads any."""
         note(f"{len(waiting)} pages are not read: the model is fitted to the device by them")
         try:
             healed = heal(self._decoder, self._lost(waiting, right))
@@ -155,20 +218,30 @@ class PageReader:
             if isinstance(error, StorageError) and not self._give_up:
                 raise
             note(f"not healed: {error}")
-            return [page for page, _ in waiting]
+            return None
+        model = healed.decoder, self._tracker.refitted(healed.decoder)
+        found = self._again(waiting, model, healed.rounds, take)
+        if found is not None:
+            self._healings.healed(*model)
+        read = sum(page.loss is None for page in found or ())
+        note(f"{read} of them are read after {healed.rounds} rounds, {healed.seconds:.0f} s")
+        return found
+
+    def _again(self, waiting: Waiting, model: Model, rounds: int | None, take: Take) -> list[RecoveredPage] | None:
+        """Pages that were not read, by a model of so many rounds, which stays in use; None where it reads none."""
         following, before, found = self._next, (self._decoder, self._tracker), list[RecoveredPage]()
-        self._use(healed.decoder, self._tracker.refitted(healed.decoder))
+        self._use(*model)
         decoded = self._decoded([page.page for page, _ in waiting])
         for (page, expected), (index, result) in zip(waiting, decoded, strict=True):
             again = self._read(index, result, expected, take)
-            found.append(page if again.loss else replace(again, healed_rounds=healed.rounds))
-        self._next, read = following, sum(page.loss is None for page in found)
-        note(f"{read} of them are read after {healed.rounds} rounds, {healed.seconds:.0f} s")
-        if not read:
+            found.append(page if again.loss else replace(again, healed_rounds=rounds))
+        self._next = following
+        if all(page.loss for page in found):
             self._use(*before)
+            return None
         return found
 
-    def _lost(self, waiting: Sequence[tuple[RecoveredPage, Header | None]], right: int | None) -> LostPages:
+    def _lost(self, waiting: Waiting, right: int | None) -> LostPages:
         """Frames of pages that were not read, and of one among them that was.
 
         Raises:
@@ -193,7 +266,7 @@ class PageReader:
             start = time.perf_counter()
             pair = narrow(frames, self._recording.bit_depth)
             found = page.tracker.decode(pair, self._levels.count, self._pilots, page.turn)
-            return found, time.perf_counter() - start
+            return found, time.perf_counter() - start - found.timings.waited_s
 
         return decoded_ahead(self._recording, pages, lambda: self._tracker, self._decoder.batches.largest, decode)
 

@@ -1,7 +1,5 @@
 """Working ahead: pages are read while others are decoded, or several are decoded at a time."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -18,8 +16,8 @@ def read_ahead(
 ) -> Generator[tuple[Key, Future[T]], None, None]:
     """Every page and what is read of it, in order; the next ones are read while the caller works on one.
 
-    So many are held beside the caller's, whatever a page weighs. A recording has one lock for all that is read of it,
-    so what the caller reads of it meanwhile waits.
+    So many are held beside the caller's, whatever a page weighs. HDF5 has one lock for all that is read by it:
+    several threads are faster than one only with pages that lie in the file as they are.
 
     Args:
         read: what is wanted of a page; `result()` raises what it raises.

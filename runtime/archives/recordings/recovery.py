@@ -1,7 +1,5 @@
 """Reads a file back from recorded pages: frames to symbols, symbols to bytes, parity for what is lost."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -13,7 +11,7 @@ from pydantic import ValidationError
 from scipy.stats import beta
 
 from lightpage.codec.code import Code, problems_of
-from lightpage.codec.page_bytes import LOSSES, Loss
+from lightpage.codec.page_bytes import LOSSES, Loss, PageBytes
 from lightpage.codec.volume import Volume
 from lightpage.codec.volume_file import Restored, VolumeFiles, ranges
 from lightpage.errors import (
@@ -26,6 +24,7 @@ from lightpage.errors import (
 from lightpage.progress import track
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.page_reader import PageReader, RecoveredPage
+from lightpage.runtime.archives.recordings.read_pages import ReadPages
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.tracking import Tracker
@@ -155,6 +154,7 @@ def recover(
     checksum: int | None = None,
     holes: bool = False,
     heals: bool = True,
+    known_out: Path | None = None,
 ) -> Recovery:
     """Read the file of one volume back; pages that storage does not give are unread, as those that are lost.
 
@@ -167,18 +167,28 @@ def recover(
         volume_id, checksum: which volume; if left out, the recording must hold only one.
         holes: write zeros where data are lost, in place of no file.
         heals: whether the model is re-fitted by pages that it does not read.
+        known_out: a recording of the pages that are read, of any volume, with their symbols.
 
     Raises:
-        RecordingError: another device's recording, or one of other levels or pilots.
+        RecordingError: another device's recording, or one of other levels or pilots; or see `ReadPages.write`.
         InvalidInputError: several volumes and no choice between them, none of those asked for, pages that contradict
             each other, or no room.
         LostDataError: the file that was put together is not the one that was encoded.
     """
     reader = PageReader(decoder, recording, tracker, code)
     codec, mask = reader.codec, decoder.bundle.pilot_mask
+    known = None if known_out is None else ReadPages(recording, decoder, code)
     with VolumeFiles(out) as files:
-        read = reader.read(range(recording.pages), lambda index, found: files.add(found), heals=heals)
+
+        def take(index: int, found: PageBytes) -> Volume | None:
+            if known is not None:
+                known.add(index, found)
+            return files.add(found)
+
+        read = reader.read(range(recording.pages), take, heals=heals)
         pages = tuple(sorted(track(read, "recover", total=recording.pages), key=lambda page: page.page))
+        if known is not None and known_out is not None:
+            known.write(known_out)
         file = files.chosen(volume_id, checksum)
         done = Restored((), ()) if file is None else file.restore()
         if file is not None and (holes or not done.lost):

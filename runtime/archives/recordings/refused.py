@@ -1,7 +1,5 @@
 """Pages that could not be decoded: they are kept out of the figures, told, and end a command with an error."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Self

@@ -4,8 +4,6 @@ A decoder whose table is traced for a geometry that is off reads them as a right
 far the other way.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Runs a job: hands out what is missing, counts what comes back, and holds no results."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The interface of engines, which spread ranges over workers."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Generator, Iterable

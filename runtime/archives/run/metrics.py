@@ -1,7 +1,5 @@
 """Prometheus metrics of a bulk run: served while it works, written to a file after its end."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterable
 from pathlib import Path

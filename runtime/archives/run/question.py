@@ -1,7 +1,5 @@
 """The question of a bulk run, from what is named now and what its folder was asked before."""
 
-from __future__ import annotations
-
 import glob
 import os
 from collections.abc import Mapping, Sequence

@@ -129,6 +129,7 @@ class Choices(Plain):
         code: of the pages whose user bytes are read; None for each recording's, or else its bundle's.
         provider: what pages are computed with.
         batches: pages that are computed together at most.
+        code_threads: that share the code of a page, where it is compiled.
         known_pages: that a device is recalibrated with; None for `KNOWN_PAGES`, or all of them with `fine_tuning`.
         fine_tuning: how devices are trained on after the fit of their geometry; None to fit the geometry alone.
         parts: that processes do independently of each other.
@@ -142,6 +143,7 @@ class Choices(Plain):
     code: Code | None = None
     provider: str = CPU
     batches: int = 1
+    code_threads: int = 1
     known_pages: int | None = None
     fine_tuning: FineTuning | None = None
     parts: int = 1

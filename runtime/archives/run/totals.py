@@ -80,6 +80,7 @@ class Counts:
         pages: all of them; of a fleet that is recalibrated, its devices.
         read, left_out: how many were.
         lost: by cause.
+        healed: read, by a model that was healed.
         recalibration_due: read, and show that the device has changed.
         models: pages by the version of what read them.
         figures: of those that were read.
@@ -89,6 +90,7 @@ class Counts:
     read: int = 0
     left_out: int = 0
     lost: Counter[str] = field(default_factory=Counter)
+    healed: int = 0
     recalibration_due: int = 0
     models: Counter[str] = field(default_factory=Counter)
     figures: Means = field(default_factory=Means)
@@ -106,6 +108,7 @@ class Counts:
             self.lost[page.loss or UNKNOWN] += 1
         if page.state is PageState.READ:
             self.read += 1
+            self.healed += page.figures.get("healed_rounds") is not None
             self.recalibration_due += page.recalibration_due
             confirmed = {} if page.confirmed_bits is None else {CONFIRMED: page.confirmed_bits}
             self.figures.add({**page.figures, **confirmed})
@@ -119,6 +122,7 @@ class Counts:
             "pages_lost": self.lost.total(),
             "pages_missing": self.missing,
             "lost": dict(self.lost),
+            "pages_healed": self.healed,
             "pages_recalibration_due": self.recalibration_due,
         }
 

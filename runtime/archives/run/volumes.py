@@ -1,7 +1,5 @@
 """The files of a run that recovers user bytes: pages are gathered from the shards, and parity mends what is lost."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter, defaultdict
 from contextlib import closing

@@ -1,9 +1,8 @@
 """A device that a worker recalibrates: re-fitted, or trained on too, from known pages of its own."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import TypeVar
 from lightpage.errors import CalibrationError, FrameError, InvalidInputError, RecalibrationRefusedError
 from lightpage.progress import State, reporting
 from lightpage.recording.reader import Recording
+from lightpage.runtime.archives.recordings.read_pages import write_read_pages
 from lightpage.runtime.archives.recordings.recovery import code_of
 from lightpage.runtime.archives.run.shard import BUNDLE, LOG, TRAINING, Findings, PageRecord, PageState, with_end
 from lightpage.runtime.archives.run.task import Step, Task
@@ -25,6 +25,7 @@ T = TypeVar("T")
 EVERY_S = 30.0
 """Seconds from one line of a step to the next."""
 
+_KNOWN = "known.h5"
 _TOLD = ("version", "previous_version", "air_before", "air_after", "air_limit", "pages_used", "pages_held_back")
 """What a device's record has of the outcome, beside the angle."""
 
@@ -45,7 +46,7 @@ def recalibrated(
 
     Args:
         task: which device.
-        recording: with its known pages.
+        recording: with its known pages, or pages of user data.
         decoder: of its bundle.
         fit, deep, tell: see `lightpage.runtime.archives.workers.work.Worker`.
 
@@ -66,14 +67,25 @@ def recalibrated(
                 raise InvalidInputError(f"device {task.device}", "no run", expected)
             name = task.device or task.name
             log = StepLog(with_end(task.shard, LOG), lambda what: tell(Step(device=name, what=what)))
-            with reporting(log):
+            with reporting(log), ExitStack() as stack:
                 folder = with_end(task.shard, TRAINING)
-                outcome = deep().recalibrate(decoder, recording, task.run, folder, out, tuning, pages, log.progress)
+                if not (known := recording).has_symbols:
+                    known = stack.enter_context(_read(recording, decoder, folder, pages))
+                outcome = deep().recalibrate(decoder, known, task.run, folder, out, tuning, pages, log.progress)
     except findings as error:
         lost = PageRecord(page=0, state=PageState.LOST, loss=type(error).__name__, reason=str(error))
         return Findings(pages=(lost,))
     summary = {name: getattr(outcome, name) for name in _TOLD} | {"angle_deg": outcome.report.angle_deg}
     return Findings(pages=(PageRecord(page=0, state=PageState.READ),), summary=summary)
+
+
+def _read(recording: Recording, decoder: Decoder, folder: Path, most: int) -> Recording:
+    """Pages of user data that were read, as known ones; kept in `folder`, where they are not read again."""
+    path = folder / _KNOWN
+    if not path.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        write_read_pages(decoder, recording, code_of(recording, decoder.bundle), path, most)
+    return Recording.open(path)
 
 
 class StepLog:

@@ -1,7 +1,5 @@
 """The engines of bulk runs by name; what only one of them needs is imported when it is chosen."""
 
-from __future__ import annotations
-
 from lightpage.runtime.archives.run.engine import THREADS_OF_WORKER, Engine
 from lightpage.runtime.archives.workers.local import LocalEngine
 from lightpage.runtime.model.execution.cpus import available_cpus

@@ -1,7 +1,5 @@
 """A worker's process, which `local` starts."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import ClassVar
 

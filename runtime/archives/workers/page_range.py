@@ -1,7 +1,5 @@
 """The pages of a range on their way: decoded, measured or read for their user bytes; each is a finding, or lost."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -19,7 +17,7 @@ from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.decoding_ahead import Shown, Symbols, decoded_ahead
 from lightpage.runtime.archives.recordings.evaluation import check_symbols, decode_unseen, pilots_of
-from lightpage.runtime.archives.recordings.page_reader import PageReader, RecoveredPage
+from lightpage.runtime.archives.recordings.page_reader import Healings, PageReader, RecoveredPage
 from lightpage.runtime.archives.recordings.recovery import code_of
 from lightpage.runtime.archives.run.shard import SYMBOLS, Findings, PageRecord, PageState, with_end, write_user_bytes
 from lightpage.runtime.archives.run.task import Operation, Task
@@ -39,12 +37,14 @@ class PageRange:
         recording: of the pages.
         decoder: of the task's bundle.
         tracker: of that, which has learnt nothing yet.
+        healings: of earlier ranges of the device.
     """
 
     task: Task
     recording: Recording
     decoder: Decoder
     tracker: Tracker
+    healings: Healings
 
     def findings(self) -> Findings:
         """Return what becomes of the pages; what they give beside it is written.
@@ -106,7 +106,8 @@ class PageRange:
     def _recovered(self) -> Findings:
         """User bytes."""
         code = self.task.choices.code or code_of(self.recording, self.decoder.bundle)
-        reader = PageReader(self.decoder, self.recording, self.tracker, code, give_up=self.task.give_up)
+        give_up, healings = self.task.give_up, self.healings
+        reader = PageReader(self.decoder, self.recording, self.tracker, code, give_up=give_up, healings=healings)
         kept: list[tuple[int, PageBytes]] = []
 
         def take(page: int, found: PageBytes) -> Volume | None:

@@ -14,6 +14,7 @@ from lightpage.failures import may_pass, os_errors, understood
 from lightpage.recording.joined import join
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.evaluation import check_recording
+from lightpage.runtime.archives.recordings.page_reader import Healings
 from lightpage.runtime.archives.run.job import bundle_sha256
 from lightpage.runtime.archives.run.shard import Findings, ShardRecord
 from lightpage.runtime.archives.run.task import Choices, Done, Failed, NamedBundle, Outcome, Problem, Stamp, Step, Task
@@ -80,7 +81,7 @@ class Worker:
         if task.recalibrates:
             return recalibrated(task, recording, warm.decoder, self._fit, self._deep, self.tell)
         tracker = warm.tracker.anew() if task.choices.tracking else NoTracker(warm.decoder)
-        return PageRange(task, recording, warm.decoder, tracker).findings()
+        return PageRange(task, recording, warm.decoder, tracker, warm.healings_of(task.device)).findings()
 
     def _opened(self, bundle: NamedBundle, choices: Choices) -> _Warm:
         """The decoder of a bundle; the one before it is let go first, so that there is one at a time.
@@ -94,15 +95,23 @@ class Worker:
             self._warm = None
             if (found := bundle_sha256(bundle.path)) != bundle.sha256:
                 raise BundleError(f"bundle {bundle.path}", f"SHA-256 {found}", f"{bundle.sha256}, as at the start")
-            self._warm = bundle, choices, _Warm(Decoder.load(bundle.path, self._threads, provider, batching))
+            decoder = Decoder.load(bundle.path, self._threads, provider, batching, choices.code_threads)
+            self._warm = bundle, choices, _Warm(decoder)
         return self._warm[2]
 
 
 class _Warm:
-    """A decoder, and a tracker of which each range gets one that has learnt nothing."""
+    """A decoder, a tracker of which each range gets one that has learnt nothing, and the last device's healings."""
 
     def __init__(self, decoder: Decoder) -> None:
         self.decoder = decoder
+        self._healings = "", Healings()
+
+    def healings_of(self, device: str) -> Healings:
+        """The healings of a device; those of another one, whose model takes memory, are forgotten."""
+        if self._healings[0] != device:
+            self._healings = device, Healings()
+        return self._healings[1]
 
     @cached_property
     def tracker(self) -> Tracker:

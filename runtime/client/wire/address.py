@@ -1,7 +1,5 @@
 """Network addresses as users write them."""
 
-from __future__ import annotations
-
 import errno
 import ipaddress
 import os

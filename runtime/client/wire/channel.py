@@ -1,7 +1,5 @@
 """Both ends of a connection, one way for all who call a service and for all that serve, and their certificates."""
 
-from __future__ import annotations
-
 import json
 import ssl
 from dataclasses import dataclass

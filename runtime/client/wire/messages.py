@@ -13,8 +13,6 @@ A value is written and read by what its field is declared to be:
 Chunks of frames are written and read without the copies that protobuf makes of each.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from enum import Enum

@@ -1,7 +1,5 @@
 """The one place where errors become gRPC status codes, and on the client's side errors again."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

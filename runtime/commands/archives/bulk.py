@@ -29,7 +29,7 @@ from lightpage.runtime.archives.workers.engines import LOCAL, RAY, engine_of
 from lightpage.runtime.archives.workers.fine_tuning import deep_recalibration
 from lightpage.runtime.commands.archives.bulk_metrics import check_metrics, watched
 from lightpage.runtime.commands.archives.bulk_result import Result
-from lightpage.runtime.commands.provider_option import BATCHES, PROVIDER
+from lightpage.runtime.commands.provider_option import BATCHES, CODE_THREADS, PROVIDER
 from lightpage.runtime.model.bundle.shipped import DEFAULT
 from lightpage.runtime.model.execution.providers import Provider
 
@@ -103,6 +103,7 @@ def decode(**asked: Any) -> None:
 @bulk.command()
 @_options
 @_pages_options
+@CODE_THREADS
 @click.option("--code", "code_path", type=_FILE, help="Code; by default the recordings' or the bundles'.")
 @click.option("--heal/--no-heal", "heals", default=None, help="Re-fit by pages that are not read; the default.")
 @click.option("--volume", metavar="ID[:CHECKSUM]", help="Write the file of this volume alone.")

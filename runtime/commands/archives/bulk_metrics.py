@@ -1,7 +1,5 @@
 """The metrics of `lightpage bulk`: served while it works, and in a file after its end."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path

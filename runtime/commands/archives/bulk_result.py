@@ -1,7 +1,5 @@
 """The result of `lightpage bulk`: figures for programs, a table for people, and the error that it ends with."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,6 +64,7 @@ class Result:
             (unit, f"{len(found.devices)}" if recalibrated else f"{found.pages} of {len(found.recordings)} recordings"),
             ("this run", f"{made.pages} {unit}{speed}" if made.pages or made.failed else "nothing was missing"),
             ("recalibrated" if recalibrated else "read", f"{found.read}"),
+            ("healed", f"{found.healed} of them" if found.healed else ""),
             ("left out", f"{found.left_out} that a bundle was made from" if found.left_out else ""),
             ("refused" if recalibrated else "lost", f"{found.lost.total()} ({causes})" if causes else "0"),
             ("missing", f"{found.missing}, the next run tries them again" if found.missing else ""),

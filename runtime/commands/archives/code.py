@@ -1,7 +1,6 @@
 """`lightpage code`: chooses how user bytes are protected on a device's pages."""
 
-from __future__ import annotations
-
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 
@@ -10,12 +9,15 @@ import click
 from lightpage.cli.options import JSON
 from lightpage.cli.paths import NewPath, OutputFile
 from lightpage.codec.choose import HEADER, HEADROOM, bytes_without_headroom
+from lightpage.codec.code import Code, load_code
 from lightpage.errors import BundleError, CalibrationError, InvalidInputError
 from lightpage.files import write_json
 from lightpage.progress import note
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.coded_pages import choose_code
 from lightpage.runtime.archives.recordings.evaluation import pilots_of
+from lightpage.runtime.archives.recordings.read_pages import known_pages_of
+from lightpage.runtime.archives.recordings.recovery import code_of
 from lightpage.runtime.archives.recordings.survived_drift import KINDS, DriftedReading
 from lightpage.runtime.commands.execution import Load, decoder_options
 from lightpage.runtime.model.bundle.bundle import write_bundle
@@ -27,7 +29,10 @@ _UNITS = ", ".join(f"{name} ({kind.unit})" for name, kind in KINDS.items())
 
 @click.command()
 @decoder_options
-@click.option("--recording", required=True, type=click.Path(), help="HDF5 recording with known symbols.")
+@click.option("--recording", required=True, type=click.Path(), help="HDF5 recording, symbols known or user data.")
+@click.option(
+    "--code", "code_path", type=click.Path(path_type=Path), help="Code of user data; the recording's or the bundle's."
+)
 @click.option("--out", type=OutputFile(), help="Write the code to this TOML file.")
 @click.option("--out-bundle", type=NewPath(), help="Write the bundle with this code in it: a folder, or a .zip.")
 @click.option("--version", help="Of that bundle.")
@@ -50,6 +55,7 @@ _UNITS = ", ".join(f"{name} ({kind.unit})" for name, kind in KINDS.items())
 def code(
     load: Load,
     recording: str,
+    code_path: Path | None,
     out: Path | None,
     out_bundle: Path | None,
     version: str | None,
@@ -60,7 +66,8 @@ def code(
     """Choose levels and rate of a device's page code by pages of a recording that the bundle has not seen.
 
     The rate is the one that 999 of 1,000 pages still carry, as far as these pages can say: more pages, a higher rate.
-    Says what is kept for drift, what that costs, and how much drift of each kind pages survive.
+    Says what is kept for drift, what that costs, and how much drift of each kind pages survive. Of a recording without
+    symbols, the pages of user data count that are read.
     """
     if out is None and out_bundle is None:
         raise InvalidInputError("options", "neither --out nor --out-bundle", "at least one of them")
@@ -69,7 +76,13 @@ def code(
     decoder, asked = load(), dict(drifts)
     if len(asked) < len(drifts):
         raise InvalidInputError("--survive", ", ".join(name for name, _ in drifts), "each kind once")
-    with Recording.open(recording) as pages:
+    with ExitStack() as stack:
+        recorded = stack.enter_context(Recording.open(recording))
+
+        def own() -> Code:
+            return code_of(recorded, decoder.bundle) if code_path is None else load_code(code_path)
+
+        pages = stack.enter_context(known_pages_of(decoder, recorded, own))
         reading = _drifted_reading(decoder, pages, needed=bool(asked))
         unknown = [name for name in asked if reading and name not in reading.kinds]
         if reading and unknown:

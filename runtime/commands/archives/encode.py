@@ -1,7 +1,5 @@
 """`lightpage encode`: puts a file on pages to write."""
 
-from __future__ import annotations
-
 import secrets
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """`lightpage evaluate`: what a bundle is worth on a recording."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

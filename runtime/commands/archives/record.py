@@ -1,7 +1,5 @@
 """`lightpage record`: pages of any source into a recording, one by one, so that an interruption loses nothing."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections import Counter

@@ -1,7 +1,5 @@
 """`lightpage recover`: reads a file back from recorded pages."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click
@@ -16,6 +14,7 @@ from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.recovery import Recovery, code_of, lost_data, told_losses
 from lightpage.runtime.archives.recordings.recovery import recover as recover_file
 from lightpage.runtime.commands.execution import Load, decoder_options
+from lightpage.runtime.commands.provider_option import CODE_THREADS
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.decoding.tracking import NoTracker
 from lightpage.words import counted
@@ -23,17 +22,24 @@ from lightpage.words import counted
 
 @click.command()
 @decoder_options
+@CODE_THREADS
 @click.option("--recording", required=True, type=click.Path(), help="HDF5 recording of the file's pages.")
 @click.option("--code", "code_path", type=click.Path(path_type=Path), help="Code; the recording's or the bundle's.")
 @click.option("--out", required=True, type=OutputFile(), help="The file.")
 @click.option("--volume", metavar="ID[:CHECKSUM]", help="Which volume, where the recording holds several.")
 @click.option("--holes", is_flag=True, help="Write zeros where data are lost, in place of no file.")
 @click.option("--give-up", is_flag=True, help="Take pages that storage does not give for lost.")
+@click.option(
+    "--known-out",
+    type=OutputFile(),
+    help="Write the pages that are read as a recording with known symbols; its frames stay in --recording.",
+)
 @click.option("--heal/--no-heal", default=True, show_default=True, help="Re-fit by pages that are not read.")
 @JSON
 @click.option("--tracking/--no-tracking", default=True, show_default=True, help="Follow the image, and find it again.")
 def recover(
     load: Load,
+    code_threads: int | None,
     recording: str,
     code_path: Path | None,
     out: Path,
@@ -41,6 +47,7 @@ def recover(
     holes: bool,
     json_path: Path | None,
     give_up: bool,
+    known_out: Path | None,
     heal: bool,
     tracking: bool,
 ) -> None:
@@ -51,11 +58,12 @@ def recover(
     lost, each is named, no file is written and the exit status is 3. Where storage did not give some of them, it is 75:
     the same command tries again.
     """
-    decoder = load()
+    decoder = load(code_threads or 1)
     with Recording.open(recording) as pages:
         code = code_of(pages, decoder.bundle) if code_path is None else load_code(code_path)
         tracker = tracker_for(decoder) if tracking else NoTracker(decoder)
-        result = recover_file(decoder, pages, tracker, code, out, *parse_volume(volume), holes=holes, heals=heal)
+        asked = parse_volume(volume)
+        result = recover_file(decoder, pages, tracker, code, out, *asked, holes=holes, heals=heal, known_out=known_out)
     write_json(json_path, result.to_json())
     click.echo(describe(result))
     for line in told_losses(result.unread) if not result.lost and result.volume is not None else ():

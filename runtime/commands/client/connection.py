@@ -1,7 +1,5 @@
 """Options of the commands that talk to a running service."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`lightpage console`: opens the web page of a running service."""
 
-from __future__ import annotations
-
 import json
 import webbrowser
 from pathlib import Path

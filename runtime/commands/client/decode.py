@@ -1,7 +1,5 @@
 """`lightpage decode`: decodes pages with a running service."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, replace

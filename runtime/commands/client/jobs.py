@@ -1,11 +1,8 @@
 """`lightpage jobs`: the recalibrations of a running service."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -37,12 +34,7 @@ from lightpage.runtime.commands.client.recalibrate import summary, table, watche
 )
 @JSON
 def jobs(
-    target: str,
-    tls: TlsFiles | None,
-    watch: str | None,
-    cancel: str | None,
-    timeout_s: float,
-    json_path: Path | None,
+    target: str, tls: TlsFiles | None, watch: str | None, cancel: str | None, timeout_s: float, json_path: Path | None
 ) -> None:
     """Show, follow or cancel the recalibrations of a service; without an option all that it remembers, newest first."""
     if watch is not None and cancel is not None:
@@ -58,13 +50,9 @@ def jobs(
             click.echo(table(data))
         else:
             found = client.jobs.list() if cancel is None else [client.jobs.cancel(cancel)]
-            write_json(json_path, {"jobs": list(map(_figures, found))})
+            told = [{**asdict(replace(job, error=None)), "error": job.error and str(job.error)} for job in found]
+            write_json(json_path, {"jobs": told})
             click.echo("\n".join(map(_line, found)) if found else "no jobs")
-
-
-def _figures(job: JobInfo) -> dict[str, Any]:
-    """Return a job under the names that other programs read."""
-    return {**asdict(replace(job, error=None)), "error": job.error and str(job.error)}
 
 
 def _line(job: JobInfo) -> str:
@@ -73,7 +61,7 @@ def _line(job: JobInfo) -> str:
     if job.state is JobState.RUNNING:
         told = f"{job.fraction:.0%} {job.step}"
     elif job.result is not None:
-        told = f"{job.result.model_version} in service instead of {job.result.previous_version}"
+        told = job.result.told
     else:
         told = str(job.error or "")
     return "  ".join(filter(None, [job.id, f"{job.state.lower():<11}", begun, job.pages_of, job.correlation_id, told]))

@@ -1,7 +1,5 @@
 """`lightpage models`: the models of a running service."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`lightpage recalibrate` and `lightpage rollback`: a bundle offline, or a running service's model."""
 
-from __future__ import annotations
-
 import time
 from contextlib import suppress
 from dataclasses import asdict
@@ -30,7 +28,7 @@ from lightpage.runtime.model.bundle.shipped import bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.healed_bundle import recalibrate_by_recording
 from lightpage.runtime.recalibration.known_pages import read_recorded
-from lightpage.runtime.recalibration.recalibration import RefitReport, next_version
+from lightpage.runtime.recalibration.recalibration import next_version
 from lightpage.runtime.recalibration.refit import refit
 from lightpage.runtime.service.jobs.messages import result_message
 
@@ -46,7 +44,13 @@ DEFAULT_PAGES = 2
 @click.option("--out", type=NewPath(), help="Offline: where the new bundle goes; a zip where it ends in .zip.")
 @target_option(required=False, help="Recalibrate this running service instead of a bundle.")
 @with_tls
-@click.option("--pages", default=DEFAULT_PAGES, show_default=True, type=click.IntRange(2), help="Known pages to use.")
+@click.option(
+    "--pages",
+    default=DEFAULT_PAGES,
+    show_default=True,
+    type=click.IntRange(2),
+    help="Known pages to use. Of user data six are, with --other-device eight.",
+)
 @click.option(
     "--timeout",
     "timeout_s",
@@ -91,7 +95,7 @@ def recalibrate(
     With --other-device, an archive is read on a drive that was never calibrated: its geometry is found from nominal, by
     the pilots of the first eight pages, and then healed by the pages themselves.
     """
-    start, report = time.perf_counter(), RefitReport()
+    start = time.perf_counter()
     if bundle and from_environment("target"):
         target = None
     if target is not None:
@@ -117,10 +121,8 @@ def recalibrate(
             given = {"--bundle": bundle, "--recording": recording, "--out": out}
             lacking = ", ".join(name for name, value in given.items() if not value)
             raise InvalidInputError("options", f"no {lacking}", f"{', '.join(given)}, or --target")
-        result, report = _offline(bundle, recording, out, pages, version, other_device=other_device)
+        result = _offline(bundle, recording, out, pages, version, other_device=other_device)
     data = summary(result, time.perf_counter() - start)
-    if (goodness := report.goodness) is not None:
-        data |= {"verdict": goodness.verdict, "bits_lost": goodness.bits_lost, "cause": goodness.cause or None}
     write_json(json_path, data)
     click.echo(table(data))
 
@@ -188,8 +190,8 @@ def _start(client: LightpageClient, recording: str | None, pages: int, send: boo
 
 def _offline(
     bundle: str, recording: str, out: Path, pages: int, version: str | None, *, other_device: bool
-) -> tuple[Recalibrated, RefitReport]:
-    """Return what came of it, and what the fit says of itself."""
+) -> Recalibrated:
+    """Return what came of it."""
     if out.exists():
         raise InvalidInputError(f"--out {out}", "something that exists", "a new path: bundles are never overwritten")
     if version is not None:
@@ -209,7 +211,7 @@ def _offline(
             progress,
             other_device=other_device,
         )
-    return answer_of(Recalibrated, result_message(outcome)), outcome.report
+    return answer_of(Recalibrated, result_message(outcome))
 
 
 @click.command()

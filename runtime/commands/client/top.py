@@ -1,7 +1,5 @@
 """`lightpage top`: how a running service fares, live in a terminal."""
 
-from __future__ import annotations
-
 import math
 import os
 import select

@@ -1,7 +1,5 @@
 """`lightpage bench`: how long a page takes, inference alone, decoded, and through gRPC, timed side by side."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The end of a service: signals that ask for it, and the end of its process whatever still computes."""
 
-from __future__ import annotations
-
 import logging
 import os
 import signal

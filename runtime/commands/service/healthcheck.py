@@ -1,7 +1,5 @@
 """Asks the service for its health, exit code the answer: the image's HEALTHCHECK."""
 
-from __future__ import annotations
-
 import os
 import sys
 

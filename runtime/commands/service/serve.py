@@ -1,7 +1,5 @@
 """`lightpage serve`: the service until it is told to stop."""
 
-from __future__ import annotations
-
 import logging
 import platform
 from collections.abc import Callable, Iterator

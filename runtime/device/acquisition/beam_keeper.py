@@ -1,7 +1,5 @@
 """Blocks the beams for a while, and sees to it that both are open again, however that ends."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The TOML file that says how a device's cameras, trigger, modulator and shutters are wired: `camera:CONFIG.toml`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -51,8 +49,7 @@ def _kind_of_camera(table: object) -> object:
 
 
 AnyCameraTable = Annotated[
-    Annotated[CameraTable, Tag("genicam")] | Annotated[PluginCameraTable, Tag("plugin")],
-    Discriminator(_kind_of_camera),
+    Annotated[CameraTable, Tag("genicam")] | Annotated[PluginCameraTable, Tag("plugin")], Discriminator(_kind_of_camera)
 ]
 
 

@@ -1,7 +1,5 @@
 """Opens the source `camera:CONFIG.toml`: cameras, trigger, modulator and shutters, as the file says."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial

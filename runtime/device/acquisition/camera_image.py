@@ -1,7 +1,5 @@
 """Processing of one camera's frames before they are read."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Two cameras, a trigger, a modulator and the beams' shutters as one source of pages."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections import Counter

@@ -1,7 +1,5 @@
 """Pages that a source's modulator shows: rows of a file, followed by pages that a caller has uploaded."""
 
-from __future__ import annotations
-
 import threading
 
 import numpy as np

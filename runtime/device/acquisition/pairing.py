@@ -21,8 +21,6 @@ Three shots in a row that are lost to rules 1, 3 or 4 are no accident: a camera'
 stepped, or its trigger is off. What is remembered is dropped then, and learnt again before the next shot.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Self

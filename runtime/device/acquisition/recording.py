@@ -1,7 +1,5 @@
 """Pages of a recording as a source."""
 
-from __future__ import annotations
-
 import threading
 from pathlib import Path
 
@@ -23,7 +21,7 @@ class RecordingSource(FrameSource):
     def __init__(self, path: str | Path) -> None:
         self._recording = Recording.open(path)
         self._lock = threading.Lock()
-        """Guards the file and the position; held while one page is read."""
+        """Guards the position."""
         self._next = 0
         self.name = f"recording:{path}"
         self.profile = self._recording.header.own_profile()
@@ -45,13 +43,13 @@ class RecordingSource(FrameSource):
         with self._lock:
             if page is None:
                 page, self._next = self._next, (self._next + 1) % max(1, recording.pages)
-            if not 0 <= page < recording.pages:
-                raise NoSuchPageError(f"page of {self.name}", page, f"0..{recording.pages - 1}")
-            try:
-                pair, symbols = narrow(recording.frames(page), self.bit_depth), recording.symbols(page)
-                return Shot(pair, page, symbols, recording.pilots(), recording.cameras.frame_infos(page))
-            except (RecordingError, StorageError) as error:
-                raise type(error)(f"page {page}, {error.subject}", error.got, error.expected) from None
+        if not 0 <= page < recording.pages:
+            raise NoSuchPageError(f"page of {self.name}", page, f"0..{recording.pages - 1}")
+        try:
+            pair, symbols = narrow(recording.frames(page), self.bit_depth), recording.symbols(page)
+            return Shot(pair, page, symbols, recording.pilots(), recording.cameras.frame_infos(page))
+        except (RecordingError, StorageError) as error:
+            raise type(error)(f"page {page}, {error.subject}", error.got, error.expected) from None
 
     def page_count(self) -> int:
         """See `FrameSource.page_count`."""
@@ -59,10 +57,8 @@ class RecordingSource(FrameSource):
 
     def references(self) -> FramePair:
         """The recording's reference frames."""
-        with self._lock:
-            return narrow(self._recording.references(), self.bit_depth)
+        return narrow(self._recording.references(), self.bit_depth)
 
     def close(self) -> None:
         """Close the file."""
-        with self._lock:
-            self._recording.close()
+        self._recording.close()

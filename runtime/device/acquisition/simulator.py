@@ -1,7 +1,5 @@
 """A simulated device as a source."""
 
-from __future__ import annotations
-
 import threading
 from pathlib import Path
 from urllib.parse import parse_qsl

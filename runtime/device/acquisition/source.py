@@ -3,8 +3,6 @@
 Sources are entry points of the group `lightpage.sources`, so that another package may bring its own.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager

@@ -1,7 +1,5 @@
 """GigE Vision and USB3 Vision cameras, driven by Aravis."""
 
-from __future__ import annotations
-
 import ctypes
 import logging
 import time

@@ -1,7 +1,5 @@
 """A camera under Aravis: found, opened and given its settings, until it is released or has gone away."""
 
-from __future__ import annotations
-
 import threading
 from ctypes import byref, c_double, c_int, c_uint32
 from typing import Any

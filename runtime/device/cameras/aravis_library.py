@@ -5,8 +5,6 @@ when it is first asked for, so that a machine without cameras needs none. Its na
 functions take other arguments.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import os

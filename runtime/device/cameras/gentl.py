@@ -1,7 +1,5 @@
 """Cameras of any kind that their maker has a GenTL producer for, each in a process of its own."""
 
-from __future__ import annotations
-
 import mmap
 import os
 from typing import Any

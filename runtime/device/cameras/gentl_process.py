@@ -4,8 +4,6 @@ Producers are libraries of camera makers, and harvesters, which drives them, hol
 frame. Neither is to happen in the process that serves.
 """
 
-from __future__ import annotations
-
 import logging
 import mmap
 import time

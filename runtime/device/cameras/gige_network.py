@@ -1,7 +1,5 @@
 """Questions to a GigE camera and to this machine's network beside the driver: quick, and without control."""
 
-from __future__ import annotations
-
 import os
 import socket
 import struct

@@ -5,8 +5,6 @@ one up. `Mono10Packed` and `Mono12Packed` are GigE Vision's older packings: two 
 first and the last one, the low bits of both between them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

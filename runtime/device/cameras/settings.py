@@ -1,7 +1,5 @@
 """Address and settings of one camera."""
 
-from __future__ import annotations
-
 from typing import Literal, Self
 
 from pydantic import Field, field_validator, model_validator

@@ -1,7 +1,5 @@
 """The settings that every GenICam camera gets, whichever driver gives them; features have their names of the SFNC."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """A modulator, and beams, that a controller outside works by itself: it is asked, and says when it has done so."""
 
-from __future__ import annotations
-
 from threading import Condition
 from typing import Generic, TypeVar
 

@@ -1,9 +1,8 @@
 """The lookup table of a phase modulator: which grey value shows which level."""
 
-from __future__ import annotations
-
 import math
 import re
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +10,13 @@ from numpy.typing import NDArray
 
 from lightpage.errors import InvalidInputError
 from lightpage.files import read_text
+from lightpage.page.levels import MIN_LEVELS
+from lightpage.progress import warn
 
 GREYS = 256
 """Grey values of a modulator: 8 bits."""
+MOST_SHORT = 0.06
+"""Share of the phases from level 0 to level M - 1 that a modulator may lack: a stroke that is 5% too short lacks it."""
 CALIBRATION_HEADER = ["phase_rad", "grey"]
 LEVELS_HEADER = ["grey"]
 
@@ -34,7 +37,7 @@ def read_table(path: Path, levels: int) -> NDArray[np.uint8]:
     - ``phase_rad grey``: a calibration of the modulator. Each line below it has a phase in radians and the grey value
       that shows it. Phases may be wrapped, and differ by less than pi from one grey value to the next. Level k gets the
       grey value that lies 2 pi k / M above the lowest phase, interpolated and rounded; a phase that all levels share
-      makes no difference to a page.
+      makes no difference to a page. Phases that span up to `MOST_SHORT` less are shared out evenly, with a warning.
     - ``grey``, or the first number: grey values of level 0, 1, ... M - 1, in lines of any length.
 
     Args:
@@ -54,7 +57,7 @@ def read_table(path: Path, levels: int) -> NDArray[np.uint8]:
         if (words := [word for word in _SEPARATOR.split(_COMMENT.sub("", line)) if word])
     ]
     if lines and lines[0][1] == CALIBRATION_HEADER:
-        return _different(_of_calibration(lines[1:], levels, subject), subject)
+        return _of_calibration(lines[1:], levels, subject)
     return _different(_of_levels(lines, levels, subject), subject)
 
 
@@ -106,6 +109,14 @@ def _of_calibration(lines: list[Line], levels: int, subject: str) -> NDArray[np.
 
 def _of_curve(points: dict[int, float], levels: int, subject: str) -> NDArray[np.uint8]:
     """Grey values interpolated between those whose phases, radians, are known."""
+    greys, lacking = _even(points, levels, subject)
+    if lacking > 1e-9:
+        warn(f"{subject}: too short a stroke; level {levels - 1} of {levels} lies {lacking:.2g} rad too low")
+    return greys
+
+
+def _even(points: dict[int, float], levels: int, subject: str) -> tuple[NDArray[np.uint8], float]:
+    """Different grey values [M] at even phases, and the phase, radians, that the modulator lacks for the last one."""
     if len(points) < 2:
         raise InvalidInputError(subject, f"a calibration of {len(points)} grey values", "at least 2")
     greys = np.array(sorted(points))
@@ -117,11 +128,25 @@ def _of_curve(points: dict[int, float], levels: int, subject: str) -> NDArray[np
         raise InvalidInputError(subject, got, "one that rises or falls all along; smooth a noisy calibration first")
     if steps[0] < 0:
         greys, phase = greys[::-1], phase[::-1]
-    wanted = 2 * math.pi * np.arange(levels) / levels
-    if (span := phase[-1] - phase[0]) < wanted[-1] - 1e-9:
-        raise InvalidInputError(subject, f"phases over {span:.4g} rad", f"{wanted[-1]:.4g} rad for {levels} levels")
-    found: NDArray[np.float64] = np.interp(phase[0] + wanted, phase, greys)
-    return found.round().astype(np.uint8)
+    last, span = 2 * math.pi * (levels - 1) / levels, float(phase[-1] - phase[0])
+    if (lacking := last - span) > MOST_SHORT * last:
+        raise InvalidInputError(subject, f"phases over {span:.4g} rad", f"{last:.4g} rad for {levels} levels")
+    found = np.interp(phase[0] + np.linspace(0.0, min(last, span), levels), phase, greys)
+    return _different(found.round().astype(np.uint8), subject), max(0.0, lacking)
+
+
+def most_levels(curve: dict[int, float], subject: str) -> int:
+    """Most levels that `read_table` makes even by the phases, radians, of some grey values.
+
+    Raises:
+        InvalidInputError: not even two; it is about `subject`.
+    """
+    for levels in range(GREYS, MIN_LEVELS, -1):
+        with suppress(InvalidInputError):
+            _even(curve, levels, subject)
+            return levels
+    _even(curve, MIN_LEVELS, subject)
+    return MIN_LEVELS
 
 
 def calibration_text(curve: dict[int, float]) -> str:
@@ -136,7 +161,7 @@ def levels_text(curve: dict[int, float], levels: int, subject: str) -> str:
     Raises:
         InvalidInputError: see `read_table`; it is about `subject`.
     """
-    greys = _different(_of_curve(curve, levels, subject), subject)
+    greys = _of_curve(curve, levels, subject)
     return "\n".join([*LEVELS_HEADER, *map(str, greys.tolist())]) + "\n"
 
 

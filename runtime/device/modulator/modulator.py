@@ -1,7 +1,5 @@
 """The interfaces of the modulator, which shows pages, and of the beam control: a device, or a person."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 

@@ -1,7 +1,5 @@
 """Shutters in both beams, each driven by a channel of the pulse generator."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from typing import Annotated, Literal

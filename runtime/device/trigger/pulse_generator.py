@@ -3,8 +3,6 @@
 `:PULSE0` is its clock T0, `:PULSE1` to `:PULSE8` are its channels A to H.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 import threading

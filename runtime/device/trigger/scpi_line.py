@@ -3,8 +3,6 @@
 A caller that gives up takes nothing with it: the answer that may still come belongs to its message alone.
 """
 
-from __future__ import annotations
-
 import queue
 import re
 import threading

@@ -1,7 +1,5 @@
 """The interface of triggers: one call, one edge to both cameras; and one without a pulse generator."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from typing import Protocol

@@ -1,7 +1,5 @@
 """Reads the files of a bundle, a flat folder or one zip, into memory, trusting no name, size or link in it."""
 
-from __future__ import annotations
-
 import io
 import os
 import stat

@@ -1,7 +1,5 @@
 """The manifest of a bundle: what it holds, where it came from, and the hash of every file in it."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from typing import Annotated, Any, Literal

@@ -1,7 +1,5 @@
 """The bundles that come with Lightpage, by name."""
 
-from __future__ import annotations
-
 import os
 from importlib import resources
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Detached signatures of bundles: a file beside a zip says that whoever has the private key has seen it."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The detached signature of a bundle: its path and its reader."""
 
-from __future__ import annotations
-
 import os
 import stat
 from pathlib import Path

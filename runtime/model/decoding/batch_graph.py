@@ -1,7 +1,5 @@
 """A bundle's graph for batches, opened; the constants of a table that it runs with, and the memory of its frames."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,7 +15,8 @@ from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import BATCH, CONSTANTS, FLOAT16
 from lightpage.runtime.model.decoding.golden import check_golden
 from lightpage.runtime.model.decoding.page import OUTPUTS, Inference
-from lightpage.runtime.model.execution.session import BoundSession, open_session, running
+from lightpage.runtime.model.execution.device_memory import ON_NO_DEVICE, DeviceTwins
+from lightpage.runtime.model.execution.session import BoundSession, OnDevice, open_session, running
 from lightpage.runtime.model.execution.table_graph import TableGraph
 
 _log = logging.getLogger(__name__)
@@ -56,23 +55,36 @@ class Constants:
 class FrameBuffer:
     """Memory for the frames of a batch: pages are written in from many threads, each to its own place.
 
+    For a GPU it is pinned, and a page is copied there once it is written, while a run from another buffer is on.
+
     Args:
         pages: at most.
         frame_shape, dtype: of a frame.
+        twins: makes its twin on a device.
     """
 
-    def __init__(self, pages: int, frame_shape: tuple[int, int], dtype: str) -> None:
-        self.frames = {name: np.zeros((pages, *frame_shape), dtype) for name in ("in_phase", "quadrature")}
+    def __init__(self, pages: int, frame_shape: tuple[int, int], dtype: str, twins: DeviceTwins = ON_NO_DEVICE) -> None:
+        both = np.zeros((2, pages, *frame_shape), dtype)
+        self.pages, self.frames = pages, dict(zip(("in_phase", "quadrature"), both, strict=True))
         self.shift = np.zeros((pages, 2, 2), np.float32)
+        self._twin = twins.of(both)
 
     def put(self, place: int, pair: FramePair, shift: NDArray[np.float32]) -> None:
-        """Write a page."""
+        """Write a page.
+
+        Raises:
+            ProviderError: the device failed.
+        """
         self.frames["in_phase"][place], self.frames["quadrature"][place] = pair.in_phase, pair.quadrature
         self.shift[place] = shift
+        if self._twin is not None:
+            self._twin.send(*(frames[place] for frames in self.frames.values()))
 
-    def feeds(self, pages: slice) -> dict[str, NDArray[np.generic]]:
+    def feeds(self, pages: slice) -> dict[str, NDArray[np.generic] | OnDevice]:
         """Inputs of some pages, by name; what was written before stands where nothing was since."""
-        return {name: array[pages] for name, array in {**self.frames, SHIFT: self.shift}.items()}
+        frames, twin = {name: array[pages] for name, array in self.frames.items()}, self._twin
+        there = frames if twin is None else {name: twin.of(part) for name, part in frames.items()}
+        return {**there, SHIFT: self.shift[pages]}
 
 
 class BatchGraph:
@@ -97,18 +109,23 @@ class BatchGraph:
     """
 
     def __init__(self, bundle: Bundle, graph: TableGraph, pages: int, threads: int | None = None) -> None:
-        self.subject, self.pages = f"{bundle.subject}: {BATCH}", pages
+        self.subject = f"{bundle.subject}: {BATCH}"
         if missing := _FILES - bundle.files.keys():
             raise BundleError(f"{bundle.subject}: files", f"no {', '.join(sorted(missing))}", "a graph for batches")
-        self._bundle, self._provider = bundle, graph.provider
+        self._bundle, self._provider, self._twins = bundle, graph.provider, DeviceTwins(graph.provider)
         self._session = open_session(bundle.files[BATCH], self.subject, threads, provider=graph.provider, rounded=True)
         if SHIFT not in {node.name for node in self._session.get_inputs()}:
             raise BundleError(self.subject, f"no input {SHIFT}", "an export by this version of Lightpage")
         # stays open, since opening it takes longer than running it; `once` has it keep no memory
         self._first = open_session(bundle.files[CONSTANTS], f"{bundle.subject}: {CONSTANTS}", threads, once=True)
         self.constants_of_bundle = self.constants(graph)
+        self.fit(pages)
+
+    def fit(self, pages: int) -> None:
+        """Have so many pages a run, or as many as there is memory for; raises as the constructor does."""
+        self.pages = pages
         while not self._has_room():
-            self.pages = (self.pages + 1) // 2
+            self.pages = fewer(self.pages)
             _log.warning("%s: batches of %d pages, since memory is short", self.subject, self.pages)
 
     def _has_room(self) -> bool:
@@ -125,7 +142,8 @@ class BatchGraph:
 
     def buffer(self) -> FrameBuffer:
         """Memory for the frames of a run."""
-        return FrameBuffer(self.pages, self._bundle.profile.frame_shape, self._bundle.manifest.frame_dtype)
+        manifest = self._bundle.manifest
+        return FrameBuffer(self.pages, self._bundle.profile.frame_shape, manifest.frame_dtype, self._twins)
 
     def constants(self, graph: TableGraph, registration: NDArray[np.float32] | None = None) -> Constants:
         """Constants of a table, computed on the CPU.
@@ -153,7 +171,7 @@ class BatchGraph:
         """
         count = pages.stop - pages.start
         # of few sizes, since a GPU looks for kernels at each: others are computed beside them, whatever they are
-        size = min(self.pages - pages.start, 1 << (count - 1).bit_length())
+        size = min(buffer.pages - pages.start, 1 << (count - 1).bit_length())
         feeds = buffer.feeds(slice(pages.start, pages.start + size))
         answers = list(zip(*constants.bound.run([*OUTPUTS, "residual"], feeds), strict=True))
         if len(answers) != size:
@@ -166,6 +184,11 @@ class BatchGraph:
             frames = pair if number == place else FramePair(pair.quadrature, pair.in_phase)
             buffer.put(number, frames, np.zeros((2, 2), np.float32))
         return self.run(self.constants_of_bundle, buffer, slice(0, pages))[place].p
+
+
+def fewer(pages: int) -> int:
+    """The next smaller size of a run."""
+    return 1 << ((pages - 1).bit_length() - 1)
 
 
 def with_proven_batches(bundle: Bundle, graph: TableGraph) -> Bundle:

@@ -1,7 +1,5 @@
 """Dynamic batching: pages that are inferred at the same time are computed in one run of a graph for batches."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections import deque
@@ -9,12 +7,15 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
+from weakref import finalize, ref
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.clock import SYSTEM, Clock
+from lightpage.errors import LightpageError
 from lightpage.failures import lacks_memory
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.bundle import Bundle
@@ -24,10 +25,12 @@ from lightpage.runtime.model.decoding.batch_graph import (
     BatchGraph,
     Constants,
     FrameBuffer,
+    fewer,
     holds_batches,
 )
 from lightpage.runtime.model.decoding.page import Inference
 from lightpage.runtime.model.decoding.under_way import Phase, UnderWay
+from lightpage.runtime.model.execution.providers import ON_CPU
 from lightpage.runtime.model.execution.table_graph import TableGraph
 
 _log = logging.getLogger(__name__)
@@ -92,24 +95,32 @@ class _Ticket:
 class _Held:
     """Constants with the table that they follow from, and when they were last asked for."""
 
-    graph: TableGraph
+    graph: ref[TableGraph]
     own: NDArray[np.float32]
     constants: Constants
     asked: int = 0
 
 
+def _beside(work: Callable[[], None]) -> None:
+    """Have something done on a thread of its own."""
+    threading.Thread(target=work, name="lightpage-constants").start()
+
+
 class HeldConstants:
-    """Constants of the tables in use, a few of them.
+    """Constants of the tables in use, a few of them; those of a table that nothing decodes with any more are let go.
 
     Args:
         graph: that runs with them.
         table: whose constants it has already.
+        beside: has constants made, which takes as long as some pages do, while pages go on.
     """
 
-    def __init__(self, graph: BatchGraph, table: TableGraph) -> None:
-        self._graph, self._lock, self._asked = graph, threading.Lock(), 0
+    def __init__(
+        self, graph: BatchGraph, table: TableGraph, beside: Callable[[Callable[[], None]], None] = _beside
+    ) -> None:
+        self._graph, self._beside, self._lock, self._asked = graph, beside, threading.Lock(), 0
         first = graph.constants_of_bundle
-        self._held = [_Held(table, first.registration, first)]
+        self._held = [_Held(ref(table), first.registration, first)]
         self._making: set[TableGraph] = set()
 
     def of(
@@ -117,7 +128,7 @@ class HeldConstants:
     ) -> tuple[Constants, NDArray[np.float32]] | None:
         """Constants of a table, and by how much an image lies elsewhere than they have it, [2, 2] pixels.
 
-        None where there is no room for them, or they are being made for another page.
+        None where there is no room for them, or they are being made from now on.
 
         Args:
             table: which.
@@ -125,23 +136,37 @@ class HeldConstants:
         """
         with self._lock:
             self._asked += 1
-            for held in self._held:
-                shift = held.constants.shift_of(held.own if registration is None else registration)
-                if held.graph is table and shift is not None:
-                    held.asked = self._asked
-                    return held.constants, shift
-            if table in self._making or not self._has_room():
-                return None
+            self._held = [held for held in self._held if held.graph() is not None]
+            if (found := self._found(table, registration)) or table in self._making or not self._has_room():
+                return found
             self._making.add(table)
+        self._beside(partial(self._make, table, registration))
+        with self._lock:
+            return self._found(table, registration)
+
+    def _found(
+        self, table: TableGraph, registration: NDArray[np.float32] | None
+    ) -> tuple[Constants, NDArray[np.float32]] | None:
+        """See `of`: what is held."""
+        for held in self._held:
+            shift = held.constants.shift_of(held.own if registration is None else registration)
+            if held.graph() is table and shift is not None:
+                held.asked = self._asked
+                return held.constants, shift
+        return None
+
+    def _make(self, table: TableGraph, registration: NDArray[np.float32] | None) -> None:
+        """Make constants, and hold them in place of those that were not asked for the longest."""
+        made = list[_Held]()
         try:
             own = table.value(REGISTRATION)
-            made = _Held(table, own, self._graph.constants(table, registration), self._asked)
+            made.append(_Held(ref(table), own, self._graph.constants(table, registration), self._asked))
+        except Exception:  # its pages go one by one until it works
+            _log.exception("%s: no constants of a table", self._graph.subject)
         finally:
             with self._lock:
                 self._making.discard(table)
-        with self._lock:
-            self._held = [*sorted(self._held, key=lambda held: held.asked)[1 - KEPT :], made]
-        return made.constants, np.zeros((2, 2), np.float32)
+                self._held = [*sorted(self._held, key=lambda held: held.asked), *made][-KEPT:]
 
     def _has_room(self) -> bool:
         """Return whether there is room for one more, beside those that are being made."""
@@ -165,6 +190,9 @@ class OneByOne:
     def under_way(self) -> AbstractContextManager[None]:
         """A page is decoded within the `with` statement; until it is inferred, a batch may wait for it."""
         return nullcontext()
+
+    def put_off(self) -> None:
+        """Have no batch wait for the caller's page until it is inferred: that waits for something else."""
 
     def infer(
         self, table: TableGraph, pair: FramePair, registration: NDArray[np.float32] | None = None
@@ -200,8 +228,9 @@ class Batches(OneByOne):
         self._clock = clock
         self._graph, self._batching, self._constants = graph, batching, HeldConstants(graph, table)
         self.largest = min(batching.largest, graph.pages)
-        """Pages of a run, at most; fewer once memory was short."""
-        self._pages = batching.pages
+        """Pages of a run, at most; fewer once memory was short, until another model is gone."""
+        self._pages, self._gone = batching.pages, batching.pages.gone
+        finalize(self, batching.pages.let_go).atexit = False
         self._changed = threading.Condition()
         """Held while runs are looked at or changed, and never while anything is copied or computed."""
         self._free = [graph.buffer() for _ in range(_BUFFERS)]
@@ -223,6 +252,8 @@ class Batches(OneByOne):
                 "%s: no %s, so pages are computed one by one (lightpage export --batches)", bundle.subject, BATCH
             )
             return OneByOne(_ALONE)
+        if table.provider == ON_CPU:
+            _log.warning("%s: batches on a CPU take longer than pages one by one", bundle.subject)
         return cls(BatchGraph(bundle, table, batching.largest, threads), table, batching)
 
     @contextmanager
@@ -240,14 +271,12 @@ class Batches(OneByOne):
         self, table: TableGraph, pair: FramePair, registration: NDArray[np.float32] | None = None
     ) -> Inference | None:
         """See `OneByOne`."""
-        thread = threading.get_ident()
-        behind = Phase.BEHIND if self._pages.knows(thread) else None
         if (found := self._constants.of(table, registration)) is None:
-            self._pages.move(behind, thread)
-            with self._changed:  # a run may have waited for it
-                self._changed.notify_all()
+            self._pages.went_alone()
+            self.put_off()
             return None
-        came = self._clock.now()
+        came, thread = self._clock.now(), threading.get_ident()
+        behind = self._behind(thread)
         self._pages.move(Phase.WAITING, thread)
         try:
             run, place = self._joined(found[0], thread)
@@ -262,6 +291,15 @@ class Batches(OneByOne):
             raise copy(run.error) from run.error  # each caller's own: callers add to errors
         return replace(run.inferences[place], waited_s=run.begun - came)
 
+    def put_off(self) -> None:
+        """See `OneByOne`."""
+        self._pages.move(self._behind(thread := threading.get_ident()), thread)
+        with self._changed:
+            self._changed.notify_all()
+
+    def _behind(self, thread: int) -> Phase | None:
+        return Phase.BEHIND if self._pages.knows(thread) else None
+
     def _joined(self, constants: Constants, thread: int) -> tuple[_Run, int]:
         """A run that is gathered with these constants, and the page's place in it."""
         ticket = _Ticket(constants)
@@ -270,7 +308,7 @@ class Batches(OneByOne):
             try:
                 self._wait_for(lambda: bool(self._open(constants) or (self._free and self._queue[0] is ticket)))
                 if (run := self._open(constants)) is None:
-                    run = _Run(constants, self._free.pop(), self._clock.now())
+                    run = _Run(constants, self._buffer(), self._clock.now())
                     self._gathering.append(run)
                 run.threads.append(thread)
                 return run, len(run.threads) - 1
@@ -280,8 +318,16 @@ class Batches(OneByOne):
 
     def _open(self, constants: Constants) -> _Run | None:
         """A run that takes one more page with these constants."""
-        same = (run for run in self._gathering if run.constants is constants and len(run.threads) < self.largest)
+        same = (run for run in self._gathering if run.constants is constants and not self._is_full(run))
         return next(same, None)
+
+    def _is_full(self, run: _Run) -> bool:
+        return len(run.threads) >= min(self.largest, run.buffer.pages)
+
+    def _buffer(self) -> FrameBuffer:
+        """Memory that is free; there is more of it where runs are larger now."""
+        buffer = self._free.pop()
+        return buffer if buffer.pages >= self._graph.pages else self._graph.buffer()
 
     def _see_to(self, run: _Run) -> None:
         """Wait until a run is done, in which one more page is there; run it if nobody else does once it may begin."""
@@ -295,6 +341,7 @@ class Batches(OneByOne):
             self._is_running, run.begun = True, self._clock.now()
         inferences, failure = None, None
         try:
+            self._grow()
             self._pages.move(Phase.RUNNING, *run.threads)
             inferences = self._computed(run)
         except BaseException as error:  # an interrupt too: others wait
@@ -326,24 +373,36 @@ class Batches(OneByOne):
         """Return whether it is a run's turn, and nothing is to be waited for."""
         if self._is_running or [run] != self._gathering[:1] or run.written < len(run.threads):
             return False
-        if len(run.threads) >= self.largest:
+        if self._is_full(run):
             return True
         if any(ticket.constants is run.constants for ticket in self._queue):  # which has been told that there is room
             return False
         return not run.is_patient or not self._pages.count(Phase.COMING)
 
+    def _grow(self) -> None:
+        """Have runs of as many pages as are wanted once more, where a model is gone since memory was short."""
+        if self.largest == self._batching.largest or self._gone == self._pages.gone:
+            return
+        self._gone, before = self._pages.gone, self._graph.pages
+        try:
+            self._graph.fit(self._batching.largest)
+        except LightpageError as error:
+            self._graph.pages = before
+            _log.warning("batches stay as they are: %s", error)
+        self.largest = self._graph.pages
+
     def _computed(self, run: _Run) -> list[Inference]:
         """The graph's answers to a run's pages; in smaller runs from now on where there was no memory for so many."""
         pages, found = len(run.threads), list[Inference]()
-        size = pages
+        size = min(pages, self.largest)
         while (first := len(found)) < pages:
             part = slice(first, min(first + size, pages))
             try:
                 found += self._graph.run(run.constants, run.buffer, part)
             except Exception as error:
-                if size == 1 or not lacks_memory(error):
+                if (ran := part.stop - first) == 1 or not lacks_memory(error):
                     raise
-                self.largest = size = (size + 1) // 2
+                self.largest, self._gone = (size := fewer(ran)), self._pages.gone
                 told = "%s: batches of %d pages from now on, since memory was short: %s"
                 _log.warning(told, self._graph.subject, size, error)
             else:

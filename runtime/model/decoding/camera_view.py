@@ -1,7 +1,5 @@
 """Takes back what a decoder claims of symbols that a camera does not show, where the image lies partly off it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cached_property
 

@@ -99,7 +99,7 @@ class Decoder:
         batching: Batching = NO_BATCHES,
         batches: OneByOne | None = None,
     ) -> None:
-        self.bundle, self.threads, self._code_threads = bundle, threads, code_threads
+        self.bundle, self.threads, self.code_threads = bundle, threads, code_threads
         self.graph = graph or open_graph(bundle, threads, provider)
         self.batches, self._batching = batches or OneByOne(), batching
         residual = bundle.manifest.residual_output
@@ -122,14 +122,15 @@ class Decoder:
         threads: int | None = None,
         provider: Provider = ON_CPU,
         batching: Batching = NO_BATCHES,
+        code_threads: int = 1,
     ) -> Decoder:
         """Open the bundle at `path` and its decoder; raises as `Bundle.open` and the constructor do."""
-        return cls(Bundle.open(path), threads, provider=provider, batching=batching)
+        return cls(Bundle.open(path), threads, provider=provider, batching=batching, code_threads=code_threads)
 
     def of_another(self, bundle: Bundle) -> Decoder:
         """The decoder of another bundle, on the same threads and provider; raises as the constructor does."""
         provider, batching = self.graph.provider, self._batching
-        return Decoder(bundle, self.threads, provider=provider, code_threads=self._code_threads, batching=batching)
+        return Decoder(bundle, self.threads, provider=provider, code_threads=self.code_threads, batching=batching)
 
     def with_table(self, table: SamplingTable) -> Decoder:
         """This decoder with other tensors in its table, by name; those left out stay. The golden page is not looked at.
@@ -272,7 +273,7 @@ class Decoder:
             raise NoCodeError(f"{self.bundle.subject}: code", "none", "one, as `lightpage code --out-bundle` adds it")
         with raised_as(BundleError, InvalidInputError, about=f"{self.bundle.subject}: "):
             code = self.bundle.code
-            return PageCodec(code, self.bundle.pilot_mask, self.bundle.levels(code.levels), self._code_threads)
+            return PageCodec(code, self.bundle.pilot_mask, self.bundle.levels(code.levels), self.code_threads)
 
     def written_pilots(self, levels: int) -> Pilots:
         """The pilots of pages that were written at `levels` levels, each on one of them.
@@ -359,7 +360,7 @@ class Decoder:
 
 def _like(decoder: Decoder, bundle: Bundle, graph: TableGraph) -> Decoder:
     """The decoder of the same graphs with another table; whatever is open is shared."""
-    codes, batching, batches = decoder._code_threads, decoder._batching, decoder.batches
+    codes, batching, batches = decoder.code_threads, decoder._batching, decoder.batches
     return Decoder(bundle, decoder.threads, graph, code_threads=codes, batching=batching, batches=batches)
 
 

@@ -1,7 +1,5 @@
 """A decoder that follows its device's image from page to page, for who calls it from Python."""
 
-from __future__ import annotations
-
 from functools import cached_property
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The golden page of a bundle, by which a decoder shows that it computes what the bundle's maker did."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -50,6 +50,10 @@ decoder that is lost hardly more."""
 SAFE_DEVIATIONS = 2.5
 """A decision serves like a pilot where the nearest wrong one lies this many standard deviations away."""
 
+_MOST_SYMBOLS = 10_000
+"""Symbols beside the pilots from which drift is read, at most: they show shift to some thousandths of a pixel on a page
+of any size, and pages of the same device wait for each other's drift."""
+
 _CAP = 1500.0
 """Largest concentration that counts as such: no symbol shall outvote the rest."""
 
@@ -136,25 +140,36 @@ class DriftModel:
             pilots: its known symbols.
             prior: covariance [4, 4] of the drift about zero before the page was seen.
         """
-        levels, concentration = Levels.of(levels), inference.concentration.astype(np.float64)
-        phase = inference.phase - read_pilots(inference.p, pilots).piston.angle_rad
-        at = pilots.mask
-        residual, weight = wrapped(phase[at] - pilots.phases), np.minimum(concentration[at], _CAP)
+        known = np.zeros(pilots.mask.shape)
+        known[pilots.mask] = pilots.phases
+        taken = np.flatnonzero(pilots.mask | _lattice(pilots.mask.shape))
+        at, known, slopes = pilots.mask.ravel()[taken], known.ravel()[taken], self.slopes.reshape(4, -1)[:, taken]
+        levels, concentration = Levels.of(levels), inference.concentration.ravel()[taken].astype(np.float64)
+        phase = inference.phase.ravel()[taken] - read_pilots(inference.p, pilots).piston.angle_rad
+        residual, weight = wrapped(phase[at] - known[at]), np.minimum(concentration[at], _CAP)
         if not weight.sum() > 0 or abs(np.sum(weight * np.exp(1j * residual))) < LEAST_COHERENCE * weight.sum():
             return None
-        coarse = _solve(residual, self.slopes[:, at], weight, prior)
+        coarse = _solve(residual, slopes[:, at], weight, prior)
         if coarse is None:
             return None
         concentration /= coarse.over_claim
-        freed = phase - coarse.constant_rad - self.phase_change(coarse.drift)
+        freed = phase - coarse.constant_rad - np.tensordot(coarse.drift, slopes, 1)
         safe = SAFE_DEVIATIONS / np.sqrt(np.maximum(concentration, 1e-9)) < levels.half_way(freed)
         decided = levels.nearest_phases(freed)
-        decided[at] = pilots.phases
+        decided[at] = known[at]
         chosen = safe | at
         weight = np.minimum(concentration[chosen], _CAP)
-        fine = _solve(wrapped(phase - decided)[chosen], self.slopes[:, chosen], weight, prior)
+        fine = _solve(wrapped(phase - decided)[chosen], slopes[:, chosen], weight, prior)
         # a page of more levels than it is read with is decided wrongly throughout
         return coarse if fine is None or fine.over_claim > _MOST_OVER_CLAIM else fine
+
+
+def _lattice(shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Places evenly over a page, `_MOST_SYMBOLS` or fewer, bool [ny, nx]; all of them where they are no more."""
+    every = int(np.ceil(np.sqrt(np.prod(shape) / _MOST_SYMBOLS)))
+    lattice = np.zeros(shape, bool)
+    lattice[every // 2 :: every, every // 2 :: every] = True
+    return lattice
 
 
 def drift_slopes(decoder: Decoder, twin: Twin, parameters: Real, pair: FramePair | None = None) -> Real:

@@ -1,7 +1,5 @@
 """Position of a page's image."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

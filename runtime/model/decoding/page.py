@@ -54,6 +54,7 @@ class Timings:
         decision_s: piston, tracking and decision.
         search_s: looking for the image.
         waiting_s: waiting for the other pages of a batch, and for the batch before it.
+        turn_s: waiting for the pages before it, behind which it is followed.
     """
 
     check_s: float
@@ -61,11 +62,22 @@ class Timings:
     decision_s: float
     search_s: float = 0.0
     waiting_s: float = 0.0
+    turn_s: float = 0.0
+
+    @property
+    def waited_s(self) -> float:
+        """All waiting for other pages."""
+        return self.waiting_s + self.turn_s
+
+    @property
+    def worked_s(self) -> float:
+        """All but that."""
+        return self.check_s + self.inference_s + self.decision_s + self.search_s
 
     @property
     def total_s(self) -> float:
         """All of it."""
-        return self.check_s + self.inference_s + self.decision_s + self.search_s + self.waiting_s
+        return self.worked_s + self.waited_s
 
 
 @dataclass(frozen=True, repr=False)

@@ -7,8 +7,6 @@ fitted, and again with what is left. Pilots are known. Where symbols are too unc
 the distances average out and nothing is taken off.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Pages that are under way to a batch or behind one, and what the device that computes batches does meanwhile."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import Counter
@@ -43,6 +41,8 @@ class UnderWay:
 
     Attributes:
         runs: how many batches there were of each number of pages.
+        alone: pages that were not computed together though that was wanted.
+        gone: models that gathered pages, and are no more: the memory of their graphs is free.
         waits: is called again and again by each thread that waits for others' batches.
     """
 
@@ -52,6 +52,7 @@ class UnderWay:
         self._phases: dict[int, Phase] = {}
         self._spent = dict.fromkeys(Device, 0.0)
         self.runs: Counter[int] = Counter()
+        self.alone = self.gone = 0
         self.waits: Callable[[], None] = lambda: None
 
     def move(self, phase: Phase | None, *threads: int) -> None:
@@ -78,6 +79,16 @@ class UnderWay:
         """Count a batch that was run."""
         with self._lock:
             self.runs[pages] += 1
+
+    def went_alone(self) -> None:
+        """Count a page that is not computed together."""
+        with self._lock:
+            self.alone += 1
+
+    def let_go(self) -> None:
+        """Count a model that is gone."""
+        with self._lock:
+            self.gone += 1
 
     def seconds(self) -> dict[Device, float]:
         """Seconds that the device spent in each state until now."""

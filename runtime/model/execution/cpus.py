@@ -1,7 +1,5 @@
 """Count of the CPU cores that this process may use: by affinity and control group, not by the machine's size."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The memory of a process that answers many threads for weeks."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from lightpage.allocator import set_options

@@ -50,8 +50,24 @@ class Port:
         )
 
 
+@dataclass(frozen=True)
+class OnDevice:
+    """An array in the memory of what computes, row after row.
+
+    Attributes:
+        pointer: to its first element.
+        dtype, shape: of it.
+    """
+
+    pointer: int
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+
+
 Session: TypeAlias = onnxruntime.InferenceSession
 VERSION: str = onnxruntime.__version__
+CUDA_VERSION: str = getattr(onnxruntime, "cuda_version", "")
+"""That this onnxruntime was built for; empty for CPUs."""
 _USABLE = "a GPU of that number with room for the model, its driver and its libraries"
 _VERSION_DIGITS = 16
 _FATAL_ONLY = 4
@@ -189,8 +205,10 @@ class BoundSession:
                 binding.bind_ortvalue_input(name, value)
         return binding
 
-    def run(self, outputs: Iterable[str], feeds: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
+    def run(self, outputs: Iterable[str], feeds: Mapping[str, NDArray[Any] | OnDevice]) -> list[NDArray[Any]]:
         """Outputs of the names asked for; `feeds` holds the other inputs, and may stand in for constants.
+
+        What lies on the device is taken as it is; arrays are copied there first.
 
         Raises:
             ProviderError: a GPU failed, or has no room.
@@ -198,8 +216,12 @@ class BoundSession:
         """
         with running(self._subject, self._provider):
             binding = self.binding(feeds)
-            for name, array in feeds.items():
-                binding.bind_cpu_input(name, np.asarray(array, order="C"))
+            for name, fed in feeds.items():
+                if isinstance(fed, OnDevice):
+                    where = self._provider.memory, self._provider.device
+                    binding.bind_input(name, *where, fed.dtype, fed.shape, fed.pointer)
+                else:
+                    binding.bind_cpu_input(name, np.asarray(fed, order="C"))
             for name in outputs:
                 binding.bind_output(name, "cpu")
             self.session.run_with_iobinding(binding)

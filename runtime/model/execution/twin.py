@@ -1,7 +1,5 @@
 """The exported twin: the device's geometry as an ONNX function from parameters to places, phases and pixels."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

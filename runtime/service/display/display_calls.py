@@ -1,7 +1,5 @@
 """The controller's side of the modulator: UploadPages, WatchDisplay, ReportDisplay."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import AsyncIterator
 

@@ -1,7 +1,5 @@
 """Frames that callers send: checked against the camera, received, decoded with the model in service, and answered."""
 
-from __future__ import annotations
-
 import threading
 import time
 
@@ -222,7 +220,7 @@ def decode(
                 page = plane.decode(model, place, pair, levels, pilots, subject, stages, monitor, sure=sure)
             found = plane.user_data(model, page, stages, monitor) if user_data else None
             seen.note(page=page, user_data=found)
-        plane.decodes.took(time.perf_counter() - began)
+        plane.decodes.took(time.perf_counter() - began - page.timings.turn_s)
     return plane.answer(page, model, stages, found, monitor)
 
 
@@ -247,7 +245,7 @@ def decode_reply(
         level_phases=page.level_phases if options.want_phase else None,
         recalibration_reasons=_recalibration_reasons(answer),
         user_data=None if answer.user_data is None else user_data_message(answer.user_data),
-        timings=message_of(pb.Timings, answer, decode_s=page.timings.total_s, inference_s=page.timings.inference_s),
+        timings=message_of(pb.Timings, answer, decode_s=page.timings.worked_s, inference_s=page.timings.inference_s),
         correlation_id=correlation_id,
         frame_id=frame_id,
         captured_s=captured_s,

@@ -1,18 +1,17 @@
 """Tensors and parameters of the Open Inference Protocol: requests to arrays, a decoded page to tensors."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any
 
 import numpy as np
-from google.protobuf.descriptor import EnumDescriptor, FieldDescriptor
+from google.protobuf.descriptor import FieldDescriptor
 from numpy.typing import NDArray
 
 from lightpage.errors import InvalidInputError
 from lightpage.runtime.client.pb.inference import open_inference_pb2 as oip
+from lightpage.runtime.client.wire.messages import enum_name
 
 RAW_TYPES = {
     "BOOL": np.dtype(np.bool_),
@@ -196,20 +195,13 @@ def parameters_message(message: Any, left_out: Collection[str] = (), prefix: str
             if message.HasField(field.name):
                 found |= parameters_message(value, left_out, f"{name}.")
         elif field.enum_type is not None:
-            names = [_enum_name(field.enum_type, each) for each in (value if field.is_repeated else [value])]
-            found[name] = oip.InferParameter(string_param=",".join(names))
+            names = [enum_name(field.enum_type, each) for each in (value if field.is_repeated else [value])]
+            found[name] = oip.InferParameter(string_param=",".join(names).replace("UNSPECIFIED", ""))
         elif field.is_repeated:
             found[name] = oip.InferParameter(string_param=",".join(map(str, value)))
         else:
             found[name] = oip.InferParameter(**{_PARAMETERS[type(value)]: value})
     return found
-
-
-def _enum_name(enum: EnumDescriptor, number: int) -> str:
-    values = enum.values_by_number
-    prefix = values[0].name.removesuffix("UNSPECIFIED")
-    name = values[number].name.removeprefix(prefix)
-    return "" if name == "UNSPECIFIED" else name
 
 
 def _told(datatype: str, shape: Sequence[int]) -> str:

@@ -1,7 +1,5 @@
 """Recalibration as a job: Recalibrate, StartRecalibration, RecalibrateFrames, ListJobs, GetJob, WatchJob, CancelJob."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import AsyncIterator, Callable, Iterator

@@ -1,7 +1,5 @@
 """Recalibrations as jobs: the one that runs, and those that have ended, which the store remembers."""
 
-from __future__ import annotations
-
 import logging
 import secrets
 import threading
@@ -23,6 +21,7 @@ from lightpage.errors import (
     StoppingError,
     StoreError,
 )
+from lightpage.runtime.client.answers import job_info
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.status import refusal_of
 from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome
@@ -142,7 +141,10 @@ class Jobs:
             told = logging.INFO if unforeseen is None else logging.ERROR
             _log.log(told, "recalibration: job %s ended: %s", running.id, end, exc_info=unforeseen)
         try:
-            self._keep(self._ended(self._jobs[running.id], end))
+            ended = self._ended(self._jobs[running.id], end)
+            self._keep(ended)
+            if (result := job_info(ended).result) is not None:
+                _log.info("recalibration: job %s ended: %s", running.id, result.told)
         finally:
             self._running = None
             self._idle.set()

@@ -1,7 +1,5 @@
 """Runs one recalibration at a time beside the decoding, as a job, and puts the result in service."""
 
-from __future__ import annotations
-
 import logging
 import queue
 import threading

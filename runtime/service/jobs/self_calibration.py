@@ -1,7 +1,5 @@
 """Recalibrates the model in service by itself when the monitor says that it is due."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """Pages with known symbols that a caller sends, with their frames, checked as they come."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator

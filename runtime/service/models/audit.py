@@ -1,7 +1,5 @@
 """The record of every change of models: who did what, when, and how it ended. It outlives the service."""
 
-from __future__ import annotations
-
 import errno
 import json
 import logging

@@ -1,7 +1,5 @@
 """The SQLite file of what a service remembers across restarts: its models' history, its jobs, the record of changes."""
 
-from __future__ import annotations
-
 import os
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping

@@ -1,7 +1,5 @@
 """Reader of stores whose service had no database yet, as that of version 0.1.0."""
 
-from __future__ import annotations
-
 import json
 import logging
 from dataclasses import replace

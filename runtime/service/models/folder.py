@@ -1,7 +1,5 @@
 """The folder of a service's bundles: it is locked, swept of what killed programs have left, and tried now and then."""
 
-from __future__ import annotations
-
 import errno
 import logging
 import os

@@ -1,7 +1,5 @@
 """A folder where bundles are put for the service to take in."""
 
-from __future__ import annotations
-
 import logging
 import os
 import threading

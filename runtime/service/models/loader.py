@@ -1,7 +1,5 @@
 """A model: a decoder with the trackers that belong to it, and how it is loaded and checked."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property

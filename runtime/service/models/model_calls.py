@@ -1,7 +1,5 @@
 """The models: ListModels, Rollback, RollForward, UploadModel, ActivateModel, PinModel."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import AsyncIterator
 from functools import partial

@@ -1,7 +1,5 @@
 """Memory of a service across restarts: a folder with its bundles and a database, and the health of its disk."""
 
-from __future__ import annotations
-
 import errno
 import logging
 import sqlite3

@@ -1,7 +1,5 @@
 """Health of the store, for health checks and metrics: a disk that hangs must not silence the rest."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass

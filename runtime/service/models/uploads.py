@@ -1,7 +1,5 @@
 """Bundles that come from elsewhere: received into the store in pieces, checked, and given their names."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Keeps the frames of pages that went wrong, so that an engineer can look at them later: a bounded ring of files."""
 
-from __future__ import annotations
-
 import logging
 import queue
 import threading

@@ -1,7 +1,5 @@
 """Logging of the service to stderr: text or JSON lines, of one kind only so many a second."""
 
-from __future__ import annotations
-
 import json
 import logging
 import sys

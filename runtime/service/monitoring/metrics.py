@@ -143,7 +143,7 @@ class ServiceMetrics:
         with self._naming:
             if version in self._versions:
                 self.pages.labels(version).inc()
-        self.decode.observe(page.timings.total_s)
+        self.decode.observe(page.timings.worked_s)
         if not shown:
             return
         self.confidence.set(float(page.confidence.mean()))
@@ -180,9 +180,9 @@ class ServiceMetrics:
         """Show how busy the service is, whenever somebody looks."""
         self.registry.register(_Figures(partial(_load, decodes, received)))
 
-    def watch_batches(self, pages: UnderWay) -> None:
+    def watch_batches(self, pages: UnderWay, largest: Callable[[], int]) -> None:
         """Show how full batches are, and what the device does that computes them, whenever somebody looks."""
-        self.registry.register(_Figures(partial(_batches, pages)))
+        self.registry.register(_Figures(partial(_batches, pages, largest)))
 
     def watch(self, source: FrameSource) -> None:
         """Show what the source counts, whenever somebody looks."""
@@ -231,13 +231,15 @@ def _load(decodes: Slots, received: ReceiveBudget) -> Iterator[Metric]:
     yield GaugeMetricFamily("lightpage_receive_buffer_limit_bytes", "Limit of undecoded frames.", value=received.size)
 
 
-def _batches(pages: UnderWay) -> Iterator[Metric]:
+def _batches(pages: UnderWay, largest: Callable[[], int]) -> Iterator[Metric]:
     """Yield how full batches are, and what the device does that computes them."""
     runs = pages.runs.copy()
     bounds = {**{str(bound): bound for bound in _BATCH_PAGES}, "+Inf": math.inf}
     buckets = [(told, sum(runs[size] for size in runs if size <= bound)) for told, bound in bounds.items()]
     total = sum(size * count for size, count in runs.items())
     yield HistogramMetricFamily("lightpage_batch_pages", "Pages of a batch.", buckets=buckets, sum_value=total)
+    yield GaugeMetricFamily("lightpage_batch_largest", "Pages of a batch, at most, as memory allows.", value=largest())
+    yield CounterMetricFamily("lightpage_pages_alone", "Pages computed by themselves in place of a batch.", pages.alone)
     spent = CounterMetricFamily("lightpage_device_seconds", "What computes batches, by state.", labels=["state"])
     for state, seconds in pages.seconds().items():
         spent.add_metric([state.value], seconds)

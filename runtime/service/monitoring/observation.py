@@ -1,7 +1,5 @@
 """Observations of every page, given out or lost, for monitor, console and flight recorder."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol
 

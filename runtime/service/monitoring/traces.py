@@ -4,8 +4,6 @@ OpenTelemetry is an extra, and is imported only where somebody has named an endp
 ended, from what was timed anyway; another thread sends them. Where nobody takes them, they are dropped.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

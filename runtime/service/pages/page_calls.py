@@ -1,7 +1,5 @@
 """Pages of the service's own source: ReadPage, ReadPages, ReadData."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial

@@ -1,7 +1,5 @@
 """Replay of answers: one shot for a request id at most; a repeated request gets the first answer."""
 
-from __future__ import annotations
-
 import sys
 import threading
 from collections import OrderedDict

@@ -1,7 +1,5 @@
 """Logs how calls end."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """The service's certificates, read anew when their files change: nobody restarts a service for a certificate."""
 
-from __future__ import annotations
-
 import logging
 import math
 import os

@@ -31,7 +31,7 @@ from lightpage.runtime.service.caller import LOCAL, STRANGER, Call, Caller, Iden
 from lightpage.runtime.service.limits import Limits
 from lightpage.runtime.service.monitoring.metrics import ServiceMetrics
 from lightpage.runtime.service.monitoring.traces import MOST_PAGES, Traces
-from lightpage.runtime.service.rpc import Rpc, rpc_of
+from lightpage.runtime.service.rpc import Rpc
 from lightpage.runtime.service.server.call_log import log_end
 from lightpage.runtime.service.server.certificates import identity_of
 from lightpage.runtime.service.stages import CallTimes
@@ -134,11 +134,8 @@ class Dispatcher:
                 False: (grpc.stream_unary_rpc_method_handler, self._unary),
                 True: (grpc.stream_stream_rpc_method_handler, self._stream),
             }[method.server_streaming]
-            name, message, served = (
-                f"{service.prefix}{method.name}",
-                GetMessageClass(method.input_type),
-                rpc_of(handler),
-            )
+            name, message = f"{service.prefix}{method.name}", GetMessageClass(method.input_type)
+            served: Rpc = handler.rpc  # type: ignore[attr-defined]
             parse = parsed_part if message is pb.DecodeFramesRequest else message.FromString
             serialise = GetMessageClass(method.output_type).SerializeToString
             rpc = _Method(service.descriptor.full_name, name, handler, served, method.client_streaming, serialise)

@@ -1,7 +1,5 @@
 """All that answers calls, and what the service says of itself."""
 
-from __future__ import annotations
-
 from importlib.metadata import version as installed_version
 
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb

@@ -4,8 +4,6 @@ The service tells every half second whether each of its services serves. Where i
 whatever the service still holds. The process is idle, so it answers at once where the service is busy with decoding.
 """
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from collections.abc import Coroutine

@@ -1,7 +1,5 @@
 """Health checks on an address of their own, answered by a process that does nothing else."""
 
-from __future__ import annotations
-
 import logging
 import os
 import threading

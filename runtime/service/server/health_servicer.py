@@ -1,7 +1,5 @@
 """The standard health protocol, all of its calls."""
 
-from __future__ import annotations
-
 import asyncio
 from typing import Any
 

@@ -1,13 +1,10 @@
 """The server: gRPC, its health and reflection on an address, a graceful end, and nothing left behind."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import threading
-from collections.abc import Coroutine
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Self, TypeVar
+from typing import Self
 
 import grpc
 from grpc_health.v1 import health, health_pb2_grpc
@@ -41,8 +38,6 @@ _LOOK_S = 2.0
 
 STORE_HEALTH = "lightpage.store"
 """Name under which health checks ask whether the store can be written."""
-
-T = TypeVar("T")
 
 _log = logging.getLogger(__name__)
 
@@ -97,7 +92,7 @@ class LightpageServer:
         self._thread.start()
         try:
             check_free("address", self._address)
-            self._await(self._open())
+            asyncio.run_coroutine_threadsafe(self._open(), self._loop).result()
         except BaseException as error:
             self._close()
             if isinstance(error, RuntimeError):
@@ -199,9 +194,6 @@ class LightpageServer:
             self._dispatcher.end_all()
             await self._dispatcher.ended_within(_END_S)
         await self._server.stop(_END_S)
-
-    def _await(self, work: Coroutine[Any, Any, T]) -> T:
-        return asyncio.run_coroutine_threadsafe(work, self._loop).result()
 
     def _run(self) -> None:
         asyncio.set_event_loop(self._loop)

@@ -47,9 +47,6 @@ def command(folder: Path, *options: object) -> Result:
     return CliRunner().invoke(main, [str(word) for word in (*own, *options)], catch_exceptions=False)
 
 
-# ---- what is committed ----------------------------------------------------------------------------------------------
-
-
 def test_the_page_is_what_the_kept_figures_make_it() -> None:
     results = Results(kept_measurements())
     assert render(results) == PAGE.read_text("utf-8"), "edited by hand, or `make results` not run"
@@ -93,9 +90,6 @@ def test_the_ledger_is_that_of_the_shipped_code() -> None:
     assert shipped is not None
     # what the code needs is measured anew with every choice, and stands on no page
     assert Code(**kept_measurements()["ledger"].figures["bright"]["code"]).id == shipped.id
-
-
-# ---- collecting -----------------------------------------------------------------------------------------------------
 
 
 def test_figures_are_collected_without_their_curves_and_what_lacks_is_left_out(tmp_path: Path) -> None:

@@ -56,7 +56,6 @@ class TestNumbers:
         ("change", "subject", "got"),
         [
             ({"id": -1}, "volume id", -1),
-            ({"file_bytes": MOST_BYTES + 1}, "file", MOST_BYTES + 1),
             ({"data_pages": 0}, "group of pages", "0 data and 3 parity"),
             # 2^24 pages in groups of 8 hold 5 x 2^21 data pages
             ({"file_bytes": 10 * 5 * (1 << 21) + 1}, "file", (1 << 24) + 8),
@@ -273,26 +272,20 @@ class TestFile:
         assert path.read_bytes() == b"earlier"
 
 
-def make_file(path: Path, pages: list[PageBytes], room_for_pages: int, room_to_restore: int) -> None:
-    """Make the file of pages on a disk that is full beyond so many bytes."""
-    with VolumeFiles(path) as files:
-        with full_disk(room_for_pages):
-            for page in pages:
-                files.add(page)
-        with full_disk(room_to_restore):
-            chosen(files).restore()
-
-
 class TestFullDisk:
     ENOUGH = 1 << 20
 
-    @pytest.mark.parametrize("rooms", [(0, ENOUGH), (2 * SIZE + 10, ENOUGH), (ENOUGH, 5 * SIZE)])
+    @pytest.mark.parametrize(("room", "to_restore"), [(0, ENOUGH), (2 * SIZE + 10, ENOUGH), (ENOUGH, 5 * SIZE)])
     def test_pages_that_find_no_room_leave_nothing(
-        self, written: Written, tmp_path: Path, rooms: tuple[int, int]
+        self, written: Written, tmp_path: Path, room: int, to_restore: int
     ) -> None:
         pages = [page for number, page in written.pages.items() if number not in (8, 9)]
-        with refused(".partial", kind=SurroundingsError):
-            make_file(tmp_path / "file", pages, *rooms)
+        with refused(".partial", kind=SurroundingsError), VolumeFiles(tmp_path / "file") as files:
+            with full_disk(room):
+                for page in pages:
+                    files.add(page)
+            with full_disk(to_restore):
+                chosen(files).restore()
         assert list(tmp_path.iterdir()) == []
 
 

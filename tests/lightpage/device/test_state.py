@@ -1,7 +1,5 @@
 """Device state: its settings are checked like a profile's, and drawn devices stay within the capture range."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

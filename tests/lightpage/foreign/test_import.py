@@ -97,11 +97,6 @@ def test_a_recording_comes_back_from_every_form(
     assert Recording.open(tmp_path / "R.h5").header.device(None) == toy.PROFILE
 
 
-def left_aligned(a: Arrays) -> None:
-    for name in COUNTS:
-        np.save(f"{name}.npy", a[name].astype(">u2") << 8)
-
-
 def turned(a: Arrays) -> None:
     for name in ("quadrature", "reference_quadrature"):
         np.save(f"{name}.npy", np.rot90(a[name], 1, (-2, -1))[..., ::-1])
@@ -137,7 +132,7 @@ def archive(a: Arrays) -> None:
 @pytest.mark.parametrize(
     ("write", "options"),
     [
-        (left_aligned, FRAMES),
+        (lambda a: [np.save(f"{name}.npy", a[name].astype(">u2") << 8) for name in COUNTS], FRAMES),
         (turned, f"{FRAMES} --flip-quadrature x --turn-quadrature 90"),
         (compressed_tiff, "--frames both.tif"),
         (pictures, "--frames both"),
@@ -147,7 +142,7 @@ def archive(a: Arrays) -> None:
     ],
 )
 def test_frames_may_lie_in_many_ways(
-    write: Callable[[Arrays], None], options: str, folder: Path, arrays: Arrays
+    write: Callable[[Arrays], object], options: str, folder: Path, arrays: Arrays
 ) -> None:
     write(arrays)
     bring(f"{options} {REFERENCES} {REST}")

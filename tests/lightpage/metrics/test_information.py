@@ -54,14 +54,6 @@ def test_posterior_equals_the_plain_softmax(levels: Levels) -> None:
     assert (difference <= 1e-9 + 1e-13 * kappa).all()
 
 
-@pytest.mark.parametrize("levels", [2, 7, 256])
-def test_decision_is_the_nearest_level_whatever_the_winding(levels: int) -> None:
-    symbols = np.arange(levels)
-    mu = symbols * 2 * np.pi / levels + 0.49 * 2 * np.pi / levels
-    for turns in (-3, 0, 2):
-        assert np.array_equal(information.decide(mu + 2 * np.pi * turns, levels), symbols)
-
-
 def test_overconfident_estimates_claim_more_than_they_achieve() -> None:
     kappa = np.full(50_000, 8.0)
     symbols, mu = drawn_page(16, kappa, 3)
@@ -156,7 +148,6 @@ def test_maps_average_to_the_figures_of_the_page() -> None:
     ("mu", "kappa", "symbols", "levels", "named"),
     [
         (np.zeros(2), np.ones(2), np.zeros(2, int), 1, "levels"),
-        (np.zeros(2), np.ones(2), np.zeros(2, int), 257, "levels"),
         (np.zeros(2), np.ones(3), np.zeros(2, int), 4, "equal shapes"),
         (np.zeros(2), np.array([1, np.nan]), np.zeros(2, int), 4, "concentration"),
         (np.zeros(2), np.array([1, -1.0]), np.zeros(2, int), 4, "concentration"),

@@ -76,16 +76,12 @@ class TestDarkness:
                 DarkFrame.of(light.astype(np.uint8), 8)
 
 
+PLACE = np.arange(96 * 128).reshape(96, 128)
+
+
 def counts(bits: int, top: float = 0.9) -> np.ndarray:
     """A frame of right-aligned counts of so many bits."""
     return np.random.default_rng(0).integers(0, int(top * 2**bits), (96, 128), dtype=np.uint16)
-
-
-def one_odd_pixel() -> np.ndarray:
-    """As of a digital gain, which ends at full scale."""
-    frame = counts(12) << 4
-    frame[3, 5] = 65535
-    return frame
 
 
 class TestAlignment:
@@ -99,9 +95,9 @@ class TestAlignment:
         [
             (np.zeros((96, 128), np.uint16), None),  # few counts do not tell
             (np.full((96, 128), 65520, np.uint16), None),
-            (np.where(np.arange(128) % 2, 4096, 0).astype(np.uint16) * np.ones((96, 1), np.uint16), None),
+            (np.where(PLACE % 2, 4096, 0).astype(np.uint16), None),
             (counts(3) << 4, None),  # a dark frame
-            (one_odd_pixel(), 0),
+            (np.maximum(counts(12) << 4, np.uint16(65535) * (PLACE == 389)), 0),  # a digital gain ends at full scale
             (counts(6) << 10, 8),  # a gain that the lower counts need leaves eight bits
         ],
     )

@@ -204,11 +204,6 @@ def array(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[h5
     return edit
 
 
-def group_instead(file: h5py.File) -> None:
-    del file["quadrature"]
-    file.create_group("quadrature")
-
-
 BAD = [
     (attribute("format", "other"), "attribute 'format'", "'other'"),
     (attribute("version", 2), "attribute 'version'", "2"),
@@ -222,7 +217,7 @@ BAD = [
     (attribute("levels", 15), "dataset 'symbols'", "15"),
     (attribute("profile", 3), "attribute 'profile'", "int"),
     (lambda file: file.__delitem__("quadrature"), "dataset 'quadrature'", "none"),
-    (group_instead, "dataset 'quadrature'", "group"),
+    (lambda file: [file.__delitem__("quadrature"), file.create_group("quadrature")], "dataset 'quadrature'", "group"),
     (array("in_phase", lambda d: d.astype(np.uint32)), "dataset 'in_phase'", "uint32"),
     (array("in_phase", lambda d: d.astype(np.uint8)), "dataset 'in_phase'", "uint8"),
     (array("quadrature", lambda d: d[:2]), "dataset 'quadrature'", (2, 14, 20)),

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import h5py
 import numpy as np
@@ -21,6 +22,7 @@ from tests.clock import HandClock
 from tests.lightpage.recording.test_recording import LEVELS, PAGES, write_foreign
 from tests.lightpage.refused import refused
 from tests.runtime import toy
+from tests.told import Told
 
 UNLIMITED = h5py.h5s.UNLIMITED
 FRAME = (14, 20)
@@ -363,17 +365,10 @@ class TestChunkMemory:
     def test_chunks_beyond_the_memory_are_told_of(self, foreign: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.shared(foreign, FRAME[0])
         monkeypatch.setattr(stored, "CACHE_BYTES", 1000)
-        notes: list[str] = []
-
-        class Watcher:
-            def track(self, items: object, *_: object) -> object:
-                return items
-
-            note = staticmethod(notes.append)
-
-        with reporting(Watcher()), Recording.open(foreign) as recording:
+        told = Told()
+        with reporting(told), Recording.open(foreign) as recording:
             recording.frames(0)
-        assert any("h5repack -l in_phase:CHUNK=1x14x20" in note for note in notes)
+        assert any("h5repack -l in_phase:CHUNK=1x14x20" in note for note in told.notes)
 
 
 class TestUnfinishedFiles:
@@ -465,8 +460,9 @@ class TestAttributes:
 
 
 def failing(monkeypatch: pytest.MonkeyPatch, error: Exception, times: int, name: str = "/in_phase") -> None:
-    """Have the next reads of a dataset fail."""
+    """Have the next reads of a dataset fail, and all that do without HDF5."""
     original, left = h5py.Dataset.__getitem__, [times]
+    monkeypatch.setattr(os, "preadv", Mock(side_effect=OSError(errno.EIO, "Input/output error")))
 
     def read(dataset: h5py.Dataset, *args: object, **kwargs: object) -> object:
         if dataset.name == name and left[0]:
@@ -480,6 +476,20 @@ def failing(monkeypatch: pytest.MonkeyPatch, error: Exception, times: int, name:
 EIO_OF_HDF5 = OSError(
     "Can't synchronously read data (file read failed: errno = 5, error message = 'Input/output error')"
 )
+
+
+@pytest.mark.parametrize("options", [{}, {"chunks": (1, *FRAME)}, {"dtype": ">u2"}])
+def test_pages_that_lie_in_the_file_as_they_are_are_read_without_hdf5(
+    foreign: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, object]
+) -> None:
+    data = replace(foreign, "in_phase", lambda f, d: f.create_dataset("in_phase", data=d, **options))
+    with Recording.open(foreign) as recording:
+        monkeypatch.setattr(h5py.Dataset, "__getitem__", Mock(side_effect=AssertionError))
+        for page in range(recording.pages):
+            np.testing.assert_array_equal(recording.frames(page).in_phase, data[page])
+        os.truncate(foreign, 1000)
+        with refused("dataset 'in_phase' page 1", kind=StorageError):
+            recording.frames(1)
 
 
 class TestStorageThatFails:

@@ -1,7 +1,5 @@
 """Claims about the cameras: interference from polarisation states, counts from electrons, pixels from poses."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

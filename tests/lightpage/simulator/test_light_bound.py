@@ -1,7 +1,5 @@
 """Claims about the bound of the light."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

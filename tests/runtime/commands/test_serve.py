@@ -65,9 +65,7 @@ def test_every_option_is_above_the_environment_and_printed_settings_open_nothing
     ("options", "named"),
     [
         ("--self-calibrate", "--self-calibrate"),
-        ("--calibration-page 1 --calibration-page 2", "--calibration-page"),
         ("--source simulator:bench --calibration-page 1", "--calibration-page"),
-        ("--address nowhere", "--address"),
         ("--incoming {folder}", "--incoming"),
     ],
 )
@@ -182,28 +180,21 @@ def test_a_thread_that_does_not_end_does_not_keep_the_process(
 
 
 @pytest.mark.parametrize("kind", [signal.SIGTERM, signal.SIGHUP])
-def test_each_signal_stops_and_leaves_the_handlers_that_were_there(kind: signal.Signals) -> None:
-    before = signal.signal(kind, signal.SIG_DFL)  # nohup has a hangup ignored
+@pytest.mark.parametrize("handler", [signal.SIG_DFL, signal.SIG_IGN])  # as nohup has a hangup
+def test_each_signal_but_an_ignored_hangup_stops_and_leaves_the_handlers_that_were_there(
+    kind: signal.Signals, handler: signal.Handlers
+) -> None:
+    before = signal.signal(kind, handler)
     try:
         with stop_signals() as wait_for_stop:
             os.kill(os.getpid(), kind)
+            if (kind, handler) == (signal.SIGHUP, signal.SIG_IGN):
+                assert signal.getsignal(kind) == handler
+                os.kill(os.getpid(), signal.SIGTERM)
             wait_for_stop()
-        assert signal.getsignal(kind) == signal.SIG_DFL
+        assert signal.getsignal(kind) == handler
     finally:
         signal.signal(kind, before)
-
-
-def test_a_hangup_that_was_to_be_ignored_is() -> None:
-    """As nohup has it."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        with stop_signals() as wait_for_stop:
-            os.kill(os.getpid(), signal.SIGHUP)
-            assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
-            os.kill(os.getpid(), signal.SIGTERM)
-            wait_for_stop()
-    finally:
-        signal.signal(signal.SIGHUP, before)
 
 
 def test_the_exit_code_of_the_health_probe_is_its_answer() -> None:

@@ -13,6 +13,7 @@ from lightpage.codec.checksum import crc32c
 from lightpage.errors import InvalidInputError, LostDataError, RecordingError, StorageError
 from lightpage.page.symbols import pilot_mask
 from lightpage.recording.pages import Pages
+from lightpage.recording.reader import Recording
 from lightpage.runtime.commands.archives.code import code as code_command
 from lightpage.runtime.commands.archives.encode import encode
 from lightpage.runtime.commands.archives.recover import recover
@@ -43,15 +44,10 @@ def recovered(bundle: Path, recording: Path, *more: str) -> tuple[Result, dict]:
 
 def test_a_file_comes_back_and_the_figures_say_what_it_cost(bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
     assert len(pages) == 9 + 3 * 2  # 9 data pages in groups of three, two parity pages each
-    result, figures = recovered(bundle, coded.recording(tmp_path / "R.h5", pages))
+    result, figures = recovered(bundle, coded.recording(tmp_path / "R.h5", pages), "--code-threads", "2")
     assert result.exception is None
     assert (tmp_path / "read.bin").read_bytes() == coded.CONTENT
-    assert {key: figures[key] for key in ("pages", "pages_unread", "pages_lost", "user_bytes")} == {
-        "pages": 15,
-        "pages_unread": 0,
-        "pages_lost": 0,
-        "user_bytes": 1000,
-    }
+    assert [figures[key] for key in ("pages", "pages_unread", "pages_lost", "user_bytes")] == [15, 0, 0, 1000]
     data = 384 - np.count_nonzero(pilot_mask(toy.PROFILE))
     assert figures["share_of_air"] == pytest.approx(figures["user_bytes_per_page"] / figures["air_bytes_per_page"])
     assert figures["air_bytes_per_page"] == pytest.approx(figures["air_bits_per_symbol"] * data / 8, rel=0.01)
@@ -135,6 +131,22 @@ def test_code_is_chosen_by_known_pages_and_kept_in_a_bundle(tmp_path: Path) -> N
     assert 0.4 < 8 * figures["user_bytes_per_page"] / 364 / 5.1 < 0.95
     pages = coded.pages(tmp_path / "with.zip", tmp_path)
     assert pages.max() < figures["code"]["levels"]
+
+
+def test_pages_that_are_read_are_known_and_choose_a_code_as_known_ones_do(
+    bundle: Path, pages: np.ndarray, tmp_path: Path
+) -> None:
+    unknown = coded.recording(tmp_path / "R.h5", pages, {2: coded.half_lost, 5: coded.dark}, known=False)
+    recovered(bundle, unknown, "--known-out", str(tmp_path / "K.h5"))
+    with Recording.open(tmp_path / "K.h5") as known, Recording.open(unknown) as whole:
+        assert (known.pages, known.levels) == (len(pages) - 2, coded.CODE.levels)
+        for page, number in enumerate(n for n in range(len(pages)) if n not in (2, 5)):
+            np.testing.assert_array_equal(known.symbols(page), pages[number])
+            np.testing.assert_array_equal(known.frames(page).in_phase, whole.frames(number).in_phase)
+    for name in ("R", "K"):
+        asked = f"--bundle {bundle} --recording {tmp_path / name}.h5 --out {tmp_path / name}.toml"
+        CliRunner().invoke(code_command, asked.split(), standalone_mode=False, catch_exceptions=False)
+    assert (tmp_path / "R.toml").read_text() == (tmp_path / "K.toml").read_text()
 
 
 @pytest.mark.parametrize(("options", "status"), [((), 75), (("--give-up",), 3)])

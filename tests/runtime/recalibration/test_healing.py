@@ -93,6 +93,7 @@ def test_a_service_recalibrates_by_the_pages_that_it_keeps(small_bundle: Path, d
         shown = Observation("page", 0, "small-1", 0.0, 0.1, Reason.PILOTS_DISAGREE, pair=pair)
         kept.observe(replace(shown, of_device=False))
         kept.observe(shown)
+        kept.observe(shown)  # seen again, it is one page
         assert kept.enough_for_lost(decoder) == (pair is not pairs[0])  # the first could not be judged by
     lost = kept.pages(decoder, (0.0, 0.0))
     assert isinstance(lost, LostPages)
@@ -103,12 +104,13 @@ def test_a_service_recalibrates_by_the_pages_that_it_keeps(small_bundle: Path, d
     # a known page shows it to 0.01; where decisions gave more pages, theirs stays
     assert outcome.report.angle_deg == pytest.approx(-0.2, abs=0.03)
     healed = Decoder.load(out, threads=1)
-    for pair in pairs:
+    for pair in [*pairs, pairs[-2]]:
         page = healed.post_process(healed.infer(pair), CODE.levels, healed.written_pilots(CODE.levels))
         kept.observe(Observation("page", 0, "small-1+r1", 0.0, 0.1, pair=pair, page=page))
     known = kept.pages(healed, (0.0, 0.0))
     assert isinstance(known, KnownPages)
-    np.testing.assert_array_equal(known.symbols[0], symbols[-1])
+    np.testing.assert_array_equal(known.symbols[0], symbols[-2])
+    known.check(healed)
     kinds = []
     assert not kept.enough_for_lost(healed)
     for pair in pairs[:2]:  # the device is knocked: what was read before shows another one
@@ -192,10 +194,27 @@ def test_a_healed_model_has_a_verdict_and_is_not_written_where_it_is_wrong(small
     manifest = decoder.bundle.manifest.model_copy(update={"calibration": wrong})
     spoilt = replace(healed, decoder=decoder.of_bundle(replace(decoder.bundle, manifest=manifest)))
     all_fitted = replace(healed.known, fitted=tuple(map(hash_frames, healed.known.pairs)))
-    for subject, one in (("re-fit", spoilt), ("healing", replace(healed, known=all_fitted))):
+    unjudged = decoder.bundle.calibration.model_copy(update={"goodness": None}).to_toml()
+    earlier = manifest.model_copy(update={"calibration": unjudged})
+    other = decoder.of_bundle(replace(decoder.bundle, manifest=earlier))
+    all_healed = replace(healed, known=all_fitted)
+    for subject, one, start in (("re-fit", spoilt, None), ("re-fit", spoilt, other), ("healing", all_healed, None)):
         with patch.object(healed_bundle, "heal", return_value=one), pytest.raises(RecalibrationRefusedError) as refused:
-            recalibrate_by_lost(decoder, lost, drifted / "out", "small-1+r1", refit, untouched)
+            recalibrate_by_lost(decoder, lost, drifted / "out", "small-1+r1", refit, untouched, start=start)
         assert refused.value.subject.startswith(subject)
+
+
+def test_where_only_the_image_has_moved_a_last_fit_that_fails_takes_no_page_away(
+    small_bundle: Path, small_device: list[str], drifted: Path
+) -> None:
+    moved = ["--set", "in_phase_camera.shift_y_px=7", "--set", "quadrature_camera.shift_y_px=12"]
+    run(simulate, *small_device[:2], "--symbols", drifted / "pages.h5", *moved, "--seed", 6, "--out", drifted / "M.h5")
+    with Recording.open(drifted / "M.h5") as recording:
+        lost = LostPages(tuple(map(recording.frames, range(2))), CODE, references=recording.references())
+    fails = Mock(side_effect=CalibrationError("re-fit", "nothing", "a geometry"))
+    healed = heal(Decoder.load(small_bundle, threads=1), lost, fit=fails)
+    assert (healed.rounds, len(healed.known.pairs)) == (0, 2)
+    assert healed.result.report.goodness == healed.decoder.bundle.calibration.goodness is not None
 
 
 def test_a_bundle_without_a_calibration_is_not_healed(small_bundle: Path, drifted: Path) -> None:

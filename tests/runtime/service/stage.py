@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -94,6 +96,17 @@ class Running:
 
 
 Start = Callable[..., Running]
+
+
+@contextmanager
+def served(servicer: pb_grpc.LightpageServicer, port: int = 0) -> Iterator[int]:
+    """A server of nothing else on a port of this machine."""
+    server = grpc.server(ThreadPoolExecutor(4))
+    pb_grpc.add_LightpageServicer_to_server(servicer, server)  # type: ignore[no-untyped-call]
+    port = server.add_insecure_port(f"127.0.0.1:{port}")
+    server.start()
+    yield port
+    server.stop(grace=None).wait(60)
 
 
 def a_page(levels: int = 16, seed: int = 3) -> tuple[np.ndarray, FramePair]:

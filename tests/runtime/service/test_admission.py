@@ -37,6 +37,18 @@ def test_first_come_is_first_served() -> None:
     assert (slots.busy, slots.queued) == (0, 0)
 
 
+def test_more_slots_serve_those_who_wait_and_fewer_nobody_until_enough_are_back() -> None:
+    slots = Slots(1, "tests", 60.0)
+    with ThreadPoolExecutor(2) as pool:
+        pool.map(slots.take, [Caller(), Caller()])
+        eventually(lambda: slots.queued == 1)
+        slots.resize(2)
+    slots.resize(1)
+    slots.give_back()
+    with pytest.raises(SlotsTakenError), slots.held_at_once():
+        pass
+
+
 def test_one_who_leaves_the_queue_is_gone_at_once() -> None:
     slots, caller = Slots(1, "tests", math.inf, HandClock()), Caller()
     slots.take(Caller())

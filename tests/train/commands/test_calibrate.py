@@ -72,6 +72,7 @@ REGISTERED = Registered(
     cost=1.0,
     significant=0.5,
     goodness=EXPLAINED,
+    quadrature_deviation=np.deg2rad(0.123),
 )
 
 
@@ -125,7 +126,7 @@ def test_what_was_found_is_written_as_json(tmp_path: Path, monkeypatch: pytest.M
     data = json.loads(figures.read_text())
     calibration = load_calibration(out)
     assert data["angle_deg"] == pytest.approx(-0.6)
-    assert data["turn_deg"] == pytest.approx(-88)
+    assert (data["turn_deg"], data["turn_deviation_deg"]) == pytest.approx((-88, 0.123))
     assert (data["pages_used"], data["coherence_before"], data["coherence_after"]) == (2, 0.02, 0.71)
     assert data["parameters"] == calibration.parameters
     assert data["symbols_beside_cameras"] == 0

@@ -66,9 +66,6 @@ def options(*words: str) -> tuple[str, Any]:
     return localizer, chosen_trainer(localizer, small_profile(), 450, given).choices
 
 
-# ---- options --------------------------------------------------------------------------------------------------------
-
-
 def test_a_preset_is_what_it_says_and_single_options_change_it() -> None:
     plain = Hyperparameters(reflections=REFLECTIONS)
     assert options() == ("coherent", PRESETS["accurate"].choices) == ("coherent", replace(plain, refinements=1))
@@ -102,9 +99,6 @@ def test_what_is_no_option_is_refused(device: list[str], tmp_path: Path) -> None
         run(*device, "--test-share", "nan", "--out", tmp_path / "run")
     with pytest.raises(InvalidInputError, match="4 validation"):
         run(*device, "--validation-share", "0.5", "--test-share", "0.5", "--out", tmp_path / "run")
-
-
-# ---- runs -----------------------------------------------------------------------------------------------------------
 
 
 def test_a_further_pass_reads_more_than_the_first(small_run: Path) -> None:
@@ -237,9 +231,6 @@ def test_a_run_is_calibrated_on_its_first_usable_pages_once(
     for _ in range(2):
         run(*device[:3], recording, *device[6:], "--out", tmp_path / "run")
     assert made == [[1, 2]]
-
-
-# ---- what a run was begun with --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("left", ["checkpoints", "fitted.json"])

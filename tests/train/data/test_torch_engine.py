@@ -1,5 +1,7 @@
 """The simulator in torch: the light of numpy's within the rounding of float32, noise of its own, clear refusals."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -65,15 +67,11 @@ def test_pages_are_those_of_numpy_but_for_the_noise() -> None:
 def test_a_page_is_made_on_one_device_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     meta = torch.device("meta")  # it computes nothing, and refuses tensors of others
 
-    class Noise:
-        poisson = staticmethod(torch.poisson)
-
-        def standard_normal(self, shape: tuple[int, ...], dtype: object = None) -> torch.Tensor:
-            return torch.randn(shape, device=meta)
-
+    normal = lambda shape, dtype=None: torch.randn(shape, device=meta)  # noqa: E731
     monkeypatch.setattr("lightpage.train.data.torch_engine.torch_device", lambda _: meta)
     engine = TorchEngine("cuda")
-    monkeypatch.setattr(engine, "generator", lambda _: Noise())
+    noise = SimpleNamespace(poisson=torch.poisson, standard_normal=normal)
+    monkeypatch.setattr(engine, "generator", lambda _: noise)
     simulator = Simulator(PROFILE, ROUGH, engine=engine)
     simulator.optics.__dict__["signal_scale"] = 1.0  # a number that comes back
     seen = simulator.see(random_symbols(PROFILE, 256, 1, np.random.default_rng(0))[0])

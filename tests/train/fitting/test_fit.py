@@ -153,9 +153,6 @@ def test_freed_memory_is_left_to_another_c_library(monkeypatch: pytest.MonkeyPat
     assert not keep_freed_memory()
 
 
-# ---- loss -----------------------------------------------------------------------------------------------------------
-
-
 def test_the_loss_is_the_density_that_scipy_has() -> None:
     kappa, mu, theta = np.array([0.1, 2.0, 40.0]), np.array([0.3, -2.0, 3.0]), np.array([1.0, 2.5, -3.1])
     p = torch.from_numpy(np.stack([kappa * np.cos(mu), kappa * np.sin(mu)])[None])

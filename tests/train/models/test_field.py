@@ -1,7 +1,5 @@
 """Claims about field recovery: how near it comes to the true field, and what its residual tells."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

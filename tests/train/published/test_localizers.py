@@ -144,9 +144,6 @@ def test_a_ray_that_the_pipe_loses_is_looked_for_outside_of_the_frames() -> None
     assert (reach < 1).any()
 
 
-# ---- rays traced anew only where the angle has moved ----------------------------------------------------------------
-
-
 class TracedAtEachStep(RayLocalizer):
     """Rays as they were published: traced, and differentiated through the trace, at every angle."""
 

@@ -142,9 +142,6 @@ def test_a_run_says_what_it_did(ray_run: Path) -> None:
     assert len(states) == SMALL_PAGES - 1
 
 
-# ---- network and classes --------------------------------------------------------------------------------------------
-
-
 def test_table_1_of_samples_and_no_others() -> None:
     assert [samples_for(size) for size in (2, 4, 8, 16)] == [4, 4, 8, 16]
     with pytest.raises(InvalidInputError, match="4, 8, 16"):

@@ -1,7 +1,5 @@
 """The settings of a modulator that is a monitor, and a page as the picture that it shows."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import numpy as np

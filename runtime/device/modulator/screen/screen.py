@@ -1,7 +1,5 @@
 """A modulator that is a monitor, as those with an HDMI input are."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from functools import cache

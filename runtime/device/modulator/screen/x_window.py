@@ -5,8 +5,6 @@ field, which is most of Present (its protocol is in the file presentproto.txt of
 `PutImage` one by one: 60 ms for 1920x1080, against 3 ms as one piece.
 """
 
-from __future__ import annotations
-
 import io
 import os
 import struct

@@ -14,7 +14,7 @@ from tests.runtime.archives.jobs import BUNDLE, NEWER, PAGES, STAYS, job, lost, 
 def test_pages_are_counted_by_what_became_of_them(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path)
     left_out = PageRecord(page=2, state=PageState.LEFT_OUT)
-    write(ledger.shard(0, 0), page(0, 1.0, air_bits_per_symbol=4.0), page(1, 3.0, True, **{AIR: 2.0}), left_out)
+    write(ledger.shard(0, 0), page(0, 1.0, healed_rounds=0, **{AIR: 4.0}), page(1, 3.0, True, **{AIR: 2.0}), left_out)
     write(ledger.shard(1, 3), lost(3), lost(4, None, "no reason"), lost(5))
     asked = job(source("a"), source("b"), source("c", STAYS))
     found = totals(ledger, asked)
@@ -36,6 +36,7 @@ def test_pages_are_counted_by_what_became_of_them(tmp_path: Path) -> None:
         ("/c.h5", 1, str(STAYS)),
     ]
     told = found.to_json()
+    assert [row["pages_healed"] for row in (told, *found.recordings)] == [1, 1, 0, 0]
     assert (told["pages"], told["pages_read"], told["pages_lost"], told["pages_missing"]) == (14, 2, 3, 8)
     part = totals(Ledger(tmp_path, Part(index=1, count=3)), asked)
     assert (part.pages, part.lost.total(), len(part.recordings)) == (PAGES, 3, 1)

@@ -4,19 +4,27 @@ import errno
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, NoReturn
 from unittest.mock import Mock
 
 import h5py
+import numpy as np
 import pytest
 
-from lightpage.errors import StorageError
+from lightpage.errors import LostPageError, RecalibrationRefusedError, StorageError
+from lightpage.recording.pages import Pages
 from lightpage.recording.reader import Recording
+from lightpage.runtime.archives.recordings import page_reader
+from lightpage.runtime.archives.recordings.page_reader import Healings, PageReader
 from lightpage.runtime.archives.run.ledger import Ledger
 from lightpage.runtime.archives.run.question import of_recordings
 from lightpage.runtime.archives.run.shard import PageState, ShardRecord, record_of
-from lightpage.runtime.archives.run.task import Choices, Done, Failed, Operation, Task
+from lightpage.runtime.archives.run.task import Choices, Done, Failed, FineTuning, Operation, RecordedFile, Stamp, Task
+from lightpage.runtime.archives.workers import device
 from lightpage.runtime.archives.workers.device import EVERY_S, StepLog
 from lightpage.runtime.archives.workers.work import Worker
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.tracking import NoTracker
 from tests.clock import HandClock
 from tests.runtime import coded, toy
 
@@ -58,6 +66,13 @@ def test_a_range_is_read_and_its_record_says_what_it_was(operation: Operation, a
     assert (record.model.version, done.lost, done.left_out, done.seconds) == ("toy-1", {}, 0, record.seconds)
     assert record.pages[0].figures["air_bits_per_symbol"] == pytest.approx(5, abs=0.5)
     assert bool(record.confidence_bins) == (operation is Operation.EVALUATE)
+
+
+def test_a_range_is_read_in_batches_of_the_size_that_is_asked_for(asked: Callable[..., Task], monkeypatch: Any) -> None:
+    monkeypatch.setattr(Decoder, "load", opened := Mock(wraps=Decoder.load))
+    choices = Choices(operation=Operation.DECODE, tracking=False, batches=4)
+    assert isinstance(Worker(1).work(asked(choices=choices)), Done)
+    assert opened.call_args.args[-1].largest == 4
 
 
 @pytest.mark.parametrize("operation", OPERATIONS)
@@ -134,6 +149,58 @@ def test_an_evaluation_needs_symbols(asked: Callable[..., Task], tmp_path: Path)
     failed = failure(asked(Operation.EVALUATE))
     assert (failed.problem.got, failed.whole_recording) == ("no symbols", True)
     assert isinstance(Worker(1).work(asked(Operation.DECODE)), Done)
+
+
+def test_a_deep_recalibration_is_given_the_pages_of_user_data_that_were_read(
+    asked: Callable[..., Task], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Pages.open(tmp_path / "pages.h5") as written:
+        sent, seen = np.stack(list(written))[:8], list[np.ndarray | None]()
+    paths = [coded.recording(tmp_path / f"{n}.h5", sent[n::2], {n: coded.half_lost}, known=False) for n in range(2)]
+    files = tuple(RecordedFile(path=path, stamp=Stamp.of(path)) for path in paths)
+    deeply = Choices(operation=Operation.RECALIBRATE, fine_tuning=FineTuning())
+    task = asked(choices=deeply, files=files, pages=tuple(range(5)), run=tmp_path)
+
+    def recalibrate(_: object, recording: Recording, *more: object) -> NoReturn:
+        seen.extend(map(recording.symbols, range(len(recording))))
+        raise RecalibrationRefusedError("model", "worse", "better")
+
+    for _ in range(2):
+        assert isinstance(Worker(1, deep=lambda: Mock(recalibrate=recalibrate)).work(task), Done)
+        monkeypatch.setattr(device, "write_read_pages", Mock(side_effect=ZeroDivisionError))  # it is not read again
+    np.testing.assert_array_equal(seen, [*sent[[2, 4, 6, 1, 5]]] * 2)  # as many as are wanted
+
+
+def test_ranges_that_nothing_heals_are_tried_ever_less_often(
+    asked: Callable[..., Task], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    worker, tries = Worker(1), list[int]()
+    monkeypatch.setattr(page_reader, "heal", refuse := Mock(side_effect=RecalibrationRefusedError("", "", "")))
+    sent = toy.symbols_of(coded.CODE.levels, 1, PAGES)
+    coded.recording(tmp_path / "a.h5", sent, dict.fromkeys(range(PAGES), coded.dark))
+    for _ in range(9):
+        worker.work(task := asked(Operation.RECOVER))
+        record_of(task.shard).unlink()
+        tries.append(refuse.call_count)
+    assert tries == [1, 1, 1, 1, 2, 2, 2, 2, 2]  # for any of them, then for twelve, then for 24
+
+
+def test_a_range_begins_with_the_model_that_an_earlier_one_healed_and_falls_back_to_its_own(
+    asked: Callable[..., Task], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    blind, healings = type("Blind", (NoTracker,), {"decode": Mock(side_effect=LostPageError("", "", ""))}), Healings()
+    decoder = Decoder.load(asked().bundle.path, threads=1)
+    monkeypatch.setattr(page_reader, "heal", heal := Mock(return_value=Mock(decoder=decoder, rounds=1, seconds=0.0)))
+
+    def read(tracker: NoTracker) -> list[int | None]:
+        with Recording.open(tmp_path / "a.h5") as recording:
+            reader = PageReader(decoder, recording, tracker, coded.CODE, healings=healings)
+            return [page.healed_rounds for page in reader.read(range(PAGES), lambda page, found: None) if not page.loss]
+
+    assert [read(blind(decoder)) for _ in range(2)] == [[1] * PAGES, [None] * PAGES]
+    healings.model = decoder, blind(decoder)
+    assert read(NoTracker(decoder)) == [None] * PAGES
+    assert (healings.model, heal.call_count) == (None, 1)
 
 
 def test_steps_are_told_when_they_begin_and_then_now_and_then(tmp_path: Path) -> None:

@@ -2,8 +2,6 @@
 
 import socket
 from collections.abc import Callable, Iterator
-from concurrent import futures
-from contextlib import contextmanager
 from pathlib import Path
 
 import grpc
@@ -18,6 +16,7 @@ from lightpage.runtime.client.wire.address import check_address, check_free, hos
 from lightpage.runtime.client.wire.channel import REPEATABLE
 from lightpage.runtime.service.server.dispatcher import SERVICE
 from tests.clock import HandClock
+from tests.runtime.service.stage import served
 from tests.waiting import eventually
 
 
@@ -83,9 +82,6 @@ def test_an_ipv6_address_goes_into_brackets() -> None:
         assert host_and_port(host, 5) == told
 
 
-# ---- channels -------------------------------------------------------------------------------------------------------
-
-
 class Failing(pb_grpc.LightpageServicer):
     """Is unavailable so many times at first."""
 
@@ -110,16 +106,6 @@ class Failing(pb_grpc.LightpageServicer):
         yield pb.Job(id=request.id, state=pb.JOB_STATE_RUNNING)
         self._answer(context)
         yield pb.Job(id=request.id, state=pb.JOB_STATE_DONE)
-
-
-@contextmanager
-def served(servicer: Failing, port: int = 0) -> Iterator[int]:
-    server = grpc.server(futures.ThreadPoolExecutor(max_workers=2))
-    pb_grpc.add_LightpageServicer_to_server(servicer, server)  # type: ignore[no-untyped-call]
-    port = server.add_insecure_port(f"127.0.0.1:{port}")
-    server.start()
-    yield port
-    server.stop(grace=None).wait(60)
 
 
 def test_a_service_that_is_back_is_found() -> None:

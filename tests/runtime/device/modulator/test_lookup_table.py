@@ -13,7 +13,7 @@ from lightpage.runtime.device.modulator.screen.raster import Raster, ScreenSetti
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.shipped import bundle_path
 from tests.lightpage.small import small_profile
-from tests.lightpage.uneven import OVERLAPPING
+from tests.lightpage.uneven import OVERLAPPING, modulation
 
 
 def table(tmp_path: Path, text: str, levels: int) -> list[int]:
@@ -119,3 +119,20 @@ def test_a_corrected_table_makes_the_levels_even(levels: int | None, in_use: str
     calibration.save(tmp_path / "c.toml")
     with pytest.raises(InvalidInputError, match="no modulation"):
         CliRunner().invoke(lookup_table, told_by, catch_exceptions=False)
+
+
+@pytest.mark.parametrize(("stroke", "sine", "levels"), [(-0.015, 0.15, 128), (-0.05, 0.0, 256)])
+def test_levels_share_a_stroke_that_is_a_little_short(
+    stroke: float, sine: float, levels: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    of = modulation(stroke_relative=stroke, phase_sin_1_rad=sine)
+    calibration = parse_calibration(Bundle.open(bundle_path("bench")).manifest.calibration)
+    calibration.model_copy(update={"modulation": of.as_dict()}).save(tmp_path / "c.toml")
+    command = ["--calibration", str(tmp_path / "c.toml"), "--out", str(tmp_path / "new.csv")]
+    for options in ([], ["--levels", str(levels)]):
+        caplog.clear()
+        CliRunner().invoke(lookup_table, [*command, *options], catch_exceptions=False)
+        assert caplog.records
+        greys = read_table(tmp_path / "new.csv", levels)
+        steps = np.diff(of.phases(256)[greys])
+        assert np.ptp(steps) < 2 * (1 + sine) * 2 * np.pi / 256  # each end is rounded by half a grey value

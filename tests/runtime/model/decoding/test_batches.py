@@ -5,13 +5,14 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any, cast
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 from lightpage.errors import BundleError
 from lightpage.recording.frame_pair import FramePair
-from lightpage.runtime.model.decoding.batch_graph import REGISTRATION, BatchGraph, Constants, FrameBuffer
+from lightpage.runtime.model.decoding.batch_graph import REGISTRATION, BatchGraph, Constants, FrameBuffer, fewer
 from lightpage.runtime.model.decoding.batches import KEPT, Batches, Batching, HeldConstants
 from lightpage.runtime.model.decoding.page import Inference
 from lightpage.runtime.model.decoding.under_way import Device, Phase, UnderWay
@@ -46,6 +47,9 @@ class Graph:
         self.may_run.set()
         self.fails: Callable[[list[int]], None] = lambda numbers: None
 
+    def fit(self, pages: int) -> None:
+        self.pages = 4
+
     def constants(self, table: Table, registration: np.ndarray | None = None) -> Constants:
         own = table.registration if registration is None else registration
         return Constants(own, cast(BoundSession, None), reach_px=5.0)
@@ -67,18 +71,21 @@ class Stage:
     def __init__(self) -> None:
         self.table, self.pages, self.clock = Table(), UnderWay(), HandClock()
         self.graph = Graph(self.table)
-        graph, table = cast(BatchGraph, self.graph), cast(TableGraph, self.table)
-        self.batches = Batches(graph, table, Batching(8, 0.005, self.pages), self.clock)
+        self.batches = self.gathering()
         self.pool = ThreadPoolExecutor(10)
 
-    def infer(self, number: int, table: Table | None = None) -> int:
+    def gathering(self) -> Batches:
+        graph, table = cast(BatchGraph, self.graph), cast(TableGraph, self.table)
+        return Batches(graph, table, Batching(8, 0.005, self.pages), self.clock)
+
+    def infer(self, number: int, table: Table | None = None) -> int | None:
+        """The number, None of a page that is to be computed alone."""
         frame = np.full((1, 1), number, np.uint8)
         found = self.batches.infer(cast(TableGraph, table or self.table), FramePair(frame, frame))
-        assert found is not None
-        return int(found.p[0])
+        return None if found is None else int(found.p[0])
 
     @contextmanager
-    def held(self, *numbers: int) -> Iterator[list[Future[int]]]:
+    def held(self, *numbers: int) -> Iterator[list[Future[int | None]]]:
         """Page 0 runs while these others come; they are computed behind the `with` statement."""
         self.graph.may_run.clear()
         first = self.pool.submit(self.infer, 0)
@@ -119,6 +126,12 @@ def test_a_run_waits_for_a_page_whose_frames_are_being_checked(stage: Stage) -> 
     assert [sorted(run) for run in stage.graph.runs] == [[1, 2]]
 
 
+def test_a_run_waits_for_no_page_that_waits_for_something_else(stage: Stage) -> None:
+    with stage.batches.under_way():
+        stage.batches.put_off()
+        assert stage.pool.submit(stage.infer, 1).result(PATIENT) == 1
+
+
 def test_a_run_waits_no_longer_than_is_set(stage: Stage) -> None:
     with stage.batches.under_way():
         page = stage.pool.submit(stage.infer, 1)
@@ -154,10 +167,17 @@ def test_where_memory_is_short_runs_are_smaller_from_then_on(stage: Stage, caplo
     assert stage.batches.largest == 1
     assert stage.pages.runs == {1: 5}
     assert "memory" in caplog.text
+    assert [fewer(pages) for pages in (16, 12, 6, 5, 3, 2)] == [8, 8, 4, 4, 2, 1]
+    stage.graph.fails = lambda numbers: None
+    stage.gathering()  # another model comes and goes
+    assert stage.infer(6) == 6
+    assert stage.batches.largest == 4
 
 
 def test_only_pages_of_the_same_constants_are_computed_together(stage: Stage) -> None:
     other = Table(shift=9.0)
+    eventually(lambda: stage.infer(1, other) == 1)  # alone until its constants are made
+    stage.graph.runs.clear()
     stage.graph.may_run.clear()
     pages = [stage.pool.submit(stage.infer, number, table) for number, table in enumerate([None, other, None, other])]
     eventually(lambda: stage.pages.count(Phase.WAITING) + stage.pages.count(Phase.RUNNING) == 4)
@@ -166,33 +186,43 @@ def test_only_pages_of_the_same_constants_are_computed_together(stage: Stage) ->
     assert all(len({number % 2 for number in run}) == 1 for run in stage.graph.runs)
 
 
+def holding(table: Any) -> HeldConstants:
+    """Constants, each made before anything else goes on."""
+    return HeldConstants(cast(BatchGraph, Graph(table)), table, lambda work: work())
+
+
 def test_few_constants_are_held_and_those_in_use_stay() -> None:
     tables: Any = [Table(9.0 * number) for number in range(KEPT + 1)]
-    held = HeldConstants(cast(BatchGraph, Graph(tables[0])), tables[0])
+    held = holding(tables[0])
     found = [held.of(table, None) for table in tables]
     assert [each is None for each in found] == [*[False] * KEPT, True]
     for _ in range(100):
         assert held.of(tables[0], None) is not None
     assert held.of(tables[-1], None) is not None
     assert held.of(tables[1], None) is not None  # made again
+    tables = [Table(9.0 * number) for number in range(KEPT)]  # in place of those that are gone
+    assert all(held.of(table, None) is not None for table in tables)
 
 
-def test_constants_that_are_being_made_take_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    tables: Any = [Table(9.0 * number) for number in range(KEPT + 1)]
-    held, make, found = HeldConstants(cast(BatchGraph, Graph(tables[0])), tables[0]), Graph.constants, list[Any]()
-
-    def constants(graph: Graph, table: Table, _: None) -> Constants:
-        found.append(held.of(tables[tables.index(table) + 1], None))
-        return make(graph, table)
-
-    monkeypatch.setattr(Graph, "constants", constants)
-    found.append(held.of(tables[1], None))
-    assert [each is None for each in found] == [True, *[False] * (KEPT - 1)]
+def test_pages_go_alone_until_their_constants_are_made(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
+    tables, work = cast(Any, [Table(9.0 * number) for number in range(KEPT + 1)]), list[Callable[[], None]]()
+    held = HeldConstants(cast(BatchGraph, Graph(tables[0])), tables[0], work.append)
+    assert [held.of(table, None) for table in tables[1:] * 2] == [None] * 2 * KEPT
+    assert len(work) == KEPT - 1  # those that are being made take room
+    with patch.object(Graph, "constants", side_effect=MemoryError):
+        work.pop(0)()
+    assert caplog.records
+    for made in work:
+        made()
+    assert [held.of(table, None) is None for table in tables] == [False, True, False, False, True]
+    with patch.object(HeldConstants, "of", return_value=None):
+        assert stage.infer(1) is None
+    assert stage.pages.alone == 1
 
 
 def test_constants_follow_an_image_that_leaves_their_reach() -> None:
     table: Any = Table()
-    held = HeldConstants(cast(BatchGraph, Graph(table)), table)
+    held = holding(table)
     near, far = (np.zeros((2, 2, 10), np.float32) for _ in range(2))
     near[..., 0], far[..., 0] = 2, 20
     first, second = held.of(table, near), held.of(table, far)

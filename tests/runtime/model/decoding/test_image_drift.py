@@ -68,6 +68,19 @@ def test_safe_decisions_count_beside_the_pilots_and_unsafe_ones_do_not() -> None
     assert np.all(np.abs(few.deviations / many.deviations / share - 1) < 0.6)
 
 
+def test_a_large_page_shows_its_drift_by_some_of_its_symbols(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen, few = page((0.1, -0.05, 0.01, 0.02), kappa=1e9)
+    noise = np.random.default_rng(1).normal(0, 0.05, (20 * NY, 20 * NX))
+    large = inference(np.tile(seen.phase, (20, 20)) + noise, 400)
+    mask = np.pad(few.mask, [(0, 19 * side) for side in toy.PAGE])
+    decide, symbols = Levels.nearest_phases, list[int]()
+    monkeypatch.setattr(Levels, "nearest_phases", lambda own, mu: symbols.append(mu.size) or decide(own, mu))
+    found = DriftModel(np.tile(SLOPES, (1, 20, 20))).estimate(large, 16, Pilots(mask, few.phases), ANYTHING)
+    assert found is not None
+    assert np.abs(found.drift[SHIFT] - (0.1, -0.05)).max() < 0.01
+    assert 5000 < symbols[0] <= len(few.phases) + 10_000 < 0.1 * mask.size
+
+
 def test_decisions_among_uneven_levels_say_as_much_as_among_even_ones() -> None:
     even, other = estimate((0.1, 0.1), 16), estimate((0.1, 0.1), uneven(16))
     np.testing.assert_allclose(other.deviations, even.deviations, rtol=0.2)

@@ -333,10 +333,12 @@ def test_what_was_learnt_goes_over_as_text_and_decodes_the_next_page_the_same(de
     assert other.memory() == tracker.memory()
 
 
-def test_pages_decoded_at_the_same_time_are_taken_in_their_order(device: FakeDevice) -> None:
+def test_pages_decoded_at_the_same_time_are_taken_in_their_order(device: FakeDevice, monkeypatch: Any) -> None:
     """In batches, a page that was decoded ahead is decoded again where the page before shows that the image moved."""
     device.together = 2
+    monkeypatch.setattr(OneByOne, "put_off", put_off := Mock())
     tracker = settled(device)
+    put_off.assert_called_once()  # no batch waits for a page whose image is looked for
     device.drift[SHIFT] = (0.5, 0.0)
     first, second = tracker.turn(), tracker.turn()
     with ThreadPoolExecutor(1) as pool:
@@ -344,9 +346,21 @@ def test_pages_decoded_at_the_same_time_are_taken_in_their_order(device: FakeDev
         eventually(lambda: len(device.decodes) == 1)
         image = tracker.decode(device.page(1), 16, None, first).image
         assert behind.result().image is not None
+    assert behind.result().timings.turn_s > 0
     assert image is not None
     assert image.shift_x_px == pytest.approx(0.5, abs=0.01)
     assert [round(float(held[0]), 1) for held in device.decodes] == [0.0, 0.0, 0.5, 0.5]
+
+
+@pytest.mark.parametrize(("error", "most"), [(1e-6, 0.03), (0.14, 0.05)])
+def test_in_batches_a_page_is_read_near_where_it_was_looked_at(device: FakeDevice, error: float, most: float) -> None:
+    device.together, device.error = 2, error
+    tracker, away = settled(device), list[float]()
+    for _ in range(24):
+        device.drift[SHIFT] += 0.008
+        tracker.decode(device.page(), 16)
+        away.append(float(np.abs(tracker.state.untraced[SHIFT]).max()))
+    assert most / 2 < max(away) <= most
 
 
 def test_without_batches_pages_wait_for_none_and_teach_once(device: FakeDevice, monkeypatch: Any) -> None:

@@ -79,9 +79,6 @@ def fails(service: Running, request: oip.ModelInferRequest) -> Refused:
     return refused(lambda: infer(service, request))
 
 
-# ---- answers ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("typed", [False, True])
 def test_a_pair_gives_the_same_page_as_by_decode_frames(service: Running, typed: bool) -> None:
     own = service.client.frames.decode(PAIR, 16, stateless=True, want_phase=True, want_concentration=True)
@@ -213,9 +210,6 @@ def test_sessions_are_those_of_the_own_contract(start: Start) -> None:
     assert [piston(session="mine"), piston(), piston(), piston(stateless=True)] == [2, 1, 2, 1]
 
 
-# ---- refusals -----------------------------------------------------------------------------------------------------
-
-
 def with_pilots(request: oip.ModelInferRequest, mask: np.ndarray, symbols: np.ndarray | None) -> None:
     add(request, "pilot_mask", mask)
     if symbols is not None:
@@ -226,33 +220,16 @@ def with_text(parameter: oip.InferParameter) -> None:
     parameter.string_param = "16"
 
 
-def one_less(request: oip.ModelInferRequest) -> None:
-    request.inputs.pop()
-    request.raw_input_contents.pop()
-
-
-def with_a_flag_of_2(request: oip.ModelInferRequest) -> None:
-    with_pilots(request, NO_PILOTS, A_PAGE)
-    request.raw_input_contents[2] = b"\2" * A_PAGE.size
-
-
-def with_a_typed(value: int) -> Callable[[oip.ModelInferRequest], None]:
-    def change(request: oip.ModelInferRequest) -> None:
-        request.CopyFrom(request_of(typed=True))
-        request.inputs[0].contents.uint_contents[6143] = value
-
-    return change
-
-
-def with_mixed(request: oip.ModelInferRequest) -> None:
+def typed(request: oip.ModelInferRequest, change: Callable[[oip.InferTensorContents], object]) -> None:
     request.CopyFrom(request_of(typed=True))
-    request.inputs[0].contents.int_contents.append(1)
+    change(request.inputs[0].contents)
 
 
 Change = Callable[[oip.ModelInferRequest], object]
 NO_PILOTS, A_PAGE = np.zeros(toy.PAGE, bool), np.zeros(toy.PAGE, np.uint8)
+TYPED = "inputs.in_phase.contents"
 WRONG: list[tuple[Change, str, str]] = [
-    (one_less, "inputs.quadrature", "INVALID_VALUE"),
+    (lambda r: [r.inputs.pop(), r.raw_input_contents.pop()], "inputs.quadrature", "INVALID_VALUE"),
     (lambda r: add(r, "image", A_PAGE), "inputs", "INVALID_VALUE"),
     (lambda r: add(r, "in_phase", np.zeros(toy.SHAPE, np.uint8)), "inputs.in_phase", "INVALID_VALUE"),
     (lambda r: setattr(r.inputs[0], "datatype", "UINT16"), "inputs.in_phase", "FRAME_FORMAT"),
@@ -260,10 +237,10 @@ WRONG: list[tuple[Change, str, str]] = [
     (lambda r: r.inputs[1].shape.extend([1] * 100_000), "inputs.quadrature", "FRAME_FORMAT"),
     (lambda r: r.raw_input_contents.__setitem__(0, b"1"), "inputs.in_phase", "FRAME_FORMAT"),
     (lambda r: r.raw_input_contents.pop(), "raw_input_contents", "INVALID_VALUE"),
-    (lambda r: r.inputs[0].contents.uint_contents.append(1), "inputs.in_phase.contents", "INVALID_VALUE"),
-    (lambda r: r.ClearField("raw_input_contents"), "inputs.in_phase.contents.uint_contents", "FRAME_FORMAT"),
-    (with_a_typed(256), "inputs.in_phase.contents.uint_contents", "FRAME_FORMAT"),
-    (with_mixed, "inputs.in_phase.contents", "FRAME_FORMAT"),
+    (lambda r: r.inputs[0].contents.uint_contents.append(1), TYPED, "INVALID_VALUE"),
+    (lambda r: r.ClearField("raw_input_contents"), f"{TYPED}.uint_contents", "FRAME_FORMAT"),
+    (lambda r: typed(r, lambda c: c.uint_contents.__setitem__(6143, 256)), f"{TYPED}.uint_contents", "FRAME_FORMAT"),
+    (lambda r: typed(r, lambda c: c.int_contents.append(1)), TYPED, "FRAME_FORMAT"),
     (lambda r: with_text(r.inputs[0].parameters["region"]), "inputs.in_phase.parameters", "INVALID_VALUE"),
     (lambda r: r.outputs.add(name="logits"), "outputs", "INVALID_VALUE"),
     (lambda r: [r.outputs.add(name="phase") for _ in range(2)], "outputs.phase", "INVALID_VALUE"),
@@ -272,7 +249,7 @@ WRONG: list[tuple[Change, str, str]] = [
     (lambda r: with_text(r.parameters["levels"]), "parameters.levels", "INVALID_VALUE"),
     (lambda r: setattr(r.parameters["levels"], "int64_param", -1), "parameters.levels", "INVALID_VALUE"),
     (lambda r: with_pilots(r, NO_PILOTS, None), "inputs.pilot_mask", "INVALID_VALUE"),
-    (with_a_flag_of_2, "inputs.pilot_mask", "INVALID_VALUE"),
+    (lambda r: with_pilots(r, (A_PAGE + np.uint8(2)).view(bool), A_PAGE), "inputs.pilot_mask", "INVALID_VALUE"),
     (lambda r: [r.outputs.add(name="phase") for _ in range(300)], "", "TOO_LARGE"),
 ]
 """What is changed, the field that the error names, and its reason."""

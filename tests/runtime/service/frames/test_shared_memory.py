@@ -31,8 +31,6 @@ PAIR = 2 * toy.SHAPE[0] * toy.SHAPE[1]
 SYMBOLS, FRAMES = a_page()
 MOST = 4000
 
-# ---- regions ------------------------------------------------------------------------------------------------------
-
 
 @pytest.fixture
 def target(tmp_path: Path) -> Iterator[str]:
@@ -108,9 +106,6 @@ def test_whoever_says_nothing_or_too_much_is_hung_up_on(target: str, said: bytes
             while connection.recv(100):  # the region may have come before the rest was heard
                 pass
     eventually(lambda: all_is_free(target))
-
-
-# ---- frames in them -----------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

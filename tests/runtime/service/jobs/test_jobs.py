@@ -21,6 +21,7 @@ from lightpage.errors import (
     RecalibrationRefusedError,
     StoppingError,
 )
+from lightpage.runtime.client.answers import job_info
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.recalibration import RecalibrationOutcome, Refit, RefitReport
@@ -33,12 +34,12 @@ from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.models.store import Store
 from tests.clock import HandClock
 from tests.lightpage.full_disk import full_disk
+from tests.lightpage.small import EXPLAINED
 from tests.runtime import toy
 from tests.runtime.slow_fit import SlowFit
 
-OUTCOME = RecalibrationOutcome(
-    Path("x.zip"), "toy-1+r1", "toy-1", RefitReport(angle_deg=0.5), 1.0, 3.5, 1, 3, 2, 4.0, 0.9, 0.1
-)
+REPORT = RefitReport(angle_deg=0.5, goodness=EXPLAINED)
+OUTCOME = RecalibrationOutcome(Path("x.zip"), "toy-1+r1", "toy-1", REPORT, 1.0, 3.5, 1, 3, 2, 4.0, 0.9, 0.1, rounds=3)
 
 
 Open = Callable[..., Jobs]
@@ -131,6 +132,9 @@ def test_each_end_is_told_and_kept_over_a_restart(
     found = jobs.job(ended(jobs, end))
     assert found.state == state
     assert found.HasField("result") == isinstance(end, RecalibrationOutcome) != found.HasField("refusal")
+    if (result := job_info(found).result) is not None:
+        assert (result.rounds, result.verdict, result.bits_lost, result.cause) == (3, "good", 0.01, None)
+        assert {"3", "good"} <= {*result.told.split()}
     assert (found.correlation_id, found.pages_of) == ("mine", "source")
     assert start().all() == [found]
     assert Jobs(Store(None, decoder.bundle)).all() == []

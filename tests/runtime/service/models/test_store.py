@@ -17,6 +17,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 from google.protobuf import json_format
@@ -80,13 +81,9 @@ def worn(start: Start, folder: Path) -> DataPlane:
     return plane
 
 
-def failing(number: int) -> Callable[..., None]:
+def failing(number: int) -> Mock:
     """A call of the system that fails."""
-
-    def call(*_: object, **__: object) -> None:
-        raise OSError(number, os.strerror(number))
-
-    return call
+    return Mock(side_effect=OSError(number, os.strerror(number)))
 
 
 def trouble(plane: DataPlane) -> str:

@@ -1,7 +1,5 @@
 """Pages that went wrong are kept in a bounded ring that other programs open, and no read waits for the disk."""
 
-from __future__ import annotations
-
 import threading
 from contextlib import suppress
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What the service logs, and what it does not; the record of model changes."""
 
-from __future__ import annotations
-
 import io
 import json
 import logging

@@ -1,15 +1,13 @@
 """What is known of a page: observers are told of each and cost nobody one; figures; the stages of its whole way."""
 
-from __future__ import annotations
-
 from itertools import pairwise
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from lightpage.errors import FrameError, LostShotError, Reason, SourceError, UnconfirmedPageError
 from lightpage.page.pilots import Pilots
-from lightpage.runtime.device.acquisition.source import SHOT_S, Shot
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.dataplane import DataPlane, Seen
@@ -25,38 +23,21 @@ from tests.clock import HandClock
 from tests.runtime import toy
 
 
-class Notebook:
-    def __init__(self, *, broken: bool = False) -> None:
-        self.seen: list[Observation] = []
-        self.broken = broken
-
-    def observe(self, observation: Observation) -> None:
-        self.seen.append(observation)
-        if self.broken:
-            raise RuntimeError("no more paper")
-
-
-class LosingSource(toy.ToySource):
-    def shot(self, timeout_s: float = SHOT_S, page: int | None = None) -> Shot:
-        if page == 1:
-            raise LostShotError("page 1 of toy:device", "no frame", "two frames", Reason.MISSING_FRAME)
-        return super().shot(timeout_s, page)
-
-
 def test_pages_given_out_and_lost_are_observed(decoder: Decoder) -> None:
-    broken, notebook = Notebook(broken=True), Notebook()
-    registry = Models(decoder)
-    plane = DataPlane(registry, LosingSource(toy.ToyDevice()), observers=[broken, notebook])
+    broken, notebook, registry = Mock(), Mock(), Models(decoder)
+    broken.observe.side_effect = RuntimeError("no more paper")
+    plane = DataPlane(registry, source := toy.ToySource(toy.ToyDevice()), observers=[broken, notebook])
     read_page(plane, 0, None, Caller())
+    lost = LostShotError("page 1 of toy:device", "no frame", "two frames", Reason.MISSING_FRAME)
+    source.shot = Mock(side_effect=lost)  # type: ignore[method-assign]
     with pytest.raises(LostShotError):
         read_page(plane, 1, None, Caller())
     pair = toy.ToyDevice().page(toy.symbols_of(16, 3)[0], 16, 0.1)
     wrong = Pilots.of_symbols(registry.current.decoder.bundle.pilot_mask, np.zeros(toy.PAGE, np.uint8), 16)
     with pytest.raises(UnconfirmedPageError):
         decode(plane, pair, 16, Caller(), wrong)
-    given, shot, unconfirmed = notebook.seen
+    given, shot, unconfirmed = (call.args[0] for call in notebook.observe.call_args_list)
     assert (given.page_index, given.lost, given.tells) == (0, None, True)
-    assert given.page is not None
     assert given.pair is not None
     kappa = given.page.concentration.astype(np.float64)
     assert given.page.information_bits == pytest.approx(information(kappa).mean() / np.log(2))
@@ -64,19 +45,19 @@ def test_pages_given_out_and_lost_are_observed(decoder: Decoder) -> None:
     assert (shot.page_index, shot.lost, shot.pair, shot.page) == (1, Reason.MISSING_FRAME, None, None)
     assert (unconfirmed.lost, unconfirmed.tells) == (Reason.PILOTS_DISAGREE, False)
     assert unconfirmed.page is not None
-    assert len(broken.seen) == 3
-    lost = plane.metrics.registry.get_sample_value("lightpage_pages_lost_total", {"reason": "MISSING_FRAME"})
-    assert lost == 1
+    assert broken.observe.call_count == 3
+    counted = plane.metrics.registry.get_sample_value("lightpage_pages_lost_total", {"reason": "MISSING_FRAME"})
+    assert counted == 1
 
 
 def test_pages_of_the_source_whose_frames_contradict_each_other_are_observed_as_lost(decoder: Decoder) -> None:
-    notebook, source = Notebook(), toy.ToySource(toy.ToyDevice((180.0, 30.0)))
+    notebook, source = Mock(), toy.ToySource(toy.ToyDevice((180.0, 30.0)))
     plane = DataPlane(Models(decoder), source, observers=[notebook])
     with pytest.raises(SourceError, match="contradict"):
         read_page(plane, 0, None, Caller())
     with pytest.raises(FrameError, match="contradict"):  # a caller's frames may be swapped
         decode(plane, source.shot(page=1).pair, 16, Caller())
-    (seen,) = notebook.seen
+    (seen,) = notebook.observe.call_args.args
     assert (seen.lost, seen.page_index, seen.page) == (Reason.UNSPECIFIED, 0, None)
     assert seen.pair is not None
     assert "contradict" in seen.detail

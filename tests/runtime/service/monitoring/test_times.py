@@ -1,7 +1,5 @@
 """Where the time of calls goes: the stages of their pages are all of it, and a receiver of OTLP gets them as spans."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor

@@ -50,11 +50,9 @@ def test_earlier_files_that_are_put_back_count(tmp_path: Path) -> None:
         link.unlink()
         link.symlink_to(folder)
         assert certificates.pem().ca == (folder / "ca.pem").read_bytes()
-        assert certificates.context().get_ca_certs(binary_form=True) == [_der(folder / "ca.pem")]
-
-
-def _der(path: Path) -> bytes:
-    return ssl.PEM_cert_to_DER_cert(path.read_text())
+        assert certificates.context().get_ca_certs(binary_form=True) == [
+            ssl.PEM_cert_to_DER_cert((folder / "ca.pem").read_text())
+        ]
 
 
 def test_half_replaced_files_leave_the_earlier_ones(authority: Authority) -> None:

@@ -38,22 +38,6 @@ def health_of(service: Running) -> Any:
     return health_pb2_grpc.HealthStub(service.channel())
 
 
-# ---- messages -----------------------------------------------------------------------------------------------------
-
-
-def test_messages_that_cannot_be_parsed_are_the_callers_fault(service: Running) -> None:
-    channel, name = service.channel(), SERVICE.full_name
-    for method in (m.name for m in SERVICE.methods if not m.client_streaming):
-        answer = refused(lambda method=method: channel.unary_stream(f"/{name}/{method}")(b"\xff\xff\xff", timeout=20))  # type: ignore[misc]
-        assert (answer.code, answer.reason) == (INVALID, "MALFORMED"), method
-    for messages in ([b"\xff\xff"], [pb.DecodeFramesRequest(header=header()).SerializeToString(), b"\xff\xff"]):
-        answer = refused(lambda sent=messages: channel.stream_unary(f"/{name}/DecodeFrames")(iter(sent), timeout=20))  # type: ignore[misc]
-        assert answer.code is INVALID
-
-
-# ---- too many, too late, too slow ---------------------------------------------------------------------------------
-
-
 def test_a_deadline_that_is_too_short_is_told_so(start: Start) -> None:
     service = start(limits=Limits(concurrent_decodes=1))
     service.plane.decodes.took(15.0)
@@ -115,9 +99,6 @@ def test_work_that_never_begins_leaves_nothing_behind() -> None:
         asyncio.run(cut_off(pool))
         eventually(closed.is_set)
         hold.set()
-
-
-# ---- sessions and request ids -------------------------------------------------------------------------------------
 
 
 def test_answers_do_not_depend_on_what_others_sent(start: Start) -> None:
@@ -187,9 +168,6 @@ def test_a_page_that_is_read_on_though_its_caller_left_has_the_services_own_dead
     assert left == [7.0, 5.0]
 
 
-# ---- many pages in one call ---------------------------------------------------------------------------------------
-
-
 def test_pairs_are_decoded_in_a_row_and_a_bad_one_ends_nothing(service: Running) -> None:
     symbols, pairs = zip(*(a_page(seed=seed) for seed in range(2)), strict=True)
     black = FramePair(np.zeros_like(pairs[0].in_phase), np.zeros_like(pairs[0].quadrature))
@@ -235,9 +213,6 @@ def test_pages_of_the_source_are_read_in_a_row(start: Start) -> None:
     for request, subject in ((pb.ReadPagesRequest(count=10), "count"), (pb.ReadPagesRequest(pages=range(10)), "pages")):
         answer = refused(lambda request=request: read(request, timeout=20))  # type: ignore[misc]
         assert (answer.code, answer.subject, answer.error.got) == (EXHAUSTED, subject, "10")
-
-
-# ---- health, reflection and the end -------------------------------------------------------------------------------
 
 
 def test_a_source_in_trouble_is_told_by_health_and_metrics_until_it_is_well(start: Start) -> None:
@@ -296,9 +271,6 @@ def test_what_a_stop_cuts_off_or_turns_away_hears_why(start: Start, caplog: pyte
         ending.result(60)
     assert {(one.code, one.reason) for one in told} == {(grpc.StatusCode.UNAVAILABLE, "STOPPING")}
     assert not [record for record in caplog.records if record.exc_info]
-
-
-# ---- a Unix socket, where gRPC has one name for all connections ---------------------------------------------------
 
 
 def test_clients_at_one_unix_socket_are_followed_apart(start: Start, tmp_path: Path) -> None:

@@ -44,9 +44,6 @@ def chunk(size: int) -> pb.DecodeFramesRequest:
     return pb.DecodeFramesRequest(chunk=bytes(size))
 
 
-# ---- answers ------------------------------------------------------------------------------------------------------
-
-
 def test_the_service_describes_itself(start: Start) -> None:
     description = start(limits=Limits(replay_s=7.0, range_pages=9)).client.describe()
     assert (description.model.version, description.model.current) == ("toy-1", True)
@@ -99,8 +96,6 @@ def test_what_is_asked_of_a_pair_is_done_and_no_more_is_sent(service: Running) -
         answer = sent(service, beginning(black_level=level))
         assert (answer.code, answer.subject) == (INVALID, "black_level")
 
-
-# ---- refusals -----------------------------------------------------------------------------------------------------
 
 _, PAIR = a_page()
 
@@ -188,9 +183,6 @@ def test_waiting_for_a_slot_is_not_stalling(start: Start) -> None:
         assert (waiting.result(60).symbols == a_page()[0]).all()
 
 
-# ---- lost and damaged pages ---------------------------------------------------------------------------------------
-
-
 def test_a_damaged_page_of_the_source_is_the_services_own_fault(start: Start, tmp_path: Path) -> None:
     path = tmp_path / "source.h5"
     toy.write_toy_recording(path, toy.ToyDevice(), 16, 4)
@@ -231,9 +223,6 @@ def test_a_page_whose_pilots_disagree_is_lost_and_not_answered(start: Start) -> 
     assert service.count("lightpage_recalibration_due") == 0
     page = service.client.frames.decode(PAIR, 16)
     assert page.confirmed_bits == pytest.approx(page.claimed_bits, rel=0.15)
-
-
-# ---- the server itself --------------------------------------------------------------------------------------------
 
 
 def test_a_server_is_found_where_it_is_and_says_what_it_lacks(service: Running, start: Start, tmp_path: Path) -> None:

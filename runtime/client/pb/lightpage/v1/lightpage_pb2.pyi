@@ -795,7 +795,7 @@ class Progress(_message.Message):
     def __init__(self, step: _Optional[str] = ..., fraction: _Optional[float] = ...) -> None: ...
 
 class RecalibrationResult(_message.Message):
-    __slots__ = ("model_version", "previous_version", "pages_used", "pages_held_back", "air_before", "air_after", "angle_deg", "coherence_before", "coherence_after", "seconds", "pages_lost_before", "image", "air_limit", "air_standard_error")
+    __slots__ = ("model_version", "previous_version", "pages_used", "pages_held_back", "air_before", "air_after", "angle_deg", "coherence_before", "coherence_after", "seconds", "pages_lost_before", "image", "air_limit", "air_standard_error", "rounds", "verdict", "bits_lost", "cause")
     MODEL_VERSION_FIELD_NUMBER: _ClassVar[int]
     PREVIOUS_VERSION_FIELD_NUMBER: _ClassVar[int]
     PAGES_USED_FIELD_NUMBER: _ClassVar[int]
@@ -810,6 +810,10 @@ class RecalibrationResult(_message.Message):
     IMAGE_FIELD_NUMBER: _ClassVar[int]
     AIR_LIMIT_FIELD_NUMBER: _ClassVar[int]
     AIR_STANDARD_ERROR_FIELD_NUMBER: _ClassVar[int]
+    ROUNDS_FIELD_NUMBER: _ClassVar[int]
+    VERDICT_FIELD_NUMBER: _ClassVar[int]
+    BITS_LOST_FIELD_NUMBER: _ClassVar[int]
+    CAUSE_FIELD_NUMBER: _ClassVar[int]
     model_version: str
     previous_version: str
     pages_used: int
@@ -824,7 +828,11 @@ class RecalibrationResult(_message.Message):
     image: ImagePosition
     air_limit: float
     air_standard_error: float
-    def __init__(self, model_version: _Optional[str] = ..., previous_version: _Optional[str] = ..., pages_used: _Optional[int] = ..., pages_held_back: _Optional[int] = ..., air_before: _Optional[float] = ..., air_after: _Optional[float] = ..., angle_deg: _Optional[float] = ..., coherence_before: _Optional[float] = ..., coherence_after: _Optional[float] = ..., seconds: _Optional[float] = ..., pages_lost_before: _Optional[int] = ..., image: _Optional[_Union[ImagePosition, _Mapping]] = ..., air_limit: _Optional[float] = ..., air_standard_error: _Optional[float] = ...) -> None: ...
+    rounds: int
+    verdict: str
+    bits_lost: float
+    cause: str
+    def __init__(self, model_version: _Optional[str] = ..., previous_version: _Optional[str] = ..., pages_used: _Optional[int] = ..., pages_held_back: _Optional[int] = ..., air_before: _Optional[float] = ..., air_after: _Optional[float] = ..., angle_deg: _Optional[float] = ..., coherence_before: _Optional[float] = ..., coherence_after: _Optional[float] = ..., seconds: _Optional[float] = ..., pages_lost_before: _Optional[int] = ..., image: _Optional[_Union[ImagePosition, _Mapping]] = ..., air_limit: _Optional[float] = ..., air_standard_error: _Optional[float] = ..., rounds: _Optional[int] = ..., verdict: _Optional[str] = ..., bits_lost: _Optional[float] = ..., cause: _Optional[str] = ...) -> None: ...
 
 class RollbackRequest(_message.Message):
     __slots__ = ("expected_version", "correlation_id")
