@@ -15,7 +15,7 @@ import re
 import threading
 from bisect import bisect_left
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -423,15 +423,8 @@ class StoredArray:
 
         patiently(look_at_all, self.subject)
         step = self.dataset.chunks[0]
-        rows = range(0, len(self) if across else 0, step)
-
-        def lacks(row: int) -> bool:
-            return seen.get(row, 0) < across
-
-        # from either end, since an array that nobody has written may say that it has any number of rows
-        if (first := next(filter(lacks, rows), None)) is not None:
-            last = next(filter(lacks, reversed(rows)))
-            raise self._unwritten(range(first, min(last + step, len(self))))
+        if ends := _ends(range(0, len(self) if across else 0, step), lambda row: seen.get(row, 0) < across):
+            raise self._unwritten(range(ends[0], min(ends[1] + step, len(self))))
         for index, told in missing_filters:
             if seen and not skipped >> index & 1:
                 got = f"data compressed by the filter {told}, which HDF5 does not have here"
@@ -658,6 +651,12 @@ def decodes(code: int) -> bool:
 
 def _size_of(path: Path, subject: str, expected: str = "a file that can be read") -> int:
     return patiently(lambda: path.stat().st_size, subject, expected, RecordingError)
+
+
+def _ends(rows: range, lacks: Callable[[int], bool]) -> tuple[int, int] | None:
+    """Return the first and the last row that lacks data, if any: an array can claim too many rows to ask each."""
+    first = next(filter(lacks, rows), None)
+    return None if first is None else (first, next(filter(lacks, reversed(rows))))
 
 
 def _told(rows: Indices | Sequence[int]) -> str:

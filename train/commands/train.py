@@ -24,6 +24,7 @@ from lightpage.train.processes import AUTO, STRATEGIES, Processes, Silence, is_f
 from lightpage.train.published.localizers import NAMES as PUBLISHED
 from lightpage.train.runs import Run, sole_writer
 from lightpage.train.trainers.whole_run import Split, make_run, usable_pages
+from lightpage.words import counted
 
 
 @click.command()
@@ -124,7 +125,7 @@ def _tell(run: Run, folder: Path, json_path: Path | None) -> None:
         )
     click.echo(
         f"validation AIR {run.validation_air:.3f} bits/symbol, {trained} recorded and {run.synthetic_pages} synthetic "
-        f"pages trained on, {validated} validation pages, {left} left for evaluate, kappa scaled by "
+        f"pages trained on, {counted(validated, 'validation page')}, {left} left for evaluate, kappa scaled by "
         f"{run.kappa_scale:.3f}, {run.seconds / 60:.1f} min; run in {folder}"
     )
 

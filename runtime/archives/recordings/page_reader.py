@@ -29,6 +29,7 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.page import DecodedPage
 from lightpage.runtime.model.decoding.tracking import Tracker
 from lightpage.runtime.recalibration.healing import TOGETHER, LostPages, heal
+from lightpage.words import counted
 
 Decoded = tuple[tuple[DecodedPage, float], Symbols]
 """A page with the seconds that it took, and its symbols where they are known."""
@@ -211,7 +212,7 @@ class PageReader:
 
     def _healed(self, waiting: Waiting, right: int | None, take: Take) -> list[RecoveredPage] | None:
         """Pages that were not read, as a model reads them that is healed by them; None where none reads any."""
-        note(f"{len(waiting)} pages are not read: the model is fitted to the device by them")
+        note(f"{counted(len(waiting), 'page')} not read: the model is fitted to the device by them")
         try:
             healed = heal(self._decoder, self._lost(waiting, right))
         except (RecalibrationRefusedError, BundleError, RecordingError, InvalidInputError, StorageError) as error:
@@ -224,7 +225,7 @@ class PageReader:
         if found is not None:
             self._healings.healed(*model)
         read = sum(page.loss is None for page in found or ())
-        note(f"{read} of them are read after {healed.rounds} rounds, {healed.seconds:.0f} s")
+        note(f"{read} of them are read after {counted(healed.rounds, 'round')}, {healed.seconds:.0f} s")
         return found
 
     def _again(self, waiting: Waiting, model: Model, rounds: int | None, take: Take) -> list[RecoveredPage] | None:

@@ -116,5 +116,5 @@ def encode(
     write_json(json_path, figures)
     click.echo(
         f"{out}: volume {volume.id}, {volume.pages} pages of {code.levels} levels and {codec.user_bytes} bytes; "
-        f"{volume.file_pages} hold {volume.file_bytes} bytes, {volume.pages - volume.file_pages} are parity"
+        f"{volume.file_bytes} bytes on {volume.file_pages}, parity on {volume.pages - volume.file_pages}"
     )
