@@ -9,3 +9,7 @@ from lightpage_client.runtime.client.outgoing import KnownPilots
 from lightpage_client.runtime.client.wire.channel import TlsFiles
 
 __all__ = ["FramePair", "KnownPilots", "LightpageClient", "LightpageError", "RemotePage", "TlsFiles", "errors"]
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from lightpage.calibration.known_pages import first_lit_pages
+from lightpage.cli.main import RESUME_KEY
 from lightpage.cli.options import JSON, FiniteRange
 from lightpage.cli.paths import NewPath
 from lightpage.cli.progress_bar import percent_bar
@@ -111,6 +112,8 @@ def recalibrate(
             write_json(json_path, {"job": job.id})
             click.echo(job.id)
             return
+        told = "the service is told to stop, and keeps the model that it has"
+        click.get_current_context().meta[RESUME_KEY] = told
         result = _remote(target, tls, recording, pages, send, wait_s)
     else:
         if send or detach:
