@@ -34,7 +34,7 @@ def profile() -> None:
 @click.option("--like", default="bench", show_default=True, metavar="P", help="Whose numbers it starts with.")
 @click.option("--force", is_flag=True, help="Overwrite a file that is there.")
 def new(out: Path, like: str, force: bool) -> None:
-    """Write a profile with every key, what it means and which values it may have."""
+    """Write a profile with every key and its meaning."""
     if out.exists() and not force:
         raise InvalidInputError(f"--out {out}", "a file that exists", "a new name, or --force")
     replace_text(out, commented_toml(load_profile(like)), "profile")

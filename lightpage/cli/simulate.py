@@ -92,8 +92,9 @@ def simulate(
             raise InvalidInputError("options", "no --profile", "one, or --symbols with pages that carry it")
         device = _true_device(profile, device_file, settings)
         job = RecordingJob(profile, device, many, seed, truth, out, written, compute)
-        job.claim(force)
         count = pages or len(written or ())
+        job.check_room(count)
+        job.claim(force)
         job.run(count)
     made = {"recording": str(out), "pages": count, "levels": many, "seed": seed, "profile": profile.name}
     write_json(json_path, made)

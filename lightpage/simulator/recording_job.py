@@ -90,9 +90,7 @@ class RecordingJob:
         Raises:
             InvalidInputError: more pages are there already.
             RecordingError: the file cannot be written.
-            NoRoomError: the disk has no room for the pages.
         """
-        self._check_room(pages)
         simulator = self._simulator
         bits = self.device.sensor.bit_depth
         code = None if self._written is None else self._written.code
@@ -109,7 +107,7 @@ class RecordingJob:
                 self._append(writer, simulator, page)
         drop_claim(self.out)
 
-    def _check_room(self, pages: int) -> None:
+    def check_room(self, pages: int) -> None:
         """Check that the frames of so many pages have room on the disk, but for those that are there already.
 
         Raises:
