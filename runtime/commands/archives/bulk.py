@@ -109,7 +109,7 @@ def decode(**asked: Any) -> None:
 @click.option("--volume", metavar="ID[:CHECKSUM]", help="Write the file of this volume alone.")
 @click.option("--holes", is_flag=True, help="Where data are lost, write FILE.holes with zeros in their place.")
 def recover(code_path: Path | None, volume: str | None, holes: bool, **asked: Any) -> None:
-    """Read the files back whose pages recordings show; the pages of a file may be in several recordings."""
+    """Read files back. Pages of a file may be in several recordings."""
     code = None if code_path is None else load_code(code_path)
     _bulk(Operation.RECOVER, code=code, wanted=Wanted(*parse_volume(volume), holes), **asked)
 
@@ -118,7 +118,7 @@ def recover(code_path: Path | None, volume: str | None, holes: bool, **asked: An
 @_options
 @_pages_options
 def evaluate(**asked: Any) -> None:
-    """Measure bundles on the pages of recordings that they have not seen."""
+    """Measure bundles on pages that they have not seen."""
     _bulk(Operation.EVALUATE, **asked)
 
 
@@ -131,7 +131,7 @@ def evaluate(**asked: Any) -> None:
 @_tuning("synthetic_pages", click.IntRange(0), "pages to simulate after drifts, trained on too")
 @_tuning("seed", click.IntRange(0), "seed of batches and rotations")
 def recalibrate(pages: int | None, deep: bool, fleet: Path | None, **asked: Any) -> None:
-    """Recalibrate devices, each from recordings of its own; the new bundles are in OUT."""
+    """Recalibrate devices. Each has recordings of its own; the new bundles are in OUT."""
     given = {name: value for name in FineTuning.model_fields if (value := asked.pop(name)) is not None}
     if given and not deep:
         flag = f"--{next(iter(given)).replace('_', '-')}"

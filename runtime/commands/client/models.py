@@ -46,7 +46,7 @@ def list_models(client: LightpageClient, json_path: Path | None, stored: bool = 
 @JSON
 @click.pass_obj
 def upload(client: LightpageClient, bundle: Path, json_path: Path | None) -> None:
-    """Give the service a bundle, a .zip; `activate` puts it in service."""
+    """Give the service a bundle, a .zip. `activate` puts it in service."""
     model = client.models.upload(bundle)
     write_json(json_path, asdict(model))
     click.echo(f"{model.version} is in the store")
@@ -76,7 +76,7 @@ def forward(client: LightpageClient, expect: str, json_path: Path | None) -> Non
 @JSON
 @click.pass_obj
 def pin(client: LightpageClient, version: str, json_path: Path | None) -> None:
-    """See that a model is never deleted, and not replaced by the service itself."""
+    """Keep a model from being deleted. The service does not replace it by itself either."""
     model = client.models.pin(version)
     write_json(json_path, asdict(model))
     click.echo(_line(model))
