@@ -112,8 +112,7 @@ def recalibrate(
             write_json(json_path, {"job": job.id})
             click.echo(job.id)
             return
-        told = "the service is told to stop, and keeps the model that it has"
-        click.get_current_context().meta[RESUME_KEY] = told
+        click.get_current_context().meta[RESUME_KEY] = "the service is told to stop, and keeps its model"
         result = _remote(target, tls, recording, pages, send, wait_s)
     else:
         if send or detach:
