@@ -2,8 +2,8 @@
 
     python release/build_site.py
 
-What the code lists is written here and kept nowhere else: commands with their options, settings, metrics, alerts, keys of
-profiles and of camera files, calls of the service, and names of the Python package. A broken link ends the build.
+What the code lists is written here and kept nowhere else: commands with their options, settings, metrics, alerts, keys
+of profiles and of camera files, calls of the service, and names of the Python package. A broken link ends the build.
 """
 
 from __future__ import annotations
