@@ -132,7 +132,7 @@ MADE: dict[str, tuple[str, int, Callable[[Path], object]]] = {
     "deep.toml": ("recursion", 2, lambda path: path.write_text("a = " + "[" * 100_000)),
     "deep.json": ("recursion", 2, lambda path: path.write_text("[" * 100_000)),
     "pipe": ("a pipe", 2, os.mkfifo),
-    "loop": ("Too many levels", 2, lambda path: path.symlink_to(path.name)),
+    "loop": ("too many levels", 2, lambda path: path.symlink_to(path.name)),
     "folders": ("inner", 2, folder_loop),
     "new\nline": ("new\\nline", 2, lambda path: path.write_bytes(b"\0\1\2")),
     "zero": ("a device", 2, lambda path: path.symlink_to("/dev/zero")),
