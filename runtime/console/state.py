@@ -18,7 +18,7 @@ POINTS = 600
 RECENT = 50
 """Pages in the table."""
 _IDLE_S = 30.0
-_SERIES = [figure.name for figure in fields(PageRow) if figure.type == "float | None"]
+_SERIES = [figure.name for figure in fields(PageRow) if figure.type == float | None]
 
 
 class ConsoleState:

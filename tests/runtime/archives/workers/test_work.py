@@ -72,7 +72,7 @@ def test_a_range_is_read_in_batches_of_the_size_that_is_asked_for(asked: Callabl
     monkeypatch.setattr(Decoder, "load", opened := Mock(wraps=Decoder.load))
     choices = Choices(operation=Operation.DECODE, tracking=False, batches=4)
     assert isinstance(Worker(1).work(asked(choices=choices)), Done)
-    assert opened.call_args.args[-1].largest == 4
+    assert opened.call_args.args[-2].largest == 4
 
 
 @pytest.mark.parametrize("operation", OPERATIONS)
