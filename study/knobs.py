@@ -38,7 +38,8 @@ class Knob:
 
     def turned(self, device: Device, value: float) -> Device:
         """Return the device with this knob at a value."""
-        return device.with_values({key: factor * value for key, factor in self.settings.items()})
+        values = {key: float(factor * value) for key, factor in self.settings.items()}
+        return device.with_values({key: int(one) if one.is_integer() else one for key, one in values.items()})
 
     def at(self, device: Device) -> float:
         """Return the number that a device has, by the first of the settings."""

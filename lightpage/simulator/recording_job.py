@@ -117,7 +117,10 @@ class RecordingJob:
         partial = partial_path(self.out)
         with os_errors(f"--out {self.out}", "a folder"):
             there = partial.stat().st_size if partial.exists() else 0
-            free = shutil.disk_usage(self.out.absolute().parent).free
+            try:
+                free = shutil.disk_usage(self.out.absolute().parent).free
+            except AttributeError:  # a system without the call
+                return
         if (needed := 2 * frame * pages - there) > free:
             told = counted(pages, "page")
             raise NoRoomError(f"--out {self.out}", f"{free / 1e9:.3g} GB free", f"{needed / 1e9:.3g} GB for {told}")

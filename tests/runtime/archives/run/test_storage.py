@@ -66,7 +66,7 @@ def test_faults_of_the_disk_below_hdf5_are_understood(archive: Archive) -> None:
     assert [(each["pages_lost"], each["pages_read"]) for each in told] == [(0, PAGES), (0, PAGES), (0, 2 * PAGES)]
     opened, read = (each["this_run"]["problems"][0] for each in told[:2])
     assert "nput/output error" in opened
-    assert "Input/output error" in read
+    assert "input/output error" in read
     assert [each["pages_missing"] for each in told] == [0, PAGES, 0]  # a recording that was not opened has none
 
 

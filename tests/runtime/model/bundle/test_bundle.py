@@ -81,7 +81,7 @@ def test_a_flipped_byte_anywhere_in_a_zip_is_refused_or_changes_nothing(toy_zip:
 
 def test_what_is_no_whole_zip_is_refused(toy_zip: Path, tmp_path: Path) -> None:
     data, path = toy_zip.read_bytes(), tmp_path / "cut.zip"
-    with pytest.raises(BundleError, match="nothing"):
+    with pytest.raises(BundleError, match="no such file"):
         Bundle.open(path)
     for content in (b"", data[: len(data) // 2], data[:-1], b"PK\x03\x04 but no more"):
         path.write_bytes(content)

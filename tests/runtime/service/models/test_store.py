@@ -472,7 +472,7 @@ def test_a_store_that_cannot_be_written_is_noticed_and_nothing_changes(
         for change in (models.rollback, lambda: models.pin("toy-1", True), lambda: models.activate("toy-1")):
             with pytest.raises(StoreError, match="model store"):
                 change()
-        assert "Read-only" in trouble(worn)
+        assert "read-only" in trouble(worn)
         assert figure(worn, "lightpage_store_trouble", reason="read_only") == 1
     assert models.current.version == "toy-1+r3"
     assert not models.now.state.known("toy-1").pinned
@@ -510,7 +510,7 @@ def test_the_store_is_tried_now_and_then_and_not_whenever_somebody_asks(
     clock.advance(PROBE_S - 0.1)
     assert trouble(plane) == ""
     clock.advance(0.1)
-    assert "Read-only" in trouble(plane)
+    assert "read-only" in trouble(plane)
 
 
 def test_a_service_without_a_store_has_no_trouble_and_shows_none(decoder: Decoder) -> None:
