@@ -77,7 +77,7 @@ class RecoveredPage:
 
 @dataclass
 class Healings:
-    """What healings have come to, for pages of the same device that are read later.
+    """Outcome of healings, for pages of the same device that are read later.
 
     Attributes:
         model: decoder of the last healed model and its tracker; None for the bundle's own.
