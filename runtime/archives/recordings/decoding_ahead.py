@@ -17,7 +17,7 @@ from lightpage.runtime.model.decoding.turns import Turn
 from lightpage.runtime.model.execution.cpus import available_cpus
 
 _READERS = 4
-"""Threads that read pages for batches: one reads some 100 full-size pages a second out of the page cache."""
+"""Threads that read pages for batches. The number is a guess: nothing was timed on an idle machine."""
 
 T = TypeVar("T")
 Symbols = NDArray[np.uint8] | None
