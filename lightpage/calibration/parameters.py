@@ -82,6 +82,10 @@ KNOWN = (NAMES.index("modulator_axial_rad"), NAMES.index("modulator_axial_x_rad"
 """Counts of parameters that twins know: those of bundles of before, which took planes for those of the profile, or knew
 their axial places alone; all."""
 PRIORS: Real = np.array([p.prior for p in PARAMETERS])
+_STEPS = {"axial": 1e-2, "tilt": 0.1}
+STEPS: Real = PRIORS * [_STEPS.get(p.group, 3e-3) for p in PARAMETERS]
+"""Steps of finite differences of the light: long enough for what rounding adds, though a plane's tilt changes little,
+and short enough for the light to be straight along them."""
 
 
 def nominal() -> Real:

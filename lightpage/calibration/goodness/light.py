@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.goodness.frame_noise import with_more_noise
 from lightpage.calibration.interfaces import Twin
-from lightpage.calibration.parameters import PARAMETERS, PRIORS, SEEN_BY_CAMERAS
+from lightpage.calibration.parameters import PARAMETERS, SEEN_BY_CAMERAS, STEPS
 from lightpage.calibration.samplers import smooth_reference
 from lightpage.calibration.waves.wave_fit import READ_NOISE
 from lightpage.calibration.waves.wave_model import FittedWaves, illumination_terms, on_modulator
@@ -30,8 +30,6 @@ _STRIDE, _ACCURACY = 4, 3 / 8
 """Samples of the common grid from one to the next, and share of the splitting steps, for corrections of the model: few
 unknowns need few equations."""
 _EVERY = (slice(None, None, _STRIDE), slice(None, None, _STRIDE))
-_DIFFERENCE = 1e-2
-"""Finite difference of the derivatives, in standard deviations of the priors."""
 _LOSSES = (1, 2)
 """Powers of R^2 in the light that is lost towards the edges of the entrance facet."""
 
@@ -147,7 +145,7 @@ class SeenLight:
         places = np.stack(np.meshgrid(self._grid.x_m, self._grid.y_m), axis=-1)[_EVERY]
         for index in range(min(self._twin.known, len(PARAMETERS))):
             moved = self._device.parameters.copy()
-            moved[index] += _DIFFERENCE * PRIORS[index]
+            moved[index] += STEPS[index]
             if index in SEEN_BY_CAMERAS:
                 at = _rows_and_columns(self._twin.pixels(moved, places.reshape(-1, 2)).reshape(2, *places.shape))
                 yield self.equations(

@@ -210,10 +210,10 @@ def test_where_only_the_image_has_moved_a_last_fit_that_fails_takes_no_page_away
     moved = ["--set", "in_phase_camera.shift_y_px=-1", "--set", "quadrature_camera.shift_y_px=4"]
     run(simulate, *small_device[:2], "--symbols", drifted / "pages.h5", *moved, "--seed", 6, "--out", drifted / "M.h5")
     with Recording.open(drifted / "M.h5") as recording:
-        lost = LostPages(tuple(map(recording.frames, range(2))), CODE, references=recording.references())
+        lost = LostPages(tuple(map(recording.frames, range(4))), CODE, references=recording.references())
     fails = Mock(side_effect=CalibrationError("re-fit", "nothing", "a geometry"))
     healed = heal(Decoder.load(small_bundle, threads=1), lost, fit=fails)
-    assert (healed.rounds, len(healed.known.pairs)) == (0, 2)
+    assert (healed.rounds, len(healed.known.pairs)) == (0, 4)
     assert healed.result.report.goodness == healed.decoder.bundle.calibration.goodness is not None
 
 
