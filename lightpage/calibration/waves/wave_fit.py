@@ -312,11 +312,14 @@ class WaveFit:
             progress(number / len(of_light))
             there, step = stepped(index)
             moved = waves(there, here)
+            seen: Complex
             if index in _AT_CAMERA:
-                changed = field * (moved.against_reference / here.against_reference)
+                seen = field * (moved.against_reference / here.against_reference)
+            elif index in _BEHIND_PIPE:
+                seen = moved.from_exit(leaving)
             else:
-                changed = moved.from_exit(leaving) if index in _BEHIND_PIPE else moved.to_cameras(page)
-            light.append((changed - field) / step)
+                seen = moved.to_cameras(page)
+            light.append((seen - field) / step)
         for there, step in map(stepped, of_cameras):
             moved_px = (self._pixels(there) - self._pixels(state.parameters)) / step
             places.append(moved_px @ self._samples_per_pixel(state.parameters)[:, None])
