@@ -50,6 +50,9 @@ TOGETHER = 6
 MOST_ROUNDS = 5
 """The bench device comes right in one to three, half a degree of the pipe's angle away in four."""
 
+_IN_VAIN = 2
+"""Times that a page claims enough and no checksum holds, after which no more is won: its bits are those of no page."""
+
 _AROUND_PX = np.array([(x, y) for x in (-20.0, 0.0, 20.0) for y in (-20.0, 0.0, 20.0)])
 """Where the image is looked for, beside where it was last seen: it is found within some thirty pixels."""
 
@@ -120,10 +123,12 @@ def heal(
     start = time.perf_counter()
     with raised_as(RecalibrationRefusedError, CalibrationError, FrameError, InvalidInputError, PageError):
         work = _Healing(decoder, pages, OnnxTwin(decoder.bundle) if twin is None else twin)
-        model, rounds = work.model, 0
+        model, rounds, in_vain = work.model, 0, 0
         while (known := work.known(model)) is None:
-            if rounds == MOST_ROUNDS:
-                raise RecalibrationRefusedError("healing", work.unread(model), _WANTED)
+            in_vain += not work.lacking(model)
+            if rounds == MOST_ROUNDS or in_vain == _IN_VAIN:
+                told = f"{len(work.pairs)} pages of which none is read after {rounds} rounds; {work.unread(model)}"
+                raise RecalibrationRefusedError("healing", told, _WANTED)
             rounds += 1
             model = work.fitted(model, partial(_within, progress, rounds))
         told = partial(_within, progress, MOST_ROUNDS + 1)
@@ -214,9 +219,7 @@ class _Healing:
         told = sum(check.confirmed_bits * np.log(2) * check.pilots - check.gained_nats for check in checks)
         if told >= LEAST_CONFIRMED_NATS:
             return ImagePosition(0.0, 0.0, searched=True, found=False)
-        got = (
-            f"{len(self.pairs)} pages that do not show this device's pilots ({told:.1f} of {LEAST_CONFIRMED_NATS} nats)"
-        )
+        got = f"{len(self.pairs)} pages without this device's pilots ({told:.1f} of {LEAST_CONFIRMED_NATS} nats)"
         raise RecalibrationRefusedError("healing", got, _WANTED)
 
     def _with(self, calibration: Calibration) -> tuple[Decoder, RefitResult]:
@@ -232,16 +235,17 @@ class _Healing:
         """Return how many pages a model reads."""
         return sum(page.loss is None for page in self._read(model))
 
+    def lacking(self, model: _Model) -> float:
+        """Return how much the page lacks by its own claims that is nearest to being read, hundredths of a bit a symbol."""
+        return round(max(0.0, min(-page.margin_bits for page in self._read(model))), 2)
+
     def unread(self, model: _Model) -> str:
-        """Return that no page is read, and how far the one is from it that is nearest."""
-        pages = self._read(model)
-        lacking = max(0.0, min(-page.margin_bits for page in pages))
-        told = f"the nearest lacks {lacking:.2f} bit a symbol by its own claims"
-        if lacking < 0.005:
-            told = "one claims enough, and no checksum holds"
-        if decoded := sum(page.loss is Loss.CHECKSUM for page in pages):
-            told = f"{decoded} fail in bits that their LDPC blocks, which all converge, leave out"
-        return f"{len(pages)} pages of which none is read after {MOST_ROUNDS} rounds; {told}"
+        """Return how far the page that is nearest is from being read."""
+        if decoded := sum(page.loss is Loss.CHECKSUM for page in self._read(model)):
+            return f"{decoded} fail in bits that their LDPC blocks, which all converge, leave out"
+        lacking = self.lacking(model)
+        told = f"the nearest lacks {lacking} bit a symbol by its own claims"
+        return told if lacking else "one claims enough, and no checksum holds"
 
     def known(self, model: _Model) -> KnownPages | None:
         """The pages that come right, the fitted ones first, then by what they have to spare; None if none does."""
