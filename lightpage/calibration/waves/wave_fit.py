@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import scipy
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.parameters import NAMES, PARAMETERS, PRIORS, SEEN_BY_CAMERAS, STEPS, indices
 from lightpage.calibration.samplers import smooth_reference
-from lightpage.calibration.waves.wave_model import FittedWaves, illumination_terms, on_modulator
+from lightpage.calibration.waves.wave_model import FittedWaves, Lit, illumination_terms, on_modulator
 from lightpage.device.profile import Profile
 from lightpage.page import modulation as modulations
 from lightpage.page.modulation import NOMINAL, Modulation
@@ -55,6 +55,8 @@ _INSIDE = 0.98
 """Share of the page's image that is compared, to either side."""
 _CHORD_SAMPLES = 2
 """Samples a symbol and axis for it: half as many as usual leave an error of 0.3% in the light."""
+_USUAL_BLUR, _BLUR_PRIOR, _BLUR_STEP = 0.1, 0.5, 0.01
+"""Variance of the modulator's blur to start from, its standard deviation about 0, and its finite difference."""
 _CAMERAS = ("in_phase", "quadrature")
 _AT_CAMERA = frozenset(indices("camera_phase"))
 """Parameters whose change of the light needs no propagation."""
@@ -78,7 +80,7 @@ class WaveFitted:
         modulation: light that the modulator makes of its levels; the prior's centre where a page does not tell it from
             that.
         modulation_deviations: standard deviations of its coefficients, zero where held.
-        illumination: coefficients [T] of the terms of the page's illumination.
+        lit: the page's illumination and blur.
         quadrature_deviation: standard deviation of the angle between the arms, radians.
     """
 
@@ -88,7 +90,7 @@ class WaveFitted:
     residual: float
     modulation: Modulation = NOMINAL
     modulation_deviations: tuple[float, ...] = (0.0,) * len(modulations.NAMES)
-    illumination: Complex | None = None
+    lit: Lit | None = None
     quadrature_deviation: float | None = None
 
 
@@ -112,12 +114,14 @@ class _State(NamedTuple):
         quadrature_phase: angle between the arms, radians.
         light: coefficients [T] of the illumination's terms.
         levels: coefficients of the modulation.
+        blur: of the modulator, as for `FittedWaves`.
     """
 
     parameters: Real
     quadrature_phase: float
     light: Complex
     levels: Real
+    blur: float
 
 
 class _Slopes(NamedTuple):
@@ -125,6 +129,7 @@ class _Slopes(NamedTuple):
 
     Attributes:
         by_term: derivatives of the light by the illumination's terms, [T, 2, ...].
+        by_blur: derivative of the light by the blur, [2, ...].
         by_level: derivatives of the light by the terms of the modulation's logarithm, [K, 2, ...]; none where it is
             held.
         of_light: derivatives of the light by parameters that change it, [2, ...] each.
@@ -133,6 +138,7 @@ class _Slopes(NamedTuple):
     """
 
     by_term: Complex
+    by_blur: Complex
     by_level: list[Complex]
     of_light: list[Complex]
     of_cameras: list[Real]
@@ -141,8 +147,8 @@ class _Slopes(NamedTuple):
 class WaveFit:
     """Least squares of two frames against the waves of the page that they show.
 
-    Unknown are, beside the parameters asked for, the page's illumination (a quadratic over the page) and the angle
-    between the arms.
+    Unknown are, beside the parameters asked for, the page's illumination (a quadratic over the page), the modulator's
+    blur, and the angle between the arms. Without blur, light that is even over the page would seem too bright.
 
     Args:
         twin: ray tracer of the nominal device, for the cameras' poses.
@@ -157,7 +163,7 @@ class WaveFit:
         self._twin, self._profile, self._symbols = twin, profile, symbols.size
         self._samples = symbol_samples(profile)
         self._phases = np.mod(np.angle(symbols), 2 * np.pi)
-        waves = self._waves(np.zeros(len(PARAMETERS)))
+        waves = FittedWaves(profile, np.zeros(len(PARAMETERS)), self._samples)
         self._terms = np.stack(illumination_terms(waves.x, waves.y))
         grid = field_grid(profile)
         self._beside = grid.pitch_m * np.array([[0, 0], [1, 0], [0, 1]])
@@ -226,12 +232,13 @@ class WaveFit:
             others = columns.shape[1] - len(free)
             fitted_levels = slice(others - (len(modulations.NAMES) if levels else 0), others)
             prior = np.zeros(columns.shape[1])
-            prior[others:] = precision
+            prior[others:], prior[len(directions) + 1] = precision, 1 / _BLUR_PRIOR**2
             if levels:
                 prior[fitted_levels] = 1 / levels.deviations**2
             information = columns.T @ columns / variance + np.diag(prior)
             pull = columns.T @ left / variance
             pull[others:] -= precision * (state.parameters[free] - centre[free])
+            pull[len(directions) + 1] -= state.blur / _BLUR_PRIOR**2
             if levels:
                 pull[fitted_levels] -= prior[fitted_levels] * (state.levels - levels.centre.coefficients)
             covariance = _inverse(information)
@@ -245,14 +252,11 @@ class WaveFit:
                 residual,
                 Modulation(tuple(state.levels.tolist())),
                 tuple(known[fitted_levels].tolist()) if levels else best.modulation_deviations,
-                state.light,
+                Lit(state.light, state.blur),
                 float(known[len(directions)]),
             )
             state = self._moved(state, covariance @ pull, directions, fitted_levels, free, bends=bends)
         return best if levels is None else _told_apart(best, levels.centre)
-
-    def _waves(self, parameters: Real) -> FittedWaves:
-        return FittedWaves(self._profile, parameters, self._samples, filled=True)
 
     def _page(self, levels: Real, samples: int) -> Complex:
         """Return the light on the modulator under even illumination, complex [ny samples, nx samples].
@@ -265,13 +269,14 @@ class WaveFit:
     def _light(self, state: _State) -> Complex:
         """The page's light on the common grid, as either camera sees it, [2, Gy, Gx]."""
         lit = self._page(state.levels, self._samples) * np.tensordot(state.light, self._terms, 1)
-        return self._waves(state.parameters).to_cameras(lit)
+        waves = FittedWaves(self._profile, state.parameters, self._samples, filled=True, blur=state.blur)
+        return waves.to_cameras(lit)
 
     def _start(self, parameters: Real, quadrature_phase: float, modulation: Modulation) -> _State:
         """Return the state to start from: the given values, and the even illumination that fits best."""
         chosen, counts, amplitude = self._look(parameters)
         even = np.eye(1, len(self._terms), dtype=np.complex128)[0]
-        state = _State(parameters, quadrature_phase, even, np.array(modulation.coefficients))
+        state = _State(parameters, quadrature_phase, even, np.array(modulation.coefficients), _USUAL_BLUR)
         here = [field[self._every][chosen] / amplitude for field in self._light(state)]
         arms = (0.0, quadrature_phase)
         columns = np.concatenate([field * np.exp(-1j * arm) for field, arm in zip(here, arms, strict=True)])
@@ -289,11 +294,9 @@ class WaveFit:
     ) -> _Slopes:
         samples = min(_CHORD_SAMPLES, self._samples)
 
-        def waves(parameters: Real, like: FittedWaves | None = None) -> FittedWaves:
-            stride, accuracy = self._stride, _CHORD_ACCURACY
-            return FittedWaves(
-                self._profile, parameters, samples, filled=True, stride=stride, accuracy=accuracy, like=like
-            )
+        def waves(parameters: Real, like: FittedWaves | None = None, blur: float = state.blur) -> FittedWaves:
+            how: dict[str, Any] = {"stride": self._stride, "accuracy": _CHORD_ACCURACY, "like": like, "blur": blur}
+            return FittedWaves(self._profile, parameters, samples, filled=True, **how)
 
         def stepped(index: int) -> tuple[Real, float]:
             there = state.parameters.copy()
@@ -305,6 +308,7 @@ class WaveFit:
         by_term = np.stack([here.to_cameras(even * term) for term in terms])
         page, field = even * np.tensordot(state.light, terms, 1), np.tensordot(state.light, by_term, 1)
         leaving = here.to_exit(page)
+        by_blur = (waves(state.parameters, blur=state.blur + _BLUR_STEP).to_cameras(page) - field) / _BLUR_STEP
         functions = [on_modulator(one, samples) for one in modulations.basis(self._phases)] if levels else []
         by_level = [here.to_cameras(page * one) for one in functions]
         light, places = list[Complex](), list[Real]()
@@ -323,7 +327,7 @@ class WaveFit:
         for there, step in map(stepped, of_cameras):
             moved_px = (self._pixels(there) - self._pixels(state.parameters)) / step
             places.append(moved_px @ self._samples_per_pixel(state.parameters)[:, None])
-        return _Slopes(by_term, by_level, light, places)
+        return _Slopes(by_term, by_blur, by_level, light, places)
 
     def _samples_per_pixel(self, parameters: Real) -> Real:
         """Grid samples (x, y) for a pixel along (column, row) of either camera, [2, 2, 2]."""
@@ -361,7 +365,7 @@ class WaveFit:
     def _columns(self, state: _State, fields: Complex, slopes: _Slopes, directions: Complex) -> Real:
         """Derivatives of the equations of `_left`, [2 N, K].
 
-        Columns are those of the illumination's `directions`, the turn, the modulation's coefficients, and the
+        Columns are those of the illumination's `directions`, the turn, the blur, the modulation's coefficients, and the
         parameters of `slopes`.
         """
         chosen, _, amplitude = self._look(state.parameters)
@@ -370,7 +374,8 @@ class WaveFit:
             return np.asarray(field[chosen] / amplitude)
 
         of_phase, of_amplitude = [1j * each for each in slopes.by_level], slopes.by_level[1:]
-        changes = [*np.tensordot(directions, slopes.by_term, 1), *of_phase, *of_amplitude, *slopes.of_light]
+        by_light = *np.tensordot(directions, slopes.by_term, 1), slopes.by_blur
+        changes = [*by_light, *of_phase, *of_amplitude, *slopes.of_light]
         moves = [places[:, chosen] for places in slopes.of_cameras]
         columns = []
         for camera, arm in enumerate((0.0, state.quadrature_phase)):
@@ -402,6 +407,7 @@ class WaveFit:
             state.quadrature_phase + share * float(step[len(directions)]),
             light if bends else _of_one_phase(light),
             state.levels + share * by_level,
+            max(0.0, state.blur + share * float(step[len(directions) + 1])),
         )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +88,18 @@ def _ramp(value: Mapping[str, Any], geometry: WaveGeometry, x_m: Any, y_m: Any) 
     return per_metre * (value["pipe_centre_x_m"] * x_m + value["pipe_centre_y_m"] * y_m)
 
 
+class Lit(NamedTuple):
+    """What a page's light depends on, beside its symbols, modulation and geometry.
+
+    Attributes:
+        illumination: coefficients [T] of `illumination_terms`.
+        blur: as for `FittedWaves`.
+    """
+
+    illumination: Complex
+    blur: float
+
+
 class FittedWaves:
     """Modulator to common grid and back, with fitted geometry and smooth phases.
 
@@ -101,6 +113,7 @@ class FittedWaves:
         grid: the common grid, where it is not the usual one.
         like: waves whose work is shared where geometry and sampling are the same.
         changed: fields of the geometry that are not as fitted, by name.
+        blur: variance of the modulator's blur, over the square of its pixels' pitch.
 
     Attributes:
         x, y: places of the modulator's samples over the page's half width and half height, [nx samples], [ny samples].
@@ -121,6 +134,7 @@ class FittedWaves:
         grid: FieldGrid | None = None,
         like: FittedWaves | None = None,
         changed: Mapping[str, Any] | None = None,
+        blur: float = 0.0,
     ) -> None:
         value = as_dict(parameters)
         geometry = replace(fitted_geometry(profile, value), **(changed or {}))
@@ -139,6 +153,7 @@ class FittedWaves:
             stride,
             accuracy,
             grid.shape,
+            blur,
         )
         self.channel: WaveChannel
         if like is not None and like._sampling == self._sampling:
@@ -152,6 +167,7 @@ class FittedWaves:
                 cells=cells_for(geometry, *page, float(grid.x_m[-1]), float(grid.y_m[-1])),
                 steps=splitting_steps(profile, accuracy),
                 envelope_m=pitch if filled else 0.0,
+                blur_m=float(np.sqrt(blur)) * profile.slm.pitch_m,
             )
         at_launch = fitted_launch_phase(profile, value, geometry, x[None, :], y[:, None])
         at_camera = fitted_camera_phase(profile, value, geometry, grid_x[None, :], grid_y[:, None])

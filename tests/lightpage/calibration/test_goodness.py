@@ -45,13 +45,13 @@ def goodness_of(*settings: str, wrong_symbols: float = 0.0, stated: float = 1.0)
         modulation=known.modulation,
         levels=LevelPrior(),
     )
-    assert lit.illumination is not None
+    assert lit.lit is not None
     pipe, parameters = PROFILE.pipe, known.parameters.copy()
     profile = PROFILE.model_copy(update={"pipe": pipe.model_copy(update={"length_m": stated * pipe.length_m})})
     length = NAMES.index("pipe_length_relative")
     parameters[length] = (1 + parameters[length]) / stated - 1
     fitted = replace(known, profile=profile, parameters=parameters, modulation=lit.modulation)
-    return measure_goodness(TWIN, fitted, lit.illumination, pair, told)
+    return measure_goodness(TWIN, fitted, lit.lit, pair, told)
 
 
 @pytest.mark.parametrize("settings", [(), ("slm.phase_noise_rad=0.3",), ("sensor.full_well_e=1000", "slm.blur_px=0.5")])

@@ -150,8 +150,10 @@ def test_a_nominal_modulator_stays_nominal_and_axial_places_and_tilts_are_found_
     found = seen_by(device, 5).fit(start, device.homodyne.turn_rad, EVERY, levels=LevelPrior())
     assert found.modulation is NOMINAL
     assert all(found.modulation_deviations)
-    assert found.illumination is not None
-    assert np.abs((found.illumination / found.illumination[0]).imag).max() < 1e-9  # the launch alone bends phases
+    assert found.lit is not None
+    assert (
+        np.abs((found.lit.illumination / found.lit.illumination[0]).imag).max() < 1e-9
+    )  # the launch alone bends phases
     off = ((found.parameters - truth) / np.maximum(found.deviations, 1e-12))[axial]
     assert np.sqrt(np.mean(off**2)) < 2
     assert np.rad2deg(abs(found.quadrature_phase - device.homodyne.turn_rad)) < 0.3

@@ -207,7 +207,7 @@ def test_a_healed_model_has_a_verdict_and_is_not_written_where_it_is_wrong(small
 def test_where_only_the_image_has_moved_a_last_fit_that_fails_takes_no_page_away(
     small_bundle: Path, small_device: list[str], drifted: Path
 ) -> None:
-    moved = ["--set", "in_phase_camera.shift_y_px=-1", "--set", "quadrature_camera.shift_y_px=4"]
+    moved = ["--set", "in_phase_camera.shift_y_px=-2", "--set", "quadrature_camera.shift_y_px=3"]
     run(simulate, *small_device[:2], "--symbols", drifted / "pages.h5", *moved, "--seed", 6, "--out", drifted / "M.h5")
     with Recording.open(drifted / "M.h5") as recording:
         lost = LostPages(tuple(map(recording.frames, range(4))), CODE, references=recording.references())
