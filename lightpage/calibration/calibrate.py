@@ -324,7 +324,7 @@ def goodness_of(
     fit = WaveFit(twin, device.profile, page.pair, device.references, page.symbols)
     turn, levels = device.quadrature_phase_rad, device.modulation
     found = fit.fit(start, turn, group, start, _HELD, progress, levels, rough=True)
-    if found.lit is None:
+    if not np.isfinite(found.residual):
         raise CalibrationError("calibration, verdict", "no light of a page", "some")
     return measure_goodness(twin, device, found.lit, page.pair, page.symbols, progress)
 

@@ -127,8 +127,8 @@ def heal(
         while (known := work.known(model)) is None:
             in_vain += not work.lacking(model)
             if rounds == MOST_ROUNDS or in_vain == _IN_VAIN:
-                told = f"{len(work.pairs)} pages of which none is read after {rounds} rounds; {work.unread(model)}"
-                raise RecalibrationRefusedError("healing", told, _WANTED)
+                got = f"{len(work.pairs)} pages of which none is read after {rounds} rounds; {work.unread(model)}"
+                raise RecalibrationRefusedError("healing", got, _WANTED)
             rounds += 1
             model = work.fitted(model, partial(_within, progress, rounds))
         told = partial(_within, progress, MOST_ROUNDS + 1)
@@ -236,7 +236,7 @@ class _Healing:
         return sum(page.loss is None for page in self._read(model))
 
     def lacking(self, model: _Model) -> float:
-        """Return how much the page lacks by its own claims that is nearest to being read, hundredths of a bit a symbol."""
+        """Return what the page that is nearest to being read lacks by its own claims, bits a symbol to two digits."""
         return round(max(0.0, min(-page.margin_bits for page in self._read(model))), 2)
 
     def unread(self, model: _Model) -> str:

@@ -77,10 +77,10 @@ class WaveFitted:
         quadrature_phase: angle between the homodyne arms, radians.
         residual: root mean square of what is left of the equations, in standard deviations of the reference's noise
             times an unknown factor: it says which of two fits is better.
+        lit: the page's illumination and blur.
         modulation: light that the modulator makes of its levels; the prior's centre where a page does not tell it from
             that.
         modulation_deviations: standard deviations of its coefficients, zero where held.
-        lit: the page's illumination and blur.
         quadrature_deviation: standard deviation of the angle between the arms, radians.
     """
 
@@ -88,9 +88,9 @@ class WaveFitted:
     deviations: Real
     quadrature_phase: float
     residual: float
+    lit: Lit
     modulation: Modulation = NOMINAL
     modulation_deviations: tuple[float, ...] = (0.0,) * len(modulations.NAMES)
-    lit: Lit | None = None
     quadrature_deviation: float | None = None
 
 
@@ -214,7 +214,8 @@ class WaveFit:
         precision = 1 / (PRIORS * prior_scale)[free] ** 2
         centre = np.zeros(len(PARAMETERS)) if centre is None else centre
         state = self._start(start, quadrature_phase, modulation)
-        best = WaveFitted(start, np.zeros(len(PARAMETERS)), quadrature_phase, np.inf, modulation)
+        nothing, lit = np.zeros(len(PARAMETERS)), Lit(state.light, state.blur)
+        best = WaveFitted(start, nothing, quadrature_phase, np.inf, lit, modulation)
         slopes, taken_at = None, np.inf
         for number in range(ROUNDS):
             progress(number / ROUNDS)
@@ -250,9 +251,9 @@ class WaveFit:
                 deviations,
                 state.quadrature_phase,
                 residual,
+                Lit(state.light, state.blur),
                 Modulation(tuple(state.levels.tolist())),
                 tuple(known[fitted_levels].tolist()) if levels else best.modulation_deviations,
-                Lit(state.light, state.blur),
                 float(known[len(directions)]),
             )
             state = self._moved(state, covariance @ pull, directions, fitted_levels, free, bends=bends)

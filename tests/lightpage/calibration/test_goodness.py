@@ -45,7 +45,6 @@ def goodness_of(*settings: str, wrong_symbols: float = 0.0, stated: float = 1.0)
         modulation=known.modulation,
         levels=LevelPrior(),
     )
-    assert lit.lit is not None
     pipe, parameters = PROFILE.pipe, known.parameters.copy()
     profile = PROFILE.model_copy(update={"pipe": pipe.model_copy(update={"length_m": stated * pipe.length_m})})
     length = NAMES.index("pipe_length_relative")
