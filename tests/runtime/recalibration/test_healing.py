@@ -184,7 +184,7 @@ def test_pages_wait_for_others_and_for_twice_as_many_where_that_brought_none(
 def test_a_healed_model_has_a_verdict_and_is_not_written_where_it_is_wrong(small_bundle: Path, drifted: Path) -> None:
     decoder = Decoder.load(small_bundle, threads=1)
     with Recording.open(drifted / "R.h5") as recording:
-        lost = LostPages(tuple(map(recording.frames, range(2))), CODE, references=recording.references())
+        lost = LostPages(tuple(map(recording.frames, range(4))), CODE, references=recording.references())
     healed = heal(decoder, lost, fit=Mock(side_effect=CalibrationError("re-fit", "nothing", "a geometry")))
     found, report = healed.decoder.bundle.calibration, healed.result.report
     assert report.goodness == found.goodness is not None
