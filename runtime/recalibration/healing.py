@@ -48,7 +48,7 @@ TOGETHER = 6
 """Pages at most that one healing takes: the pilots of six show a smooth error as well as it can be shown."""
 
 MOST_ROUNDS = 5
-"""The bench device comes right in one to three, half a degree of the pipe's angle away in four."""
+"""The bench device comes right in one to three, as long as the pipe's angle is off by no more than 0.3 degree."""
 
 _IN_VAIN = 2
 """Times that a page claims enough and no checksum holds, after which no more is won: its bits are those of no page."""
