@@ -31,7 +31,7 @@ from lightpage.calibration.samplers import FieldSampler, FrameSampler
 from lightpage.calibration.sampling_table import cameras_apart, registration_coefficients, stand_apart
 from lightpage.calibration.waves.cameras_apart import related_apart
 from lightpage.calibration.waves.wave_fit import LevelPrior, WaveFit
-from lightpage.calibration.waves.wave_model import Lit
+from lightpage.calibration.waves.wave_model import LaunchConditions
 from lightpage.device.profile import Profile
 from lightpage.errors import CalibrationError
 from lightpage.page.modulation import DRIFTS, NOMINAL, Modulation
@@ -326,7 +326,7 @@ def goodness_of(
     found = fit.fit(start, turn, group, start, _HELD, progress, levels, rough=True)
     if not np.isfinite(found.residual):
         raise CalibrationError("calibration, verdict", "no light of a page", "some")
-    return measure_goodness(twin, device, found.lit, page.pair, page.symbols, progress)
+    return measure_goodness(twin, device, found.conditions, page.pair, page.symbols, progress)
 
 
 def least_coherence(symbols: int) -> float:
@@ -401,7 +401,7 @@ class _Registration:
         self.levels = LevelPrior()
         self.modulation, self.modulation_deviations = NOMINAL, NOMINAL.coefficients
         self.fit: PatchFit | None = None
-        self.lit: Lit | None = None
+        self.conditions: LaunchConditions | None = None
         self.total = 1
         self._stage, self._done, self._behind = "", 0, 0.0
         self._pixel = profile.image_pixel_m
@@ -520,7 +520,7 @@ class _Registration:
         self.parameters, self.deviations = found.parameters, found.deviations
         self.quadrature_phase, self.quadrature_deviation = found.quadrature_phase, found.quadrature_deviation
         self.modulation, self.modulation_deviations = found.modulation, found.modulation_deviations
-        self.lit = found.lit
+        self.conditions = found.conditions
 
     def result(self) -> Registered:
         """Judge the outcome."""
@@ -556,14 +556,14 @@ class _Registration:
 
     def _goodness(self) -> Goodness | None:
         """Verdict on the fit, by the light of the first page."""
-        if self.lit is None or self.rough:
+        if self.conditions is None or self.rough:
             return None
         self.begin("unexplained light")
         device = CalibratedDevice(
             self.profile, self.parameters, self.quadrature_phase, self.references, self.modulation
         )
         page = self.pages[0]
-        return measure_goodness(self.twin, device, self.lit, page.pair, page.symbols, self.tell)
+        return measure_goodness(self.twin, device, self.conditions, page.pair, page.symbols, self.tell)
 
     def _share(self, branch: str) -> float:
         """Share of the patches of a branch that the last stage found."""

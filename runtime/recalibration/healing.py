@@ -127,7 +127,7 @@ def heal(
         while (known := work.known(model)) is None:
             in_vain += not work.lacking(model)
             if rounds == MOST_ROUNDS or in_vain == _IN_VAIN:
-                got = f"{len(work.pairs)} pages of which none is read after {rounds} rounds; {work.unread(model)}"
+                got = f"{len(work.pairs)} pages of which none is read after round {rounds}; {work.unread(model)}"
                 raise RecalibrationRefusedError("healing", got, _WANTED)
             rounds += 1
             model = work.fitted(model, partial(_within, progress, rounds))

@@ -29,12 +29,7 @@ from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.evaluation import evaluate
 from lightpage.runtime.model.bundle.bundle import npz
 from lightpage.runtime.model.bundle.manifest import BATCH, CONSTANTS, GOLDEN
-from lightpage.runtime.model.decoding.batch_graph import (
-    REGISTRATION,
-    BatchGraph,
-    Constants,
-    with_proven_batches,
-)
+from lightpage.runtime.model.decoding.batch_graph import REGISTRATION, BatchGraph, Constants, with_proven_batches
 from lightpage.runtime.model.decoding.batches import Batches, Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for

@@ -16,7 +16,7 @@ from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.parameters import PARAMETERS, SEEN_BY_CAMERAS, STEPS
 from lightpage.calibration.samplers import smooth_reference
 from lightpage.calibration.waves.wave_fit import READ_NOISE
-from lightpage.calibration.waves.wave_model import FittedWaves, Lit, illumination_terms, on_modulator
+from lightpage.calibration.waves.wave_model import FittedWaves, LaunchConditions, illumination_terms, on_modulator
 from lightpage.recording.frame_pair import FramePair
 from lightpage.waves.geometry import couplings, facet_axis, on_facet
 from lightpage.waves.grid import field_grid, symbol_samples
@@ -51,16 +51,16 @@ class SeenLight:
         self,
         twin: Twin,
         device: CalibratedDevice,
-        lit: Lit,
+        conditions: LaunchConditions,
         pair: FramePair,
         symbols: NDArray[np.complex128],
     ) -> None:
         self._twin, self._device, self._pair, profile = twin, device, pair, device.profile
         self._samples, self._grid = symbol_samples(profile), field_grid(profile)
-        self._blur = lit.blur
-        self.waves = FittedWaves(profile, device.parameters, self._samples, filled=True, blur=lit.blur)
+        self._blur = conditions.blur
+        self.waves = FittedWaves(profile, device.parameters, self._samples, filled=True, blur=self._blur)
         self._terms = np.stack(illumination_terms(self.waves.x, self.waves.y))
-        illumination = np.tensordot(lit.illumination, self._terms, 1)
+        illumination = np.tensordot(conditions.illumination, self._terms, 1)
         self.page = on_modulator(device.modulation.light(np.angle(symbols)), self._samples) * illumination
         places = np.stack(np.meshgrid(self._grid.x_m, self._grid.y_m), axis=-1).reshape(-1, 2)
         pixels = twin.pixels(device.parameters, places).reshape(2, *self._grid.shape, 2)
@@ -179,9 +179,8 @@ class SeenLight:
     def changed(self, parameters: Real | None = None, **geometry: float) -> FittedWaves:
         """The waves on the coarse grid with other parameters, or with another geometry."""
         parameters = self._device.parameters if parameters is None else parameters
-        how: dict[str, Any] = {"filled": True, "stride": _STRIDE, "accuracy": _ACCURACY, "changed": geometry}
-        how["blur"] = self._blur
-        return FittedWaves(self._device.profile, parameters, self._samples, **how)
+        coarse: dict[str, Any] = {"filled": True, "stride": _STRIDE, "accuracy": _ACCURACY}
+        return FittedWaves(self._device.profile, parameters, self._samples, changed=geometry, blur=self._blur, **coarse)
 
     @property
     def _lacking(self) -> Real:

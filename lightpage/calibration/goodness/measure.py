@@ -20,7 +20,7 @@ from lightpage.calibration.goodness.light import SeenLight
 from lightpage.calibration.goodness.suspects import LEVELS, NEIGHBOURS, likeliest, unlike_profile
 from lightpage.calibration.goodness.verdict import GOOD, USABLE, Goodness, Map
 from lightpage.calibration.interfaces import Twin
-from lightpage.calibration.waves.wave_model import Lit
+from lightpage.calibration.waves.wave_model import LaunchConditions
 from lightpage.errors import CalibrationError
 from lightpage.recording.frame_pair import FramePair
 
@@ -46,7 +46,7 @@ _MOST_RATIO = 1e6
 def measure_goodness(
     twin: Twin,
     device: CalibratedDevice,
-    lit: Lit,
+    conditions: LaunchConditions,
     pair: FramePair,
     symbols: NDArray[np.complex128],
     progress: Callable[[float], None] = lambda share: None,
@@ -56,12 +56,12 @@ def measure_goodness(
     Args:
         twin: ray tracer of the nominal device.
         device: device as it was fitted.
-        lit: the page's illumination and blur.
+        conditions: the page's illumination and blur.
         pair: frames of the page.
         symbols: unit phasors of the page's symbols [ny, nx].
         progress: told of the share that is behind.
     """
-    light = SeenLight(twin, device, lit, pair, symbols)
+    light = SeenLight(twin, device, conditions, pair, symbols)
     progress(0.2)
     light.correct_amplitude()
     progress(0.4)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.parameters import NAMES, PARAMETERS, PRIORS, SEEN_BY_CAMERAS, STEPS, indices
 from lightpage.calibration.samplers import smooth_reference
-from lightpage.calibration.waves.wave_model import FittedWaves, Lit, illumination_terms, on_modulator
+from lightpage.calibration.waves.wave_model import FittedWaves, LaunchConditions, illumination_terms, on_modulator
 from lightpage.device.profile import Profile
 from lightpage.page import modulation as modulations
 from lightpage.page.modulation import NOMINAL, Modulation
@@ -34,6 +34,8 @@ READ_NOISE = 0.3
 ROUNDS = 9
 _CHORD_ACCURACY = 3 / 8
 """Share of the splitting steps for that derivative: an error of a percent in it costs no round."""
+_CHORD_SAMPLES = 2
+"""Samples a symbol and axis for it: half as many as usual leave an error of 0.3% in the light."""
 _STALE = 0.03
 """Relative fall of the residual, since the derivative of the light was taken, beyond which it is taken anew. That costs
 as much as several rounds, but one from further off leaves axial places twenty deviations from the best."""
@@ -53,8 +55,6 @@ _LEAST_STRIDE = 2
 """Grid samples from one equation to the next: the grid has twice the rate that the light needs."""
 _INSIDE = 0.98
 """Share of the page's image that is compared, to either side."""
-_CHORD_SAMPLES = 2
-"""Samples a symbol and axis for it: half as many as usual leave an error of 0.3% in the light."""
 _USUAL_BLUR, _BLUR_PRIOR, _BLUR_STEP = 0.1, 0.5, 0.01
 """Variance of the modulator's blur to start from, its standard deviation about 0, and its finite difference."""
 _CAMERAS = ("in_phase", "quadrature")
@@ -77,7 +77,7 @@ class WaveFitted:
         quadrature_phase: angle between the homodyne arms, radians.
         residual: root mean square of what is left of the equations, in standard deviations of the reference's noise
             times an unknown factor: it says which of two fits is better.
-        lit: the page's illumination and blur.
+        conditions: the page's illumination and blur.
         modulation: light that the modulator makes of its levels; the prior's centre where a page does not tell it from
             that.
         modulation_deviations: standard deviations of its coefficients, zero where held.
@@ -88,7 +88,7 @@ class WaveFitted:
     deviations: Real
     quadrature_phase: float
     residual: float
-    lit: Lit
+    conditions: LaunchConditions
     modulation: Modulation = NOMINAL
     modulation_deviations: tuple[float, ...] = (0.0,) * len(modulations.NAMES)
     quadrature_deviation: float | None = None
@@ -214,8 +214,8 @@ class WaveFit:
         precision = 1 / (PRIORS * prior_scale)[free] ** 2
         centre = np.zeros(len(PARAMETERS)) if centre is None else centre
         state = self._start(start, quadrature_phase, modulation)
-        nothing, lit = np.zeros(len(PARAMETERS)), Lit(state.light, state.blur)
-        best = WaveFitted(start, nothing, quadrature_phase, np.inf, lit, modulation)
+        nothing, first = np.zeros(len(PARAMETERS)), LaunchConditions(state.light, state.blur)
+        best = WaveFitted(start, nothing, quadrature_phase, np.inf, first, modulation)
         slopes, taken_at = None, np.inf
         for number in range(ROUNDS):
             progress(number / ROUNDS)
@@ -251,7 +251,7 @@ class WaveFit:
                 deviations,
                 state.quadrature_phase,
                 residual,
-                Lit(state.light, state.blur),
+                LaunchConditions(state.light, state.blur),
                 Modulation(tuple(state.levels.tolist())),
                 tuple(known[fitted_levels].tolist()) if levels else best.modulation_deviations,
                 float(known[len(directions)]),

@@ -88,8 +88,8 @@ def _ramp(value: Mapping[str, Any], geometry: WaveGeometry, x_m: Any, y_m: Any) 
     return per_metre * (value["pipe_centre_x_m"] * x_m + value["pipe_centre_y_m"] * y_m)
 
 
-class Lit(NamedTuple):
-    """What a page's light depends on, beside its symbols, modulation and geometry.
+class LaunchConditions(NamedTuple):
+    """Conditions under which a page's light is launched, beside symbols, modulation and geometry.
 
     Attributes:
         illumination: coefficients [T] of `illumination_terms`.

@@ -38,19 +38,14 @@ def goodness_of(*settings: str, wrong_symbols: float = 0.0, stated: float = 1.0)
     told = np.exp(1j * symbol_phases(np.where(replaced, rng.integers(256, size=symbols.shape), symbols), 256))
     known = perfectly_calibrated(PROFILE, device, references)
     fit = WaveFit(TWIN, PROFILE, pair, references, told)
-    lit = fit.fit(
-        known.parameters,
-        known.quadrature_phase_rad,
-        ("camera_phase",),
-        modulation=known.modulation,
-        levels=LevelPrior(),
-    )
+    start, levels = (known.parameters, known.quadrature_phase_rad), LevelPrior()
+    found = fit.fit(*start, ("camera_phase",), modulation=known.modulation, levels=levels)
     pipe, parameters = PROFILE.pipe, known.parameters.copy()
     profile = PROFILE.model_copy(update={"pipe": pipe.model_copy(update={"length_m": stated * pipe.length_m})})
     length = NAMES.index("pipe_length_relative")
     parameters[length] = (1 + parameters[length]) / stated - 1
-    fitted = replace(known, profile=profile, parameters=parameters, modulation=lit.modulation)
-    return measure_goodness(TWIN, fitted, lit.lit, pair, told)
+    fitted = replace(known, profile=profile, parameters=parameters, modulation=found.modulation)
+    return measure_goodness(TWIN, fitted, found.conditions, pair, told)
 
 
 @pytest.mark.parametrize("settings", [(), ("slm.phase_noise_rad=0.3",), ("sensor.full_well_e=1000", "slm.blur_px=0.5")])

@@ -149,8 +149,8 @@ def test_a_nominal_modulator_stays_nominal_and_axial_places_and_tilts_are_found_
     found = seen_by(device, 5).fit(start, device.homodyne.turn_rad, EVERY, levels=LevelPrior())
     assert found.modulation is NOMINAL
     assert all(found.modulation_deviations)
-    even = found.lit.illumination[0]
-    assert np.abs((found.lit.illumination / even).imag).max() < 1e-9  # the launch alone bends phases
+    even = found.conditions.illumination[0]
+    assert np.abs((found.conditions.illumination / even).imag).max() < 1e-9  # the launch alone bends phases
     off = ((found.parameters - truth) / np.maximum(found.deviations, 1e-12))[axial]
     assert np.sqrt(np.mean(off**2)) < 2
     assert np.rad2deg(abs(found.quadrature_phase - device.homodyne.turn_rad)) < 0.3
@@ -164,7 +164,7 @@ def test_what_the_modulator_makes_of_its_levels_comes_back_with_calibrated_devia
     found = seen_by(device, 2).fit(start, device.homodyne.turn_rad, EVERY, levels=LevelPrior())
     off = np.array(found.modulation.coefficients) - truth.coefficients
     assert np.sqrt(np.mean((off / found.modulation_deviations) ** 2)) < 2
-    assert found.lit.blur == pytest.approx(slm.blur_px**2, abs=0.02)
+    assert found.conditions.blur == pytest.approx(slm.blur_px**2, abs=0.02)
     # of levels: what a decision among 256 of them notices is a tenth of their distance, the noise of most pages 0.02
     phases = found.modulation.phases(256) - truth.phases(256)
     assert np.std(phases) < 0.003 < 0.1 < np.std(truth.phases(256) - symbol_phases(np.arange(256), 256))

@@ -14,6 +14,7 @@ from click.testing import CliRunner
 from lightpage.cli.simulate import simulate
 from lightpage.codec.code import Code
 from lightpage.codec.page_bytes import Loss
+from lightpage.codec.page_codec import PageCodec
 from lightpage.device.state import Device
 from lightpage.errors import CalibrationError, LostPageError, Reason, RecalibrationRefusedError, RecordingError
 from lightpage.page.pilots import Pilots
@@ -63,6 +64,11 @@ def drifted(small_bundle: Path, small_device: list[str], tmp_path_factory: pytes
     turned = ["--set", "geometry.pipe_angle_deg=-0.2", "--seed", 5]
     run(simulate, *small_device[:2], "--symbols", folder / "pages.h5", *turned, "--out", folder / "R.h5")
     return folder
+
+
+def lost_pages(path: Path, count: int) -> LostPages:
+    with Recording.open(path) as recording:
+        return LostPages(tuple(map(recording.frames, range(count))), CODE, references=recording.references())
 
 
 def run(command: object, *words: object) -> str:
@@ -183,8 +189,7 @@ def test_pages_wait_for_others_and_for_twice_as_many_where_that_brought_none(
 
 def test_a_healed_model_has_a_verdict_and_is_not_written_where_it_is_wrong(small_bundle: Path, drifted: Path) -> None:
     decoder = Decoder.load(small_bundle, threads=1)
-    with Recording.open(drifted / "R.h5") as recording:
-        lost = LostPages(tuple(map(recording.frames, range(4))), CODE, references=recording.references())
+    lost = lost_pages(drifted / "R.h5", 4)
     healed = heal(decoder, lost, fit=Mock(side_effect=CalibrationError("re-fit", "nothing", "a geometry")))
     found, report = healed.decoder.bundle.calibration, healed.result.report
     assert report.goodness == found.goodness is not None
@@ -209,10 +214,8 @@ def test_where_only_the_image_has_moved_a_last_fit_that_fails_takes_no_page_away
 ) -> None:
     moved = ["--set", "in_phase_camera.shift_y_px=-2", "--set", "quadrature_camera.shift_y_px=3"]
     run(simulate, *small_device[:2], "--symbols", drifted / "pages.h5", *moved, "--seed", 6, "--out", drifted / "M.h5")
-    with Recording.open(drifted / "M.h5") as recording:
-        lost = LostPages(tuple(map(recording.frames, range(4))), CODE, references=recording.references())
     fails = Mock(side_effect=CalibrationError("re-fit", "nothing", "a geometry"))
-    healed = heal(Decoder.load(small_bundle, threads=1), lost, fit=fails)
+    healed = heal(Decoder.load(small_bundle, threads=1), lost_pages(drifted / "M.h5", 4), fit=fails)
     assert (healed.rounds, len(healed.known.pairs)) == (0, 4)
     assert healed.result.report.goodness == healed.decoder.bundle.calibration.goodness is not None
 
@@ -220,10 +223,15 @@ def test_where_only_the_image_has_moved_a_last_fit_that_fails_takes_no_page_away
 def test_a_bundle_without_a_calibration_is_not_healed(small_bundle: Path, drifted: Path) -> None:
     bundle = Bundle.open(small_bundle)
     manifest = bundle.manifest.model_copy(update={"calibration": ""})
-    with Recording.open(drifted / "R.h5") as recording:
-        lost = LostPages((recording.frames(0),), CODE, references=recording.references())
     with pytest.raises(RecalibrationRefusedError):
-        heal(Decoder(replace(bundle, manifest=manifest), threads=1), lost, untouched)
+        heal(Decoder(replace(bundle, manifest=manifest), threads=1), lost_pages(drifted / "R.h5", 1), untouched)
+
+
+def test_a_healing_ends_where_pages_claim_enough_and_no_checksum_holds(small_bundle: Path, drifted: Path) -> None:
+    decode = PageCodec.decode
+    in_vain = patch.object(PageCodec, "decode", lambda *given: replace(decode(*given), loss=Loss.BODY, margin_bits=0.0))
+    with in_vain, pytest.raises(RecalibrationRefusedError, match="round 1"):
+        heal(Decoder.load(small_bundle, threads=1), lost_pages(drifted / "R.h5", 1))
 
 
 def test_a_models_own_decisions_speak_for_it_and_pages_that_come_right_for_the_better_one(small_bundle: Path) -> None:
