@@ -231,7 +231,7 @@ def test_a_healing_ends_where_pages_claim_enough_and_no_checksum_holds(small_bun
     decode = PageCodec.decode
     in_vain = patch.object(PageCodec, "decode", lambda *given: replace(decode(*given), loss=Loss.BODY, margin_bits=0.0))
     with in_vain, pytest.raises(RecalibrationRefusedError, match="round 1"):
-        heal(Decoder.load(small_bundle, threads=1), lost_pages(drifted / "R.h5", 1))
+        heal(Decoder.load(small_bundle, threads=1), lost_pages(drifted / "R.h5", 4))
 
 
 def test_a_models_own_decisions_speak_for_it_and_pages_that_come_right_for_the_better_one(small_bundle: Path) -> None:
