@@ -40,7 +40,7 @@ def estimates(
             known = np.array(state.piston_rad)
             piston = float(decide(known, classes)) * 2 * np.pi / classes if classes else state.piston_rad
             return np.asarray(turned(torch.from_numpy(p), -piston).numpy())
-        return without_piston(p, phases, mask)
+        return without_piston(p, phases, mask, module.levels)
 
     decoded = decode_pages(module, pages)
     p = [still(*page)[:, ~mask] for page in zip(*decoded, pages.states, strict=True)]

@@ -18,7 +18,7 @@ from lightpage.device.profile import Profile
 from lightpage.device.state import Device
 from lightpage.metrics.information import achievable_rate
 from lightpage.page.levels import MAX_LEVELS
-from lightpage.page.pilots import Pilots, read_pilots, remove_piston
+from lightpage.page.pilots import Pilots, read_pilots, remove_piston, stroke_error
 from lightpage.page.symbols import pilot_mask
 from lightpage.progress import reporting
 from lightpage.recording.reader import Recording
@@ -26,6 +26,7 @@ from lightpage.runtime.model.decoding.phase_refit import PhaseRefit
 from lightpage.simulator.recording_job import RecordingJob
 from lightpage.study.known import Known
 from lightpage.train.data.features import FeatureExtractor
+from lightpage.train.fitting.validation import without_piston
 from lightpage.train.models.decoder import SymbolDecoder
 from lightpage.train.models.presets import PRESETS, STANDARD
 from lightpage.train.runs import Run, load_decoder, load_run
@@ -75,8 +76,8 @@ class KeptDecoder:
     def air(self, device: CalibratedDevice, pages: Known) -> float:
         """Measure what is read of known pages, bits a data symbol, with a device's geometry, levels and references.
 
-        Piston, smooth phase errors and trust come from the pilots, as in service; each page's image shift from its
-        symbols, since a service follows it.
+        Piston, smooth phase errors, flicker and trust come from the pilots, as in service; each page's image shift from
+        its symbols, since a service follows it.
         """
         profile, mask = device.profile, pilot_mask(device.profile)
         levels = device.modulation.page_levels(MAX_LEVELS)
@@ -89,10 +90,12 @@ class KeptDecoder:
                 light, positions = torch.from_numpy(shown.light).float(), torch.from_numpy(shown.positions)
                 p = self.decoder.network(light.flatten(0, 2)[None], positions[None])[0].numpy() * self.run.kappa_scale
             pilots = Pilots.of_symbols(mask, symbols, levels)
+            p = without_piston(p, levels.phases[symbols].astype(np.float32), mask, levels)
             reading = read_pilots(p, pilots)
             phase = remove_piston(np.arctan2(p[1], p[0]), reading.piston.angle_rad)
             concentration = np.hypot(p[0], p[1]) * np.float32(reading.trust)
             phase = remove_piston(phase, refit.error(phase, concentration, levels, pilots))
+            phase = remove_piston(phase, stroke_error(phase, concentration, reading.sound).of_phases(phase))
             rates.append(achievable_rate(phase[~mask], concentration[~mask], symbols[~mask], levels).mean())
         return float(np.mean(rates))
 

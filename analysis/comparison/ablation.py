@@ -88,7 +88,7 @@ def without(part: str, bench: Bench, choices: Hyperparameters) -> Outcome:
         f"features without {part}",
     )
     validation, unseen = bench.held_out(features)
-    training = training_pages([FeatureStore(features, range(len(bench.training)))], bench.mask, choices)
+    training = training_pages([FeatureStore(features, range(len(bench.training)))], bench.mask, choices, LEVELS)
     folder = bench.begun(at / f"{choices.steps}", {"without": part, **asdict(choices)})
     kind = Unconditioned if part == POSITIONS else SymbolUNet
     fitted = fit_network(folder, choices, bench.mask, LEVELS, training, validation, kind=kind, processes=ONE)

@@ -68,6 +68,6 @@ def kappa_scale(
         assert symbols is not None
         truth = symbol_phases(symbols, LEVELS).astype(np.float32)
         p = torch_answer(graph, recording.frames(page), tensors)["p"]
-        shown.append(without_piston(p, truth, mask)[:, ~mask])
+        shown.append(without_piston(p, truth, mask, LEVELS)[:, ~mask])
         truths.append(truth[~mask])
     return calibrating_factor(np.concatenate(shown, axis=1), np.concatenate(truths))

@@ -61,7 +61,7 @@ class Scene:
         """Achievable rate of an answer, bits a symbol."""
         mask = pilot_mask(self.profile)
         truth = symbol_phases(self.symbols[page], LEVELS).astype(np.float32)
-        x, y = without_piston(p, truth, mask)[:, ~mask]
+        x, y = without_piston(p, truth, mask, LEVELS)[:, ~mask]
         phase, length, symbols = np.arctan2(y, x)[::3], np.hypot(x, y)[::3], self.symbols[page][~mask][::3]
         return max(float(achievable_rate(phase, scale * length, symbols, LEVELS).mean()) for scale in _SCALES)
 

@@ -226,7 +226,7 @@ class TrueTable:
             "reference_quadrature": references.quadrature,
             **sampling_table(self._twin, parameters, truth.device.homodyne.turn_rad, profile),
         }
-        bundle, modulation = self.decoder.bundle, true_modulation(truth.device.slm)
+        bundle, modulation = self.decoder.bundle, true_modulation(truth.device.slm, self.decoder.bundle.profile)
         calibration = bundle.calibration.model_copy(update={"modulation": modulation.as_dict()}).to_toml()
         manifest = bundle.manifest.model_copy(update={"calibration": calibration})
         fed = Decoder(
@@ -247,4 +247,4 @@ def light_of(parameters: NDArray[np.float64], modulation: Modulation) -> dict[st
 
 def true_light(profile: Profile, device: Device) -> dict[str, float]:
     """Return `light_of` of a device's true parameters and modulation."""
-    return light_of(true_parameters(profile, device), true_modulation(device.slm))
+    return light_of(true_parameters(profile, device), true_modulation(device.slm, profile))

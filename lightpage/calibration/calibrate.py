@@ -98,7 +98,7 @@ class KnownPage:
 
     def light(self, modulation: Modulation) -> NDArray[np.complex128]:
         """Light that a modulator makes of the symbols, complex [ny, nx]."""
-        return modulation.light(np.angle(self.symbols))
+        return modulation.page_light(np.angle(self.symbols))
 
 
 @dataclass(frozen=True)

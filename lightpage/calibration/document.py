@@ -32,8 +32,11 @@ _LATER = NAMES[KNOWN[0] :]
 _ADDED = {
     "parameters": {"lens_path_relative": -1.0, **dict.fromkeys(_LATER, 0.0)},
     "deviations": dict.fromkeys(("lens_path_relative", *_LATER), 0.0),
+    "modulation": dict.fromkeys(modulations.CROSSTALK, 0.0),
+    "modulation_deviations": dict.fromkeys(modulations.CROSSTALK, 0.0),
 }
-"""Fields that older documents lack: they took lenses for ideal, and planes for those of the profile."""
+"""Fields that older documents lack: they took lenses for ideal, planes for those of the profile, and symbols for
+independent of those beside them."""
 
 
 _OPTIONAL = ("turn_deviation_rad", "coherence_at_first", "goodness")
@@ -232,10 +235,11 @@ def parse_calibration(text: str, source: str = "calibration") -> Calibration:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ProfileError(source, f"text that is not TOML ({error})", "a TOML document") from None
+    for table, added in _ADDED.items():
+        if isinstance(values := data.get(table), dict):
+            data[table] = added | values
     for table in ("parameters", "deviations"):
         values = data.get(table)
-        if isinstance(values, dict):
-            data[table] = values = _ADDED[table] | values
         problem = _names_problem(values) if isinstance(values, dict) else ""
         if problem:
             raise ProfileError(f"{source}: [{table}]", problem, "every parameter of the ray twin and no other")

@@ -39,6 +39,9 @@ SOUND_SHARE = 0.85
 
 _NOISE_DEVIATIONS = 3.0
 """Standard deviations of the pilots' noise that are allowed for before a device is said to have changed."""
+_CHANCE = 2.0
+"""Times its variance that a stroke's squared error must be beyond, and by which it is drawn to zero: on a page without
+flicker what 12 pilots show of it then costs less than 0.001 bit."""
 _NOTHING = 1e-9
 """Below it a sum of weights, or a mean square of radians, is rounding."""
 
@@ -293,22 +296,42 @@ def read_pilots(p: NDArray[np.floating], pilots: Pilots, gained_nats: float = 0.
     return PilotReading(piston, trust, check_claims(p, sound, piston.angle_rad, trust, gained_nats), sound)
 
 
-def stroke_error(phase: NDArray[np.floating], concentration: NDArray[np.floating], pilots: Pilots) -> float:
-    """Relative error of the modulator's stroke against its calibration: a slope over the pilots' phases.
+@dataclass(frozen=True)
+class StrokeError:
+    """Error of the modulator's phase stroke on a page: drift, or flicker.
+
+    Attributes:
+        relative: as the pilots show it; NaN where they have but one phase.
+        deviation: its standard deviation; infinite where pilots tell nothing.
+    """
+
+    relative: float
+    deviation: float
+
+    def of_phases(self, phase: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Phase that it adds to each symbol, radians [ny, nx]: to be taken off. What chance may show is left."""
+        chance = _CHANCE * self.deviation**2
+        if not self.relative**2 > chance:
+            return np.zeros(phase.shape, np.float32)
+        likely = self.relative - chance / self.relative
+        return np.asarray(likely * (np.mod(phase, 2 * np.pi) - np.pi), np.float32)
+
+
+def stroke_error(phase: NDArray[np.floating], concentration: NDArray[np.floating], pilots: Pilots) -> StrokeError:
+    """Measure the stroke's error: a slope over the pilots' phases.
 
     Args:
         phase: radians, piston and smooth error removed, [ny, nx].
         concentration: von Mises kappa, [ny, nx].
         pilots: the known symbols of this page, those left out that are outliers.
-
-    Returns:
-        NaN where the pilots have but one phase.
     """
     weight = concentration[pilots.mask].astype(np.float64)
     error = remove_piston(phase[pilots.mask], pilots.phases)
     away = pilots.phases - np.sum(weight * pilots.phases) / max(float(weight.sum()), _NOTHING)
     spread = float(np.sum(weight * away**2))
-    return float(np.sum(weight * away * error)) / spread if spread > _NOTHING * weight.sum() else np.nan
+    if not spread > _NOTHING * weight.sum():
+        return StrokeError(np.nan, np.inf)
+    return StrokeError(float(np.sum(weight * away * error)) / spread, spread**-0.5)
 
 
 def _errors(p: NDArray[np.floating], pilots: Pilots) -> NDArray[np.complex128]:

@@ -271,21 +271,23 @@ class TrueOptics:
 
 def perfectly_calibrated(profile: Profile, device: Device, references: FramePair) -> CalibratedDevice:
     """A device as a calibration without any error would find it."""
-    parameters, modulation = true_parameters(profile, device), true_modulation(device.slm)
+    parameters, modulation = true_parameters(profile, device), true_modulation(device.slm, profile)
     return CalibratedDevice(profile, parameters, device.homodyne.turn_rad, references, modulation)
 
 
-def true_modulation(slm: SlmDefects) -> Modulation:
+def true_modulation(slm: SlmDefects, profile: Profile) -> Modulation:
     """The truth as a calibration without any error would tell it: what its few coefficients can."""
     phases = symbol_phases(np.arange(MAX_LEVELS), MAX_LEVELS)
-    shown, (stroke, *series) = modulated(slm, phases), basis(phases)
+    # Of a symbol's pixels, one in so many has a neighbour of the symbol beside.
+    crosstalk = slm.crosstalk_relative / profile.page.symbol_size_px
+    shown, (stroke, *series) = modulated(slm, phases - 4 * crosstalk * (phases - np.pi)), basis(phases)
     if np.allclose(shown, np.exp(1j * phases), rtol=0, atol=1e-12):
         return NOMINAL
     even = np.ones(len(phases))
     off = np.unwrap(np.angle(shown * np.exp(-1j * phases)))
     phase = np.linalg.lstsq(np.stack([stroke, *series, even], axis=1), off, rcond=None)[0]
     amplitude = np.linalg.lstsq(np.stack([*series, even], axis=1), np.log(np.abs(shown)), rcond=None)[0]
-    return Modulation((*phase[:-1].tolist(), *amplitude[:-1].tolist()))
+    return Modulation((*phase[:-1].tolist(), *amplitude[:-1].tolist(), crosstalk, crosstalk))
 
 
 def true_geometry(profile: Profile, device: Device, camera_tilt_rad: tuple[float, float]) -> WaveGeometry:

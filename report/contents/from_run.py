@@ -47,7 +47,8 @@ def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportDat
         module = decoded.module
         outputs, phases = decode_pages(module.eval(), decoded.pages)
     levels = levels_of(phases, run.calibration.modulator)
-    p = np.stack([without_piston(run.kappa_scale * o, t, mask) for o, t in zip(outputs, phases, strict=True)])
+    pages = zip(run.kappa_scale * outputs, phases, strict=True)
+    p = np.stack([without_piston(page, truth, mask, levels) for page, truth in pages])
     symbols = decide(phases[:, ~mask], levels)
     phase, kappa = np.arctan2(p[:, 1], p[:, 0]), np.hypot(p[:, 0], p[:, 1])[:, ~mask]
     accumulator = Accumulator(levels, ~mask, len(p))

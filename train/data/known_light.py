@@ -70,7 +70,7 @@ def explained(extractor: FeatureExtractor, pages: Sequence[KnownPage]) -> list[E
         with torch.no_grad():
             measured, solved = extractor.measure(page.pair, state.shift_px)
         field, seen = solved[0].numpy() + 1j * solved[1].numpy(), measured.lit.numpy().astype(bool)
-        written = on_modulator(modulation.light(nominal), samples)
+        written = on_modulator(modulation.page_light(nominal), samples)
         few = seen[::stride, ::stride]
         shown = np.stack([at_few.to_camera(written * term)[few] for term in terms], axis=-1)
         factors = np.linalg.lstsq(shown, field[::stride, ::stride][few], rcond=None)[0]

@@ -11,46 +11,59 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from lightpage.errors import InvalidInputError
+from lightpage.page.levels import Levels, of_neighbours
 from lightpage.train.data.feature_store import FeatureStore
 from lightpage.train.data.pages import Page
 from lightpage.train.models.hyperparameters import Hyperparameters
 from lightpage.train.models.network import reach, with_page_coordinates
 
 
-def training_pages(stores: Sequence[FeatureStore], mask: NDArray[np.bool_], choices: Hyperparameters) -> Dataset[Page]:
+def training_pages(
+    stores: Sequence[FeatureStore], mask: NDArray[np.bool_], choices: Hyperparameters, levels: int | Levels
+) -> Dataset[Page]:
     """Return the data set of a network at symbol pitch: whole pages, or patches where pages are larger than those.
 
     Args:
         stores: pages of one shape.
         mask: pilots, bool [ny, nx].
         choices: say how large patches are, and the network.
+        levels: levels of the pages.
 
     Raises:
         InvalidInputError: patches in which the network would not see the neighbours of a single symbol.
     """
-    return Patches(stores, mask, choices.patch, reach(choices.blocks, choices.depth), 2**choices.depth)
+    rim, crosstalk = reach(choices.blocks, choices.depth), Levels.of(levels).crosstalk
+    return Patches(stores, mask, choices.patch, rim, 2**choices.depth, crosstalk)
 
 
 class Patches(Dataset[Page]):
     """Patches of pages, at a place drawn anew each time; whole pages where they are no larger.
 
     An item is a page's as of `FeatureStore`, cut; its positions also hold column and row on the page (see
-    `with_page_coordinates`), and phases that are not to be learnt from are NaN: pilots, and a rim.
+    `with_page_coordinates`). Phases are those of the light, crosstalk included; those that are not to be learnt from
+    are NaN: pilots, and a rim.
 
     Args:
         stores, mask: see `training_pages`.
         side: symbols along an edge.
         rim: symbols along a patch's edge that are shown and not asked for: the network misses their neighbours.
         step: places lie on multiples of it, as the network's coarser grids do.
+        crosstalk: of the modulator, see `lightpage.page.levels.Levels`.
 
     Raises:
         InvalidInputError: patches that are all rim.
     """
 
     def __init__(
-        self, stores: Sequence[FeatureStore], mask: NDArray[np.bool_], side: int, rim: int, step: int = 1
+        self,
+        stores: Sequence[FeatureStore],
+        mask: NDArray[np.bool_],
+        side: int,
+        rim: int,
+        step: int = 1,
+        crosstalk: tuple[float, float] = (0.0, 0.0),
     ) -> None:
-        self._rim, self._step = rim, step
+        self._rim, self._step, self._crosstalk = rim, step, crosstalk
         self._places = [(store, index) for store in stores for index in range(len(store))]
         self._shape = mask.shape
         # the last place lies on the step too
@@ -72,6 +85,7 @@ class Patches(Dataset[Page]):
         starts = [patch_start(count, side, self._rim, self._step) for count, side in sizes]
         rows, columns = (slice(start, start + side) for start, side in zip(starts, self._sides, strict=True))
         light, positions, *estimate, phases = store.part(page, rows, columns)
+        phases = phases + torch.from_numpy(of_neighbours(phases.numpy(), self._crosstalk)).float()
         where = with_page_coordinates(positions, self._shape, (rows, columns))
         return light, where, *estimate, torch.where(self._asked(rows, columns), phases, torch.nan)
 

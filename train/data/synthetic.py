@@ -130,7 +130,7 @@ class SyntheticPages:
         light_on = np.tensordot(self._like.illumination, np.stack(illumination_terms(waves.x, waves.y)), 1)
         for symbols in random_symbols(profile, MAX_LEVELS, self._per_state, rng):
             nominal, modulation = symbol_phases(symbols, MAX_LEVELS), self._device.modulation
-            field = waves.to_camera(on_modulator(modulation.light(nominal), symbol_samples(profile)) * light_on)
+            field = waves.to_camera(on_modulator(modulation.page_light(nominal), symbol_samples(profile)) * light_on)
             field = (self._like.seen * (field + self._noise(field, rng))).astype(np.complex64)
             if waves_back is not None:
                 light = localized(waves_back, field)

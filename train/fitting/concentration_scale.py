@@ -41,7 +41,7 @@ def best_kappa_scale(module: DecoderTraining[Any], pages: Dataset[Page], mask: N
     """
     outputs, truths = [], []
     for p, truth in zip(*decode_pages(module, pages), strict=True):
-        outputs.append(without_piston(p, truth, mask)[:, ~mask])
+        outputs.append(without_piston(p, truth, mask, module.levels)[:, ~mask])
         truths.append(truth[~mask])
     return calibrating_factor(np.concatenate(outputs, axis=1), np.concatenate(truths))
 

@@ -23,19 +23,24 @@ def held_out_air(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDAr
     """
     rates = []
     for page, truth in zip(p, phases, strict=True):
-        px, py = without_piston(page, truth, mask)[:, ~mask]
+        px, py = without_piston(page, truth, mask, levels)[:, ~mask]
         air = achievable_rate(np.arctan2(py, px), np.hypot(px, py), decide(truth[~mask], levels), levels)
         rates.append(float(np.mean(air)))
     return float(np.mean(rates))
 
 
-def without_piston(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """p [2, ny, nx] of a page, turned by what its pilots show of the piston, as the runtime does it.
+def without_piston(
+    p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.bool_], levels: int | Levels
+) -> NDArray[np.float32]:
+    """p [2, ny, nx] of a page, turned by what its pilots show of the piston and by crosstalk, as the runtime does it.
 
     Args:
         p: decoded.
         phases: true phases [ny, nx].
         mask: pilots, bool [ny, nx].
+        levels: levels of the page.
     """
     piston = estimate_piston(p, Pilots(mask, phases[mask].astype(np.float64))).angle_rad
-    return np.asarray(turned(torch.tensor(p), -piston).numpy(), dtype=np.float32)
+    still = np.asarray(turned(torch.tensor(p), -piston).numpy(), dtype=np.float32)
+    beside = Levels.of(levels).of_neighbours(still)
+    return np.asarray(turned(torch.tensor(still), torch.tensor(-beside)).numpy(), dtype=np.float32)

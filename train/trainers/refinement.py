@@ -134,7 +134,7 @@ def fit_refinements(
             FeatureStore(features, part) for part in (range(inputs.training), range(inputs.training, seen))
         )
         mask, levels = first.module.pilot_mask, first.module.levels
-        patches = training_pages([training], mask, chosen)
+        patches = training_pages([training], mask, chosen, levels)
         passes.append(
             fit_network(at, chosen, mask, levels, patches, validation, kind=Refiner, start=start, processes=processes)
         )

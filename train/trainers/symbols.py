@@ -85,7 +85,7 @@ class SymbolTrainer:
         count = len(inputs.training)
         known_light = self._explained(inputs)
         stores = [FeatureStore(features, range(count)), *map(FeatureStore, self._synthetic(inputs, known_light))]
-        training = training_pages(stores, inputs.pilot_mask, self.choices)
+        training = training_pages(stores, inputs.pilot_mask, self.choices, inputs.levels)
         validation = FeatureStore(features, range(count, len(known)))
         fitted = fit_network(
             inputs.out,

@@ -22,9 +22,10 @@ from lightpage.train.fitting.validation import without_piston
 
 
 def decoded(bench: Bench, module: DecoderTraining[Any], pages: Dataset[Page], scale: float) -> NDArray[np.float32]:
-    """p of all data symbols of pages, piston off and calibrated, [2, symbols]."""
+    """p of all data symbols of pages, piston and crosstalk off, and calibrated, [2, symbols]."""
     found = zip(*decode_pages(module, pages), strict=True)
-    return np.concatenate([without_piston(p * scale, t, bench.mask)[:, ~bench.mask] for p, t in found], axis=1)
+    still = [without_piston(p * scale, truth, bench.mask, module.levels) for p, truth in found]
+    return np.concatenate([p[:, ~bench.mask] for p in still], axis=1)
 
 
 def judged(

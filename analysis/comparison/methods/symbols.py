@@ -83,7 +83,7 @@ def first_pass(
     make = partial(bench.features_of, name, bench.recording, bench.pages)
     preparing = fill(features, bench.key(name), len(bench.pages), make, f"features of {name}")
     training, (validation, _) = FeatureStore(features, range(len(bench.training))), bench.held_out(features)
-    patches = training_pages([training], bench.mask, choices)
+    patches = training_pages([training], bench.mask, choices, bench.levels_of(name))
     folder = bench.begun(bench.out / name / f"{size}-{choices.steps}", asdict(replace(choices, refinements=0)))
     return (
         folder,

@@ -42,6 +42,8 @@ class SeenLight:
     Attributes:
         waves: the fitted ones.
         page: light on the modulator, [ny samples, nx samples].
+        steps: nominal phases of the samples beside each along x, and along y, less twice its own, [2, ny samples,
+            nx samples].
         fields: light that the model predicts for each camera.
         counts: frames less references, over twice the references, [2, Gy, Gx].
         references: counts of the references, [2, Gy, Gx].
@@ -61,7 +63,9 @@ class SeenLight:
         self.waves = FittedWaves(profile, device.parameters, self._samples, filled=True, blur=self._blur)
         self._terms = np.stack(illumination_terms(self.waves.x, self.waves.y))
         illumination = np.tensordot(conditions.illumination, self._terms, 1)
-        self.page = on_modulator(device.modulation.light(np.angle(symbols)), self._samples) * illumination
+        self.page = on_modulator(device.modulation.page_light(np.angle(symbols)), self._samples) * illumination
+        written = np.pad(np.mod(on_modulator(np.angle(symbols), self._samples).real, 2 * np.pi), 1, mode="edge")
+        self.steps = np.stack([np.diff(written[1:-1], 2, axis=1), np.diff(written[:, 1:-1], 2, axis=0)])
         places = np.stack(np.meshgrid(self._grid.x_m, self._grid.y_m), axis=-1).reshape(-1, 2)
         pixels = twin.pixels(device.parameters, places).reshape(2, *self._grid.shape, 2)
         edge, size = len(self._grid.prefilter), np.array(pair.in_phase.shape[::-1])

@@ -109,6 +109,8 @@ def _suspects(light: SeenLight) -> Iterator[tuple[str, list[Real]]]:
     curved = coarse.from_exit(1j * leaving * squares)
     tilted = [curved * place * chosen for place in light.coarse_places for chosen in (one, 1 - one)]
     yield "a focus that changes over the image: are the cameras tilted?", [*map(light.equations_of, tilted)]
+    mixed = [factor * page * step**power for power, factor in ((1, 1j), (2, 1)) for step in light.steps]
+    yield NEIGHBOURS, [light.equations_of(coarse.to_cameras(each)) for each in mixed]
     higher = light.changed(pipe_height_relative=_STEP).to_cameras(page) - here
     yield "walls of the pipe that are not equally far apart in x and y", [light.equations_of(higher)]
     length = light.waves.channel.geometry.pipe_length_m

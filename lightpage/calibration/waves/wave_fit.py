@@ -130,8 +130,8 @@ class _Slopes(NamedTuple):
     Attributes:
         by_term: derivatives of the light by the illumination's terms, [T, 2, ...].
         by_blur: derivative of the light by the blur, [2, ...].
-        by_level: derivatives of the light by the terms of the modulation's logarithm, [K, 2, ...]; none where it is
-            held.
+        by_level: derivatives of the light by the terms of the modulation's logarithm, [K, 2, ...], the last two of
+            crosstalk; none where it is held.
         of_light: derivatives of the light by parameters that change it, [2, ...] each.
         of_cameras: derivatives of the places (x, y), grid samples, by parameters that move the cameras, [2, ..., 2]
             each.
@@ -264,7 +264,7 @@ class WaveFit:
 
         It is as bright as with the usual samples: fewer stand for more light each.
         """
-        light = Modulation(tuple(levels.tolist())).light(self._phases)
+        light = Modulation(tuple(levels.tolist())).page_light(self._phases)
         return on_modulator(light * (self._samples / samples), samples)
 
     def _light(self, state: _State) -> Complex:
@@ -310,7 +310,7 @@ class WaveFit:
         page, field = even * np.tensordot(state.light, terms, 1), np.tensordot(state.light, by_term, 1)
         leaving = here.to_exit(page)
         by_blur = (waves(state.parameters, blur=state.blur + _BLUR_STEP).to_cameras(page) - field) / _BLUR_STEP
-        functions = [on_modulator(one, samples) for one in modulations.basis(self._phases)] if levels else []
+        functions = [on_modulator(one, samples) for one in modulations.page_basis(self._phases)] if levels else []
         by_level = [here.to_cameras(page * one) for one in functions]
         light, places = list[Complex](), list[Real]()
         for number, index in enumerate(of_light):
@@ -374,9 +374,10 @@ class WaveFit:
         def seen(field: Complex) -> Complex:
             return np.asarray(field[chosen] / amplitude)
 
-        of_phase, of_amplitude = [1j * each for each in slopes.by_level], slopes.by_level[1:]
+        of_levels, of_neighbours = slopes.by_level[:-2], slopes.by_level[-2:]
+        of_phase, of_crosstalk = ([1j * each for each in some] for some in (of_levels, of_neighbours))
         by_light = *np.tensordot(directions, slopes.by_term, 1), slopes.by_blur
-        changes = [*by_light, *of_phase, *of_amplitude, *slopes.of_light]
+        changes = [*by_light, *of_phase, *of_levels[1:], *of_crosstalk, *slopes.of_light]
         moves = [places[:, chosen] for places in slopes.of_cameras]
         columns = []
         for camera, arm in enumerate((0.0, state.quadrature_phase)):

@@ -307,13 +307,19 @@ class Decoder:
         return replace(page, timings=Timings(checked - start, inferred - checked - waited, behind, waiting_s=waited))
 
     def post_process(self, inference: Inference, levels: int, pilots: Pilots | None = None) -> DecodedPage:
-        """Piston, smooth phase error, trust and decision: all that is behind the graph, timings left at zero."""
+        """Piston, crosstalk, smooth phase error, flicker, trust, decision: all behind the graph; timings are zero."""
         known, shown = pilots or self.pilots(levels), self.bundle.levels(levels)
         reading = read_pilots(inference.p * (inference.concentration > 0), known)
+        if any(shown.crosstalk):
+            inference = inference.turned(-shown.of_neighbours(inference.turned(-reading.piston.angle_rad).p))
+            reading = read_pilots(inference.p, known)
         phase = remove_piston(inference.phase, reading.piston.angle_rad)
         error = self.phase_refit.error(phase, inference.concentration, shown, known)
         phase = remove_piston(phase, error)
         concentration = inference.concentration * np.float32(reading.trust)
+        stroke = stroke_error(phase, concentration, reading.sound)
+        flicker = stroke.of_phases(phase)
+        phase = remove_piston(phase, flicker)
         symbols, confidence = decide_with_confidence(phase, concentration, shown)
         return DecodedPage(
             symbols=symbols,
@@ -326,9 +332,9 @@ class Decoder:
             pilot_trust=reading.trust,
             check=reading.check,
             timings=Timings(0.0, 0.0, 0.0),
-            phase_error=error,
+            phase_error=error + flicker,
             level_phases=shown.uneven,
-            stroke_relative=stroke_error(phase, concentration, reading.sound),
+            stroke_relative=stroke.relative,
         )
 
     def _check_graph(self) -> None:

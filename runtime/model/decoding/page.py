@@ -37,8 +37,8 @@ class Inference:
     residual: float = 0.0
     waited_s: float = 0.0
 
-    def turned(self, by: NDArray[np.floating]) -> Inference:
-        """The same with `by` (radians [ny, nx]) added to the phases."""
+    def turned(self, by: NDArray[np.floating] | float) -> Inference:
+        """The same with `by` (radians, [ny, nx] or one number) added to the phases."""
         phase = (self.phase + by).astype(np.float32)
         p = self.concentration * np.stack([np.cos(phase), np.sin(phase)])
         return replace(self, p=p, phase=phase)

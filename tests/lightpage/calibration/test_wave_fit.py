@@ -88,7 +88,7 @@ def test_a_realistic_device_is_told_from_near_it_with_calibrated_deviations() ->
     seed = 1
     # a taper is told by the other parameters
     device = draw_device(np.random.default_rng(seed)).with_settings(["geometry.pipe_taper_relative=0.003"])
-    truth, levels = true_parameters(PROFILE, device), true_modulation(device.slm)
+    truth, levels = true_parameters(PROFILE, device), true_modulation(device.slm, PROFILE)
     rng, angle = np.random.default_rng([seed, 1]), NAMES.index("pipe_angle_rad")
     start = truth + 0.02 * PRIORS * rng.standard_normal(len(PRIORS))
     start[angle] = truth[angle] + 4e-4
@@ -127,7 +127,7 @@ def test_how_much_path_real_lenses_add_comes_back() -> None:
 
 def test_held_parameters_keep_their_values_and_priors_hold_the_others() -> None:
     device = draw_device(np.random.default_rng(3))
-    truth, levels = true_parameters(PROFILE, device), true_modulation(device.slm)
+    truth, levels = true_parameters(PROFILE, device), true_modulation(device.slm, PROFILE)
     fit, start = seen_by(device, 3), truth.copy()
     angle = NAMES.index("pipe_angle_rad")
     start[angle] += 4e-4
@@ -158,9 +158,9 @@ def test_a_nominal_modulator_stays_nominal_and_axial_places_and_tilts_are_found_
 
 def test_what_the_modulator_makes_of_its_levels_comes_back_with_calibrated_deviations() -> None:
     slm = SlmDefects(stroke_relative_error=-0.08, level_sine_rad=0.2, level_cosine_rad=0.1, unmodulated_relative=0.1)
-    slm = slm.model_copy(update={"blur_px": 0.45})
+    slm = slm.model_copy(update={"blur_px": 0.45, "crosstalk_relative": 0.02})
     device = Device(slm=slm, drift=Drift(shift_px=0))
-    start, truth = true_parameters(PROFILE, device), true_modulation(slm)
+    start, truth = true_parameters(PROFILE, device), true_modulation(slm, PROFILE)
     found = seen_by(device, 2).fit(start, device.homodyne.turn_rad, EVERY, levels=LevelPrior())
     off = np.array(found.modulation.coefficients) - truth.coefficients
     assert np.sqrt(np.mean((off / found.modulation_deviations) ** 2)) < 2
@@ -173,7 +173,9 @@ def test_what_the_modulator_makes_of_its_levels_comes_back_with_calibrated_devia
 @pytest.mark.parametrize("stroke", [0.0, -0.02])
 def test_a_re_fit_finds_a_stroke_that_has_changed_and_else_leaves_the_levels_as_they_were(stroke: float) -> None:
     slm = SlmDefects(level_sine_rad=0.1, unmodulated_relative=0.05)
-    earlier, later = (true_modulation(slm.model_copy(update={"stroke_relative_error": by})) for by in (0.0, stroke))
+    earlier, later = (
+        true_modulation(slm.model_copy(update={"stroke_relative_error": by}), PROFILE) for by in (0.0, stroke)
+    )
     device = Device(slm=slm.model_copy(update={"stroke_relative_error": stroke}), drift=Drift(shift_px=0))
     start, drift = true_parameters(PROFILE, device), LevelPrior(earlier, DRIFTS)
     found = seen_by(device, 2).fit(start, device.homodyne.turn_rad, ("in_phase",), modulation=earlier, levels=drift)

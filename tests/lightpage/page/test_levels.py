@@ -5,16 +5,17 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from lightpage.device.profile import load_profile
 from lightpage.device.state import SlmDefects
 from lightpage.errors import PageError
 from lightpage.page.levels import Levels
-from lightpage.page.modulation import NOMINAL
+from lightpage.page.modulation import NOMINAL, Modulation
 from lightpage.page.symbols import symbol_phases
 from lightpage.simulator.true_optics import modulated, true_modulation
 from tests.lightpage.refused import refused
 from tests.lightpage.uneven import UNEVEN, overlapping, uneven
 
-ALL = Levels(256).phases
+ALL, BENCH = Levels(256).phases, load_profile("bench")
 
 
 @pytest.mark.parametrize("levels_of", [Levels, uneven, overlapping])
@@ -67,7 +68,22 @@ def test_the_phase_of_a_level_is_that_of_its_light() -> None:
 )
 def test_few_coefficients_tell_what_a_real_modulator_makes_of_its_levels(defects: dict[str, float]) -> None:
     slm = SlmDefects(**defects)  # type: ignore[arg-type]
-    off = modulated(slm, ALL) / true_modulation(slm).light(ALL)
+    off = modulated(slm, ALL) / true_modulation(slm, BENCH).light(ALL)
     # but for a factor, which is illumination and piston, what a fifth of unmodulated light leaves of the next harmonics
     assert np.abs(off / off.mean() - 1).max() < 1.5e-3
-    assert true_modulation(SlmDefects()) == NOMINAL
+    assert true_modulation(SlmDefects(), BENCH) == NOMINAL
+
+
+def test_what_crosstalk_adds_is_seen_in_a_decoded_page() -> None:
+    modulation = Modulation((*NOMINAL.coefficients[:-2], 0.01, 0.004))
+    written = np.random.default_rng(0).uniform(0, 2 * np.pi, (20, 30))
+    added = modulation.page_phase(written) - written
+    beside = written[4, [2, 4]].sum() - 2 * np.pi, written[[3, 5], 3].sum() - 2 * np.pi
+    assert added[4, 3] == pytest.approx(0.01 * beside[0] + 0.004 * beside[1])
+    light, levels = modulation.page_light(written), modulation.page_levels(256)
+    np.testing.assert_allclose(light, np.exp(1j * (written + added)), atol=1e-12)
+    p = 1e4 * np.stack([light.real, light.imag])
+    off = levels.of_neighbours(p) - added
+    assert np.sqrt(np.mean(off[1:-1, 1:-1] ** 2)) < 0.15 * np.std(added)
+    assert np.abs(levels.of_neighbours(1e-8 * p)).max() < 1e-5
+    assert not Levels(256).of_neighbours(p).any()

@@ -48,14 +48,14 @@ def mask() -> np.ndarray:
 
 
 def test_small_pages_are_trained_on_whole(store: FeatureStore, mask: np.ndarray) -> None:
-    pages = training_pages([store, store], mask, Hyperparameters(patch=41))
+    pages = training_pages([store, store], mask, Hyperparameters(patch=41), 4)
     assert len(pages) == 6  # type: ignore[arg-type]
     light, positions, phases = store[1]
     positions = with_page_coordinates(positions, SHAPE, (slice(None), slice(None)))
     pilots = torch.from_numpy(mask)
     for shown, whole in zip(pages[4], (light, positions, phases.masked_fill(pilots, torch.nan)), strict=True):
         torch.testing.assert_close(shown, whole, rtol=0, atol=0, equal_nan=True)
-    wide = training_pages([store], mask, Hyperparameters(patch=40))
+    wide = training_pages([store], mask, Hyperparameters(patch=40), 4)
     assert wide[0][-1].shape == (30, 40)  # the shorter side is taken whole
 
 
@@ -70,11 +70,11 @@ def test_a_page_of_few_rows_is_cut_along_its_columns_alone(tmp_path: Path, mask:
 
 def test_patches_in_which_the_network_sees_no_symbol_whole_are_refused(store: FeatureStore, mask: np.ndarray) -> None:
     with pytest.raises(InvalidInputError, match="at least 11"):
-        training_pages([store], mask, Hyperparameters(blocks=2, patch=10))
+        training_pages([store], mask, Hyperparameters(blocks=2, patch=10), 4)
     rim = reach(1, 1)
     with pytest.raises(InvalidInputError, match=f"at least {2 * rim + 2}"):  # cut to whole steps of two
-        training_pages([store], mask, Hyperparameters(blocks=1, depth=1, patch=2 * rim + 1))
-    smallest = training_pages([store], mask, Hyperparameters(blocks=1, depth=1, patch=2 * rim + 2))
+        training_pages([store], mask, Hyperparameters(blocks=1, depth=1, patch=2 * rim + 1), 4)
+    smallest = training_pages([store], mask, Hyperparameters(blocks=1, depth=1, patch=2 * rim + 2), 4)
     assert all(torch.isfinite(smallest[index][-1]).any() for index in range(len(smallest)))  # type: ignore[arg-type]
 
 
@@ -86,7 +86,7 @@ def test_a_network_says_of_a_patch_what_it_says_of_the_page(
     network = SymbolUNet(8, channels=8, blocks=blocks, depth=depth)
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.2)
-    patches = training_pages([store], mask, Hyperparameters(blocks=blocks, depth=depth, patch=SIDE))
+    patches = training_pages([store], mask, Hyperparameters(blocks=blocks, depth=depth, patch=SIDE), 4)
     assert len(patches) == 3 * 2 * 2  # type: ignore[arg-type]
     asked_at = set()
     for index in [*range(len(patches))] * 2:  # type: ignore[arg-type]
