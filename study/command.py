@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import click
 import torch
@@ -15,15 +16,15 @@ from lightpage.cli.options import JSON, FiniteRange
 from lightpage.cli.paths import OutputFolder
 from lightpage.cli.progress_bar import percent_bar
 from lightpage.device.profile import load_profile
-from lightpage.errors import InvalidInputError
-from lightpage.metrics.provenance import write_figures
+from lightpage.errors import InvalidInputError, MissingResultsError
+from lightpage.metrics.provenance import digest, write_figures
 from lightpage.run_files import BEGUN
 from lightpage.study import STUDIES
 from lightpage.study.lights import Lights
-from lightpage.study.study import RESULTS, Settings, left, measured, written
+from lightpage.study.study import RESULTS, Case, Result, Settings, Study, left, measured, written
 from lightpage.train.data.torch_engine import torch_device
 from lightpage.train.fitting.memory import keep_freed_memory
-from lightpage.train.runs import begin, sole_writer
+from lightpage.train.runs import begin, check_begun, sole_writer
 
 _FULL = "paper"
 _RESULTS = "results"
@@ -55,11 +56,14 @@ _RESULTS = "results"
     metavar="WORD",
     help="Of a study that varies many things, the cases whose names begin so; others can follow in the same OUT.",
 )
+@click.option(
+    "--set", "changes", multiple=True, metavar="TABLE.KEY=VALUE", help="Change one number of the simulated device."
+)
 @click.option("--left", "tell_left", is_flag=True, help="Name the cases that are left to measure, in order, and end.")
 @click.option(
     "--minutes",
     type=FiniteRange(min=0.1, max=10_000),
-    help="Stop after so long as after Ctrl-C: what is measured is kept, what is trained goes on from its last pass.",
+    help="Stop after so long, with status 75: what is measured is kept, what is trained goes on from its last pass.",
 )
 @click.option(
     "--compute",
@@ -77,6 +81,7 @@ def study(
     share: float,
     channels: int,
     only: tuple[str, ...],
+    changes: tuple[str, ...],
     tell_left: bool,
     minutes: float | None,
     compute: str | None,
@@ -91,6 +96,11 @@ def study(
     device = torch_device(compute or ("cuda" if torch.cuda.is_available() else "cpu"))
     if full and chosen.trains and device.type != "cuda" and not tell_left:
         raise InvalidInputError(f"study {name} --full", "no CUDA device", "one: it trains networks at full scale")
+    if compute and not chosen.trains:
+        raise InvalidInputError(f"study {name} --compute", f"{compute} of a study that trains nothing", "no --compute")
+    if changes and not chosen.changeable:
+        able = ", ".join(name for name, study in STUDIES.items() if study.changeable)
+        raise InvalidInputError(f"study {name} --set", " ".join(changes), f"no --set, or one of {able}")
     if share < 1 and not chosen.trains:
         raise InvalidInputError(f"study {name} --share", f"{share:g} of a study that trains nothing", "no --share")
     if channels != Settings.channels and (quick or not chosen.trains):
@@ -101,12 +111,20 @@ def study(
     context = click.get_current_context()
     context.meta["lightpage.resume"] = "run the same command again; it goes on where it was"
     settings = Settings(
-        load_profile(_FULL if full else profile_name or "bench"), quick, seed, share, channels, Lights(str(device))
+        load_profile(_FULL if full else profile_name or "bench"),
+        quick,
+        seed,
+        share,
+        channels,
+        changes,
+        Lights(str(device)),
     )
+    begun = {"study": name, "results": RESULTS, **settings.key()}
     results_folder = out / _RESULTS
     cases = chosen.chosen(settings, only, results_folder)  # before anything is written
     if tell_left:
-        click.echo("\n".join(left(chosen, settings, results_folder)) or "none")
+        check_begun(out, begun)
+        click.echo("\n".join(left(cases, results_folder)) or "none")
         return
     context.with_resource(sole_writer(out))
     if results_folder.exists() and not results_folder.is_dir():
@@ -114,44 +132,76 @@ def study(
     if results_folder.exists() and not (out / BEGUN).exists():
         expected = f"a study that says in {BEGUN} what it was begun with, or another --out"
         raise InvalidInputError(f"study {out}", "results of unknown origin", expected)
-    begin(out, {"study": name, "results": RESULTS, **settings.key()})
+    begin(out, begun)
     results_folder.mkdir(exist_ok=True)
-    results = []
-    with percent_bar() as progress, _stopped_after(minutes):
-        for number, case in enumerate(cases):
-            results.append(
-                measured(
-                    chosen,
-                    settings,
-                    case,
-                    results_folder,
-                    lambda what, share, n=number, c=case: progress(f"{c['name']}: {what}", (n + share) / len(cases)),  # type: ignore[misc]
+    results: list[Result] = []
+    try:
+        with percent_bar() as progress, _stopped_after(minutes, f"study {name}"):
+            for number, case in enumerate(cases):
+                results.append(
+                    measured(
+                        chosen,
+                        settings,
+                        case,
+                        results_folder,
+                        lambda what, share, n=number, c=case: progress(
+                            f"{c['name']}: {what}", (n + share) / len(cases)
+                        ),  # type: ignore[misc]
+                    )
                 )
-            )
+    finally:
+        if results and (chosen.parts or len(results) == len(cases)):
+            _write(out, chosen, begun, settings, cases[: len(results)], results, json_path)
+
+
+def _write(
+    out: Path,
+    chosen: Study,
+    begun: dict[str, Any],
+    settings: Settings,
+    cases: Sequence[Case],
+    results: Sequence[Result],
+    json_path: Path | None,
+) -> None:
+    """Write table, picture and figures of the cases that are measured, and print the table."""
+    share, channels = settings.share, settings.channels
     how = "" if share == 1 else f"; {share:.0%} of the authors' steps"
     how += "" if channels == Settings.channels else f"; network of {channels}/{2 * channels} channels"
+    how += "".join(f"; {change}" for change in settings.changes)
     table = written(out, chosen, settings, cases, results, how)
-    figures = {
-        "study": name,
-        **settings.key(),
-        "header": list(chosen.header),
-        "rows": [list(row) for row in chosen.rows(cases, results)],
-    }
+    rows = [list(row) for row in chosen.rows(cases, results)]
+    figures = {"study": begun["study"], **settings.key(), "header": list(chosen.header), "rows": rows}
+    kept = {path.name: digest(path) for path in sorted((out / _RESULTS).iterdir()) if path.is_file()}
     for path in (out / "study.json", json_path):
-        write_figures(path, figures, settings=settings.key(), results=results_folder)
+        write_figures(path, figures, settings=settings.key(), results=kept)
     click.echo(f"{table}\n\nwritten to {out}")
 
 
 @contextmanager
-def _stopped_after(minutes: float | None) -> Iterator[None]:
-    """Interrupt the program as Ctrl-C does, where the work within takes longer."""
+def _stopped_after(minutes: float | None, subject: str) -> Iterator[None]:
+    """Interrupt the work within where it takes longer.
+
+    Raises:
+        MissingResultsError: it took longer.
+    """
     if minutes is None:
         yield
         return
-    alarm = threading.Timer(60 * minutes, signal.raise_signal, [signal.SIGINT])
+    over = threading.Event()
+
+    def stop() -> None:
+        over.set()
+        signal.raise_signal(signal.SIGINT)
+
+    alarm = threading.Timer(60 * minutes, stop)
     alarm.daemon = True
-    alarm.start()
     try:
+        alarm.start()
         yield
+    except (KeyboardInterrupt, click.Abort):
+        if over.is_set():
+            got = f"{minutes:g} minutes over"
+            raise MissingResultsError(subject, got, "the same command again: it goes on where it was") from None
+        raise
     finally:
         alarm.cancel()

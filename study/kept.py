@@ -17,16 +17,16 @@ from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.device.profile import Profile
 from lightpage.device.state import Device
 from lightpage.metrics.information import achievable_rate
+from lightpage.page.correction import corrected
 from lightpage.page.levels import MAX_LEVELS
-from lightpage.page.pilots import Pilots, read_pilots, remove_piston, stroke_error
+from lightpage.page.phase_refit import PhaseRefit
+from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import pilot_mask
 from lightpage.progress import reporting
 from lightpage.recording.reader import Recording
-from lightpage.runtime.model.decoding.phase_refit import PhaseRefit
 from lightpage.simulator.recording_job import RecordingJob
 from lightpage.study.known import Known
 from lightpage.train.data.features import FeatureExtractor
-from lightpage.train.fitting.validation import without_piston
 from lightpage.train.models.decoder import SymbolDecoder
 from lightpage.train.models.presets import PRESETS, STANDARD
 from lightpage.train.runs import Run, load_decoder, load_run
@@ -90,13 +90,9 @@ class KeptDecoder:
                 light, positions = torch.from_numpy(shown.light).float(), torch.from_numpy(shown.positions)
                 p = self.decoder.network(light.flatten(0, 2)[None], positions[None])[0].numpy() * self.run.kappa_scale
             pilots = Pilots.of_symbols(mask, symbols, levels)
-            p = without_piston(p, levels.phases[symbols].astype(np.float32), mask, levels)
-            reading = read_pilots(p, pilots)
-            phase = remove_piston(np.arctan2(p[1], p[0]), reading.piston.angle_rad)
-            concentration = np.hypot(p[0], p[1]) * np.float32(reading.trust)
-            phase = remove_piston(phase, refit.error(phase, concentration, levels, pilots))
-            phase = remove_piston(phase, stroke_error(phase, concentration, reading.sound).of_phases(phase))
-            rates.append(achievable_rate(phase[~mask], concentration[~mask], symbols[~mask], levels).mean())
+            page = corrected(np.arctan2(p[1], p[0]), np.hypot(p[0], p[1]), levels, pilots, refit)
+            air = achievable_rate(page.phase[~mask], page.concentration[~mask], symbols[~mask], levels)
+            rates.append(air.mean())
         return float(np.mean(rates))
 
 

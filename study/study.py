@@ -12,8 +12,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from lightpage.device.profile import Profile
+from lightpage.device.state import Device
 from lightpage.errors import InvalidInputError
-from lightpage.files import replace_file, replace_text
+from lightpage.files import replace_file, replace_text, write_json
 from lightpage.metrics.provenance import PROVENANCE, provenance
 from lightpage.progress import Progress
 from lightpage.study.lights import Lights
@@ -39,6 +40,7 @@ class Settings:
         seed: seed of everything random.
         share: share of the authors' steps that networks are trained for.
         channels: channels of the published network at sample pitch, twice as many below; the authors' if left out.
+        changes: changes of the realistic device, `TABLE.KEY=VALUE`.
         lights: light that cases share; where they compute does not set them apart.
     """
 
@@ -47,12 +49,23 @@ class Settings:
     seed: int = 0
     share: float = 1.0
     channels: int = PublishedChoices.channels[0]
+    changes: tuple[str, ...] = ()
     lights: Lights = field(default_factory=Lights, compare=False)
 
     def key(self) -> dict[str, Any]:
         """The settings as JSON keeps them."""
         kept = {name: getattr(self, name) for name in ("quick", "seed", "share", "channels")}
-        return {"profile": self.profile.to_toml(), **kept}
+        changes = {"changes": list(self.changes)} if self.changes else {}  # folders of before know none
+        return {"profile": self.profile.to_toml(), **kept, **changes}
+
+    @property
+    def device(self) -> Device:
+        """The realistic device with the changes.
+
+        Raises:
+            ProfileError: see `Device.with_settings`.
+        """
+        return Device().with_settings(list(self.changes))
 
 
 @dataclass(frozen=True)
@@ -70,6 +83,7 @@ class Study:
         plot: a picture of all results.
         trains: whether it trains published decoders, which takes hours without a GPU at full scale.
         parts: whether table and picture can be made of some of the cases, with those that say `needed`.
+        changeable: whether its device may be another than the realistic one.
     """
 
     title: str
@@ -81,6 +95,7 @@ class Study:
     plot: Callable[[Settings, Sequence[Case], Sequence[Result]], Figure]
     trains: bool = False
     parts: bool = False
+    changeable: bool = False
 
     def chosen(self, settings: Settings, only: Sequence[str], folder: Path) -> list[Case]:
         """Return the cases whose names begin with one of some words, are needed, or have results in the folder.
@@ -118,9 +133,9 @@ def measured(study: Study, settings: Settings, case: Case, folder: Path, progres
     return result
 
 
-def left(study: Study, settings: Settings, folder: Path) -> list[str]:
+def left(cases: Sequence[Case], folder: Path) -> list[str]:
     """Names of the cases without a result in the folder, in order."""
-    return [str(case["name"]) for case in study.cases(settings) if not (folder / f"{case['name']}.json").exists()]
+    return [str(case["name"]) for case in cases if not (folder / f"{case['name']}.json").exists()]
 
 
 def written(
@@ -158,7 +173,7 @@ def _save(path: Path, result: Result, made_by: dict[str, Any]) -> None:
     rest = {name: value for name, value in result.items() if name not in arrays}
     save_arrays(_arrays(path), arrays)
     kept = {PROVENANCE: made_by, "values": rest, "arrays": list(arrays)}
-    replace_text(path, json.dumps(kept, indent=1), "result of a study")
+    write_json(path, kept)
 
 
 def load_result(path: Path) -> Result:
@@ -170,7 +185,8 @@ def load_result(path: Path) -> Result:
     try:
         kept = json.loads(path.read_text("utf-8"))
         arrays = load_arrays(_arrays(path))
-        return dict(kept["values"]) | {name: arrays[name] for name in kept["arrays"]}
+        values = {name: np.nan if value is None else value for name, value in kept["values"].items()}
+        return values | {name: arrays[name] for name in kept["arrays"]}
     except (OSError, ValueError, TypeError, KeyError, InvalidInputError) as error:
         expected = "a whole one with its arrays; where it is removed, the case is measured again"
         raise InvalidInputError(f"result {path}", error, expected) from None

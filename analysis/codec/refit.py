@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from lightpage.cli.main import run
 from lightpage.errors import InvalidInputError
 from lightpage.metrics.information import achievable_rate
+from lightpage.page.phase_refit import ROUNDS, PhaseRefit
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import symbol_phases
 from lightpage.progress import track
@@ -26,7 +27,6 @@ from lightpage.runtime.archives.recordings.evaluation import was_seen
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
-from lightpage.runtime.model.decoding.phase_refit import ROUNDS, PhaseRefit
 
 LEVELS = (32, 64, 128, 256)
 Page = tuple[NDArray[np.float32], NDArray[np.float32]]

@@ -95,7 +95,7 @@ def main(
         places = rng.integers(profile.page_shape, size=(symbols, 2))
         found.append([bound.concentration(row, column) for row, column in places.tolist()])
         write_figures(json_path, {"asked": asked, "concentrations": found}, asked=asked)
-    each = bits([one for page in found[:pages] for one in page], levels, np.random.default_rng(seed))
+    each = bits([one for page in found for one in page], levels, np.random.default_rng(seed))
     figures = {"bits": float(each.mean()), "standard_error": float(each.std(ddof=1) / np.sqrt(each.size))}
     write_figures(json_path, {"asked": asked, **figures, "concentrations": found}, asked=asked)
     click.echo(f"bound {figures['bits']:.3f} +- {figures['standard_error']:.3f} bits a symbol, {each.size} symbols")

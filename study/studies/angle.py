@@ -13,7 +13,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from lightpage.device.state import Device
 from lightpage.progress import Progress
 from lightpage.study.lights import DataSet
 from lightpage.study.study import Case, Result, Row, Settings, Study
@@ -24,29 +23,29 @@ _LOCKED = 0.3
 
 
 def _cases(settings: Settings) -> list[Case]:
+    cases = (("ray", "ray", False), ("none", "none", False), ("ray-matched", "ray", True))
+    true = settings.device.geometry.pipe_angle_deg
     return [
-        {"name": "ray", "localizer": "ray", "matched": False},
-        {"name": "none", "localizer": "none", "matched": False},
-        {"name": "ray-matched", "localizer": "ray", "matched": True},
+        {"name": name, "localizer": localizer, "matched": matched, "true_deg": true}
+        for name, localizer, matched in cases
     ]
 
 
 def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> Result:
-    data_set = DataSet(settings.profile, Device())
+    data_set = DataSet(settings.profile, settings.device)
     if case["matched"]:
         curvature = settings.profile.light_curvature_rad
-        data_set = DataSet(settings.profile, Device().with_settings([f"reference.curvature_rad={curvature}"]))
+        data_set = DataSet(settings.profile, settings.device.with_settings([f"reference.curvature_rad={curvature}"]))
     return trained(settings, data_set, case["localizer"], work, progress)
 
 
 def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:
-    true = Device().geometry.pipe_angle_deg
     rows: list[Row] = []
     for case, result in zip(cases, results, strict=True):
         reference = "matched" if case["matched"] else "nearly flat"
         locked = first_step(result["training_curve"])
         reached = (result[name] for name in ("air", "own_mi", "steps"))
-        rows.append((case["localizer"], reference, result["angle_deg"], true, locked, *reached))
+        rows.append((case["localizer"], reference, result["angle_deg"], case["true_deg"], locked, *reached))
     return rows
 
 
@@ -71,7 +70,7 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
         axis.imshow(result["own_mi_map"], vmin=0, vmax=top, cmap="viridis")
         axis.set_title(f"{name}: own-MI {result['own_mi']:.2f}, AIR {result['air']:.2f} bit/symbol", fontsize="medium")
         axis.set_axis_off()
-    angles.axhline(Device().geometry.pipe_angle_deg, color="k", linestyle="--", label="true")
+    angles.axhline(settings.device.geometry.pipe_angle_deg, color="k", linestyle="--", label="true")
     angles.set_ylabel("fitted pipe angle, degrees")
     rates.set_ylabel("AIR, bit/symbol; thin: pages trained on")
     rates.set_ylim(-1, max(1.0, rates.get_ylim()[1]))
@@ -91,4 +90,5 @@ STUDY = Study(
     rows=_rows,
     plot=_plot,
     trains=True,
+    changeable=True,
 )

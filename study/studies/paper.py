@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from lightpage.device.state import Device
 from lightpage.progress import Progress
 from lightpage.study.lights import DataSet
 from lightpage.study.ours import preset_trained
@@ -24,7 +23,7 @@ from lightpage.study.studies import (
     receptive_field,
     symbol_size,
 )
-from lightpage.study.study import Case, Result, Row, Settings, Study, measured, written
+from lightpage.study.study import Case, Result, Row, Settings, Study, load_result, measured, written
 from lightpage.train.models.presets import ACCURATE, STANDARD
 
 _PRESET = "preset"
@@ -79,14 +78,37 @@ def _piece(figure: str, study: str, case: Case) -> Case:
 def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> Result:
     name, inner = case["study"], case["case"]
     if name == _PRESET:
-        data_set = DataSet(settings.profile.with_symbols_of(inner["size"]), Device())
+        data_set = DataSet(settings.profile.with_symbols_of(inner["size"]), settings.device)
         return preset_trained(settings, data_set, inner["preset"], work, progress)
     if name in _LEARNING:
-        return _LEARNING[name].measure(settings, inner, work, progress)
+        result = _LEARNING[name].measure(settings, inner, work, progress)
+        _draw(settings, name, {case["name"]: result}, work.parent)
+        return result
     study = _WHOLE[name]
     cases = study.cases(settings)
     written(work, study, settings, cases, [measured(study, settings, each, work, progress) for each in cases])
     return {"cases": len(cases)}
+
+
+def _draw(settings: Settings, name: str, found: dict[str, Result], results: Path) -> None:
+    """Write table and picture of a study whose cases are pieces, into a folder of its name, once all are measured.
+
+    Args:
+        settings: settings of the study.
+        name: name of that study.
+        found: results by piece that are not kept yet.
+        results: folder of the pieces' results.
+    """
+    study, known = _LEARNING[name], dict(found)
+    cases = study.cases(settings)
+    pieces = ["ray-4x4" if (name, case["name"]) == ("angle", "ray") else case["name"] for case in cases]
+    for piece in pieces:
+        path = results / f"{piece}.json"
+        if piece not in known and path.exists():
+            known[piece] = load_result(path)
+    if known.keys() >= set(pieces):
+        (results / name).mkdir(exist_ok=True)
+        written(results / name, study, settings, cases, [known[piece] for piece in pieces])
 
 
 def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:
@@ -122,7 +144,7 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
     for name, result in read:
         if len(result["angles"]):
             angles.plot(*result["angles"].T, ".-", markersize=3, label=name)
-    angles.axhline(Device().geometry.pipe_angle_deg, color="k", linestyle="--", label="true")
+    angles.axhline(settings.device.geometry.pipe_angle_deg, color="k", linestyle="--", label="true")
     angles.set_xlabel("step")
     angles.set_ylabel("pipe angle, degrees")
     angles.legend(fontsize="small")
@@ -145,4 +167,5 @@ STUDY = Study(
     plot=_plot,
     trains=True,
     parts=True,
+    changeable=True,
 )

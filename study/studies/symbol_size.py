@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from lightpage.device.state import Device
 from lightpage.progress import Progress
 from lightpage.study.lights import DataSet
 from lightpage.study.study import Case, Result, Row, Settings, Study
@@ -28,7 +27,7 @@ def _cases(settings: Settings) -> list[Case]:
 
 
 def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> Result:
-    data_set = DataSet(settings.profile.with_symbols_of(case["size"]), Device())
+    data_set = DataSet(settings.profile.with_symbols_of(case["size"]), settings.device)
     return trained(settings, data_set, case["localizer"], work, progress)
 
 
@@ -91,4 +90,5 @@ STUDY = Study(
     rows=_rows,
     plot=_plot,
     trains=True,
+    changeable=True,
 )

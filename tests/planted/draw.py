@@ -18,7 +18,7 @@ from tests.planted.faults import ROOT, Fault, blocks_of, load
 COUNT = 60
 AREAS = {
     "page-code": {"lightpage/codec": "* ldpc/* compiled/* likelihood/*"},
-    "decoder": {"lightpage": "page/* metrics/*", "runtime/model/decoding": "decoder page phase_refit"},
+    "decoder": {"lightpage": "page/* metrics/*", "runtime/model/decoding": "decoder page"},
     "tracking": {"runtime/model/decoding": "image_tracker following tracking image_drift"},
     "calibration": {"lightpage/calibration": "*", "train/fitting": "fit fitted"},
     "registry": {"runtime/service": "models/history models/loader models/models models/uploads pages/replays"},

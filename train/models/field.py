@@ -383,7 +383,8 @@ class TorchFieldSolver:
         frames = (pair.in_phase, pair.quadrature, references.in_phase, references.quadrature)
         device = next(self._recovery.buffers()).device
         seen = (torch.from_numpy(each.astype(np.float32)).to(device) for each in (*frames, registration, homodyne))
-        with torch.no_grad():
+        exact = torch.backends.cudnn.flags(enabled=True, allow_tf32=False)  # 10 bits would be seen
+        with torch.no_grad(), exact:
             field, residual = self._recovery(*seen, None if apart is None else torch.from_numpy(apart).to(device))
         real, imaginary = field.cpu().numpy()
         return np.asarray(real + 1j * imaginary, dtype=np.complex64), residual.cpu().numpy()

@@ -20,8 +20,10 @@ from lightpage.errors import (
     raised_as,
 )
 from lightpage.metrics.information import decide_with_confidence
+from lightpage.page.correction import corrected
 from lightpage.page.levels import MAX_LEVELS, check_levels
-from lightpage.page.pilots import Pilots, read_pilots, remove_piston, stroke_error
+from lightpage.page.phase_refit import PhaseRefit
+from lightpage.page.pilots import Pilots
 from lightpage.recording.exposure import check_light
 from lightpage.recording.frame_pair import FramePair, check_pair
 from lightpage.runtime.model.bundle.bundle import Bundle
@@ -31,7 +33,6 @@ from lightpage.runtime.model.decoding.batches import NO_BATCHES, Batches, Batchi
 from lightpage.runtime.model.decoding.camera_view import CameraView
 from lightpage.runtime.model.decoding.golden import check_golden
 from lightpage.runtime.model.decoding.page import OUTPUTS, DecodedPage, Inference, Timings, check_residual
-from lightpage.runtime.model.decoding.phase_refit import PhaseRefit
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
 from lightpage.runtime.model.execution.session import Port, open_session, running
 from lightpage.runtime.model.execution.table_graph import GraphFile, TableGraph
@@ -309,32 +310,22 @@ class Decoder:
     def post_process(self, inference: Inference, levels: int, pilots: Pilots | None = None) -> DecodedPage:
         """Piston, crosstalk, smooth phase error, flicker, trust, decision: all behind the graph; timings are zero."""
         known, shown = pilots or self.pilots(levels), self.bundle.levels(levels)
-        reading = read_pilots(inference.p * (inference.concentration > 0), known)
-        if any(shown.crosstalk):
-            inference = inference.turned(-shown.of_neighbours(inference.turned(-reading.piston.angle_rad).p))
-            reading = read_pilots(inference.p, known)
-        phase = remove_piston(inference.phase, reading.piston.angle_rad)
-        error = self.phase_refit.error(phase, inference.concentration, shown, known)
-        phase = remove_piston(phase, error)
-        concentration = inference.concentration * np.float32(reading.trust)
-        stroke = stroke_error(phase, concentration, reading.sound)
-        flicker = stroke.of_phases(phase)
-        phase = remove_piston(phase, flicker)
-        symbols, confidence = decide_with_confidence(phase, concentration, shown)
+        page = corrected(inference.phase, inference.concentration, shown, known, self.phase_refit)
+        symbols, confidence = decide_with_confidence(page.phase, page.concentration, shown)
         return DecodedPage(
             symbols=symbols,
             confidence=confidence,
-            concentration=concentration,
-            phase=phase,
+            concentration=page.concentration,
+            phase=page.phase,
             levels=levels,
-            piston_rad=reading.piston.angle_rad,
-            pilot_coherence=reading.piston.coherence,
-            pilot_trust=reading.trust,
-            check=reading.check,
+            piston_rad=page.reading.piston.angle_rad,
+            pilot_coherence=page.reading.piston.coherence,
+            pilot_trust=page.reading.trust,
+            check=page.reading.check,
             timings=Timings(0.0, 0.0, 0.0),
-            phase_error=error + flicker,
+            phase_error=page.error,
             level_phases=shown.uneven,
-            stroke_relative=stroke.relative,
+            stroke_relative=page.stroke_relative,
         )
 
     def _check_graph(self) -> None:

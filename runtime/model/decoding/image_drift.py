@@ -25,11 +25,11 @@ from lightpage.calibration.sampling_table import SamplingTable, sampling_table, 
 from lightpage.device.profile import Profile
 from lightpage.errors import BundleError, FrameError
 from lightpage.page.levels import Levels
+from lightpage.page.phase_refit import wrapped
 from lightpage.page.pilots import Pilots, read_pilots
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.page import Inference
-from lightpage.runtime.model.decoding.phase_refit import wrapped
 
 Real = NDArray[np.float64]
 

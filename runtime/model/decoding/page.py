@@ -37,8 +37,8 @@ class Inference:
     residual: float = 0.0
     waited_s: float = 0.0
 
-    def turned(self, by: NDArray[np.floating] | float) -> Inference:
-        """The same with `by` (radians, [ny, nx] or one number) added to the phases."""
+    def turned(self, by: NDArray[np.floating]) -> Inference:
+        """The same with `by` (radians [ny, nx]) added to the phases."""
         phase = (self.phase + by).astype(np.float32)
         p = self.concentration * np.stack([np.cos(phase), np.sin(phase)])
         return replace(self, p=p, phase=phase)
@@ -95,7 +95,7 @@ class DecodedPage:
         pilot_trust: share of the network's claimed concentration that they bear out, 0..1; low after a drift.
         check: information that is claimed of the pilots, and what of it they confirm.
         timings: seconds.
-        phase_error: float32 [ny, nx], smooth error that was taken off `phase`, radians.
+        phase_error: float32 [ny, nx], smooth error and flicker that were taken off `phase`, radians.
         level_phases: phase that stands for each level, radians; None where level s is 2 pi s / M.
         image: where the image lies as this page shows it, None where it is not followed.
         stroke_relative: what the pilots show of the modulator's stroke beyond its calibration; NaN where they show

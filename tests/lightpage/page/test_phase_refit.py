@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from lightpage.page.levels import Levels
+from lightpage.page.phase_refit import ROUNDS, PhaseRefit
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import symbol_phases
-from lightpage.runtime.model.decoding.phase_refit import ROUNDS, PhaseRefit
 from tests.lightpage.uneven import overlapping, uneven
 
 SHAPE = (48, 80)
