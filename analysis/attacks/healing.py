@@ -27,8 +27,8 @@ from lightpage.codec.page_bytes import FileFacts, Header
 from lightpage.codec.page_codec import PageCodec
 from lightpage.device.state import Device, draw_device
 from lightpage.errors import InvalidInputError, RecalibrationRefusedError
-from lightpage.files import write_json
 from lightpage.metrics.measures import measure
+from lightpage.metrics.provenance import write_figures
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols
 from lightpage.progress import track
@@ -191,7 +191,7 @@ def main(bundle: str, tries: int, json_path: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
         for seed in track(list(range(len(done), tries)), "try", unit="try"):
             done.append(attack.tried(kinds[seed % len(kinds)], seed, Path(folder)))
-            write_json(json_path, {"bundle": bundle, "tries": [asdict(one) for one in done]})
+            write_figures(json_path, {"bundle": bundle, "tries": [asdict(one) for one in done]})
     for kind in kinds:
         own = [one for one in done if one.kind == kind]
         taken = sum(not one.refused for one in own)

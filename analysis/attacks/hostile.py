@@ -28,7 +28,7 @@ from google.protobuf.message_factory import GetMessageClass
 from analysis.service.running import PagesToSend, RunningService, stub
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.progress import track
 from lightpage.runtime.client.pb.inference import open_inference_pb2 as oip
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
@@ -244,7 +244,7 @@ def main(messages: int, requests: int, seed: int, json_path: Path | None) -> Non
     }
     click.echo(f"tracebacks in the log: {figures['tracebacks']}")
     if json_path is not None:
-        write_json(json_path, figures)
+        write_figures(json_path, figures)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ from google.protobuf.message_factory import GetMessageClass
 from analysis.service.running import PagesToSend, RunningService
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.progress import track
 from lightpage.runtime.client.wire.channel import TlsFiles, open_channel
 from lightpage.runtime.service.frames.inference_calls import INFERENCE, PREFIX
@@ -181,7 +181,7 @@ def main(json_path: Path | None) -> None:
     calls = sum(map(len, found["ended"].values()))
     click.echo(f"{calls} calls: {len(found['wrong'])} not as documented, {len(found['undocumented'])} undocumented")
     if json_path is not None:
-        write_json(json_path, found)
+        write_figures(json_path, found)
     if found["wrong"] or found["undocumented"]:
         sys.exit(1)
 

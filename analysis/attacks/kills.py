@@ -27,7 +27,7 @@ from lightpage.cli.paths import OutputFile, OutputFolder
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device
 from lightpage.errors import LightpageError
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.page.symbols import random_symbols
 from lightpage.progress import track
 from lightpage.recording.writer import RecordingWriter
@@ -174,7 +174,7 @@ def main(kills: int, seed: int, longest_s: float, out: Path, json_path: Path | N
     for each in (failed + killed.bad)[:10]:
         click.echo(f"  {each}")
     if json_path is not None:
-        write_json(json_path, figures)
+        write_figures(json_path, figures)
 
 
 if __name__ == "__main__":

@@ -34,7 +34,7 @@ from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import load_profile
 from lightpage.errors import LightpageError
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
@@ -279,7 +279,7 @@ def main(tries: int, seed: int, json_path: Path | None) -> None:
     for words in wrong:
         click.echo(f"wrong: {words}")
     if json_path is not None:
-        write_json(json_path, found)
+        write_figures(json_path, found)
     if wrong:
         sys.exit(1)
 

@@ -32,7 +32,7 @@ from analysis.service.running import PagesToSend, RunningService, until
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.errors import LightpageError
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.commands.service.healthcheck import is_serving
 
@@ -224,7 +224,7 @@ def main(context: click.Context, options: tuple[str, ...], json_path: Path | Non
     click.echo(f"{len(found)} calls, {len(outgoing)} of them outgoing, {len(questions)} to name servers")
     if json_path is not None:
         figures = {"planted_seen": planted, "outgoing": len(outgoing), "name_server": len(questions)}
-        write_json(json_path, {**figures, "phases": table})
+        write_figures(json_path, {**figures, "phases": table})
     if outgoing:
         context.exit(1)
 

@@ -31,7 +31,7 @@ from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import load_profile
 from lightpage.device.state import draw_device, draw_rough
 from lightpage.errors import InvalidInputError
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.progress import track
 from lightpage.train.runs import FORMAT
 
@@ -122,11 +122,11 @@ def main(
         if seed not in done:
             done[seed] = bench.foreign(seed) if foreign else bench.own(seed)
             document = {"settings": settings, "outcomes": [asdict(done[s]) for s in sorted(done)]}
-            write_json(json_path, document)
+            write_figures(json_path, document)
         click.echo(done[seed].line())
     figures = summary([done[seed] for seed in seeds])
     document = {"settings": settings, "summary": figures, "outcomes": [asdict(done[s]) for s in sorted(done)]}
-    write_json(json_path, document)
+    write_figures(json_path, document)
     for name, value in figures.items():
         click.echo(f"{name:<24} {value if not isinstance(value, float) else format(value, '.4g')}")
 

@@ -25,8 +25,8 @@ from lightpage.cli.paths import OutputFile
 from lightpage.codec.page_bytes import FileFacts, Header
 from lightpage.device.state import Device
 from lightpage.errors import CalibrationError, FramesDisagreeError, RecalibrationRefusedError, UnconfirmedPageError
-from lightpage.files import write_json
 from lightpage.metrics.measures import measure
+from lightpage.metrics.provenance import write_figures
 from lightpage.page.pilots import Pilots
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
@@ -197,7 +197,7 @@ def main(bundle: str, names: tuple[str, ...], settings: tuple[str, ...], pages: 
     for name, changes in track(list(chosen.items()), "heal", unit="case"):
         if name not in done:
             done[name] = bench.measured(name, changes)
-            write_json(json_path, {"asked": asked, "outcomes": [asdict(each) for each in done.values()]})
+            write_figures(json_path, {"asked": asked, "outcomes": [asdict(each) for each in done.values()]})
         click.echo(done[name].line())
 
 

@@ -28,8 +28,8 @@ from lightpage.codec.page_bytes import FileFacts, Header
 from lightpage.codec.page_codec import PageCodec
 from lightpage.device.state import Device, draw_rough
 from lightpage.errors import RecalibrationRefusedError
-from lightpage.files import write_json
 from lightpage.metrics.measures import measure
+from lightpage.metrics.provenance import write_figures
 from lightpage.page.pilots import Pilots
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
@@ -181,7 +181,7 @@ def main(
                 turned = angle + device.geometry.pipe_angle_deg
                 device = device.with_values({"geometry.pipe_angle_deg": turned})
             done[seed] = drives.measured(seed, device)
-            write_json(json_path, {"asked": asked, "outcomes": [asdict(each) for each in done.values()]})
+            write_figures(json_path, {"asked": asked, "outcomes": [asdict(each) for each in done.values()]})
         click.echo(done[seed].line())
     chosen = [done[seed] for seed in seeds]
     for what, count in {

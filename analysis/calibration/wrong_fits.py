@@ -21,7 +21,7 @@ from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import Profile, load_profile
 from lightpage.device.state import Device
 from lightpage.errors import CalibrationError, LightpageError
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.page.symbols import random_symbols, symbol_phases
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
@@ -134,7 +134,7 @@ def main(profile_name: str, seed: int, json_path: Path) -> None:
     for name, given in track(list(wrong_fits(load_profile(profile_name), seed)), "calibrate", unit="fit"):
         outcomes.append(called(name, given))
         click.echo(f"{name:<42} {outcomes[-1].verdict:<8} {outcomes[-1].words}")
-        write_json(json_path, {"outcomes": [asdict(each) for each in outcomes]})
+        write_figures(json_path, {"outcomes": [asdict(each) for each in outcomes]})
     good = [each.name for each in outcomes if each.verdict == "good"]
     if good:
         raise CalibrationError("wrong fits", f"{', '.join(good)} called good", "none")

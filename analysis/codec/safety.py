@@ -26,7 +26,7 @@ from lightpage.codec.page_bytes import FileFacts, Header
 from lightpage.codec.page_codec import PageCodec
 from lightpage.device.profile import load_profile
 from lightpage.errors import LightpageError
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.page.symbols import pilot_mask, pilot_symbols, symbol_phases
 from lightpage.progress import track
 from lightpage.runtime.model.bundle.bundle import Bundle
@@ -200,7 +200,7 @@ def main(count: int, damaged: int, corrections: int, seed: int, json_path: Path 
     click.echo(f"of {settled.total()} lost pages blocks converge on {converged}, on {settled['wrong']} to another word")
     if json_path is not None:
         figures = {name: vars(counted(outcomes)) for name, outcomes in counts.items()}
-        write_json(
+        write_figures(
             json_path, figures | {"converged on lost pages": {"right": settled["right"], "wrong": settled["wrong"]}}
         )
     if any(outcomes["wrong"] for outcomes in counts.values()):

@@ -25,7 +25,7 @@ from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFolder
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.train.data.feature_store import FeatureStore, fill
 from lightpage.train.data.features import FeatureExtractor, PageFeatures
 from lightpage.train.data.patches import training_pages
@@ -130,7 +130,7 @@ def main(
         for part in parts:
             outcomes.append(without(part, bench, choices))
             click.echo(f"{HEADER}\n{outcomes[-1].line()}", err=True)
-            write_json(out / "ablation.json", {"outcomes": [outcome.as_json() for outcome in outcomes]})
+            write_figures(out / "ablation.json", {"outcomes": [outcome.as_json() for outcome in outcomes]})
     click.echo(HEADER)
     for outcome in outcomes:
         click.echo(outcome.line())

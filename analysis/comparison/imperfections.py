@@ -31,7 +31,7 @@ from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFolder
 from lightpage.device.profile import Profile, load_profile
 from lightpage.device.state import Device, draw_device
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.train.fitting.memory import keep_freed_memory
 from lightpage.train.models.decoder import WAVE
 from lightpage.train.models.presets import PRESETS, REFLECTIONS, STANDARD
@@ -159,7 +159,7 @@ def main(
     for name, (device, changes) in devices.items():
         rows.append(measured(name, device, changes, profile, pages, steps, seed, out))
         click.echo(f"{HEADER}\n{rows[-1].line()}", err=True)
-        write_json(out / "imperfections.json", {"rows": [asdict(row) for row in rows]})
+        write_figures(out / "imperfections.json", {"rows": [asdict(row) for row in rows]})
     click.echo("\n".join([HEADER, *(row.line() for row in rows)]))
 
 

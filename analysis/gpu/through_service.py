@@ -28,7 +28,7 @@ from analysis.service.constant_bundle import constant_bundle
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.errors import LightpageError
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording
@@ -165,7 +165,7 @@ def main(
     told = measured(bundle, pairs, levels, Provider.parse(provider), batches, callers, seconds)
     click.echo(json.dumps(told, indent=1))
     if json_path is not None:
-        write_json(json_path, told)
+        write_figures(json_path, told)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import load_profile
 from lightpage.errors import LostShotError
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.progress import track
 from lightpage.recording.layout import FrameInfo, frame_type
 from lightpage.runtime.device.acquisition.camera_source import CameraSource, Exposures
@@ -383,7 +383,7 @@ def main(changes: int, pairs: int, shots: int, json_path: Path | None) -> None:
             "chain": chains,
             "unpack_ms": unpack_ms,
         }
-        write_json(json_path, figures)
+        write_figures(json_path, figures)
 
 
 if __name__ == "__main__":

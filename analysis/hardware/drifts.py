@@ -25,7 +25,7 @@ from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile, OutputFolder
 from lightpage.device.state import Device
 from lightpage.errors import LightpageError
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.progress import track
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
@@ -168,7 +168,7 @@ def main(drifts: int, quiet: int, threads: int | None, out: Path, json_path: Pat
         f"{len(false)} false alarms in {quiet} quiet pages (wanted: at most {WANTED_FALSE})"
     )
     if json_path is not None:
-        write_json(json_path, figures)
+        write_figures(json_path, figures)
 
 
 if __name__ == "__main__":

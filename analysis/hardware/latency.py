@@ -22,7 +22,7 @@ from lightpage.cli.paths import OutputFile
 from lightpage.codec.volume import DATA_PAGES, PARITY_PAGES, Volume, encode_volume
 from lightpage.device.state import Device
 from lightpage.errors import LostPageError
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.progress import track
 from lightpage.recording.pages import PagesWriter
 from lightpage.runtime.device.acquisition.camera_source import CameraSource
@@ -106,7 +106,7 @@ def main(pages: int, json_path: Path | None) -> None:
         f"{1e3 * found['without_decoding_s_p50']:.0f} ms; {given}"
     )
     if json_path is not None:
-        write_json(json_path, found)
+        write_figures(json_path, found)
 
 
 if __name__ == "__main__":

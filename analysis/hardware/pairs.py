@@ -23,7 +23,7 @@ from analysis.hardware.faulty_chain import Stage, numbers_shown, small_cameras, 
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.errors import LostShotError, Reason
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.progress import track
 from lightpage.runtime.device.acquisition.camera_source import CameraSource
 from lightpage.virtual_device.namespace import go_on_inside
@@ -119,7 +119,7 @@ def main(shots: int, clean_shots: int, faults: float, tolerance: float, seed: in
                 told = ", ".join(f"{times} {reason}" for reason, times in sorted(reasons.items()))
                 click.echo(f"  {fault:<14} {found['injected'].get(fault, 0):>5}: lost {told}")
     if json_path is not None:
-        write_json(json_path, figures)
+        write_figures(json_path, figures)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from analysis.hardware.faulty_chain import Stage, numbers_shown, small_cameras, 
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.errors import LostShotError, SourceError
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.progress import track
 from lightpage.runtime.device.acquisition.camera_source import CameraSource
 from lightpage.virtual_device.namespace import go_on_inside
@@ -111,7 +111,7 @@ def main(times: int, json_path: Path | None) -> None:
         finally:
             stage.close()
     if json_path is not None:
-        write_json(json_path, figures)
+        write_figures(json_path, figures)
 
 
 if __name__ == "__main__":

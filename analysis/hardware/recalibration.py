@@ -27,7 +27,7 @@ from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.state import Device
 from lightpage.errors import LightpageError, LostPageError
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.device.acquisition.source import SHOT_S, FrameSource, Shot
@@ -183,7 +183,7 @@ def main(rounds: int, load: float, heal: bool, threads: int | None, json_path: P
     for error in failed:
         click.echo(f"failed: {error}")
     if json_path is not None:
-        write_json(json_path, {**figures, "failed": failed})
+        write_figures(json_path, {**figures, "failed": failed})
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ import numpy as np
 
 from lightpage.cli.main import run
 from lightpage.errors import LostShotError
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.runtime.device.trigger.scpi_line import ScpiLine
 from lightpage.runtime.device.trigger.scpi_port import LineTimes
 from lightpage.virtual_device.pulse_generator import CHANNELS, PulseGeneratorEmulator
@@ -220,7 +220,7 @@ def main(queries: int, fault_rate: float, unplug_every: int, kind: str, seed: in
     click.echo(line(outcome))
     if json_path is not None:
         options = {"fault_rate": fault_rate, "unplug_every": unplug_every, "port": kind, "seed": seed}
-        write_json(json_path, options | {"times": TIMES.model_dump()} | outcome.to_json())
+        write_figures(json_path, options | {"times": TIMES.model_dump()} | outcome.to_json())
 
 
 if __name__ == "__main__":

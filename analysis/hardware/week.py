@@ -37,7 +37,7 @@ from analysis.hardware.week_figure import draw
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile, OutputFolder
 from lightpage.device.state import Device, load_device
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 
 WANTED_SHARE = 0.95
@@ -159,7 +159,7 @@ def main(
     for line in table_of(week.rows, pages):
         click.echo(line)
     if json_path is not None:
-        write_json(json_path, figures)
+        write_figures(json_path, figures)
 
 
 if __name__ == "__main__":

@@ -33,7 +33,8 @@ from analysis.scaling.node_figures import DriverFigures, NodeFigures, RunFigures
 from lightpage.cli.main import run as run_command
 from lightpage.cli.paths import OutputFile, OutputFolder
 from lightpage.errors import InvalidInputError
-from lightpage.files import replace_text, write_json
+from lightpage.files import replace_text
+from lightpage.metrics.provenance import write_figures
 from lightpage.pictures import write_figure_png
 from lightpage.progress import track
 from lightpage.report.drawing import BLUE, ORANGE
@@ -261,7 +262,7 @@ def main(
     if picture_path is not None:
         picture(curves, limits, picture_path)
     if json_path is not None:
-        write_json(json_path, found)
+        write_figures(json_path, found)
 
 
 def _figures(

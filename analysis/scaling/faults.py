@@ -34,7 +34,7 @@ from analysis.scaling.single_process import bare_pages_per_s, compared, single
 from analysis.service.running import until
 from lightpage.cli.main import run as run_command
 from lightpage.cli.paths import OutputFile, OutputFolder
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.runtime.archives.run.job import Job
 from lightpage.runtime.archives.run.question import of_recordings
 from lightpage.runtime.archives.run.task import Choices, Operation
@@ -147,11 +147,11 @@ def main(
         figures |= killed(BulkRun(job, out / "killed", options, mark), job, kills, nodes, cluster, seed)
         figures |= compared(job, out / "killed", out / "single")
         if json_path is not None:  # the rest takes as long again
-            write_json(json_path, figures)
+            write_figures(json_path, figures)
         figures |= in_peace(BulkRun(job, out / "peace", options, mark), job, warm_pages)
     click.echo(json.dumps(figures, indent=2))
     if json_path is not None:
-        write_json(json_path, figures)
+        write_figures(json_path, figures)
 
 
 if __name__ == "__main__":

@@ -31,8 +31,8 @@ from lightpage.cli.main import run as run_command
 from lightpage.cli.paths import OutputFile, OutputFolder
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device
-from lightpage.files import write_json
 from lightpage.helper_process import same_packages
+from lightpage.metrics.provenance import write_figures
 from lightpage.progress import track
 from lightpage.runtime.archives.run.totals import DeviceState
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
@@ -174,7 +174,7 @@ def main(
                 )
             )
     if json_path is not None:
-        write_json(json_path, figures)
+        write_figures(json_path, figures)
 
 
 if __name__ == "__main__":

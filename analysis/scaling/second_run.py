@@ -23,8 +23,8 @@ import click
 
 from lightpage.cli.main import run as run_command
 from lightpage.cli.paths import OutputFile, OutputFolder
-from lightpage.files import write_json
 from lightpage.helper_process import same_packages
+from lightpage.metrics.provenance import write_figures
 from lightpage.runtime.archives.run.job import Job
 from lightpage.runtime.archives.run.ledger import Ledger
 from lightpage.runtime.archives.run.question import of_recordings
@@ -147,7 +147,7 @@ def main(pages: int, range_pages: int, repeats: int, seed: int, out: Path, json_
     worst = max(found["seconds_most"] for found in figures["operations"].values())
     click.echo(f"slowest {worst:.2f} s; at most {WANTED_S:g} s wanted for 10,000 pages")
     if json_path is not None:
-        write_json(json_path, figures)
+        write_figures(json_path, figures)
 
 
 if __name__ == "__main__":

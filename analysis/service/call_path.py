@@ -22,7 +22,7 @@ from analysis.service.entered import Entry, Traced, tracing
 from analysis.service.running import RunningService
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.runtime.archives.run.ledger import Ledger
 from lightpage.runtime.archives.run.question import of_recordings
 from lightpage.runtime.archives.run.task import Choices, Operation
@@ -213,7 +213,7 @@ def main(call: str, bundle: str, json_path: Path | None) -> None:
         files = files_of(CALLS[call](Bundle.open(bundle_path(bundle)), Path(folder)))
     _show(files)
     if json_path is not None:
-        write_json(json_path, {"call": call, "files": [asdict(file) for file in files]})
+        write_figures(json_path, {"call": call, "files": [asdict(file) for file in files]})
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ from analysis.service.variants import answer_of, write_variant
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.errors import BundleError
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.progress import track
 from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
@@ -146,7 +146,7 @@ def main(changes: int, seed: int, json_path: Path | None) -> None:
         f"{figures['stale']} stale"
     )
     if json_path is not None:
-        write_json(json_path, figures)
+        write_figures(json_path, figures)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ import numpy as np
 from analysis.service.running import RunningService
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile, OutputFolder
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
@@ -129,7 +129,7 @@ def main(context: click.Context, bundle: str, threads: int | None, out: Path, js
     click.echo(f"{len(found)} checks, {len(failed)} failed; exit status {status}, tracebacks in the log: {tracebacks}")
     if json_path is not None:
         figures = {"packages": PACKAGES, "checks": found, "exit_status": status, "tracebacks": tracebacks}
-        write_json(json_path, figures)
+        write_figures(json_path, figures)
     if failed or status or tracebacks or not found:
         context.exit(1)
 

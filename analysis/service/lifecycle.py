@@ -29,7 +29,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from analysis.service.running import PagesToSend, RunningService, stub
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
@@ -145,7 +145,7 @@ def main(start_count: int, times: int, stop_count: int, threads: int | None, jso
         f"{stop['beyond_last_answer_s']:.2f} s after the last answer"
     )
     if json_path is not None:
-        write_json(json_path, {"start": start, "stateless": same, "stop": stop})
+        write_figures(json_path, {"start": start, "stateless": same, "stop": stop})
 
 
 if __name__ == "__main__":

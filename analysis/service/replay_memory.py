@@ -22,7 +22,7 @@ import numpy as np
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.errors import Reason, UnconfirmedPageError
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.page.pilots import Pilots
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
@@ -123,7 +123,7 @@ def main(pages: int, json_path: Path | None) -> None:
         f"{found['counted_bytes']:.0f} counted; its frame pair has {found['frame_pair_bytes']:.0f}"
     )
     if json_path is not None:
-        write_json(json_path, found)
+        write_figures(json_path, found)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from analysis.service.overload import capacity
 from analysis.service.running import PagesToSend, RunningService, stub, until
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.progress import track
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.service.server.dispatcher import SERVICE
@@ -103,7 +103,7 @@ def main(minutes: float, warm_up: float, load: float, threads: int | None, json_
         f"memory from {first / 1e6:.1f} to {last / 1e6:.1f} MB, {figures['growth']:+.2%}"
     )
     if json_path is not None:
-        write_json(json_path, figures)
+        write_figures(json_path, figures)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ from analysis.service.running import RunningService
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import load_profile
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.client.answers import RemotePage
@@ -138,7 +138,7 @@ def main(profile_name: str, repeats: int, json_path: Path | None) -> None:
         f"({turns['p10']:.2f} to {turns['p90']:.2f})"
     )
     if json_path is not None:
-        write_json(json_path, found)
+        write_figures(json_path, found)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ import click
 
 from lightpage.cli.options import FiniteRange
 from lightpage.cli.paths import OutputFile
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.progress import track
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -94,7 +94,7 @@ def main(pages: int, rounds: int, recording: Path | None, limit: float, json_pat
             figures[command] = {"time": time_ratio, "cpu_time": cpu_ratio}
             click.echo(f"{command:<10} time {time_ratio:.2f}, CPU time {cpu_ratio:.2f} (wanted <= {limit:g})")
     if json_path is not None:
-        write_json(json_path, figures)
+        write_figures(json_path, figures)
 
 
 if __name__ == "__main__":

@@ -28,8 +28,8 @@ from lightpage.cli.paths import OutputFolder
 from lightpage.export.graph import FRAME_INPUTS, DecoderGraph, table_tensors
 from lightpage.export.half import deviation, rounded
 from lightpage.export.onnx_files import decoder_onnx
-from lightpage.files import write_json
 from lightpage.metrics.information import achievable_rate
+from lightpage.metrics.provenance import write_figures
 from lightpage.page.pilots import Pilots
 from lightpage.progress import track
 from lightpage.recording.reader import Recording
@@ -180,7 +180,7 @@ def main(kept: Path, pages: int, repeats: int, out: Path) -> None:
         milliseconds = f"{1e3 * form.seconds:.1f}" if np.isfinite(form.seconds) else "-"
         click.echo(f"{form.name:<28} {form.air:>7.3f} {milliseconds:>8} {form.deviation:>11.4f}")
     figures = [asdict(form) | {"seconds": form.seconds if np.isfinite(form.seconds) else None} for form in forms]
-    write_json(
+    write_figures(
         out / "fidelity.json", {"data_set": kept.name, "profile": profile.name, "pages": pages, "forms": figures}
     )
 

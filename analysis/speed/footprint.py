@@ -27,7 +27,7 @@ from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import Profile, load_profile
 from lightpage.device.state import Device
 from lightpage.errors import InvalidInputError
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.runtime.model.execution.cpus import available_cpus
 
 _PROCESS = "analysis.speed.footprint_process"
@@ -171,7 +171,7 @@ def main(
     if json_path is not None:
         figures = {"profile": profile.name, "threads": threads, "settings": list(settings)}
         bundles = [asdict(one) | {"unpacked_bytes": one.unpacked_bytes} for one in found]
-        write_json(json_path, figures | {"bundles": bundles})
+        write_figures(json_path, figures | {"bundles": bundles})
 
 
 if __name__ == "__main__":

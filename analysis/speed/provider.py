@@ -22,7 +22,7 @@ from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.errors import RecordingError
 from lightpage.export.half import PRECISIONS
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.page.pilots import Pilots
 from lightpage.progress import track
 from lightpage.recording.reader import Recording
@@ -113,7 +113,7 @@ def main(
             made.append(made_by(provider, form, precision, shown, levels, usual, callers, seconds, batches))
             click.echo("\n".join(lines(made[-1])))
             if json_path is not None:  # after each: the next may fail
-                write_json(json_path, {"onnxruntime": VERSION, "made": [asdict(each) for each in made]})
+                write_figures(json_path, {"onnxruntime": VERSION, "made": [asdict(each) for each in made]})
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ from lightpage.export.graph import FRAME_INPUTS
 from lightpage.export.half import PRECISIONS, in_half
 from lightpage.export.onnx_files import decoder_onnx
 from lightpage.export.operators.check import page_part
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.runtime.model.bundle.manifest import FLOAT16
 from lightpage.runtime.model.decoding.decoder import PAGE_INPUTS
 
@@ -204,7 +204,7 @@ def main(
             kinds = {kind: asdict(load) for kind, load in by_kind.items()}
             figures.setdefault("decoders", {}).setdefault(name, {})[precision] = {"kinds": kinds, **expected}
     if json_path is not None:
-        write_json(json_path, figures)
+        write_figures(json_path, figures)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import load_profile
 from lightpage.export.onnx_files import decoder_onnx
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.runtime.model.execution.cpus import available_cpus
 from lightpage.study.studies.scaling import enlarged
 
@@ -65,7 +65,7 @@ def main(
         click.echo(f"{last.symbols:>8,} {1e3 * last.seconds:>10.1f} {last.each_us:>12.2f} {over:>18.3f}")
     if json_path is not None:
         figures = {"profile": smallest.name, "decoder": name, "threads": threads, "repeats": repeats}
-        write_json(json_path, figures | {"pages": [asdict(result) for result in results]})
+        write_figures(json_path, figures | {"pages": [asdict(result) for result in results]})
 
 
 if __name__ == "__main__":

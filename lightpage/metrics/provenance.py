@@ -15,6 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import click
 from pydantic import BaseModel, ConfigDict
 
 from lightpage.failures import os_failure
@@ -26,6 +27,8 @@ PROVENANCE = "provenance"
 CHANGED = "+changes"
 """Suffix of the commit where files that it holds are changed."""
 COMMIT = "LIGHTPAGE_COMMIT"
+_LONGEST_NAME = 250
+"""Characters of what may be a file's name."""
 _ALWAYS = ("command", "commit", "machine", "time", "inputs")
 
 
@@ -83,11 +86,25 @@ def provenance(**inputs: object) -> Provenance:
 def write_figures(path: Path | None, figures: dict[str, Any], **inputs: object) -> None:
     """Write figures with their provenance, as `lightpage.files.write_json` and `provenance` do; nothing without a path.
 
+    Args:
+        path: path of the file.
+        figures: figures by name.
+        inputs: see `provenance`; the options of the running command where none is given, and the files among them.
+
     Raises:
         InvalidInputError, StorageError, SurroundingsError: a file cannot be read or written.
     """
     if path is not None:
-        write_json(path, {**figures, PROVENANCE: provenance(**inputs).to_json()})
+        write_json(path, {**figures, PROVENANCE: provenance(**(inputs or _options(path))).to_json()})
+
+
+def _options(out: Path) -> dict[str, object]:
+    """Return the options of the running command, files that it reads each by itself."""
+    context = click.get_current_context(silent=True)
+    given = {} if context is None else {name: str(value) for name, value in context.params.items()}
+    paths = {name: Path(value) for name, value in given.items() if len(value) < _LONGEST_NAME}
+    files = {name: path for name, path in paths.items() if path != out and path.is_file()}
+    return {"options": {name: value for name, value in given.items() if name not in files}, **files}
 
 
 def digest(value: object) -> str:

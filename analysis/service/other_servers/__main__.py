@@ -52,7 +52,7 @@ from analysis.service.other_servers.servers import OtherServer
 from analysis.service.other_servers.timing import CALLERS, in_turns, timed
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
-from lightpage.files import write_json
+from lightpage.metrics.provenance import write_figures
 from lightpage.runtime.model.execution.cpus import available_cpus
 from lightpage.virtual_device.namespace import go_on_inside, require
 
@@ -198,7 +198,7 @@ def main(out: Path, calls: int, rounds: int, threads: int | None, seed: int, jso
     for way, taken in others.items():
         click.echo(f"{way:<36}" + ", ".join(f"{name} {value:.1f}" for name, value in taken.items()))
     if json_path is not None:
-        write_json(json_path, figures)
+        write_figures(json_path, figures)
 
 
 if __name__ == "__main__":

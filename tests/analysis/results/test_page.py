@@ -83,6 +83,9 @@ def test_kept_figures_say_where_they_are_from() -> None:
     for path in paths:
         found = Provenance.model_validate(json.loads(path.read_text("utf-8")).get(PROVENANCE, {}))
         assert not found.unknown or (found.command and found.commit and found.source), path
+    adding_it = {"measurements.py", "kept_parts.py"}
+    for path in (ROOT / "analysis").rglob("*.py"):
+        assert path.name in adding_it or " write_json(" not in path.read_text("utf-8"), path
 
 
 def test_the_ledger_is_that_of_the_shipped_code() -> None:
