@@ -75,7 +75,7 @@ class Study:
     Attributes:
         title: the question, in a line.
         source: figure or table of the published study that it repeats, or where it goes beyond.
-        cases: cases that are measured.
+        cases: cases that are measured, some only `by_name`.
         measure: function from a case to its result; its work may be kept in the folder given, so that it can be gone on
             with.
         header: header of the table.
@@ -100,7 +100,7 @@ class Study:
     def chosen(self, settings: Settings, only: Sequence[str], folder: Path) -> list[Case]:
         """Return the cases whose names begin with one of some words, are needed, or have results in the folder.
 
-        All are chosen without a word.
+        Without a word all are chosen but those that are measured `by_name` alone.
 
         Raises:
             InvalidInputError: no name begins so.
@@ -113,7 +113,10 @@ class Study:
         return [
             case
             for case in cases
-            if not only or case.get("needed") or case["name"] in there or str(case["name"]).startswith(tuple(only))
+            if (not only and not case.get("by_name"))
+            or case.get("needed")
+            or case["name"] in there
+            or (only and str(case["name"]).startswith(tuple(only)))
         ]
 
 

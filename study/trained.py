@@ -116,7 +116,7 @@ def trained(
 
 def chosen(settings: Settings, localizer: str, profile: Profile, pages: int, **changes: Any) -> PublishedChoices:
     """The authors' choices for a device's symbols and so many training pages, as far as the study goes with them."""
-    choices = replace(published_choices(localizer, profile, pages), seed=settings.seed, **changes)
+    choices = replace(published_choices(localizer, profile, pages), **{"seed": settings.seed, **changes})
     if settings.quick:
         choices = replace(choices, **_QUICK)  # type: ignore[arg-type]
     else:

@@ -2,41 +2,103 @@
 
 Rays say where light lands, not its phase, which runs hundreds of radians over the page and is left to the network.
 Against a reference beam of the same curvature most of it does not show: what it costs to learn, the third case says.
+
+Courses ask what makes rays find the angle: how long the geometry is held, where it begins, how fast it moves; each from
+several seeds. On a device smaller than the authors' the same angle moves the picture by fewer pixels, and by less than
+a symbol a network need not care. So for courses angle, cameras' poses and rates are as many times larger.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from lightpage.device.state import Device
 from lightpage.progress import Progress
 from lightpage.study.lights import DataSet
 from lightpage.study.study import Case, Result, Row, Settings, Study
 from lightpage.study.trained import trained
+from lightpage.train.published.training import PROFILE, PublishedChoices
 
 _LOCKED = 0.3
 """Training AIR, bits a symbol, from which a decoder counts as locked; `none` comes to it too, if later, by heart."""
 
 
+_FULL_COLUMNS_PX = 5472
+"""Columns of the camera that the authors trained with."""
+_COURSES: dict[str, dict[str, Any]] = {
+    "authors": {},
+    "held": {"held_share": 0.3},
+    "from-profile": {"start": PROFILE},
+    "held-from-profile": {"held_share": 0.3, "start": PROFILE},
+    "slow-angle": {"angle_rate": PublishedChoices.angle_rate / 4},
+    "fast-angle": {"angle_rate": 4 * PublishedChoices.angle_rate},
+    "slow-affine": {"affine_rate": PublishedChoices.affine_rate / 4},
+}
+"""Courses of the geometry in training, by name: changes of the authors' choices."""
+_SEEDS = 3
+
+
 def _cases(settings: Settings) -> list[Case]:
-    cases = (("ray", "ray", False), ("none", "none", False), ("ray-matched", "ray", True))
     true = settings.device.geometry.pipe_angle_deg
-    return [
-        {"name": name, "localizer": localizer, "matched": matched, "true_deg": true}
-        for name, localizer, matched in cases
+    cases: list[Case] = [
+        {"name": "ray", "localizer": "ray", "matched": False, "true_deg": true},
+        {"name": "none", "localizer": "none", "matched": False, "true_deg": true},
+        {"name": "ray-matched", "localizer": "ray", "matched": True, "true_deg": true},
     ]
+    times = _times_smaller(settings)
+    cases += [
+        {
+            "name": f"{course}-{reference}-{seed}",
+            "localizer": "ray",
+            "matched": reference == "matched",
+            "course": course,
+        }
+        | {"seed": seed, "true_deg": true * times, "by_name": True}
+        for course in _COURSES
+        for reference in ("flat", "matched")
+        for seed in range(1 if settings.quick else _SEEDS)
+    ]
+    return cases
+
+
+def _times_smaller(settings: Settings) -> float:
+    """How many times fewer pixels a camera of the study has than the authors', along x."""
+    return _FULL_COLUMNS_PX / settings.profile.camera.columns_px
+
+
+def _enlarged(settings: Settings, device: Device) -> Device:
+    """A small device on which angle and registration move the picture by as many pixels as at full size."""
+    times = _times_smaller(settings)
+    poses = {
+        name: pose.model_copy(
+            update={
+                "scale_relative_error": times * pose.scale_relative_error,
+                "rotation_deg": times * pose.rotation_deg,
+            }
+        )
+        for name in ("in_phase_camera", "quadrature_camera")
+        for pose in (getattr(device, name),)
+    }
+    angle = times * device.geometry.pipe_angle_deg
+    return device.model_copy(update=poses).with_settings([f"geometry.pipe_angle_deg={angle!r}"])
 
 
 def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> Result:
-    data_set = DataSet(settings.profile, settings.device)
+    device, changes = settings.device, dict[str, Any]()
     if case["matched"]:
-        curvature = settings.profile.light_curvature_rad
-        data_set = DataSet(settings.profile, settings.device.with_settings([f"reference.curvature_rad={curvature}"]))
-    return trained(settings, data_set, case["localizer"], work, progress)
+        device = device.with_settings([f"reference.curvature_rad={settings.profile.light_curvature_rad}"])
+    if "course" in case:
+        device, times = _enlarged(settings, device), _times_smaller(settings)
+        rates = {"affine_rate": PublishedChoices.affine_rate, "angle_rate": PublishedChoices.angle_rate}
+        changes = {"seed": case["seed"], **rates, **_COURSES[case["course"]]}
+        changes |= {name: times * changes[name] for name in rates}
+    return trained(settings, DataSet(settings.profile, device), case["localizer"], work, progress, **changes)
 
 
 def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:
@@ -45,7 +107,7 @@ def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:
         reference = "matched" if case["matched"] else "nearly flat"
         locked = first_step(result["training_curve"])
         reached = (result[name] for name in ("air", "own_mi", "steps"))
-        rows.append((case["localizer"], reference, result["angle_deg"], case["true_deg"], locked, *reached))
+        rows.append((case["name"], reference, result["angle_deg"], case["true_deg"], locked, *reached))
     return rows
 
 
@@ -62,16 +124,23 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
     maps = [figure.add_subplot(grid[1, 2 * number : 2 * number + 2]) for number in range(len(cases))]
     top = max(float(np.nanmax(result["own_mi_map"])) for result in results)
     for number, (axis, case, result) in enumerate(zip(maps, cases, results, strict=True)):
-        name = f"{case['localizer']}, matched reference" if case["matched"] else case["localizer"]
-        if len(result["angles"]):
-            angles.plot(*result["angles"].T, ".-", markersize=3, color=f"C{number}", label=name)
+        name, step_angles = str(case["name"]), result["angles"]
+        if len(step_angles):
+            angles.plot(
+                step_angles[:, 0],
+                step_angles[:, 1] / case["true_deg"],
+                ".-",
+                markersize=3,
+                color=f"C{number}",
+                label=name,
+            )
         rates.plot(*result["training_curve"].T, color=f"C{number}", linewidth=0.8, alpha=0.6)
         rates.plot(*result["validation_curve"].T, "o-", color=f"C{number}", markersize=3, label=name)
         axis.imshow(result["own_mi_map"], vmin=0, vmax=top, cmap="viridis")
         axis.set_title(f"{name}: own-MI {result['own_mi']:.2f}, AIR {result['air']:.2f} bit/symbol", fontsize="medium")
         axis.set_axis_off()
-    angles.axhline(settings.device.geometry.pipe_angle_deg, color="k", linestyle="--", label="true")
-    angles.set_ylabel("fitted pipe angle, degrees")
+    angles.axhline(1, color="k", linestyle="--", label="true")
+    angles.set_ylabel("fitted pipe angle, over the true one")
     rates.set_ylabel("AIR, bit/symbol; thin: pages trained on")
     rates.set_ylim(-1, max(1.0, rates.get_ylim()[1]))
     for axis in (angles, rates):
@@ -86,9 +155,10 @@ STUDY = Study(
     source="figures 4C and 2C",
     cases=_cases,
     measure=_measure,
-    header=("localizer", "reference", "fitted angle", "true", "locked at", "AIR", "own-MI", "steps"),
+    header=("case", "reference", "fitted angle", "true", "locked at", "AIR", "own-MI", "steps"),
     rows=_rows,
     plot=_plot,
     trains=True,
+    parts=True,
     changeable=True,
 )

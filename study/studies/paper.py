@@ -38,6 +38,8 @@ _WHOLE = {
     "drift": drift.STUDY,
 }
 """Studies that are a piece each, with a table and a picture of their own in its folder."""
+_ANGLE = ("none", "ray-matched")
+"""Its cases that are pieces; `ray` is the piece `ray-4x4`."""
 _REPORTED_KB = {"mode-4x4": 19.0, "ray-4x4": 25.0, "mode-2x2": 46.0, "ray-2x2": 66.0}
 """What its authors report of their bench, kB a page by own-MI."""
 _COLUMNS = ("air", "own_mi_claimed", "air_kB", "own_mi_claimed_kB", "user_bytes")
@@ -64,8 +66,7 @@ def _cases(settings: Settings) -> list[Case]:
     pieces.append(_piece("figure 4", "rays", {"name": "rays"}))
     if settings.quick:
         return pieces
-    # its case `ray` is the piece `ray-4x4`
-    pieces += [_piece("figures 4C, 2C", "angle", case) for name, case in cases["angle"].items() if name != "ray"]
+    pieces += [_piece("figures 4C, 2C", "angle", case) for name, case in cases["angle"].items() if name in _ANGLE]
     pieces += [*published(16), *published(8)]
     pieces += [_piece("figure 5", "pipe-length", case) for case in cases["pipe-length"].values()]
     return pieces + [_piece(study.source, name, {"name": name}) for name, study in _WHOLE.items() if name != "rays"]
@@ -100,7 +101,7 @@ def _draw(settings: Settings, name: str, found: dict[str, Result], results: Path
         results: folder of the pieces' results.
     """
     study, known = _LEARNING[name], dict(found)
-    cases = study.cases(settings)
+    cases = [case for case in study.cases(settings) if not case.get("by_name")]
     pieces = ["ray-4x4" if (name, case["name"]) == ("angle", "ray") else case["name"] for case in cases]
     for piece in pieces:
         path = results / f"{piece}.json"

@@ -34,6 +34,10 @@ class Registration(nn.Module):
         self.matrix = nn.Parameter(torch.diag(torch.tensor(AFFINE_START)).expand(2, 2, 2).clone())
         self.offset = nn.Parameter(torch.zeros(2, 2))
 
+    def begin(self, scales: tuple[float, float]) -> None:
+        """Begin with other scales along x and y, page over camera."""
+        self.matrix.data = torch.diag(torch.tensor(scales)).to(self.matrix).expand(2, 2, 2).clone()
+
     def forward(self, places: Tensor) -> Tensor:
         """Places [h, w, 2] (x, y) to those in each frame, [2, h, w, 2]."""
         return torch.einsum("cij,hwj->chwi", self.matrix, places) + self.offset[:, None, None]

@@ -22,7 +22,7 @@ from lightpage.train.processes import AS_IT_IS, Processes
 from lightpage.train.published.decoder import PARAXIAL, PublishedDecoder, make_localizer
 from lightpage.train.published.held_pages import HeldPages
 from lightpage.train.published.states import page_states
-from lightpage.train.published.training import DataPages, FramePages, PublishedChoices, PublishedTraining
+from lightpage.train.published.training import PROFILE, DataPages, FramePages, PublishedChoices, PublishedTraining
 from lightpage.train.published.unet import samples_for
 
 EPOCHS = {4: 50, 8: 30, 16: 15}
@@ -146,4 +146,8 @@ def published_decoder(
     sign = 1 if np.sin(quadrature_phase) > 0 else -1
     samples = samples_for(profile.page.symbol_size_px)
     chosen = make_localizer(localizer, profile, samples, choices.lenses, sign)
+    if choices.start == PROFILE:
+        rows, columns = profile.frame_shape
+        pixel = profile.image_pixel_m
+        chosen.registration.begin((profile.page_width_m / (columns * pixel), profile.page_height_m / (rows * pixel)))
     return PublishedDecoder(profile, references, chosen, choices.channels, choices.classes)

@@ -24,6 +24,7 @@ from lightpage.train.fitting.modules import DecoderTraining
 from lightpage.train.published.decoder import PARAXIAL, PublishedDecoder
 from lightpage.train.published.localizers import RayLocalizer
 
+AUTHORS, PROFILE = "authors", "profile"
 WARM_UP = 0.02
 """Share of the steps over which learning rates rise."""
 DECAYS = (0.8, 0.9)
@@ -43,6 +44,8 @@ class PublishedChoices:
         steps: optimiser steps: 50 epochs of 450 pages, two at a time.
         batch: pages a step.
         decoder_rate, affine_rate, angle_rate: learning rates of U-Net, registration and pipe angle (radians).
+        held_share: share of the steps over which registration and angle stay as they begin, not the authors'.
+        start: where registrations begin: `AUTHORS`, or as the profile says, `PROFILE`.
         decay: factor on the decoder's learning rate at each of `DECAYS`.
         lenses: name out of `lightpage.train.published.decoder.LENS_CHOICES`.
         seed: seed of initial weights and batches.
@@ -56,6 +59,8 @@ class PublishedChoices:
     decoder_rate: float = 1e-3
     affine_rate: float = 2e-4
     angle_rate: float = 1e-4
+    held_share: float = 0.0
+    start: str = AUTHORS
     decay: float = 0.5
     lenses: str = PARAXIAL
     seed: int = 0
@@ -177,26 +182,29 @@ class PublishedTraining(DecoderTraining[PublishedDecoder]):
         return float(rate_of_classes(nats, self.choices.classes))
 
     def configure_optimizers(self) -> Any:
-        """Adam; all rates warm up, the decoder's falls towards the end."""
+        """Adam; all rates warm up, those of the geometry after it was held; the decoder's falls towards the end."""
         choices, localizer = self.choices, self.network.localizer
         angle = [localizer.angle] if isinstance(localizer, RayLocalizer) else []
         affine = list(localizer.registration.parameters())
         apart = {id(parameter) for parameter in (*angle, *affine)}
         decoder = [parameter for parameter in self.network.parameters() if id(parameter) not in apart]
-        groups: list[tuple[list[nn.Parameter], float, float]] = [
-            (decoder, choices.decoder_rate, choices.decay),
-            (affine, choices.affine_rate, 1.0),
-            (angle, choices.angle_rate, 1.0),
+        held = choices.held_share * choices.steps
+        groups: list[tuple[list[nn.Parameter], float, float, float]] = [
+            (decoder, choices.decoder_rate, choices.decay, 0.0),
+            (affine, choices.affine_rate, 1.0, held),
+            (angle, choices.angle_rate, 1.0, held),
         ]
         groups = [group for group in groups if group[0]]
-        optimizer = torch.optim.Adam([{"params": parameters, "lr": rate} for parameters, rate, _ in groups])
+        optimizer = torch.optim.Adam([{"params": parameters, "lr": rate} for parameters, rate, *_ in groups])
 
-        def course(decay: float) -> Any:
+        def course(decay: float, first: float) -> Any:
             warm_up = max(1.0, WARM_UP * choices.steps)
             falls = [share * choices.steps for share in DECAYS]
-            return lambda step: min(1.0, (step + 1) / warm_up) * decay ** sum(step >= at for at in falls)
+            return lambda step: (
+                min(1.0, max(0.0, step + 1 - first) / warm_up) * decay ** sum(step >= at for at in falls)
+            )
 
-        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, [course(decay) for _, _, decay in groups])
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, [course(*times) for _, _, *times in groups])
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def configure_gradient_clipping(self, *_: Any, **__: Any) -> None:
