@@ -20,6 +20,7 @@ from lightpage.train.published.decoder import p_of_classes
 from lightpage.train.published.trainer import published_choices, published_decoder, train_published
 from lightpage.train.published.training import (
     NOT_ASKED,
+    PROFILE,
     DataPages,
     FramePages,
     PublishedChoices,
@@ -56,6 +57,11 @@ def test_rates_rise_over_two_percent_of_the_steps_and_only_the_decoder_s_falls()
     assert rates[79] == pytest.approx(STEP_RATES)
     assert rates[80] == pytest.approx([5e-4, *STEP_RATES[1:]])
     assert rates[90] == pytest.approx([2.5e-4, *STEP_RATES[1:]])
+    late = module("ray", PublishedChoices(channels=(4, 8), steps=100, held_share=0.5, start=PROFILE))
+    factors = late.configure_optimizers()["lr_scheduler"]["scheduler"].lr_lambdas
+    assert [[factor(step) for factor in factors] for step in (49, 51)] == [[1, 0, 0], [1, 1, 1]]
+    across = small_profile().page_width_m / small_profile().image_pixel_m / small_profile().camera.columns_px
+    assert late.network.localizer.registration.matrix[1, 0].tolist() == pytest.approx([across, 0.0])
 
 
 def test_every_parameter_has_one_rate() -> None:
