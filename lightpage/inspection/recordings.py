@@ -14,6 +14,7 @@ from lightpage.foreign.array import MOST_BYTES, spread
 from lightpage.inspection.exposure import contrast, histogram, sampled
 from lightpage.inspection.finding import Fact, Finding, Picture, shape_fact, shape_text
 from lightpage.inspection.foreign_files import look_at_hdf5
+from lightpage.page.symbols import pilot_mask
 from lightpage.recording import decoded_file, layout, pages
 from lightpage.recording.exposure import check_different, check_pair_light
 from lightpage.recording.frame_pair import FramePair
@@ -27,6 +28,8 @@ from lightpage.waves.grid import check_camera
 _SAMPLE_BYTES = 1 << 26
 """Of frames that are read."""
 _MOST_PAGES = 8
+_MOST_PILOTS = 0.5
+"""Share of pilots that a profile has to stay below."""
 _DIFFERENT = "frames of two cameras"
 _NEEDED = "data as docs/reference/formats.md describes them"
 
@@ -129,6 +132,7 @@ def _recording(path: Path, profile: Profile | None) -> Finding:
             found.profile = header.device(profile, found.problems.append)
             check_camera(found.profile)
             found.facts["profile"] = f"{found.profile.name}{' (its own)' if profile is None else ''}"
+        _pilots(found, recording)
         _exposure(found, recording)
         found.pictures = lambda: _pictures(path)
         _next(found, recording, coded)
@@ -145,6 +149,17 @@ def _symbols(recording: Recording) -> Fact:
     levels = recording.levels if recording.has_symbols else None
     text = "unknown" if levels is None else f"known, {levels} levels"
     return Fact({"known": levels is not None, "levels": levels}, text)
+
+
+def _pilots(found: Finding, recording: Recording) -> None:
+    """Tell how many symbols of a page are pilots: the recording's own, or its profile's."""
+    own = recording.pilots()
+    if (places := own if own is not None or found.profile is None else pilot_mask(found.profile)) is None:
+        return
+    count, share = int(np.count_nonzero(places)), float(np.mean(places))
+    found.facts["pilots"] = Fact({"count": count, "share": share}, f"{count} ({share:.1%} of the symbols)")
+    if share >= _MOST_PILOTS:
+        found.problems.append(f"{count} pilots of {places.size} symbols, wanted less than half")
 
 
 def _exposure(found: Finding, recording: Recording) -> None:
