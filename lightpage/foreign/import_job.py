@@ -30,7 +30,7 @@ from lightpage.recording.writer import RecordingWriter
 
 _SAMPLED = 16
 """Frames of either camera that are looked at before the work begins."""
-_DEPTHS = (8, 10, 12, 14, 16)
+DEPTHS = (8, 10, 12, 14, 16)
 """Bit depths of cameras."""
 _PEDESTAL = 0.02
 """Share of full scale that no count of the sampled frames lies below, where a camera's black level is in them."""
@@ -176,7 +176,7 @@ def exposure_of(material: Material, bit_depth: int | None) -> Exposure:
     for frames in (*material.frames, *material.references):
         frames.shift = unused
     brightest = peak >> unused
-    depth = bit_depth or (MAX_BIT_DEPTH - unused if unused else next(bits for bits in _DEPTHS if peak < 1 << bits))
+    depth = bit_depth or (MAX_BIT_DEPTH - unused if unused else next(bits for bits in DEPTHS if peak < 1 << bits))
     if material.black_level >= (most := 2**depth - 1):
         raise InvalidInputError(f"--black-level {material.black_level}", f"counts of {depth} bits", f"0 to {most - 1}")
     return Exposure(

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError
-from lightpage.foreign.array import readable
+from lightpage.foreign.array import SEPARATOR, readable
+from lightpage.foreign.opening import names_array
 from lightpage.inspection.documents import MOST_BYTES, look_at_json, look_at_toml
 from lightpage.inspection.finding import Finding
 from lightpage.inspection.folders import look_at_bundle, look_at_folder
@@ -53,6 +54,8 @@ def look(path: Path, profile: Profile | None = None) -> Finding:
 
 def _look(path: Path, profile: Profile | None) -> Finding:
     subject = f"file {path}"
+    if names_array(str(path)):
+        return look_at_array(path, "array of a file" if SEPARATOR in str(path) else "pictures", profile)
     with readable(subject, "a file that can be read"):
         status = os.stat(path)
         if stat.S_ISDIR(status.st_mode):

@@ -11,13 +11,12 @@ import numpy as np
 from lightpage.device.profile import Profile
 from lightpage.errors import FrameError, InvalidInputError
 from lightpage.foreign.array import MOST_BYTES, spread
-from lightpage.inspection.exposure import contrast, histogram, sampled
+from lightpage.inspection.exposure import contrast, histogram
 from lightpage.inspection.finding import Fact, Finding, Picture, shape_fact, shape_text
 from lightpage.inspection.foreign_files import look_at_hdf5
 from lightpage.page.symbols import pilot_mask
 from lightpage.recording import decoded_file, layout, pages
 from lightpage.recording.exposure import check_different, check_pair_light
-from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.hdf5 import find, open_hdf5, read_attribute
 from lightpage.recording.pages import Pages
 from lightpage.recording.reader import Recording
@@ -166,14 +165,14 @@ def _exposure(found: Finding, recording: Recording) -> None:
     """Tell how some frames are exposed, and the references."""
     pair = recording.references()
     with found.trying("reference frames with light"):
-        check_pair_light("reference: ", _sampled(pair), recording.bit_depth)
+        check_pair_light("reference: ", pair, recording.bit_depth)
     frame_bytes = 2 * pair.in_phase.nbytes
     looked_at = spread(recording.pages, max(1, min(_MOST_PAGES, _SAMPLE_BYTES // frame_bytes)))
     unlit, frames = [], []
     for page in looked_at:
         frames.append(recording.frames(page))
         try:
-            check_pair_light("", _sampled(frames[-1]), recording.bit_depth)
+            check_pair_light("", frames[-1], recording.bit_depth)
         except FrameError as error:
             unlit.append(f"page {page}: {error.subject} {error.got}")
         with found.trying(_DIFFERENT):
@@ -187,10 +186,6 @@ def _exposure(found: Finding, recording: Recording) -> None:
         found.facts[f"{name}: saturated"] = Fact(saturated, f"{saturated:.2%} of the pixels")
         fringes = float(np.mean([contrast(each, reference) for each in own]))
         found.facts[f"{name}: contrast of fringes"] = Fact(fringes, f"{fringes:.2f}")
-
-
-def _sampled(pair: FramePair) -> FramePair:
-    return FramePair(sampled(pair.in_phase), sampled(pair.quadrature))
 
 
 def _next(found: Finding, recording: Recording, coded: bool) -> None:
