@@ -43,7 +43,7 @@ def open_array(named: str) -> ForeignArray:
         if not path.is_file():
             raise InvalidInputError(f"file {path}", "no regular file", _READABLE)
         array = _of_kind(path, name)
-        array.files = (path,)
+        array.files = array.files or (path,)
         return array
 
 

@@ -1,7 +1,6 @@
 """The service's settings: one TOML file, above it the environment, above both the options of the command line."""
 
 import os
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from pydantic_core import ErrorDetails
 from lightpage.device.problems import problem_of
 from lightpage.device.profile import toml_value
 from lightpage.errors import InvalidInputError
-from lightpage.files import read_text
+from lightpage.files import read_toml
 from lightpage.progress import warn
 from lightpage.runtime.client.wire.address import check_address, is_local
 from lightpage.runtime.client.wire.channel import TlsFiles
@@ -289,11 +288,8 @@ def service_settings(
     """
     subject, data = "settings", dict[str, Any]()
     if file is not None:
-        subject, expected = f"settings {file}", "a TOML file that can be read"
-        try:
-            data = tomllib.loads(read_text(file, subject, expected))
-        except tomllib.TOMLDecodeError as error:
-            raise InvalidInputError(subject, error, expected) from None
+        subject = f"settings {file}"
+        data = read_toml(file, subject, "a TOML file that can be read")
     tables = [(name, table) for name, table in data.items() if isinstance(table, dict)]
     origins = {(name, key): f"file {file}" for name, table in tables for key in table}
     for given in [*_of_environment(os.environ if environment is None else environment), *options]:
@@ -307,7 +303,12 @@ def service_settings(
     if len(problems) == 1:
         origin, got, wanted = problems[0]
         raise InvalidInputError(origin or subject, got, wanted)
-    told = "; ".join(f"{got}{f' ({origin})' * bool(origin)}, wanted {wanted}" for origin, got, wanted in problems)
+    alike = dict[str, list[str]]()
+    for origin, got, wanted in problems:
+        alike.setdefault(wanted, []).append(f"{got} ({origin})" if origin not in ("", f"file {file}") else got)
+    if len(alike) == 1:
+        raise InvalidInputError(subject, ", ".join(alike[wanted]), wanted)
+    told = "; ".join(f"{', '.join(each)}, wanted {wanted}" for wanted, each in alike.items())
     raise InvalidInputError(subject, told, "settings as docs/guides/serving.md explains them")
 
 
