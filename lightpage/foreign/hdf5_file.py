@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -94,6 +95,9 @@ def arrays_in(file: h5py.File, reversed_axes: bool = False) -> dict[str, tuple[i
             links.extend(f"{name}/{each}".strip("/") for each in names)
         return None
 
+    def look_below(group: str, name: str, item: Any) -> bool | None:
+        return look(f"{group}/{name}", item)
+
     look("", file)
     file.visititems(look)
     broken = None
@@ -104,9 +108,10 @@ def arrays_in(file: h5py.File, reversed_axes: bool = False) -> dict[str, tuple[i
             broken = error
             continue
         kept.append(linked)
-        if linked is not None and hash(linked) not in seen and not look(name, linked):
-            if isinstance(linked, h5py.Group):
-                linked.visititems(lambda each, item, name=name: look(f"{name}/{each}", item))
+        if linked is None or hash(linked) in seen or look(name, linked):
+            continue
+        if isinstance(linked, h5py.Group):
+            linked.visititems(partial(look_below, name))
     if broken is not None and not found:
         raise broken
     return found

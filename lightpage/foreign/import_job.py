@@ -179,9 +179,7 @@ def exposure_of(material: Material, bit_depth: int | None) -> Exposure:
     depth = bit_depth or (MAX_BIT_DEPTH - unused if unused else next(bits for bits in DEPTHS if peak < 1 << bits))
     if material.black_level >= (most := 2**depth - 1):
         raise InvalidInputError(f"--black-level {material.black_level}", f"counts of {depth} bits", f"0 to {most - 1}")
-    return Exposure(
-        depth, unused, bit_depth is not None, darkest >> unused, brightest, int(np.median(dark)) >> unused
-    )
+    return Exposure(depth, unused, bit_depth is not None, darkest >> unused, brightest, int(np.median(dark)) >> unused)
 
 
 def tell(exposure: Exposure, material: Material) -> None:

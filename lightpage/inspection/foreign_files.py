@@ -23,6 +23,7 @@ from lightpage.recording.hdf5 import hdf, open_hdf5
 
 _SAMPLED = 8
 _SAMPLE_BYTES = 1 << 26
+_DRAWN = 4
 _LARGEST_SYMBOL = 256
 _KINDS = ("neither", "symbols", "frames")
 """What an array of a profile's shape is, in the order in which arrays of a file are chosen."""
@@ -102,8 +103,10 @@ def _one(found: Finding, array: ForeignArray, named: str, profile: Profile | Non
     looked_at = range(min(most, pages.count)) if array.in_sequence else spread(pages.count, most)
     frames = {number: pages.page(number) for number in looked_at}
     found.facts["pages looked at"] = Fact(list(looked_at), ", ".join(map(str, looked_at)))
-    found.pictures = lambda: [(f"{Path(named).name}, page {number}", frame) for number, frame in frames.items()]
-    if _may_be_symbols(array, profile):
+    symbols, title = _may_be_symbols(array, profile), f"{Path(named).name}, page"
+    unit = "symbol" if symbols else "counts"
+    found.pictures = lambda: [(f"{title} {number}", frames[number], unit) for number in list(frames)[:_DRAWN]]
+    if symbols:
         found.facts["may be"] = "symbols"
         found.next.append(f"lightpage import --symbols {named} --in-phase I --quadrature Q ... --profile P --out R.h5")
         return

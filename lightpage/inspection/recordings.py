@@ -93,7 +93,7 @@ def _pages(path: Path, profile: Profile | None) -> Finding:
         _tell_code(found, written.code)
         found.profile = written.device(profile)
         first = written[0]
-        found.pictures = lambda: [("page 0", first)]
+        found.pictures = lambda: [("page 0", first, "symbol")]
         found.next += [
             f"lightpage record --source camera:CONFIG.toml --symbols {found.quoted} --out R.h5",
             f"lightpage simulate --symbols {found.quoted} --out R.h5",
@@ -209,14 +209,14 @@ def _pictures(path: Path) -> list[Picture]:
         pair, reference = recording.frames(0), recording.references()
         lit = np.maximum(reference.in_phase, 1)
         drawn: list[Picture] = [
-            ("in-phase frame, page 0", pair.in_phase),
-            ("quadrature frame, page 0", pair.quadrature),
-            ("in-phase reference", reference.in_phase),
-            ("quadrature reference", reference.quadrature),
-            ("fringes: in-phase over reference, middle", _middle(pair.in_phase / lit)),
+            ("in-phase frame, page 0", pair.in_phase, "counts"),
+            ("quadrature frame, page 0", pair.quadrature, "counts"),
+            ("in-phase reference", reference.in_phase, "counts"),
+            ("quadrature reference", reference.quadrature, "counts"),
+            ("fringes: in-phase over reference, middle", _middle(pair.in_phase / lit), "ratio"),
         ]
         symbols = recording.symbols(0)
-        return drawn if symbols is None else [*drawn, ("symbols of page 0", symbols)]
+        return drawn if symbols is None else [*drawn, ("symbols of page 0", symbols, "symbol")]
 
 
 def _middle(frame: np.ndarray, side: int = 96) -> np.ndarray:

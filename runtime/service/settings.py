@@ -290,8 +290,8 @@ def service_settings(
     if file is not None:
         subject = f"settings {file}"
         data = read_toml(file, subject, "a TOML file that can be read")
-    tables = [(name, table) for name, table in data.items() if isinstance(table, dict)]
-    origins = {(name, key): f"file {file}" for name, table in tables for key in table}
+    told = {name: table if isinstance(table, dict) and table else [""] for name, table in data.items()}
+    origins = {(name, key): f"file {file}" for name, keys in told.items() for key in keys}
     for given in [*_of_environment(os.environ if environment is None else environment), *options]:
         if isinstance(table := data.setdefault(given.key[0], {}), dict):
             table[given.key[1]] = given.value
@@ -303,13 +303,11 @@ def service_settings(
     if len(problems) == 1:
         origin, got, wanted = problems[0]
         raise InvalidInputError(origin or subject, got, wanted)
-    alike = dict[str, list[str]]()
+    alike = dict[tuple[str, str], list[str]]()
     for origin, got, wanted in problems:
-        alike.setdefault(wanted, []).append(f"{got} ({origin})" if origin not in ("", f"file {file}") else got)
-    if len(alike) == 1:
-        raise InvalidInputError(subject, ", ".join(alike[wanted]), wanted)
-    told = "; ".join(f"{', '.join(each)}, wanted {wanted}" for wanted, each in alike.items())
-    raise InvalidInputError(subject, told, "settings as docs/guides/serving.md explains them")
+        alike.setdefault((f" ({origin})" * bool(origin), wanted), []).append(got)
+    lines = [f"{', '.join(got)}{origin}, wanted {wanted}" for (origin, wanted), got in alike.items()]
+    raise InvalidInputError(subject, "; ".join(lines), "settings as docs/guides/serving.md explains them")
 
 
 def _of_environment(environment: Mapping[str, str]) -> Iterator[Given]:
