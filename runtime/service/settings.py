@@ -302,7 +302,7 @@ def service_settings(
         problems = [_told(each, origins) for each in error.errors(include_url=False)]
     if len(problems) == 1:
         origin, got, wanted = problems[0]
-        raise InvalidInputError(origin or subject, got, wanted)
+        raise InvalidInputError(subject if origin in ("", f"file {file}") else origin, got, wanted)
     alike = dict[tuple[str, str], list[str]]()
     for origin, got, wanted in problems:
         alike.setdefault((f" ({origin})" * bool(origin), wanted), []).append(got)
