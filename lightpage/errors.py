@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 from copyreg import __newobj__  # type: ignore[attr-defined]  # which typeshed leaves out
 from enum import StrEnum
+from json import JSONDecodeError
+from tomllib import TOMLDecodeError
 from traceback import clear_frames
 from typing import Any, ClassVar, Self
 
@@ -28,12 +31,36 @@ def lowered(text: str) -> str:
     return text[:1].lower() + text[1:] if text[1:2].islower() or text[1:2] == " " else text
 
 
+_SYSTEM = {errno.EISDIR: "a folder", errno.ENOTDIR: "a file in place of a folder"}
+_LIBRARIES = {
+    "not a zip file": "no zip file",
+    "signature not found": "no HDF5 file",
+    "cannot identify image": "no picture",
+    "cannot reshape": "data that end too early",
+    "truncated": "data that end too early",
+    "failed to read": "data that end too early",
+}
+"""Words of errors of libraries, and what has come then."""
+
+
+def in_words(got: object) -> str:
+    """Return what came; errors of the system and of libraries are sentences, and become nouns where they are known."""
+    text = str(got)
+    if isinstance(got, OSError) and got.strerror:
+        return _SYSTEM.get(got.errno or 0) or lowered(got.strerror)
+    if isinstance(got, JSONDecodeError | TOMLDecodeError):
+        return f"text that is not {type(got).__name__[:4]} ({text})"
+    if isinstance(got, Exception):
+        return next((noun for words, noun in _LIBRARIES.items() if words in text.lower()), text)
+    return text
+
+
 class LightpageError(Exception):
     """Base of every error that Lightpage raises on purpose.
 
     Args:
         subject: thing that the error is about, e.g. ``"recording R.h5: dataset 'in_phase'"``.
-        got: value or state that came; of an error of the operating system, its text without number and path.
+        got: value or state that came; for an error of the system or of a library, see `in_words`.
         expected: value or state that would have been right.
 
     Attributes:
@@ -44,7 +71,7 @@ class LightpageError(Exception):
 
     def __init__(self, subject: str, got: object, expected: object) -> None:
         self.subject = subject
-        self.got = lowered(got.strerror) if isinstance(got, OSError) and got.strerror else str(got)
+        self.got = in_words(got)
         self.expected = str(expected)
         super().__init__(f"{subject}: got {self.got}, wanted {self.expected}")
 

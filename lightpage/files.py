@@ -46,6 +46,17 @@ _ENCODINGS = (
 )
 
 
+_BINARY = {
+    b"\x89HDF": "an HDF5 file",
+    b"PK": "a zip file",
+    b"\x93NUMPY": "an array of NumPy",
+    b"\x89PNG": "a picture",
+    b"II*\0": "a TIFF",
+    b"MM\0*": "a TIFF",
+}
+"""Kinds of files that are no text, by their first bytes."""
+
+
 def new_file(folder: Path, name: str) -> tuple[int, Path]:
     """Make an empty file of a new name in `folder`, with the modes that the process's umask leaves.
 
@@ -251,7 +262,9 @@ def read_text(path: str | Path, subject: str, expected: str, failure: type[Light
         return data.decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError as error:
         line, column = data.count(b"\n", 0, error.start) + 1, error.start - data.rfind(b"\n", 0, error.start)
-        if b"\0" in data[:64]:
+        if known := next((kind for start, kind in _BINARY.items() if data.startswith(start)), None):
+            got = f"{known}: `lightpage inspect` says what is in it"
+        elif b"\0" in data[:64]:
             got = "zero bytes, as in UTF-16 without a byte order mark"
         else:
             got = f"byte 0x{data[error.start]:02x} in line {line}, column {column}, which is no {encoding.upper()}"

@@ -104,7 +104,7 @@ def import_frames(out: Path, force: bool, keep_unlit: bool, json_path: Path | No
         sources.check_kept(out)
         material.check()
         exposure = exposure_of(material, given["bit_depth"])
-        tell(exposure, material.black_level)
+        tell(exposure, material)
         references = references_of(material, exposure)
         claim(out, f"{sources.described()}\n# profile\n{material.profile.to_toml()}", force=force)
         writer = RecordingWriter(
@@ -171,6 +171,7 @@ class _Sources:
             if given["levels"] not in (None, pages.levels):
                 raise InvalidInputError("--levels", given["levels"], f"{pages.levels}, as {pages.path} has, or nothing")
         assert profile is not None  # or it was refused above
+        levels = given["levels"] if pages is None else pages.levels
         symbols = None
         if given["symbols"] is not None:
             symbols = ForeignPages(self._open("symbols"), profile.page_shape, _what("symbols", profile))
@@ -179,10 +180,11 @@ class _Sources:
             self._cameras("frames", profile),
             self._cameras("references", profile),
             symbols,
-            given["levels"] or (MAX_LEVELS if pages is None else pages.levels),
+            levels or MAX_LEVELS,
             self._pilots(profile),
             self._code(None if pages is None else pages.code),
             given["black_level"],
+            levels is not None,
         )
 
     def check_kept(self, out: Path) -> None:
@@ -267,10 +269,13 @@ class _Sources:
         found = ForeignPages(self._open("pilots"), profile.page_shape, _what("pilots", profile))
         if found.count != 1:
             raise InvalidInputError(found.subject, f"{found.count} pages of pilots", "one")
+        if (different := len(np.unique(found.page(0)))) > 2:
+            expected = "two: 0, and another one where a symbol is known"
+            raise InvalidInputError(found.subject, f"{different} different values", expected)
         places = np.asarray(found.page(0) != 0)
-        if places.all() or not places.any():
-            got = f"{np.count_nonzero(places)} pilots of {places.size} symbols"
-            raise InvalidInputError(found.subject, got, "some of them, not all")
+        if not 0 < (known := np.count_nonzero(places)) < places.size / 2:
+            expected = "some of them, less than half"
+            raise InvalidInputError(found.subject, f"{known} pilots of {places.size} symbols", expected)
         return places
 
 

@@ -13,7 +13,7 @@ _NO_COMMAND = "No such command "
 _EXTRA = re.compile(r"Got unexpected extra arguments? \((.*)\)")
 _FILE = re.compile(r"(File|Directory|Path) '(.*)' (does not exist|is a file|is a directory|is not \w+)")
 _FILES = {"does not exist": "nothing of this name", "is a file": "a file", "is a directory": "a folder"}
-_WANTED = {"file": "a file", "directory": "a file, not a folder", "path": "a file or a folder"}
+_WANTED = {"file": "a file", "directory": "a folder", "path": "a file or a folder"}
 
 
 def misused(error: click.UsageError) -> InvalidInputError:
@@ -37,11 +37,14 @@ def misused(error: click.UsageError) -> InvalidInputError:
 def _of_parameter(path: str, told: str, error: click.BadParameter, param: click.Parameter) -> InvalidInputError:
     metavar = "" if error.ctx is None else param.make_metavar(error.ctx)
     name = param.opts[0] if isinstance(param, click.Option) else metavar
+    if name == metavar and isinstance(param.type, click.Choice):  # of which all choices are told anyway
+        name = (param.name or "").upper()
     if isinstance(error, click.MissingParameter):
         return InvalidInputError(path, f"no {name}", f"{name} {metavar}" if name != metavar else "one")
     if file := _FILE.match(error.message):
         kind, value, problem = file.groups()
-        return InvalidInputError(f"{path} {name} {value}", _FILES.get(problem, problem), _WANTED[kind.lower()])
+        got = _FILES.get(problem) or f"one that {problem}"
+        return InvalidInputError(f"{path} {name} {value}", got, _WANTED[kind.lower()])
     got, _, wanted = error.message.rstrip(".").partition(" is not ")
     if isinstance(param.type, click.IntRange | click.FloatRange) and wanted.startswith("a valid "):
         wanted = "a whole number" if isinstance(param.type, click.IntRange) else "a number"

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.errors import InvalidInputError, LightpageError
+from lightpage.errors import InvalidInputError, LightpageError, in_words
 from lightpage.failures import os_failure, understood
 
 SEPARATOR = "::"
@@ -77,7 +77,9 @@ def readable(subject: str, expected: str) -> Iterator[None]:
         told = " ".join(str(error).split())[:200]
         if "imagecodecs" in told:
             expected = "one without compression, or the codecs: pip install imagecodecs"
-        raise InvalidInputError(subject, f"data that cannot be read ({told or 'damaged'})", expected) from None
+        if (got := in_words(error)) == str(error):
+            got = f"data that cannot be read ({told or 'damaged'})"
+        raise InvalidInputError(subject, got, expected) from None
 
 
 def chosen(subject: str, name: str | None, found: dict[str, tuple[int, ...]]) -> str:

@@ -67,23 +67,24 @@ class Pages:
         array: of two axes for a single page, three, or four.
         shape: rows and columns of a page.
         what: a page is, for errors: frames or symbols, and of which profile.
+        together: whether pages that lie together are read at once, for whoever wants all of them.
 
     Raises:
         InvalidInputError: an array of other axes.
     """
 
-    def __init__(self, array: ForeignArray, shape: tuple[int, int], what: str) -> None:
+    def __init__(self, array: ForeignArray, shape: tuple[int, int], what: str, *, together: bool = True) -> None:
         self.subject, self._array, self.shape = array.subject, array, shape
         self._kept: OrderedDict[int, NDArray[Any]] = OrderedDict()
         whole = array.shape
         if 0 in whole or not 2 <= len(whole) <= 4:
             raise self._other(what)
-        if (axis := _first_axis_of_pages(array, shape)) is None:
+        if (axis := first_axis_of_pages(array, shape)) is None:
             raise self._other(what)
         self._axis, self.outer = axis, whole[2:] if axis else whole[:-2]
         self.count = math.prod(self.outer)
         self._outermost = self.outer[0] if self.outer else 1
-        self._step = self._pages_at_once()
+        self._step = self._pages_at_once() if together else 1
 
     def _pages_at_once(self) -> int:
         """Return how many entries of the outermost axis of pages are read together."""
@@ -94,7 +95,9 @@ class Pages:
         rows, columns = self.shape
         got, expected = f"shape {self._array.shape}", f"{what} of {rows} x {columns} along the last or first two axes"
         if (columns, rows) in (self._array.shape[-2:], self._array.shape[:2]):
-            expected += ", or frames that are turned by 90 degrees (--turn)"
+            got += ", rows and columns exchanged"
+            if "frames" in what:
+                expected += ": --turn-in-phase and --turn-quadrature turn them by 90 degrees"
         return InvalidInputError(self.subject, got, expected)
 
     def page(self, number: int) -> NDArray[Any]:
@@ -150,7 +153,7 @@ class Frames:
             InvalidInputError, StorageError, SurroundingsError: it cannot be read.
         """
         number = self._numbers[page]
-        data = _counts(self._pages.page(number)[self._cut], f"{self.subject}: frame {number}")
+        data = whole_counts(self._pages.page(number)[self._cut], f"{self.subject}: frame {number}")
         if self.shift:
             if int(np.bitwise_or.reduce(data, axis=None)) & ((1 << self.shift) - 1):
                 expected = f"multiples of {1 << self.shift}, as in the frames before, or --bit-depth"
@@ -163,15 +166,19 @@ class Frames:
         return map(self.frame, spread(len(self), most))
 
 
-def _first_axis_of_pages(array: ForeignArray, shape: tuple[int, int]) -> Literal[0, 2] | None:
+def first_axis_of_pages(array: ForeignArray, shape: tuple[int, int]) -> Literal[0, 2] | None:
     """Return 0 where pages of a shape lie along the first axes of an array, 2 where along the last, else None."""
     fits: dict[Literal[0, 2], bool] = {0: array.shape[-2:] == shape, 2: array.shape[:2] == shape}
     order: tuple[Literal[0, 2], ...] = (0,) if array.of_pictures or len(array.shape) == 2 else (0, 2)
     return next((axis for axis in (order[::-1] if array.pages_last else order) if fits[axis]), None)
 
 
-def _counts(data: NDArray[Any], subject: str) -> Counts:
-    """Return values as whole counts of 8 or 16 bits."""
+def whole_counts(data: NDArray[Any], subject: str) -> Counts:
+    """Return values as whole counts of 8 or 16 bits.
+
+    Raises:
+        FrameError: values that are none.
+    """
     if data.dtype.kind not in "uif":
         raise FrameError(subject, f"type {data.dtype}", "whole counts")
     if data.dtype.kind == "f":
@@ -257,7 +264,7 @@ def _found(array: ForeignArray, shape: tuple[int, int]) -> Arrangement:
     """Return the one way in which both cameras' frames can lie in an array."""
     rows, columns = shape
     ends = array.shape[-2:], array.shape[:2]
-    axis = _first_axis_of_pages(array, shape)
+    axis = first_axis_of_pages(array, shape)
     if axis is None and (rows, 2 * columns) in ends:
         return Arrangement.SIDE_BY_SIDE
     if axis is None and (2 * rows, columns) in ends:

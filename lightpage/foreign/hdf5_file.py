@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +11,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.errors import InvalidInputError
+from lightpage.errors import InvalidInputError, RecordingError
 from lightpage.foreign.array import ForeignArray, chosen, readable
-from lightpage.recording.hdf5 import DATA, open_hdf5, patiently
+from lightpage.recording.hdf5 import DATA, find, hdf, open_hdf5, patiently
 from lightpage.recording.stored import ArrayFile, StoredArray
 
 _MOST_OBJECTS = 10_000
@@ -37,13 +39,18 @@ class Hdf5Array(ForeignArray):
         self._file = ArrayFile(file, f"file {path}")
         try:
             with readable(f"file {path}", DATA):
-                self._name = chosen(f"file {path}", name, arrays_in(file, reversed_axes))
+                self._name = "" if name is None else name.strip("/")
+                named = self._file.array(self._name) if self._name else None  # which may be a second name, or a link
+                if named is None or not _holds_numbers(named.dataset):
+                    self._name = chosen(f"file {path}", name, arrays_in(file, reversed_axes))
             stored = self._file.array(self._name)
             assert stored is not None  # it is among those that were found
         except BaseException:
             self._file.close()
             raise
         self._array: StoredArray = stored
+        holds = Path(stored.dataset.file.filename)
+        self.files = (path,) if holds == path.absolute() else (path, holds)
         self.subject, self.dtype = stored.subject, stored.dtype
         self.shape = stored.shape[::-1] if reversed_axes else stored.shape
 
@@ -66,19 +73,52 @@ class Hdf5Array(ForeignArray):
 
 
 def arrays_in(file: h5py.File, reversed_axes: bool = False) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the arrays of numbers in a file that have two to four axes, by name."""
-    found: dict[str, tuple[int, ...]] = {}
-    looked_at = 0
+    """Return the shapes of the arrays of numbers in a file that have two to four axes, by name; links are followed.
 
-    def look(name: str, item: object) -> bool | None:
-        nonlocal looked_at
-        looked_at += 1
+    Raises:
+        RecordingError: there is none, but a link that leads to nothing.
+        StorageError, SurroundingsError: a linked file cannot be read.
+    """
+    found: dict[str, tuple[int, ...]] = {}
+    seen: set[int] = set()
+    links: list[str] = []
+    kept: list[Any] = []  # a linked file that is closed and opened again would have other hashes
+
+    def look(name: str, item: Any) -> bool | None:
+        if len(seen) > _MOST_OBJECTS or hash(item) in seen:
+            return len(seen) > _MOST_OBJECTS or None
+        seen.add(hash(item))
         if isinstance(item, h5py.Dataset) and _holds_numbers(item):
             found[name] = item.shape[::-1] if reversed_axes else item.shape
-        return True if looked_at > _MOST_OBJECTS else None
+        elif isinstance(item, h5py.Group):
+            names = (each for each in islice(item, _MOST_OBJECTS) if _is_link(item, each))
+            links.extend(f"{name}/{each}".strip("/") for each in names)
+        return None
 
+    def look_below(group: str, name: str, item: Any) -> bool | None:
+        return look(f"{group}/{name}", item)
+
+    look("", file)
     file.visititems(look)
+    broken = None
+    for name in links:  # which grow while groups behind them are looked at
+        try:
+            linked = find(file, name, f"file {file.filename}: {name}")
+        except RecordingError as error:
+            broken = error
+            continue
+        kept.append(linked)
+        if linked is None or hash(linked) in seen or look(name, linked):
+            continue
+        if isinstance(linked, h5py.Group):
+            linked.visititems(partial(look_below, name))
+    if broken is not None and not found:
+        raise broken
     return found
+
+
+def _is_link(group: Any, name: str) -> bool:
+    return not isinstance(group.get(name, getlink=True), hdf.HardLink)
 
 
 def _holds_numbers(item: h5py.Dataset) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,6 +18,7 @@ from lightpage.errors import (
     PageError,
     SaturatedFrameError,
 )
+from lightpage.foreign.array import spread
 from lightpage.foreign.frames import Counts, Frames, Pages
 from lightpage.page.symbols import check_symbols
 from lightpage.progress import note, track, warn
@@ -28,10 +30,14 @@ from lightpage.recording.writer import RecordingWriter
 
 _SAMPLED = 16
 """Frames of either camera that are looked at before the work begins."""
-_DEPTHS = (8, 10, 12, 14, 16)
+DEPTHS = (8, 10, 12, 14, 16)
 """Bit depths of cameras."""
 _PEDESTAL = 0.02
 """Share of full scale that no count of the sampled frames lies below, where a camera's black level is in them."""
+_DARK_PERCENT = 5
+"""Most pixels of a frame that noise leaves below the right black level."""
+_CHANCE = 1e-6
+"""Chance that random symbols of all levels are as small as those looked at, below which the levels are doubted."""
 _MOST_REFERENCES = 1000
 
 
@@ -44,6 +50,7 @@ class Exposure:
         unused_bits: of the files' counts, below the first one that is used.
         told: whether the depth was told, not found.
         darkest, brightest: right-aligned counts of the frames that were looked at.
+        dark: right-aligned count that a twentieth of their pixels lie below.
     """
 
     bit_depth: int
@@ -51,6 +58,7 @@ class Exposure:
     told: bool
     darkest: int
     brightest: int
+    dark: int
 
 
 @dataclass(frozen=True)
@@ -78,6 +86,7 @@ class Material:
         pilots: places of the known symbols, boolean [ny, nx]; None for those of the profile.
         code: what the pages hold, JSON text, where an encoder made them.
         black_level: counts of a camera in the dark.
+        levels_told: whether the levels were told, not assumed.
     """
 
     profile: Profile
@@ -88,6 +97,7 @@ class Material:
     pilots: NDArray[np.bool_] | None
     code: str | None
     black_level: int
+    levels_told: bool
 
     @property
     def pages(self) -> int:
@@ -148,12 +158,14 @@ def exposure_of(material: Material, bit_depth: int | None) -> Exposure:
         InvalidInputError, StorageError, SurroundingsError: a frame cannot be read, or the black level is no count.
     """
     peak, unused, darkest = 0, MAX_BIT_DEPTH, (1 << MAX_BIT_DEPTH) - 1
+    dark: list[float] = []
     for frames in (*material.frames, *material.references):
         most = _SAMPLED if frames in material.frames else 1
         for frame in frames.sample(most):
             peak = max(peak, int(frame.max()))
             if most > 1:
                 darkest = min(darkest, int(frame.min()))
+                dark.append(float(np.percentile(frame[::4, ::4], _DARK_PERCENT)))
             # too few different counts, as of a dark frame, tell nothing
             if (found := unused_low_bits(frame, 8 * frame.dtype.itemsize)) is not None:
                 unused = min(unused, found)
@@ -164,14 +176,20 @@ def exposure_of(material: Material, bit_depth: int | None) -> Exposure:
     for frames in (*material.frames, *material.references):
         frames.shift = unused
     brightest = peak >> unused
-    depth = bit_depth or (MAX_BIT_DEPTH - unused if unused else next(bits for bits in _DEPTHS if peak < 1 << bits))
+    depth = bit_depth or (MAX_BIT_DEPTH - unused if unused else next(bits for bits in DEPTHS if peak < 1 << bits))
     if material.black_level >= (most := 2**depth - 1):
         raise InvalidInputError(f"--black-level {material.black_level}", f"counts of {depth} bits", f"0 to {most - 1}")
-    return Exposure(depth, unused, bit_depth is not None, darkest >> unused, brightest)
+    return Exposure(depth, unused, bit_depth is not None, darkest >> unused, brightest, int(np.median(dark)) >> unused)
 
 
-def tell(exposure: Exposure, black_level: int) -> None:
-    """Tell whoever watches what was found of the counts, and what may be wrong with them."""
+def tell(exposure: Exposure, material: Material) -> None:
+    """Tell whoever watches what was found of counts and symbols, and what may be wrong with them.
+
+    Raises:
+        PageError: a page that was looked at has no symbols of the levels.
+        InvalidInputError, StorageError, SurroundingsError: it cannot be read.
+    """
+    black_level = material.black_level
     if not exposure.told:
         shifted = (
             f", without the lowest {exposure.unused_bits} bits, which are not used" if exposure.unused_bits else ""
@@ -182,6 +200,21 @@ def tell(exposure: Exposure, black_level: int) -> None:
             f"no count of the frames looked at is below {exposure.darkest}: if the cameras count so in the dark, say "
             f"--black-level {exposure.darkest}, or decoding loses information"
         )
+    if black_level > exposure.dark:
+        warn(
+            f"more than {_DARK_PERCENT}% of the counts looked at are below --black-level {black_level} and become 0: "
+            f"they reach down to {exposure.darkest}"
+        )
+    if material.symbols is not None and not material.levels_told:
+        _doubt_levels(material, spread(material.pages, _SAMPLED))
+
+
+def _doubt_levels(material: Material, pages: Sequence[int]) -> None:
+    """Warn where the symbols of some pages are so small that the assumed levels are doubtful."""
+    found = [material.page_symbols(page) for page in pages]
+    levels, count = 1 + max(int(page.max()) for page in found), sum(page.size for page in found)
+    if count * math.log(levels / material.levels) < math.log(_CHANCE):
+        warn(f"no symbol looked at is above {levels - 1}, and {material.levels} levels are assumed: --levels {levels}?")
 
 
 def references_of(material: Material, exposure: Exposure) -> FramePair:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from lightpage.errors import InvalidInputError
@@ -15,6 +16,8 @@ from lightpage.foreign.pictures import SUFFIXES, Pictures, natural, pictures_in
 from lightpage.foreign.tiff_file import TiffArray
 
 _READABLE = "a TIFF, .npy, .npz, .mat or HDF5 file, or a folder or pattern of pictures"
+_MARKS = "*?["
+"""Characters of a pattern."""
 _HDF5 = (".h5", ".hdf5", ".hdf", ".he5", ".nxs", ".nc")
 
 
@@ -40,8 +43,13 @@ def open_array(named: str) -> ForeignArray:
         if not path.is_file():
             raise InvalidInputError(f"file {path}", "no regular file", _READABLE)
         array = _of_kind(path, name)
-        array.files = (path,)
+        array.files = array.files or (path,)
         return array
+
+
+def names_array(named: str) -> bool:
+    """Return whether a user means an array of a file, or pictures by a pattern, and not a file or a folder itself."""
+    return not os.path.lexists(named) and (SEPARATOR in named or any(mark in named for mark in _MARKS))
 
 
 def _parted(named: str) -> tuple[Path, str | None]:
@@ -54,7 +62,7 @@ def _parted(named: str) -> tuple[Path, str | None]:
 
 def _pattern(pattern: str) -> ForeignArray:
     paths = sorted(map(Path, matching(pattern)), key=natural)
-    if not paths or not any(mark in pattern for mark in "*?["):
+    if not paths or not any(mark in pattern for mark in _MARKS):
         raise InvalidInputError(f"file {pattern}", "no such file", _READABLE)
     if other := next((path for path in paths if path.suffix.lower() not in SUFFIXES), None):
         raise InvalidInputError(f"pattern {pattern}", other.name, f"pictures ({', '.join(sorted(SUFFIXES))})")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from PIL import Image
 
 from lightpage.errors import InvalidInputError
 from lightpage.foreign.array import ForeignArray, readable
+from lightpage.words import sides
 
 SUFFIXES = frozenset({".png", ".tif", ".tiff", ".bmp", ".pgm"})
 """Endings of pictures that lose nothing."""
@@ -29,7 +31,7 @@ class Pictures(ForeignArray):
         paths: of the pictures, in order.
 
     Raises:
-        InvalidInputError: no picture, or a first one that is in colour or damaged.
+        InvalidInputError: no picture, or one that is in colour, of another size or type, or whose header is damaged.
     """
 
     of_pictures = True
@@ -38,46 +40,46 @@ class Pictures(ForeignArray):
         self.subject, self.files = subject, paths
         if not paths:
             raise InvalidInputError(subject, "no picture", f"pictures ({', '.join(sorted(SUFFIXES))})")
-        first = read_picture(paths[0])
-        self.shape, self.dtype = (len(paths), *first.shape), first.dtype
+        size, self.dtype = _header(paths[0])
+        self.shape = len(paths), *size
+        for path in paths[1:]:
+            if (found := _header(path)) != (size, self.dtype):
+                got, expected = (f"a picture of {sides(shape)}, {kind}" for shape, kind in (found, (size, self.dtype)))
+                raise InvalidInputError(f"file {path}", got, f"{expected}, as {paths[0].name} has")
 
     def take(self, axis: int, start: int, stop: int) -> NDArray[Any]:
         """See `ForeignArray`; the axis is that of the pictures."""
         assert axis == 0, "a picture is read whole"
-        return np.stack([self._picture(path) for path in self.files[start:stop]])
-
-    def _picture(self, path: Path) -> NDArray[Any]:
-        data = read_picture(path, (self.shape[1], self.shape[2]))
-        if data.dtype != self.dtype:
-            got, expected = f"a picture of type {data.dtype}", f"{self.dtype}, as {self.files[0].name} has"
-            raise InvalidInputError(f"file {path}", got, expected)
-        return data
+        pictures = []
+        with readable(self.subject, _EXPECTED):
+            for path in self.files[start:stop]:
+                with _opened(path) as picture:
+                    pictures.append(np.asarray(picture).astype(self.dtype, copy=False))
+            return np.stack(pictures)
 
 
-def read_picture(path: Path, expected: tuple[int, int] | None = None) -> NDArray[Any]:
-    """Return a grey picture [row, column].
+def _header(path: Path) -> tuple[tuple[int, int], np.dtype[Any]]:
+    """Return rows and columns of a grey picture, and the type of its counts, without decoding it."""
+    with _opened(path) as picture:
+        return (picture.height, picture.width), np.dtype(_GREY[picture.mode])
 
-    Args:
-        path: of the picture.
-        expected: its rows and columns, looked at before it is decoded; any if left out.
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """Open a grey picture; what is wrong with it is told of the file.
 
     Raises:
-        InvalidInputError: damaged, in colour, or of another size.
+        InvalidInputError: damaged, or in colour.
     """
     subject = f"file {path}"
     with readable(subject, _EXPECTED), warnings.catch_warnings():
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         with Image.open(path) as picture:
-            size = picture.height, picture.width
             if picture.mode not in _GREY:
                 raise InvalidInputError(subject, f"a picture of mode {picture.mode}", "grey, 8 or 16 bits")
             if (pictures := getattr(picture, "n_frames", 1)) != 1:
                 raise InvalidInputError(subject, f"{pictures} pictures", "one, or the file itself as a stack")
-            if expected is not None and size != expected:
-                raise InvalidInputError(
-                    subject, f"a picture of {size[0]} x {size[1]}", f"{expected[0]} x {expected[1]}"
-                )
-            return np.asarray(picture).astype(_GREY[picture.mode], copy=False)
+            yield picture
 
 
 def pictures_in(folder: Path) -> list[Path]:

@@ -23,8 +23,9 @@ from lightpage.inspection.finding import Finding, printable
 def inspect(file: Path, profile_name: str | None, picture: Path | None, json_path: Path | None) -> None:
     """Say what FILE is, what is wrong with it, and what can be done with it next.
 
-    FILE is a recording, pages, a bundle, the folder of a run, a calibration, a profile, or frames of another program.
-    Frames are looked at by samples. What is broken or does not fit makes the exit status 2.
+    FILE is a recording, pages, a bundle, the folder of a run, a calibration, a profile, or frames of another program:
+    a file, FILE::NAME, a folder of pictures, or a pattern in quotes. Frames are looked at by samples. What is broken or
+    does not fit makes the exit status 2.
     """
     found, pictures = look_apart(file, named_profile(profile_name), drawn=picture is not None)
     write_json(json_path, found.to_json())

@@ -18,6 +18,8 @@ from lightpage.inspection.finding import Fact, Finding
 from lightpage.run_files import EVALUATE, RECOVER, REPORT_MARKS
 from lightpage.waves.consequences import consequences
 
+_KNOWN = "a profile, a calibration, a code, settings, or figures of an evaluation or a recovery"
+_FIGURES = {EVALUATE: "an evaluation", RECOVER: "a recovery"}
 MOST_BYTES = 16 << 20
 """Most bytes of a text."""
 SERVICE_TABLES = frozenset(
@@ -34,8 +36,14 @@ def look_at_toml(path: Path, profile: Profile | None) -> Finding:
         InvalidInputError: it is no TOML, or of no kind that is known here.
     """
     subject = f"file {path}"
+    named = path.suffix.lower() == ".toml"
     with readable(subject, "a TOML document"):
-        told = tomllib.loads(read_text(path, subject, "a TOML document"))
+        try:
+            told = tomllib.loads(read_text(path, subject, "a TOML document"))
+        except (tomllib.TOMLDecodeError, InvalidInputError):
+            if named:
+                raise
+            raise InvalidInputError(subject, "a text that is neither TOML nor JSON", _KNOWN) from None
     if sum(isinstance(told[name], dict) for name in told.keys() & Profile.model_fields.keys()) > 1:
         return _profile(path)
     if "calibrated_pages" in told or "turn_rad" in told:
@@ -48,7 +56,7 @@ def look_at_toml(path: Path, profile: Profile | None) -> Finding:
         return found
     if "cameras" in told or "trigger" in told:
         found = Finding(path, "cameras of a device")
-        found.next.append(f"lightpage record --source camera:{found.quoted} --pages 1 --out R.h5 --profile P")
+        found.next.append(f"lightpage record --source camera:{found.quoted} --pages 1 --out R.h5")
         return found
     if told.keys() & Device.model_fields.keys():
         found = Finding(path, "state of a simulated device")
@@ -57,7 +65,7 @@ def look_at_toml(path: Path, profile: Profile | None) -> Finding:
             found.next.append(f"lightpage simulate --profile bench --device {found.quoted} --pages 10 --out R.h5")
         return found
     keys = ", ".join(list(told)[:10]) or "none"
-    raise InvalidInputError(subject, f"TOML with the keys {keys}", "a profile, a calibration, a code or settings")
+    raise InvalidInputError(subject, f"TOML with the keys {keys}", _KNOWN)
 
 
 def look_at_json(path: Path) -> Finding:
@@ -72,8 +80,8 @@ def look_at_json(path: Path) -> Finding:
     found = Finding(path, "JSON")
     if isinstance(told, dict):
         found.facts["keys"] = Fact(list(told)[:10], ", ".join(list(told)[:10]))
-        if any(REPORT_MARKS[command] <= told.keys() for command in (EVALUATE, RECOVER)):
-            found.kind = "figures of an evaluation or a recovery"
+        if of := next((of for command, of in _FIGURES.items() if REPORT_MARKS[command] <= told.keys()), None):
+            found.kind = f"figures of {of}"
             found.next.append(f"lightpage report {found.quoted} --out F.html")
     return found
 

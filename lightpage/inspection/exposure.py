@@ -16,7 +16,7 @@ _PIXELS = 1 << 18
 """Pixels of a frame that are counted."""
 _BAR = 40
 _TOLD = 0.0005
-"""Share of the pixels from which on the last bins are shown."""
+"""Share of the pixels below which a bin is told to be under 0.1%."""
 
 
 def sampled(frame: NDArray[Any]) -> NDArray[Any]:
@@ -62,8 +62,9 @@ def bars(found: Histogram) -> list[str]:
     most = max(found.shares) or 1.0
     width = len(str(found.edges[-1] - 1))
     lines = []
-    last = max(place for place, share in enumerate(found.shares) if share >= _TOLD or not place)
+    last = max(place for place, share in enumerate(found.shares) if share or not place)
     for low, high, share in list(zip(found.edges, found.edges[1:], found.shares, strict=False))[: last + 1]:
         bar = "#" * round(_BAR * share / most)
-        lines.append(f"  {low:>{width}} to {high - 1:>{width}} {bar:<{_BAR}} {share:6.1%}")
+        told = "<0.1%" if 0 < share < _TOLD else f"{share:.1%}"
+        lines.append(f"  {low:>{width}} to {high - 1:>{width}} {bar:<{_BAR}} {told:>6}")
     return lines

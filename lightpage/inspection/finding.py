@@ -17,8 +17,8 @@ from lightpage.device.profile import Profile
 from lightpage.errors import LightpageError
 from lightpage.foreign.array import readable
 
-Picture = tuple[str, NDArray[Any]]
-"""Title, and an array [row, column]."""
+Picture = tuple[str, NDArray[Any], str]
+"""Title, an array [row, column], and what its values are."""
 
 
 @dataclass(frozen=True)

@@ -82,8 +82,8 @@ def look_at_bundle(path: Path) -> Finding:
         }
         golden = bundle.golden
         found.pictures = lambda: [
-            ("golden page, in-phase", golden.pair.in_phase),
-            ("golden page, quadrature", golden.pair.quadrature),
+            ("golden page, in-phase", golden.pair.in_phase, "counts"),
+            ("golden page, quadrature", golden.pair.quadrature, "counts"),
         ]
     found.next += [
         f"lightpage evaluate --bundle {found.quoted} --recording R.h5",

@@ -6,25 +6,25 @@ import math
 import shlex
 from contextlib import closing
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile
+from lightpage.errors import FrameError
 from lightpage.foreign.array import MOST_BYTES, SEPARATOR, ForeignArray, spread
+from lightpage.foreign.frames import Counts, Pages, first_axis_of_pages, whole_counts
 from lightpage.foreign.hdf5_file import arrays_in
+from lightpage.foreign.import_job import DEPTHS
 from lightpage.foreign.mat_file import mat_arrays
 from lightpage.foreign.numpy_file import arrays_of
 from lightpage.foreign.opening import open_array
-from lightpage.inspection.exposure import histogram, sampled
-from lightpage.inspection.finding import Fact, Finding, Picture, shape_fact, shape_text
+from lightpage.inspection.exposure import histogram
+from lightpage.inspection.finding import Fact, Finding, shape_fact, shape_text
+from lightpage.recording.exposure import check_light
 from lightpage.recording.hdf5 import hdf, open_hdf5
 
-_SAMPLED = 4
+_SAMPLED = 8
 _SAMPLE_BYTES = 1 << 26
+_DRAWN = 4
 _LARGEST_SYMBOL = 256
-_MOST_COUNT = 65_535
 _KINDS = ("neither", "symbols", "frames")
 """What an array of a profile's shape is, in the order in which arrays of a file are chosen."""
 _NEEDED = "an array of counts"
@@ -92,18 +92,26 @@ def _one(found: Finding, array: ForeignArray, named: str, profile: Profile | Non
     if not 2 <= len(array.shape) <= 4 or array.dtype.kind not in "uif" or 0 in array.shape:
         found.problems.append(f"type {array.dtype} of shape {array.shape}: neither frames nor symbols")
         return
-    axis = len(array.shape) - 1 if array.pages_last and len(array.shape) > 2 else 0
-    pages = array.shape[axis] if len(array.shape) > 2 else 1
-    if (size := math.prod(array.shape) // pages * array.dtype.itemsize) > MOST_BYTES:
+    if _in_colour(array, profile):
+        found.problems.append(f"a last axis of {array.shape[-1]}, as in colour: wanted grey pictures, or --profile P")
+        return
+    pages = Pages(array, _page_shape(array, profile), "pages", together=False)
+    if (size := math.prod(pages.shape) * array.dtype.itemsize) > MOST_BYTES:
         found.problems.append(f"a page of {size / 1e9:.3g} GB, more than is looked at")
         return
-    frames = _frames(array, axis, pages, max(1, _SAMPLE_BYTES // max(1, size)))
-    found.pictures = lambda: _pictures(str(named), frames)
-    if _may_be_symbols(array, profile):
+    most = max(1, min(_SAMPLED, _SAMPLE_BYTES // max(1, size)))
+    looked_at = range(min(most, pages.count)) if array.in_sequence else spread(pages.count, most)
+    frames = {number: pages.page(number) for number in looked_at}
+    found.facts["pages looked at"] = Fact(list(looked_at), ", ".join(map(str, looked_at)))
+    symbols, title = _may_be_symbols(array, profile), f"{Path(named).name}, page"
+    unit = "symbol" if symbols else "counts"
+    found.pictures = lambda: [(f"{title} {number}", frames[number], unit) for number in list(frames)[:_DRAWN]]
+    if symbols:
         found.facts["may be"] = "symbols"
         found.next.append(f"lightpage import --symbols {named} --in-phase I --quadrature Q ... --profile P --out R.h5")
         return
-    _values(found, [sampled(frame) for frame in frames])
+    with found.trying("counts"):
+        _counts(found, {number: whole_counts(frame, f"page {number}") for number, frame in frames.items()})
     found.next.append(
         f"lightpage import --in-phase {named} --quadrature Q --reference-in-phase RI --reference-quadrature RQ "
         "--symbols S --profile P --out R.h5"
@@ -117,37 +125,33 @@ def _may_be_symbols(array: ForeignArray, profile: Profile | None) -> bool:
     return len(array.shape) == 3 and max(array.shape[-2:]) < _LARGEST_SYMBOL and array.dtype.itemsize == 1
 
 
-def _frames(array: ForeignArray, axis: int, pages: int, most: int) -> list[NDArray[Any]]:
-    """Return some pages of an array, which lie along an axis; the first ones where the last would take long."""
-    most = min(most, _SAMPLED, pages)
-    if len(array.shape) == 2:
-        return [array.take(0, 0, array.shape[0])]
-    looked_at = range(most) if array.in_sequence else spread(pages, most)
-    taken = (array.take(axis, page, page + 1).squeeze(axis) for page in looked_at)
-    return [page if page.ndim == 2 else page[0] for page in taken]
+def _in_colour(array: ForeignArray, profile: Profile | None) -> bool:
+    """Return whether the last axis seems to be colours, not the columns or the number of the pages."""
+    known = array.pages_last or _kind(array.shape, profile) != "neither"
+    return len(array.shape) > 2 and array.shape[-1] in (3, 4) and not known
 
 
-def _values(found: Finding, pixels: list[NDArray[Any]]) -> None:
-    """Tell of the values of some frames, and of their exposure where they are counts."""
-    if any(not np.isfinite(each).all() for each in pixels):
-        found.problems.append("values that are no numbers")
-    elif any(np.any(each != np.rint(each)) or each.min() < 0 for each in pixels):
-        found.problems.append("values that are no whole counts: multiply by full scale, and round")
-    elif (most := max(each.max() for each in pixels)) > _MOST_COUNT:
-        found.problems.append(f"values up to {most:.6g}, wanted counts up to {_MOST_COUNT}")
-    else:
-        _counts(found, [each.astype(np.int64) for each in pixels])
+def _page_shape(array: ForeignArray, profile: Profile | None) -> tuple[int, int]:
+    """Return rows and columns of a page: the profile's, or those of the axes on which its program has them."""
+    for shape in () if profile is None else (profile.frame_shape, profile.page_shape):
+        if first_axis_of_pages(array, shape) is not None:
+            return shape
+    rows, columns = array.shape[:2] if array.pages_last else array.shape[-2:]
+    return rows, columns
 
 
-def _counts(found: Finding, frames: list[NDArray[np.int64]]) -> None:
-    peak = max(int(frame.max()) for frame in frames)
-    bits = max(8, peak.bit_length())
-    least = min(int(frame.min()) for frame in frames)
+def _counts(found: Finding, frames: dict[int, Counts]) -> None:
+    """Tell of the counts of some frames, and which of them have no usable light."""
+    least, peak = min(int(each.min()) for each in frames.values()), max(int(each.max()) for each in frames.values())
+    bits = next(depth for depth in DEPTHS if peak < 1 << depth)
     value = {"least": least, "greatest": peak, "bits": bits}
-    found.facts["counts"] = Fact(value, f"{least} to {peak}, so at least {bits} bits")
-    if peak == 0:
-        found.problems.append("all that was looked at is black")
-    found.histograms["frames"] = histogram(list(frames), bits)
+    found.facts["counts"] = Fact(value, f"{least} to {peak}, so {bits} bits or more")
+    for number, frame in frames.items():
+        try:
+            check_light(f"page {number}", frame, bits)
+        except FrameError as error:
+            found.problems.append(f"{error.subject} {error.got}")
+    found.histograms["frames"] = histogram(list(frames.values()), bits)
 
 
 def _fits(found: Finding, array: ForeignArray, profile: Profile) -> None:
@@ -167,7 +171,3 @@ def _kind(shape: tuple[int, ...], profile: Profile | None) -> str:
     if profile is not None and profile.frame_shape in ends:
         return "frames"
     return "symbols" if profile is not None and profile.page_shape in ends else "neither"
-
-
-def _pictures(name: str, frames: list[NDArray[Any]]) -> list[Picture]:
-    return [(f"{Path(name).name}, frame looked at {number}", frame) for number, frame in enumerate(frames)]

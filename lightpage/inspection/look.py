@@ -5,17 +5,20 @@ from __future__ import annotations
 import os
 import stat
 import zipfile
+from contextlib import suppress
 from pathlib import Path
 
 from lightpage.device.profile import Profile
-from lightpage.errors import InvalidInputError
-from lightpage.foreign.array import readable
+from lightpage.errors import BundleError, InvalidInputError
+from lightpage.foreign.array import SEPARATOR, readable
+from lightpage.foreign.opening import names_array
 from lightpage.inspection.documents import MOST_BYTES, look_at_json, look_at_toml
 from lightpage.inspection.finding import Finding
 from lightpage.inspection.folders import look_at_bundle, look_at_folder
 from lightpage.inspection.foreign_files import look_at_archive, look_at_array, look_at_mat
 from lightpage.inspection.recordings import look_at as look_at_recording
 from lightpage.runtime.model.bundle.manifest import MANIFEST
+from lightpage.runtime.model.bundle.shipped import bundle_path
 from lightpage.words import counted
 
 _HEAD = 4096
@@ -53,7 +56,12 @@ def look(path: Path, profile: Profile | None = None) -> Finding:
 
 def _look(path: Path, profile: Profile | None) -> Finding:
     subject = f"file {path}"
-    with readable(subject, "a file that can be read"):
+    if names_array(str(path)):
+        return look_at_array(path, "array of a file" if SEPARATOR in str(path) else "pictures", profile)
+    with readable(subject, "a file that can be read, or the name of a shipped bundle"):
+        if not os.path.lexists(path):
+            with suppress(BundleError):
+                path = bundle_path(str(path))
         status = os.stat(path)
         if stat.S_ISDIR(status.st_mode):
             return look_at_folder(path, profile)
@@ -110,6 +118,6 @@ def _text(path: Path, head: bytes, size: int, profile: Profile | None) -> Findin
         raise InvalidInputError(subject, f"bytes that begin with {head[:8].hex(' ')}", _KNOWN)
     if size > MOST_BYTES:
         raise InvalidInputError(subject, f"a text of {size / 1e6:.0f} MB", _KNOWN)
-    if head.lstrip()[:1] in (b"{", b"[") and path.suffix.lower() != ".toml":
+    if head.lstrip().startswith(b"{") or path.suffix.lower() == ".json":
         return look_at_json(path)
     return look_at_toml(path, profile)

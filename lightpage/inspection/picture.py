@@ -41,11 +41,12 @@ def draw(found: Finding, pictures: list[Picture], out: Path) -> None:
     if not pictures:
         raise InvalidInputError(f"--picture {out}", found.kind, "a file with frames or symbols")
     panels = len(pictures) + bool(found.histograms)
-    rows = math.ceil(panels / _COLUMNS)
-    figure = Figure(figsize=(4.6 * _COLUMNS, 3.4 * rows), layout="constrained")
+    columns = min(panels, _COLUMNS)
+    rows = math.ceil(panels / columns)
+    figure = Figure(figsize=(4.6 * columns, 3.4 * rows), layout="constrained")
     figure.suptitle(f"{printable(found.path.name)}: {found.kind}")
-    for place, (title, pixels) in enumerate(pictures, 1):
-        axis = figure.add_subplot(rows, _COLUMNS, place)
+    for place, (title, pixels, unit) in enumerate(pictures, 1):
+        axis = figure.add_subplot(rows, columns, place)
         step = max(1, max(pixels.shape) // _SIDE_PX)
         shown = np.nan_to_num(pixels[::step, ::step], posinf=0.0, neginf=0.0)
         low, high = np.percentile(sampled(shown), _SHADES)
@@ -53,9 +54,9 @@ def draw(found: Finding, pictures: list[Picture], out: Path) -> None:
         axis.set_title(title, fontsize=9)
         axis.set_xticks([])
         axis.set_yticks([])
-        figure.colorbar(image, ax=axis, shrink=0.8)
+        figure.colorbar(image, ax=axis, shrink=0.8, label=unit)
     if found.histograms:
-        axis = figure.add_subplot(rows, _COLUMNS, (panels, rows * _COLUMNS))
+        axis = figure.add_subplot(rows, columns, (panels, rows * columns))
         for name, each in found.histograms.items():
             axis.stairs([max(share, 1e-6) for share in each.shares], each.edges, label=_exposure(found, name))
         axis.set(xlabel="count", ylabel="share of the pixels", yscale="log")

@@ -11,12 +11,12 @@ import numpy as np
 from lightpage.device.profile import Profile
 from lightpage.errors import FrameError, InvalidInputError
 from lightpage.foreign.array import MOST_BYTES, spread
-from lightpage.inspection.exposure import contrast, histogram, sampled
+from lightpage.inspection.exposure import contrast, histogram
 from lightpage.inspection.finding import Fact, Finding, Picture, shape_fact, shape_text
 from lightpage.inspection.foreign_files import look_at_hdf5
+from lightpage.page.symbols import pilot_mask
 from lightpage.recording import decoded_file, layout, pages
 from lightpage.recording.exposure import check_different, check_pair_light
-from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.hdf5 import find, open_hdf5, read_attribute
 from lightpage.recording.pages import Pages
 from lightpage.recording.reader import Recording
@@ -27,6 +27,8 @@ from lightpage.waves.grid import check_camera
 _SAMPLE_BYTES = 1 << 26
 """Of frames that are read."""
 _MOST_PAGES = 8
+_MOST_PILOTS = 0.5
+"""Share of pilots that a profile has to stay below."""
 _DIFFERENT = "frames of two cameras"
 _NEEDED = "data as docs/reference/formats.md describes them"
 
@@ -91,7 +93,7 @@ def _pages(path: Path, profile: Profile | None) -> Finding:
         _tell_code(found, written.code)
         found.profile = written.device(profile)
         first = written[0]
-        found.pictures = lambda: [("page 0", first)]
+        found.pictures = lambda: [("page 0", first, "symbol")]
         found.next += [
             f"lightpage record --source camera:CONFIG.toml --symbols {found.quoted} --out R.h5",
             f"lightpage simulate --symbols {found.quoted} --out R.h5",
@@ -129,6 +131,7 @@ def _recording(path: Path, profile: Profile | None) -> Finding:
             found.profile = header.device(profile, found.problems.append)
             check_camera(found.profile)
             found.facts["profile"] = f"{found.profile.name}{' (its own)' if profile is None else ''}"
+        _pilots(found, recording)
         _exposure(found, recording)
         found.pictures = lambda: _pictures(path)
         _next(found, recording, coded)
@@ -147,18 +150,29 @@ def _symbols(recording: Recording) -> Fact:
     return Fact({"known": levels is not None, "levels": levels}, text)
 
 
+def _pilots(found: Finding, recording: Recording) -> None:
+    """Tell how many symbols of a page are pilots: the recording's own, or its profile's."""
+    own = recording.pilots()
+    if (places := own if own is not None or found.profile is None else pilot_mask(found.profile)) is None:
+        return
+    count, share = int(np.count_nonzero(places)), float(np.mean(places))
+    found.facts["pilots"] = Fact({"count": count, "share": share}, f"{count} ({share:.1%} of the symbols)")
+    if share >= _MOST_PILOTS:
+        found.problems.append(f"{count} pilots of {places.size} symbols, wanted less than half")
+
+
 def _exposure(found: Finding, recording: Recording) -> None:
     """Tell how some frames are exposed, and the references."""
     pair = recording.references()
     with found.trying("reference frames with light"):
-        check_pair_light("reference: ", _sampled(pair), recording.bit_depth)
+        check_pair_light("reference: ", pair, recording.bit_depth)
     frame_bytes = 2 * pair.in_phase.nbytes
     looked_at = spread(recording.pages, max(1, min(_MOST_PAGES, _SAMPLE_BYTES // frame_bytes)))
     unlit, frames = [], []
     for page in looked_at:
         frames.append(recording.frames(page))
         try:
-            check_pair_light("", _sampled(frames[-1]), recording.bit_depth)
+            check_pair_light("", frames[-1], recording.bit_depth)
         except FrameError as error:
             unlit.append(f"page {page}: {error.subject} {error.got}")
         with found.trying(_DIFFERENT):
@@ -172,10 +186,6 @@ def _exposure(found: Finding, recording: Recording) -> None:
         found.facts[f"{name}: saturated"] = Fact(saturated, f"{saturated:.2%} of the pixels")
         fringes = float(np.mean([contrast(each, reference) for each in own]))
         found.facts[f"{name}: contrast of fringes"] = Fact(fringes, f"{fringes:.2f}")
-
-
-def _sampled(pair: FramePair) -> FramePair:
-    return FramePair(sampled(pair.in_phase), sampled(pair.quadrature))
 
 
 def _next(found: Finding, recording: Recording, coded: bool) -> None:
@@ -199,14 +209,14 @@ def _pictures(path: Path) -> list[Picture]:
         pair, reference = recording.frames(0), recording.references()
         lit = np.maximum(reference.in_phase, 1)
         drawn: list[Picture] = [
-            ("in-phase frame, page 0", pair.in_phase),
-            ("quadrature frame, page 0", pair.quadrature),
-            ("in-phase reference", reference.in_phase),
-            ("quadrature reference", reference.quadrature),
-            ("fringes: in-phase over reference, middle", _middle(pair.in_phase / lit)),
+            ("in-phase frame, page 0", pair.in_phase, "counts"),
+            ("quadrature frame, page 0", pair.quadrature, "counts"),
+            ("in-phase reference", reference.in_phase, "counts"),
+            ("quadrature reference", reference.quadrature, "counts"),
+            ("fringes: in-phase over reference, middle", _middle(pair.in_phase / lit), "ratio"),
         ]
         symbols = recording.symbols(0)
-        return drawn if symbols is None else [*drawn, ("symbols of page 0", symbols)]
+        return drawn if symbols is None else [*drawn, ("symbols of page 0", symbols, "symbol")]
 
 
 def _middle(frame: np.ndarray, side: int = 96) -> np.ndarray:

@@ -98,7 +98,8 @@ def open_once(path: Path, subject: str) -> h5py.File:
         OSError: what HDF5 or the system says of storage and resources.
     """
     if not path.is_file():
-        got, unfinished = "no regular file" if path.exists() else "no such file", Path(f"{path}.partial")
+        got = "a folder" if path.is_dir() else "no regular file" if path.exists() else "no such file"
+        unfinished = Path(f"{path}.partial")
         if unfinished.is_file():
             raise RecordingError(subject, f"{got}, only {unfinished.name}", f"{READABLE}: write it to its end")
         raise RecordingError(subject, got, READABLE)

@@ -48,7 +48,7 @@ from lightpage.words import brief, counted, sides
 class Recording(AbstractContextManager["Recording"]):
     """A recording opened for reading and checked; use it in a `with` statement, or close it.
 
-    `len` tells its pages, and a `for` loop yields their frame pairs in order.
+    `len` tells its pages, `recording[page]` is a frame pair, and a `for` loop yields all of them in order.
 
     Attributes:
         path: of the file.
@@ -94,6 +94,11 @@ class Recording(AbstractContextManager["Recording"]):
 
     def __len__(self) -> int:
         return self.pages
+
+    def __getitem__(self, page: int) -> FramePair:
+        """The frame pair of a page, -1 being the last; see `frames`."""
+        from_end = isinstance(page, int | np.integer) and -self.pages <= page < 0
+        return self.frames(page + self.pages if from_end else page)
 
     def __iter__(self) -> Iterator[FramePair]:
         return map(self.frames, range(self.pages))

@@ -143,6 +143,7 @@ class ArrayFile:
             StorageError, SurroundingsError: it cannot be read.
         """
         with self._lock:
+            self._check_not_closed()
             if name not in self._arrays:
                 self._be_open()
                 subject = f"{self.subject}: dataset '{name}'"
@@ -181,8 +182,8 @@ class ArrayFile:
             StorageError, SurroundingsError: it cannot be read.
         """
         pages = 0 if (array := self.array(name)) is None else len(array)
-        if not 0 <= page < pages:
-            raise RecordingError(f"{self.subject}: page", page, f"0 to {pages - 1}")
+        if not isinstance(page, int | np.integer) or not 0 <= page < pages:
+            raise RecordingError(f"{self.subject}: page", repr(page), f"a whole number from 0 to {pages - 1}")
         row = self._without_hdf5(name, page)
         return self.rows(name, page, page + 1)[0] if row is None else row
 
@@ -217,6 +218,7 @@ class ArrayFile:
     def close(self) -> None:
         """Close the file; nothing can be read afterwards."""
         with self._lock:
+            self._gone = False
             self._sources.close()
             for array in self._arrays.values():
                 if array is not None:  # one behind a link keeps another file open
@@ -239,7 +241,12 @@ class ArrayFile:
         self._file, self._gone = open_once(self._path, self.subject), False
         self._arrays.clear()
 
+    def _check_not_closed(self) -> None:
+        if not (self._gone or self._file):
+            raise RecordingError(self.subject, "a file that is closed", "an open one: read inside its `with` statement")
+
     def _be_open(self) -> None:
+        self._check_not_closed()
         if self._gone:
             patiently(self._open_again, self.subject, READABLE)
 

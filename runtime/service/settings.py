@@ -1,7 +1,6 @@
 """The service's settings: one TOML file, above it the environment, above both the options of the command line."""
 
 import os
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from pydantic_core import ErrorDetails
 from lightpage.device.problems import problem_of
 from lightpage.device.profile import toml_value
 from lightpage.errors import InvalidInputError
-from lightpage.files import read_text
+from lightpage.files import read_toml
 from lightpage.progress import warn
 from lightpage.runtime.client.wire.address import check_address, is_local
 from lightpage.runtime.client.wire.channel import TlsFiles
@@ -289,13 +288,10 @@ def service_settings(
     """
     subject, data = "settings", dict[str, Any]()
     if file is not None:
-        subject, expected = f"settings {file}", "a TOML file that can be read"
-        try:
-            data = tomllib.loads(read_text(file, subject, expected))
-        except tomllib.TOMLDecodeError as error:
-            raise InvalidInputError(subject, error, expected) from None
-    tables = [(name, table) for name, table in data.items() if isinstance(table, dict)]
-    origins = {(name, key): f"file {file}" for name, table in tables for key in table}
+        subject = f"settings {file}"
+        data = read_toml(file, subject, "a TOML file that can be read")
+    told = {name: table if isinstance(table, dict) and table else [""] for name, table in data.items()}
+    origins = {(name, key): f"file {file}" for name, keys in told.items() for key in keys}
     for given in [*_of_environment(os.environ if environment is None else environment), *options]:
         if isinstance(table := data.setdefault(given.key[0], {}), dict):
             table[given.key[1]] = given.value
@@ -306,9 +302,12 @@ def service_settings(
         problems = [_told(each, origins) for each in error.errors(include_url=False)]
     if len(problems) == 1:
         origin, got, wanted = problems[0]
-        raise InvalidInputError(origin or subject, got, wanted)
-    told = "; ".join(f"{got}{f' ({origin})' * bool(origin)}, wanted {wanted}" for origin, got, wanted in problems)
-    raise InvalidInputError(subject, told, "settings as docs/guides/serving.md explains them")
+        raise InvalidInputError(subject if origin in ("", f"file {file}") else origin, got, wanted)
+    alike = dict[tuple[str, str], list[str]]()
+    for origin, got, wanted in problems:
+        alike.setdefault((f" ({origin})" * bool(origin), wanted), []).append(got)
+    lines = [f"{', '.join(got)}{origin}, wanted {wanted}" for (origin, wanted), got in alike.items()]
+    raise InvalidInputError(subject, "; ".join(lines), "settings as docs/guides/serving.md explains them")
 
 
 def _of_environment(environment: Mapping[str, str]) -> Iterator[Given]:

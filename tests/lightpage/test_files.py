@@ -160,7 +160,7 @@ def test_what_is_no_file_is_written_to_and_not_replaced(tmp_path: Path) -> None:
 
 def test_an_error_names_the_thing_what_came_and_what_was_wanted() -> None:
     assert str(InvalidInputError("--pages", 0, "at least 1")) == "--pages: got 0, wanted at least 1"
-    assert InvalidInputError("file F", OSError("truncated file"), "a whole one").got == "truncated file"
+    assert InvalidInputError("file F", OSError("odd file"), "a whole one").got == "odd file"
     error = InvalidInputError("file F", FileNotFoundError(errno.ENOENT, "No such file", "F"), "a file")
     assert error.got == "no such file"
 

@@ -120,7 +120,8 @@ def matlab(a: Arrays) -> None:
 
 
 def hdf5(a: Arrays) -> None:
-    with h5py.File("both.h5", "w") as file:
+    with h5py.File("both.h5", "w") as linking, h5py.File("data.h5", "w") as file:
+        linking["run"] = h5py.ExternalLink("data.h5", "run")
         file.create_dataset("run/all", data=np.concatenate([a["in_phase"], a["quadrature"]]), chunks=(3, 64, 96))
         file["run/short"] = [1]
 
@@ -173,11 +174,8 @@ class TestShapesThatAreReadInTwoWays:
 
     @pytest.mark.parametrize(
         ("shape", "arrangement", "kind"),
-        [
-            ((2, 3, 4, 5), "interleaved", "two cameras"),
-            ((3, 2, 4, 5), "halves", "two cameras"),
-            ((8, 4, 4), None, "--arrangement"),
-        ],
+        [((2, 3, 4, 5), "interleaved", "two cameras"), ((3, 2, 4, 5), "halves", "two cameras"),
+         ((8, 4, 4), None, "--arrangement")],
     )  # fmt: skip
     def test_an_arrangement_that_the_axes_contradict_or_leave_open(
         self, shape: tuple[int, ...], arrangement: str | None, kind: str, tmp_path: Path
@@ -244,9 +242,11 @@ class TestRefused:
             (f"{FRAMES.replace('in_phase', 'all')} {REFERENCES}", "all.npy", "no such file"),
             (f"{FRAMES} {REFERENCES} --black-level 300", "--black-level 300", "8 bits"),
             (f"{FRAMES} {REFERENCES} --pilots ones.npy", "ones.npy", "pilots of"),
+            (f"{FRAMES} {REFERENCES} --pilots page.npy", "page.npy", f"{LEVELS} different values"),
         ],
     )
     def test_options_that_do_not_go_together(self, options: str, subject: str, got: str, arrays: Arrays) -> None:
+        np.save("page.npy", arrays["symbols"][0])
         np.save("ones.npy", np.ones_like(arrays["symbols"][0]))
         with refused(subject, got):
             bring(f"{options} {REST}")
@@ -267,6 +267,11 @@ def test_each_way_that_calibrate_finds_is_set_upright(shown: tuple[tuple[int, in
         at = np.array(shown) @ (column - 1, row - 1) + 1
         seen[at[1], at[0]] = page[row, column]
     np.testing.assert_array_equal(upright(seen), page)
+
+
+def test_levels_and_a_black_level_that_seem_wrong_are_told(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bring(f"{FRAMES} {REFERENCES} {REST.replace(f'--levels {LEVELS}', '--black-level 60')}")
+    assert all(f"{name} {value}" in caplog.text for name, value in (("--levels", LEVELS), ("--black-level", 60)))
 
 
 def test_unlit_frames_are_taken_and_told_where_that_is_asked_for(folder: Path, arrays: Arrays) -> None:

@@ -47,11 +47,6 @@ def npy_of(path: Path, shape: str) -> None:
     path.write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
 
 
-def mat73(path: Path) -> None:
-    with h5py.File(path, "w", userblock_size=512) as file:
-        file["stack"] = FRAMES
-
-
 def decoded(path: Path) -> None:
     with DecodedWriter(path, 16) as writer:
         writer.append(np.zeros((4, 5), np.uint8), np.ones((4, 5), np.float32), "v", None)
@@ -72,11 +67,6 @@ def png_folder(path: Path) -> None:
 def run_folder(path: Path) -> None:
     path.mkdir()
     (path / "begun.json").write_text(json.dumps({"--profile": small_profile().to_toml()}))
-
-
-def folder_loop(path: Path) -> None:
-    path.mkdir()
-    (path / "inner").symlink_to(path)
 
 
 def pages(path: Path) -> None:
@@ -107,14 +97,19 @@ MADE: dict[str, tuple[str, int, Callable[[Path], object]]] = {
     "a.npy": ("array of NumPy", 0, lambda path: path.write_bytes(SAVED.getvalue())),
     "a.npz": ("arrays of NumPy", 0, lambda path: path.write_bytes(zipped(one=FRAMES, two=FRAMES[0]))),
     "five.mat": ("MATLAB file", 0, lambda path: savemat(path, {"stack": FRAMES})),
-    "seven.mat": ("MATLAB file", 0, mat73),
+    "7.mat": ("MATLAB file", 0, lambda p: h5py.File(p, "w", userblock_size=512).create_dataset("x", data=FRAMES)),
     "png": ("folder of pictures", 0, png_folder),
     "e.json": ("figures of an evaluation", 0, lambda path: path.write_text('{"bundle_version": "v", "pages": 6}')),
     "s.toml": ("settings of a service", 0, lambda path: path.write_text("[inference]\n")),
-    "left.npy": ("full scale 65520", 0, lambda path: np.save(path, np.minimum(2 * FRAMES, 4095) << 4)),
-    "bright.npy": ("values up to 1e+20", 2, lambda path: np.save(path, np.full((2, 9, 9), 1e20))),
+    "left.npy": ("full scale 65520", 2, lambda path: np.save(path, np.minimum(2 * FRAMES, 4095) << 4)),
+    "bright.npy": ("values from 1e+20", 2, lambda path: np.save(path, np.full((2, 9, 9), 1e20))),
     "two.npz": ("two.npz::b", 0, lambda path: path.write_bytes(zipped(a=[[1.0]], b=FRAMES))),
     "rgb.tif": ("RGB", 2, lambda path: tifffile.imwrite(path, np.zeros((40, 60, 3), np.uint8), photometric="rgb")),
+    "colour.npy": ("colour", 2, lambda path: np.save(path, np.stack([FRAMES] * 3, -1))),
+    "dark.npy": ("page 1 black", 2, lambda path: np.save(path, FRAMES * np.array([1, 0, 1], np.uint16)[:, None, None])),
+    "a.h5::x": ("array", 0, lambda path: h5py.File(path.parent / "a.h5", "w").create_dataset("x", data=FRAMES)),
+    "pics/*.png": ("0, 1, 2", 0, lambda path: png_folder(path.parent)),
+    "note.txt": ("neither TOML", 2, lambda path: path.write_text("note: well")),
     "half.npy": ("all of shape", 2, lambda path: path.write_bytes(SAVED.getvalue()[:-9])),
     "half.tif": ("TIFF", 2, lambda path: path.write_bytes(b"II*\0\x08\0\0\0\x01\0\x02\0")),
     "half.npz": ("whole", 2, lambda path: path.write_bytes(zipped(one=FRAMES)[:-99])),
@@ -133,7 +128,7 @@ MADE: dict[str, tuple[str, int, Callable[[Path], object]]] = {
     "deep.json": ("recursion", 2, lambda path: path.write_text("[" * 100_000)),
     "pipe": ("a pipe", 2, os.mkfifo),
     "loop": ("too many levels", 2, lambda path: path.symlink_to(path.name)),
-    "folders": ("inner", 2, folder_loop),
+    "folders": ("inner", 2, lambda path: (path / "inner").mkdir(parents=True)),
     "new\nline": ("new\\nline", 2, lambda path: path.write_bytes(b"\0\1\2")),
     "zero": ("a device", 2, lambda path: path.symlink_to("/dev/zero")),
     "none": ("no such file", 2, lambda path: None),

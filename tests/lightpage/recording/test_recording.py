@@ -76,12 +76,10 @@ class TestReading:
         with Recording.open(foreign) as recording, h5py.File(foreign) as file:
             assert recording.path == foreign
             assert (recording.pages, recording.levels, recording.bit_depth) == (PAGES, LEVELS, 12)
-            assert recording.frame_shape == (14, 20)
-            assert recording.page_shape == (6, 9)
-            assert recording.has_symbols
+            assert (recording.frame_shape, recording.page_shape, recording.has_symbols) == ((14, 20), (6, 9), True)
             assert recording.header.profile_text is None
             for name in ("in_phase", "quadrature"):
-                frames = [getattr(recording.frames(page), name) for page in range(PAGES)]
+                frames = [getattr(recording[page], name) for page in (*range(PAGES - 1), -1)]
                 assert np.array_equal(frames, file[name])
                 assert np.array_equal(getattr(recording.references(), name), file[f"reference_{name}"])
             assert np.array_equal([recording.symbols(page) for page in range(PAGES)], file["symbols"])
@@ -91,11 +89,8 @@ class TestReading:
         with h5py.File(foreign, "r+") as file:
             del file["symbols"], file["pilots"], file.attrs["levels"]
         with Recording.open(foreign) as recording:
-            assert recording.levels == 256
-            assert not recording.has_symbols
-            assert recording.page_shape is None
-            assert recording.symbols(0) is None
-            assert recording.pilots() is None
+            assert (recording.levels, recording.has_symbols) == (256, False)
+            assert [recording.page_shape, recording.symbols(0), recording.pilots()] == [None] * 3
             recording.header.check_against(small_profile())
 
     def test_pilots_alone_and_as_numbers_tell_the_page_shape(self, foreign: Path) -> None:
@@ -174,10 +169,13 @@ class TestReading:
         assert [record.message.count("multiples of 16") for record in caplog.records] == [1]
 
     def test_a_page_that_is_not_there_is_refused(self, foreign: Path) -> None:
+        pages: list[Any] = [-1, PAGES, 1.0, "a"]
         with Recording.open(foreign) as recording:
-            for page in (-1, PAGES):
+            for page in pages:
                 with refused("page", page, RecordingError):
                     recording.frames(page)
+        with refused("foreign.h5", "closed", RecordingError):
+            recording.frames(0)
 
     def test_a_profile_of_another_camera_or_page_is_refused(self, foreign: Path) -> None:
         profile = small_profile()

@@ -628,5 +628,5 @@ def test_joined_pages_follow_one_another_and_references_are_the_first_ones(tmp_p
 
 @pytest.mark.parametrize("path", [".", "/", ""])
 def test_a_path_without_a_name_is_no_recording(path: str) -> None:
-    with pytest.raises(RecordingError, match="no regular file"):
+    with pytest.raises(RecordingError, match="a folder"):
         Recording.open(Path(path))
