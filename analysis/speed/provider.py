@@ -78,7 +78,7 @@ def lines(made: Made) -> list[str]:
 @click.command()
 @click.option("--bundle", "paths", multiple=True, required=True, type=click.Path(path_type=Path), help="Bundles.")
 @click.option("--recording", required=True, type=click.Path(path_type=Path), help="Pages with known symbols.")
-@click.option("--provider", "text", default="cpu", show_default=True, help=f"What computes pages: {WANTED}.")
+@click.option("--provider", "text", default="cpu", show_default=True, help=f"Processor that computes pages: {WANTED}.")
 @click.option("--pages", default=2, show_default=True, type=click.IntRange(1, 1000), help="Of the recording.")
 @click.option("--precision", "precisions", multiple=True, type=click.Choice(PRECISIONS), default=PRECISIONS)
 @click.option(
