@@ -104,7 +104,7 @@ def consequences(profile: Profile) -> Consequences:
 
 
 def _walls(step_m: float, width_m: float) -> int:
-    """Return how many walls light from the middle of the facet meets that moves `step_m` sideways in the pipe."""
+    """Return the number of walls that a ray from the facet's middle meets if it shifts by `step_m`."""
     return math.floor(step_m / width_m + 0.5)
 
 

@@ -203,7 +203,7 @@ class Pairing:
         return frames
 
     def _check_times(self, offsets_s: tuple[float, ...]) -> None:
-        """Rule 4; the references follow where it holds."""
+        """Check both frames' times against the trigger (rule 4), and update the reference times."""
         deviations = [offset - (one.reference_s or 0.0) for one, offset in zip(self._channels, offsets_s, strict=True)]
         if max(map(abs, deviations)) > self.settings.tolerance_s:
             told = ", ".join(

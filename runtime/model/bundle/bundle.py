@@ -310,7 +310,7 @@ def read_manifest(path: Path) -> Manifest:
 
 
 def shows_page(coarse: float, limit: float) -> bool:
-    """Return whether frames in few counts may stand for a page: how badly they fit the homodyne equations tells.
+    """Return whether coarse frames still fit the homodyne equations well enough to hold a page.
 
     Args:
         coarse: residual of the frames `in_few_counts`.

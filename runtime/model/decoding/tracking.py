@@ -107,18 +107,18 @@ class NoTracker:
 
     @property
     def image_px(self) -> tuple[float, float]:
-        """Return where calibration saw it."""
+        """Return the image's calibrated position."""
         return 0.0, 0.0
 
     def memory(self) -> None:
         """See `Tracker`."""
 
     def anew(self) -> NoTracker:
-        """Itself: it learns nothing."""
+        """Return this tracker, which has no state to copy."""
         return self
 
     def fork(self) -> NoTracker:
-        """Itself: it learns nothing."""
+        """Return this tracker, which has no state to copy."""
         return self
 
     def refitted(self, decoder: Decoder) -> NoTracker:
