@@ -15,7 +15,7 @@ from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import BATCH, CONSTANTS, FLOAT16
 from lightpage.runtime.model.decoding.golden import check_golden
 from lightpage.runtime.model.decoding.page import OUTPUTS, Inference
-from lightpage.runtime.model.execution.device_memory import ON_NO_DEVICE, DeviceTwins
+from lightpage.runtime.model.execution.device_memory import ON_NO_DEVICE, Copies
 from lightpage.runtime.model.execution.session import BoundSession, OnDevice, open_session, running
 from lightpage.runtime.model.execution.table_graph import TableGraph
 
@@ -60,14 +60,14 @@ class FrameBuffer:
     Args:
         pages: at most.
         frame_shape, dtype: of a frame.
-        twins: makes its twin on a device.
+        copies: maker of the copy on a device.
     """
 
-    def __init__(self, pages: int, frame_shape: tuple[int, int], dtype: str, twins: DeviceTwins = ON_NO_DEVICE) -> None:
+    def __init__(self, pages: int, frame_shape: tuple[int, int], dtype: str, copies: Copies = ON_NO_DEVICE) -> None:
         both = np.zeros((2, pages, *frame_shape), dtype)
         self.pages, self.frames = pages, dict(zip(("in_phase", "quadrature"), both, strict=True))
         self.shift = np.zeros((pages, 2, 2), np.float32)
-        self._twin = twins.of(both)
+        self._copy = copies.of(both)
 
     def put(self, place: int, pair: FramePair, shift: NDArray[np.float32]) -> None:
         """Write a page.
@@ -77,13 +77,13 @@ class FrameBuffer:
         """
         self.frames["in_phase"][place], self.frames["quadrature"][place] = pair.in_phase, pair.quadrature
         self.shift[place] = shift
-        if self._twin is not None:
-            self._twin.send(*(frames[place] for frames in self.frames.values()))
+        if self._copy is not None:
+            self._copy.send(*(frames[place] for frames in self.frames.values()))
 
     def feeds(self, pages: slice) -> dict[str, NDArray[np.generic] | OnDevice]:
         """Inputs of some pages, by name; what was written before stands where nothing was since."""
-        frames, twin = {name: array[pages] for name, array in self.frames.items()}, self._twin
-        there = frames if twin is None else {name: twin.of(part) for name, part in frames.items()}
+        frames, copy = {name: array[pages] for name, array in self.frames.items()}, self._copy
+        there = frames if copy is None else {name: copy.of(part) for name, part in frames.items()}
         return {**there, SHIFT: self.shift[pages]}
 
 
@@ -112,7 +112,7 @@ class BatchGraph:
         self.subject = f"{bundle.subject}: {BATCH}"
         if missing := _FILES - bundle.files.keys():
             raise BundleError(f"{bundle.subject}: files", f"no {', '.join(sorted(missing))}", "a graph for batches")
-        self._bundle, self._provider, self._twins = bundle, graph.provider, DeviceTwins(graph.provider)
+        self._bundle, self._provider, self._copies = bundle, graph.provider, Copies(graph.provider)
         self._session = open_session(bundle.files[BATCH], self.subject, threads, provider=graph.provider, rounded=True)
         if SHIFT not in {node.name for node in self._session.get_inputs()}:
             raise BundleError(self.subject, f"no input {SHIFT}", "an export by this version of Lightpage")
@@ -143,7 +143,7 @@ class BatchGraph:
     def buffer(self) -> FrameBuffer:
         """Memory for the frames of a run."""
         manifest = self._bundle.manifest
-        return FrameBuffer(self.pages, self._bundle.profile.frame_shape, manifest.frame_dtype, self._twins)
+        return FrameBuffer(self.pages, self._bundle.profile.frame_shape, manifest.frame_dtype, self._copies)
 
     def constants(self, graph: TableGraph, registration: NDArray[np.float32] | None = None) -> Constants:
         """Constants of a table, computed on the CPU.
