@@ -280,7 +280,7 @@ def notebook(path: Path, images: Path) -> str:
     """Return a notebook as a page; its pictures are written into `images`.
 
     Args:
-        path: of the notebook, kept with its outputs.
+        path: path of the notebook, kept with its outputs.
         images: folder of pictures.
     """
     parts = list[str]()

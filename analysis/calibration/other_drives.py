@@ -86,8 +86,8 @@ class _Drives:
     """A bundle, and a file that is written with its pilots.
 
     Args:
-        decoder: of the bundle.
-        code: of the file's pages.
+        decoder: decoder of the bundle.
+        code: code of the file's pages.
     """
 
     def __init__(self, decoder: Decoder, code: Code) -> None:

@@ -103,12 +103,12 @@ def measured(
     """Rates in this process, by shared memory and by streams, their ratios, and what the device did meanwhile.
 
     Args:
-        bundle: with the decoder for many pages.
+        bundle: bundle with the decoder for many pages.
         pairs, levels: pages that are decoded in turn.
-        provider: that computes them.
+        provider: provider that computes them.
         largest: pages of a batch at most.
-        callers: at a time.
-        seconds: of each rate.
+        callers: callers at a time.
+        seconds: seconds of each rate.
     """
     opened = Bundle.open(bundle)
     share_freed_memory()  # as a service does

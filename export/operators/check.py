@@ -28,7 +28,7 @@ class Fallback:
     Attributes:
         node: its name, or that of its first output where it has none.
         operator: name, behind its domain where that is not ONNX's own.
-        version: of the operator, not of the whole set; 0 where it is unknown.
+        version: version of the operator, not of the whole set; 0 where it is unknown.
         got: what is in the graph.
         expected: what the provider has.
     """

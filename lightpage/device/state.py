@@ -288,7 +288,7 @@ class Spread(NamedTuple):
     Attributes:
         low, high: ends of the range.
         deviation: standard deviation about `centre`; 0 where rough devices have what the realistic one has.
-        centre: of a rough device. Numbers that cannot be negative scatter to one side of it.
+        centre: centre of a rough device. Numbers that cannot be negative scatter to one side of it.
     """
 
     low: float
@@ -374,7 +374,7 @@ def draw_rough(rng: np.random.Generator, share: float = 1.0) -> Device:
 
     Args:
         rng: draws.
-        share: of a rough device's deviations.
+        share: share of a rough device's deviations.
     """
     values: dict[str, float] = {}
     for key, knob in CAPTURE_RANGE.items():

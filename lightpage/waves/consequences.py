@@ -29,8 +29,8 @@ class Cost:
     """Cost of a page on two cores, about.
 
     Attributes:
-        seconds: to decode it.
-        memory_gb: at the peak.
+        seconds: time to decode it.
+        memory_gb: memory at the peak.
     """
 
     seconds: float
@@ -42,17 +42,17 @@ class Consequences:
     """Consequences of a profile.
 
     Attributes:
-        symbols: of a page.
-        most_bits: that they can carry, 256 levels each.
+        symbols: number of symbols of a page.
+        most_bits: bits that they can carry, 256 levels each.
         pixels_per_symbol: camera pixels along a symbol's edge.
         image_px: width and height of the page's image on a camera, pixels.
-        magnification: of the page's image on the sensors.
+        magnification: magnification of the page's image on the sensors.
         aperture: numerical aperture of the page's corner, small angles.
         walls_met: most walls that light meets along x and along y.
         modes: sine modes of the pipe along x and along y that carry the page's light.
         carried: share of a symbol's first diffraction order that the pipe's width passes; below 1 symbols blur.
         pair_mb: megabytes of a frame pair, 8 bits a count.
-        cost: of a page, by preset of `lightpage train`.
+        cost: cost of a page, by preset of `lightpage train`.
         refused: why such a device cannot be read; empty where it can.
         doubts: what was never tried, or will cost information.
     """

@@ -38,9 +38,9 @@ def fetch(subject: str, address: str, path: str, tls: TlsFiles | None = None) ->
     """A page of the service whose `--metrics-port` is at HOST:PORT, its first 16 MiB.
 
     Args:
-        subject: of the error.
+        subject: subject of the error.
         address: HOST:PORT.
-        path: of the page, without a slash in front.
+        path: path of the page, without a slash in front.
         tls: certificates to connect with; None for a service without TLS.
 
     Raises:

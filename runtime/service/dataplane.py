@@ -137,7 +137,7 @@ class Place:
 
     Attributes:
         tracker: follows them.
-        turn: of the page.
+        turn: turn of the page.
     """
 
     tracker: Tracker
@@ -156,7 +156,7 @@ class DataPlane:
         monitor: says by all pages of the service's own device whether a recalibration is due: those of the source, and
             those of `device_sessions`. Other sessions of callers get monitors of their own with the same settings.
         device_sessions: sessions of callers whose frames are of the device, by their names in `Caller.session`.
-        clock: by which callers wait for slots and answers, and what hangs is known.
+        clock: clock by which callers wait for slots and answers, and what hangs is known.
 
     Raises:
         InvalidInputError: the source is not for this device.

@@ -282,7 +282,7 @@ def service_settings(
         file: TOML, None for none.
         environment: variables, by default those of this process; those named `_PREFIX` + TABLE__KEY count, and before
             them, where it is not named so, `_STORE`.
-        options: of the command line.
+        options: options of the command line.
 
     Raises:
         InvalidInputError: the file cannot be read, or a setting is wrong.

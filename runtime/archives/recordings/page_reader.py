@@ -275,7 +275,7 @@ class PageReader:
         """Read a page.
 
         Args:
-            index: of it in the recording.
+            index: index of it in the recording.
             result: gives it decoded, with its symbols where they are known.
             expected: the page of its volume that it should be.
             take: see `read`.

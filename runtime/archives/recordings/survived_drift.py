@@ -76,12 +76,12 @@ class DriftedReading:
     """Reads the first pages of a recording as if the device had drifted.
 
     Args:
-        decoder: of the device.
-        recording: with known symbols.
+        decoder: decoder of the device.
+        recording: recording with known symbols.
 
     Attributes:
-        recording: that is read.
-        kinds: of `KINDS`, those that the decoder knows of.
+        recording: recording that is read.
+        kinds: names in `KINDS` that the decoder knows.
 
     Raises:
         BundleError: a decoder that holds its geometry itself, or has no calibration.

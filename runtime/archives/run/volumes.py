@@ -25,7 +25,7 @@ class Wanted:
     """Which files are made.
 
     Attributes:
-        volume_id, checksum: of one volume alone; None for any.
+        volume_id, checksum: number and checksum of one volume alone; None for any.
         holes: whether a file is made too where data are lost, with zeros in their place and `HOLES` behind its name.
     """
 

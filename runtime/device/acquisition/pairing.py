@@ -89,7 +89,7 @@ class _Channel:
 
     Attributes:
         last_id: number of its last frame, None where it is not known.
-        step: by which its numbers grow from shot to shot, None where it is not known.
+        step: step by which its numbers grow from shot to shot, None where it is not known.
         reference_s: device time less trigger time of a good shot, None before a synchronisation.
         opened: how often the camera was opened when that was learnt.
         came: frames so far, whole or not.
@@ -122,7 +122,7 @@ class Pairing:
         cameras: in-phase and quadrature, armed.
         trigger: armed.
         settings: how strict.
-        clock: by which it waits, and `trigger` tells the time of its shots.
+        clock: clock by which it waits, and `trigger` tells the time of its shots.
     """
 
     cameras: Sequence[Camera]

@@ -68,7 +68,7 @@ class PulseGenerator:
 
     Args:
         settings: see there.
-        clock: by which it waits, and tells the time of a shot.
+        clock: clock by which it waits, and tells the time of a shot.
     """
 
     def __init__(self, settings: PulseGeneratorSettings, clock: Clock = SYSTEM) -> None:

@@ -103,9 +103,9 @@ class Bundle:
         """Read the folder or zip at `path` and check every file against the manifest.
 
         Args:
-            path: of it.
-            key: that a zip must be signed with; None for any or none.
-            signature: of the zip; empty for that in the file beside it.
+            path: path of the bundle.
+            key: key that a zip must be signed with; None for any or none.
+            signature: signature of the zip; empty for that in the file beside it.
 
         Raises:
             BundleError: a missing, extra, changed or misplaced file, a newer schema, or no bundle at all; or with a

@@ -35,7 +35,7 @@ class Constants:
     """Tensors that follow from a table alone, where the graph computes.
 
     Attributes:
-        registration: in the table, [2, 2, 10].
+        registration: registration in the table, [2, 2, 10].
         bound: the graph, run with them.
         reach_px: see `REACH`.
     """
@@ -58,8 +58,8 @@ class FrameBuffer:
     For a GPU it is pinned, and a page is copied there once it is written, while a run from another buffer is on.
 
     Args:
-        pages: at most.
-        frame_shape, dtype: of a frame.
+        pages: largest number of pages.
+        frame_shape, dtype: shape and type of a frame.
         copies: maker of the copy on a device.
     """
 
@@ -93,14 +93,14 @@ class BatchGraph:
     The golden page is decoded alone, and among the most pages, in the first and in the last place.
 
     Args:
-        bundle: that has such a graph.
-        graph: of its decoder, with its provider and its table.
-        pages: of a run, at most.
-        threads: of a run on the CPU.
+        bundle: bundle that has such a graph.
+        graph: graph of its decoder, with its provider and its table.
+        pages: largest number of pages of a run.
+        threads: number of threads of a run on the CPU.
 
     Attributes:
         subject: what it is, for errors.
-        pages: of a run, at most; fewer than were wanted where there is no memory for so many.
+        pages: largest number of pages of a run; fewer than were wanted where there is no memory for so many.
         constants_of_bundle: those of the graph's table.
 
     Raises:
@@ -149,8 +149,8 @@ class BatchGraph:
         """Constants of a table, computed on the CPU.
 
         Args:
-            graph: with that table.
-            registration: in place of the table's.
+            graph: graph with that table.
+            registration: registration in place of the table's.
         """
         names = [node.name for node in self._first.get_outputs()]
         table = {node.name: graph.value(node.name) for node in self._first.get_inputs()}
@@ -195,8 +195,8 @@ def with_proven_batches(bundle: Bundle, graph: TableGraph) -> Bundle:
     """The bundle, without its graph for batches and a warning where that does not decode the golden page as it should.
 
     Args:
-        bundle: in memory.
-        graph: of its decoder, with its table.
+        bundle: bundle in memory.
+        graph: graph of its decoder, with its table.
     """
     if not holds_batches(bundle):
         return bundle

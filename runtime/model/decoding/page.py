@@ -142,7 +142,7 @@ def check_residual(residual: float, limit: float | None, *, doubtful: bool = Fal
     """Check how badly a pair of frames fits the homodyne equations.
 
     Args:
-        residual, limit: of the page, and the bundle's.
+        residual, limit: residual of the page, and limit of the bundle.
         doubtful: see `lightpage.runtime.model.decoding.decoder.Decoder.infer`.
 
     Raises:

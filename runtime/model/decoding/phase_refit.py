@@ -66,7 +66,7 @@ class PhaseRefit:
             concentration: von Mises kappa, [ny, nx].
             levels: M, or uneven levels.
             pilots: the known symbols of this page.
-            rounds: of expectation maximisation.
+            rounds: number of rounds of expectation maximisation.
         """
         known = np.full(self._shape, np.nan)
         known[pilots.mask] = pilots.phases

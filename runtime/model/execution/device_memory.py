@@ -26,8 +26,8 @@ class CudaRuntime:
     """CUDA's runtime library. Its calls release the interpreter's lock.
 
     Args:
-        library: by ctypes.
-        provider: whose GPU is used.
+        library: library by ctypes.
+        provider: provider whose GPU is used.
     """
 
     def __init__(self, library: Any, provider: Provider) -> None:
@@ -67,8 +67,8 @@ class DeviceCopy:
     many threads at once, but not while a graph reads them.
 
     Args:
-        runtime: of the device.
-        array: in C order; zero on the device until it is sent.
+        runtime: runtime of the device.
+        array: array in C order; zero on the device until it is sent.
 
     Raises:
         ProviderError: it cannot be pinned, or there is no room on the device.
@@ -114,7 +114,7 @@ class Copies:
     """Makes arrays' copies where pages are computed on a GPU, as long as that goes well.
 
     Args:
-        provider: that computes them.
+        provider: provider that computes them.
         runtime: gives the device's library.
     """
 

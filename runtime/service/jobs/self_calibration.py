@@ -82,11 +82,11 @@ class SelfCalibration:
     photographed between those that are read.
 
     Args:
-        plane: of the service.
+        plane: plane of the service.
         monitor: says when it is due.
-        recalibrator: of the service.
+        recalibrator: recalibrator of the service.
         settings: when and with what.
-        clock: by which it waits.
+        clock: clock by which it waits.
         kept: the last pages of the device; None where none are kept.
     """
 
@@ -163,7 +163,7 @@ class SelfCalibration:
 
         Args:
             caller: waits for as long as it has time. Where it leaves, the work goes on.
-            version: of the model that has lost the pages.
+            version: version of the model that has lost the pages.
             lost: how many it has lost.
 
         Returns:

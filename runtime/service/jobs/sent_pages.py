@@ -27,7 +27,7 @@ class SentPages:
     """Takes reference frames, then symbols and frames of each page, within the service's budget of memory.
 
     Args:
-        header: of the call.
+        header: header of the call.
         plane: says what frames and how many bytes are taken.
 
     Raises:

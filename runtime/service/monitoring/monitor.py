@@ -134,7 +134,7 @@ class SignState:
     """State of a sign of drift.
 
     Attributes:
-        name: of the sign.
+        name: name of the sign.
         value: what counts of the last pages, None before there are enough.
         baseline: what is usual, None before it is known.
         raise_at: where the sign is raised, None before the baseline is known.
@@ -161,8 +161,8 @@ class MonitorState:
 
     Attributes:
         due: whether a recalibration is.
-        model_version: that the pages were decoded with.
-        pages: that were seen since it is in service.
+        model_version: version that the pages were decoded with.
+        pages: pages that were seen since it is in service.
         signs: each sign.
     """
 
@@ -337,8 +337,8 @@ class Monitor:
         """Take note of a page by its figures; an empty page says nothing.
 
         Args:
-            version: of the model that decoded it; other pages than those of the model in service say nothing.
-            figures: by the names of signs.
+            version: version of the model that decoded it; other pages than those of the model in service say nothing.
+            figures: figures by the names of signs.
         """
         with self._lock:
             if not figures or (self._version and version != self._version):
