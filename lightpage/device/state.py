@@ -227,7 +227,7 @@ class Device(TomlTable):
 
 
 def _alike(path: str, tables: Mapping[str, Mapping[str, Any]]) -> str:
-    """Which settings may have been meant by a TABLE.KEY that is none."""
+    """Return the settings that a wrong TABLE.KEY may have meant."""
     known = [f"{table}.{key}" for table, keys in tables.items() for key in keys]
     table, _, key = path.rpartition(".")
     by_key = {name.partition(".")[2]: name for name in known}

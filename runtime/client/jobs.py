@@ -27,7 +27,7 @@ _AGAIN_S = 0.5
 
 
 class RecalibrationOptions(TypedDict, total=False):
-    """Which pages a recalibration has, and which model it replaces. All but the pages may be left out.
+    """Pages of a recalibration, and the model that it replaces. All but the pages may be left out.
 
     Attributes:
         count: how many of the source's next pages; or of the recording's first ones, 0 for all of them.

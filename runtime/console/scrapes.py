@@ -172,7 +172,7 @@ class Change:
         return sum(rise for _, rise in self._risen(name, **labels))
 
     def rate(self, name: str, **labels: str) -> float:
-        """The same a second; NaN where no time has passed."""
+        """Return the growth a second; NaN where no time has passed."""
         return self.rise(name, **labels) / self.seconds if self.seconds > 0 else math.nan
 
     def rises(self, name: str, label: str) -> dict[str, float]:

@@ -91,7 +91,7 @@ class Job(Plain):
             raise InvalidInputError(f"job {path}", error, expected) from None
 
     def with_bundles_of(self, asked: Job) -> Job:
-        """The same; bundles that could not be read before, or lie elsewhere now, are taken from the same question."""
+        """Return the job with bundles that could not be read before, or lie elsewhere now, from the same question."""
         now = {(source.device, source.path): asked.bundles[source.bundle] for source in asked.sources}
         places: dict[NamedBundle, int] = {}
         sources = []
@@ -104,7 +104,7 @@ class Job(Plain):
         return self.model_copy(update={"bundles": tuple(places), "sources": tuple(sources)})
 
     def looked_at_again(self, *, given_up: bool = False) -> Job:
-        """The same; recordings and bundles that could not be opened before are tried once more.
+        """Return the job after trying again recordings and bundles that could not be opened before.
 
         Args:
             given_up: whether recordings that were given up are tried too.
@@ -127,7 +127,7 @@ class Job(Plain):
         return any(problem is not None and problem.passes for problem in tried)
 
     def unopened_given_up(self, places: Iterable[int]) -> Job:
-        """The same; recordings that could not be opened are given up, unless it is their bundle that is lacking.
+        """Return the job without recordings that could not be opened, unless only their bundle is lacking.
 
         Args:
             places: places of the recordings that are meant.

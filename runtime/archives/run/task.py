@@ -46,7 +46,7 @@ class Problem(Plain):
         return cls(subject=error.subject, got=error.got, expected=error.expected, passes=may_pass(error))
 
     def about(self, device: str) -> Problem:
-        """The same, and of which device of a fleet it is; itself without a fleet."""
+        """Return the problem with the name of its device in a fleet; itself without a fleet."""
         return self.model_copy(update={"subject": f"device {device}: {self.subject}"}) if device else self
 
     def __str__(self) -> str:

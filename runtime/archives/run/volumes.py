@@ -22,7 +22,7 @@ FOLDER, TOLD, HOLES = "files", "files.json", ".holes"
 
 @dataclass(frozen=True)
 class Wanted:
-    """Which files are made.
+    """Choice of the files to make.
 
     Attributes:
         volume_id, checksum: number and checksum of one volume alone; None for any.

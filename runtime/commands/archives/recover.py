@@ -108,7 +108,7 @@ def _volume(result: Recovery) -> str:
 
 
 def _healed(result: Recovery) -> str:
-    """Which pages a re-fitted model has read."""
+    """Return the pages that a re-fitted model has read."""
     if not result.healed:
         return "none"
     most = max(page.healed_rounds or 0 for page in result.healed)

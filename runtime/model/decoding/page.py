@@ -38,7 +38,7 @@ class Inference:
     waited_s: float = 0.0
 
     def turned(self, by: NDArray[np.floating] | float) -> Inference:
-        """The same with `by` (radians, [ny, nx] or one number) added to the phases."""
+        """Return the page with `by` (radians, [ny, nx] or one number) added to its phases."""
         phase = (self.phase + by).astype(np.float32)
         p = self.concentration * np.stack([np.cos(phase), np.sin(phase)])
         return replace(self, p=p, phase=phase)

@@ -116,5 +116,5 @@ def _mean_distance(mu: NDArray[np.float64], kappa: NDArray[np.float64], levels: 
 
 
 def wrapped(angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The same angles, -pi to pi."""
+    """Return the angles within -pi to pi."""
     return np.asarray(angle - 2 * np.pi * np.rint(angle / (2 * np.pi)))

@@ -72,10 +72,10 @@ class Tracker(Protocol):
         """Return what it has learnt until now, for `tracker_for` in another process; None where it learns nothing."""
 
     def anew(self) -> Tracker:
-        """Another one for the same bundle that has learnt nothing."""
+        """Return a new tracker for the same bundle, without state."""
 
     def fork(self) -> Tracker:
-        """Another one that has learnt the same, and learns on its own from there."""
+        """Return a copy that goes on by itself."""
 
     def refitted(self, decoder: Decoder) -> Tracker:
         """A new one for the decoder of a re-fitted bundle of the same device.
