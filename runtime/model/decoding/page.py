@@ -38,7 +38,7 @@ class Inference:
     waited_s: float = 0.0
 
     def turned(self, by: NDArray[np.floating] | float) -> Inference:
-        """Return the page with `by` (radians, [ny, nx] or one number) added to its phases."""
+        """The same with `by` (radians, [ny, nx] or one number) added to the phases."""
         phase = (self.phase + by).astype(np.float32)
         p = self.concentration * np.stack([np.cos(phase), np.sin(phase)])
         return replace(self, p=p, phase=phase)
