@@ -20,8 +20,10 @@ from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 
 @click.command()
 @click.option("--bundle", default=DEFAULT, show_default=True, help="A bundle's path, or the name of a shipped one.")
-@click.option("--out", default="out/demo", show_default=True, type=OutputFolder(), help="Folder.")
-@click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Of what is written.")
+@click.option(
+    "--out", default="out/demo", show_default=True, type=OutputFolder(), help="Folder for what the demo writes."
+)
+@click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Seed of the picture and pages.")
 @click.option("--source", "spec", help="A simulated device that runs as hardware, camera:FOLDER/device.toml.")
 @JSON
 def demo(bundle: str, out: Path, seed: int, spec: str | None, json_path: Path | None) -> None:

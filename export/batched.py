@@ -63,7 +63,7 @@ class BatchGraph(nn.Module):
 
     Args:
         decoder: the batched decoder.
-        names: of the constants, in order.
+        names: names of the constants, in order.
         kappa_scale: factor on p that makes its length a calibrated concentration.
     """
 
@@ -89,7 +89,7 @@ def batched_onnx(
         graph: the decoder for one page, in evaluation mode.
         frame_dtype: "uint8" or "uint16".
         defaults: the calibrated table, by name.
-        dtype: in which pages are computed, float16 or float32.
+        dtype: type in which pages are computed, float16 or float32.
     """
     if APART in defaults:
         return None
@@ -132,7 +132,7 @@ def traced(
 
     Args:
         module, inputs: it, and tensors to trace it with.
-        names, outputs: of inputs and outputs.
+        names, outputs: names of inputs and outputs.
         of_pages: which of them have the axis of pages first.
     """
     with _named(module), warnings.catch_warnings(), tempfile.TemporaryDirectory() as folder:

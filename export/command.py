@@ -22,14 +22,16 @@ from lightpage.train.runs import load_run
 @click.argument("run", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.option("--out", required=True, type=NewPath(), help="New bundle: a folder, or a .zip.")
 @click.option("--name", default=None, help="Name of the bundle; the profile's if left out.")
-@click.option("--version", "version", default=None, help="Of the bundle; its name, the time and a hash if left out.")
+@click.option(
+    "--version", "version", default=None, help="Version of the bundle; its name, the time and a hash if left out."
+)
 @click.option("--recording", type=click.Path(path_type=Path), help="Choose the code of user bytes by its unseen pages.")
 @click.option(
     "--precision",
     type=click.Choice(PRECISIONS),
     default=FLOAT32,
     show_default=True,
-    help="Of network and waves; float16 pays on a GPU alone.",
+    help="Arithmetic of network and waves; float16 helps only on a GPU.",
 )
 @click.option(
     "--batches/--no-batches",

@@ -65,12 +65,12 @@ def export_run(
     """Write the bundle of a run.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         out: new bundle.
-        name, version: of it.
-        progress: told of every step.
-        recording: with pages that the run has not seen, to choose the code of user bytes by; no code without.
-        precision: of network and waves, one of `PRECISIONS`.
+        name, version: name and version of the bundle.
+        progress: function that takes every step.
+        recording: recording with pages that the run has not seen, to choose the code of user bytes by; no code without.
+        precision: precision of network and waves, one of `PRECISIONS`.
         batches: whether the bundle holds the decoder for many pages too. It is left out, with a warning, for a device
             that it cannot decode, and where it does not say what the decoder for one page says.
 

@@ -87,7 +87,7 @@ def exported(
 
     Args:
         module, inputs: it, and tensors to trace it with.
-        names, outputs: of inputs and outputs.
+        names, outputs: names of inputs and outputs.
         shapes: free dimensions of every input; None where there are none.
     """
     # it tells of every optional package that the graphs have no use for

@@ -128,12 +128,12 @@ class HelperProcess:
         return self.answer()
 
     def send(self, method: str, *arguments: Any, progress: Callable[..., None] | None = None) -> None:
-        """Have it call a method; `poll` says when it has.
+        """Ask the helper to call a method; `poll` returns whether there is an answer.
 
         Args:
             method: method of the helper.
             arguments: arguments of the method; arrays among them stay as they are until then.
-            progress: called by `poll` with the words of progress. The method gets what tells them as `progress`.
+            progress: function that `poll` calls with each report of progress; the method gets one to report by.
 
         Raises:
             WorkerError: the request before has no answer yet.

@@ -46,7 +46,7 @@ def open_file(path: str | Path, *, make: bool = True, new: bool = False) -> int:
     """Return a descriptor to read and write a file by, which may be renamed and removed while it is open.
 
     Args:
-        path: of the file.
+        path: path of the file.
         make: whether it is made where it is not there, with the modes that the process's umask leaves.
         new: whether it must not be there.
 

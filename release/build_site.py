@@ -22,7 +22,7 @@ from collections.abc import Iterator, Sequence
 from copy import copy
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, get_origin
 
 import click
 import griffe
@@ -67,6 +67,20 @@ PARTS = {
     },
 }
 """Chapters behind the public names on the page of Python: names by their module in `lightpage.runtime`."""
+ARGUMENTS = {
+    "out": "Folder of the run; the same command continues it.",
+    "encode file": "File to put on pages; - is stdin.",
+    "inspect file": "File to look at: frames, a recording, pages, a profile, a calibration or a bundle.",
+    "run": "Folder that `lightpage train --out` wrote.",
+    "version": "Version of the model, as `lightpage models list` has it.",
+    "bundle": "Bundle to give to the service, a .zip.",
+    "name": "Shipped name or TOML file of the profile.",
+    "source": "Folder of a training or bulk run, or what a command wrote by --json.",
+    "study name": "Study to run.",
+    "recording": "Recording to write as other files.",
+    "command": "Command to run beside the device, behind --, with its arguments.",
+}
+"""Meaning of each argument without a name, of which click keeps none, by its parameter, or by command and parameter."""
 METRICS = {"counter", "gauge", "histogram"}
 """Kinds of metrics, as functions and classes that make them are called, `MetricFamily` at the end left out."""
 
@@ -92,8 +106,16 @@ def _command(command: click.Command, path: str) -> Iterator[str]:
 
 
 def _options(params: Sequence[click.Parameter], context: click.Context) -> str:
-    records = [record for one in params if (record := one.get_help_record(context))]
+    records = [record for one in params if (record := _argument(one, context) or one.get_help_record(context))]
     return _table(("option", "meaning"), [(f"`{name}`", text) for name, text in records]) if records else ""
+
+
+def _argument(one: click.Parameter, context: click.Context) -> tuple[str, str] | None:
+    """Return an argument and its meaning, None of an option; raises KeyError where `ARGUMENTS` lacks it."""
+    if not isinstance(one, click.Argument):
+        return None
+    key = f"{context.command.name} {one.name}"
+    return one.make_metavar(context), ARGUMENTS[key if key in ARGUMENTS else str(one.name)]
 
 
 def _shown(one: click.Parameter) -> click.Parameter:
@@ -206,8 +228,14 @@ def calls() -> str:
 
 def _message(message: DescriptorProto, path: tuple[int, ...], said: dict[tuple[int, ...], str]) -> Iterator[str]:
     yield f"## {message.name}\n\n{said.get(path, '')}\n"
+    unsaid = "{} of the map." if message.options.map_entry else ""
     rows = [
-        (f"`{field.name}`", str(field.number), _type(field), said.get((*path, 2, index), "").replace("\n", " "))
+        (
+            f"`{field.name}`",
+            str(field.number),
+            _type(field),
+            said.get((*path, 2, index), unsaid.format(field.name.capitalize())).replace("\n", " "),
+        )
         for index, field in enumerate(message.field)
     ]
     if rows:
@@ -252,7 +280,7 @@ def notebook(path: Path, images: Path) -> str:
     """Return a notebook as a page; its pictures are written into `images`.
 
     Args:
-        path: of the notebook, kept with its outputs.
+        path: path of the notebook, kept with its outputs.
         images: folder of pictures.
     """
     parts = list[str]()
@@ -277,13 +305,18 @@ def _keys(model: type[BaseModel]) -> str:
     rows = [
         (
             f"`{name}`",
-            "a table" if tables_in(field.annotation) else wanted(field.annotation, list(field.metadata)),
+            _value(field.annotation, list(field.metadata)),
             "refused" if field.is_required() else default_of(field) or "none",
             _sentence(field.description or told.get(name, "")),
         )
         for name, field in model.model_fields.items()
     ]
     return _table(("key", "value", "if left out", "meaning"), rows) if rows else ""
+
+
+def _value(annotation: Any, metadata: list[Any]) -> str:
+    is_table = bool(tables_in(annotation)) or get_origin(annotation) is dict
+    return "a table" if is_table else wanted(annotation, metadata)
 
 
 def _attributes(model: type[BaseModel]) -> dict[str, str]:

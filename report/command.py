@@ -20,7 +20,7 @@ from lightpage.runtime.archives.run.job import FILE as JOB
 
 @click.command()
 @click.argument("source", metavar="RUN_OR_JSON", type=click.Path(path_type=Path, exists=True))
-@click.option("--out", required=True, type=OutputFile(), help="Where the page goes, HTML.")
+@click.option("--out", required=True, type=OutputFile(), help="HTML file to write.")
 @click.option(
     "--recording",
     type=click.Path(path_type=Path),

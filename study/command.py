@@ -35,26 +35,28 @@ _RESULTS = "results"
 @click.option("--out", required=True, type=OutputFolder(), help="Folder of the study; gone on with if it is there.")
 @click.option("--profile", "profile_name", help="Shipped profile or TOML file.  [default: bench]")
 @click.option("--quick", is_flag=True, help="Few and small cases, to see that it works.")
-@click.option("--full", is_flag=True, help=f"At full scale, profile {_FULL}; what trains needs a GPU there.")
+@click.option(
+    "--full", is_flag=True, help=f"Study at full scale, profile {_FULL}; studies that train need a GPU there."
+)
 @click.option(
     "--share",
     type=FiniteRange(min=0.001, max=1),
     default=1.0,
     show_default=True,
-    help="Of the steps that the authors trained for, where a study trains: the whole takes hours for each case.",
+    help="Share of the authors' training steps, where a study trains; 1 takes hours for each case.",
 )
 @click.option(
     "--channels",
     type=click.IntRange(4, 256),
     default=Settings.channels,
     show_default=True,
-    help="Of the published network at sample pitch, where a study trains: half as many take a quarter of the time.",
+    help="Channels of the published network at sample pitch; half as many train in a quarter of the time.",
 )
 @click.option(
     "--only",
     multiple=True,
     metavar="WORD",
-    help="Of a study that varies many things, the cases whose names begin so; others can follow in the same OUT.",
+    help="Cases whose names begin so, of a study of many; others can follow in the same OUT.",
 )
 @click.option(
     "--set", "changes", multiple=True, metavar="TABLE.KEY=VALUE", help="Change one number of the simulated device."
@@ -68,7 +70,7 @@ _RESULTS = "results"
 @click.option(
     "--compute",
     metavar="cpu|cuda[:N]",
-    help="Where light is made and networks are trained.  [default: cuda where there is a GPU]",
+    help="Processor that makes light and trains networks.  [default: cuda where there is a GPU]",
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 @JSON

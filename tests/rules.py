@@ -7,7 +7,7 @@
   they can be improved.
 - Private attributes of what is tested are left alone.
 - There are no more lines than `limits.toml` allows, and what git tracks has no more bytes.
-- Words have limits there too: of pages, of long sentences, and of docstrings that begin without their subject.
+- Words have limits there too: of pages, of long sentences, and of docstrings and help that lack their subject.
 """
 
 import ast
@@ -30,8 +30,10 @@ TEXTS = {"output", "stdout", "stderr", "message", "details", "text"}
 """Attributes that hold what a program tells people."""
 LONGEST_SENTENCE = 25
 _NO_SUBJECT = re.compile(
-    r"(Of|Those|That|With|What|Who|Whoever|As|In|By|For|From|At|On|One|Where|Whether|How|It|Its|To)\b"
+    r"(?i)(of|th(ose|at)|wh(at|o(m|se|ever)?|ere|ich|ether)|with|as|in|by|for|from|at|on|one|how|its?|to|another one|"
+    r"all of it|the same(?=[.,;]| of| in| with| a| for))\b"
 )
+_ENTRY = re.compile(r"^ {4}[a-z_][\w, ]*: (?!whether)(.+)$", re.MULTILINE)  # what is true or false may begin so
 _DOCUMENTED = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
 _SLEEP_IN_A_SCRIPT = re.compile(r"\bsleep\((\d+(?:\.\d*)?)\)")
 
@@ -117,23 +119,28 @@ def _name(node: ast.AST) -> str:
     return node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
 
 
-def without_subject(sources: Iterable[str]) -> float:
-    """Return the percentage of docstrings that begin with a preposition or a pronoun."""
-    nodes = [node for source in sources for node in ast.walk(ast.parse(source)) if isinstance(node, _DOCUMENTED)]
-    texts = [*filter(None, map(ast.get_docstring, nodes))]
-    return _percent(sum(_NO_SUBJECT.match(text) is not None for text in texts), len(texts))
+def without_subject(sources: Iterable[str]) -> dict[str, float]:
+    """Return the percentages of docstrings, entries and help texts that begin with a preposition or a pronoun."""
+    nodes = [node for source in sources for node in ast.walk(ast.parse(source))]
+    docstrings = [*filter(None, (ast.get_docstring(node) for node in nodes if isinstance(node, _DOCUMENTED)))]
+    entries = [text for docstring in docstrings for text in _ENTRY.findall(docstring)]
+    told = (each for each in nodes if isinstance(each, ast.keyword) and each.arg in ("help", "description"))
+    texts = {"": docstrings, "entries_": entries, "help_": [_text(each.value) for each in told]}
+    counts = {of: len([*filter(_NO_SUBJECT.match, each)]) for of, each in texts.items()}
+    return {f"{of}no_subject_percent": _percent(count, len(texts[of])) for of, count in counts.items()}
 
 
-def prose(pages: Iterable[str]) -> tuple[int, float]:
+def prose(pages: Iterable[str]) -> dict[str, float]:
     """Return the number of words of Markdown pages without their code, and the percentage of long sentences."""
     texts = [re.sub(r"```.*?```", "", page, flags=re.DOTALL) for page in pages]
     plain = [re.sub(r"^\s*[|#>].*$", "", text, flags=re.MULTILINE) for text in texts]
     lengths = [len(each.split()) for text in plain for each in re.split(r"(?<=[.!?])\s+(?=[A-Z`*])", text)]
-    return sum(len(text.split()) for text in texts), _percent(sum(n > LONGEST_SENTENCE for n in lengths), len(lengths))
+    long_percent = _percent(sum(n > LONGEST_SENTENCE for n in lengths), len(lengths))
+    return {"words": sum(len(text.split()) for text in texts), "long_sentences_percent": long_percent}
 
 
 def _percent(part: int, whole: int) -> float:
-    return math.ceil(1000 * part / whole) / 10
+    return math.ceil(1000 * part / max(whole, 1)) / 10
 
 
 def main() -> int:
@@ -148,13 +155,11 @@ def main() -> int:
     limits = tomllib.loads((HERE / "limits.toml").read_text("utf-8"))
     root = HERE.parent
     pages = [root / "README.md", root / "CONTRIBUTING.md", *root.glob("docs/**/*.md")]
-    words, long_percent = prose(path.read_text("utf-8") for path in pages)
     sizes = {
         "lines": sum(len(path.read_bytes().splitlines()) for path in paths),
         "bytes": tracked_bytes(root),
-        "words": words,
-        "long_sentences_percent": long_percent,
-        "no_subject_percent": without_subject(path.read_text("utf-8") for path in python_files(tests=True)),
+        **prose(path.read_text("utf-8") for path in pages),
+        **without_subject(path.read_text("utf-8") for path in python_files(tests=True)),
     }
     for unit, size in sizes.items():
         if size > limits[unit]:

@@ -18,9 +18,7 @@ def test_a_figure_is_within_its_limit(name: str, figures: dict[str, float]) -> N
 
 
 def test_lines_of_code_are_counted_without_docstrings_comments_and_blank_lines() -> None:
-    source = (
-        '"""One."""\n\n# two\nx = (\n    1\n)\n"""Three."""\n\n\ndef f():\n    """Four."""\n    return """\n\n"""\n'
-    )
+    source = '"""One."""\n\n# two\nx = (\n  1\n)\n"""Three."""\n\ndef f():\n  """Four."""\n  return """\n\n"""\n'
     assert house.code_lines(source) == 3 + 1 + 3
 
 
@@ -32,9 +30,11 @@ def test_a_class_is_as_large_as_its_lines_and_methods_and_may_say_why(tmp_path: 
 
 @pytest.mark.parametrize(("docstring", "percent"), [("Of a page.", 50), ("Offset of a page.", 0)])
 def test_docstrings_that_begin_without_their_subject_are_counted(docstring: str, percent: float) -> None:
-    assert rules.without_subject([f'"""{docstring}"""', 'def f():\n    """Return it."""\n']) == percent
+    text = f'"""{docstring}\n\nArgs:\n    x: {docstring}\n    y: whether.\n"""\nf(help="{docstring}")'
+    found = rules.without_subject([text, 'def f():\n    """Return it."""\n'])
+    assert list(found.values()) == [percent, 2 * percent, 2 * percent]
 
 
 def test_words_and_long_sentences_of_pages_are_counted_without_code() -> None:
     page = f"# Title\n\nA short one. A{' word' * 25}. Three more words.\n```\nno word\n```\n| a | row |\n"
-    assert rules.prose([page]) == (2 + 3 + 26 + 3 + 5, 33.4)
+    assert rules.prose([page]) == {"words": 2 + 3 + 26 + 3 + 5, "long_sentences_percent": 33.4}

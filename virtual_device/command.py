@@ -27,12 +27,15 @@ _END_S = 10.0
 @click.command(context_settings={"ignore_unknown_options": True})
 @click.option("--profile", "profile_name", default="bench", show_default=True, help="A shipped profile, or a file.")
 @click.option(
-    "--device", "device_file", type=click.Path(), help="Its true state: `rough`, or TOML; a realistic one if absent."
+    "--device",
+    "device_file",
+    type=click.Path(),
+    help="True state of the device: `rough`, or TOML; a realistic one if absent.",
 )
 @click.option("--set", "settings", multiple=True, metavar="TABLE.KEY=VALUE", help="Change one number of that state.")
 @click.option("--out", required=True, type=OutputFolder(), help="Folder for port, socket and device.toml.")
-@click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Of noise and drift.")
-@click.option("--pixel-format", default="Mono8", show_default=True, help="Of both cameras.")
+@click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Seed of noise and drift.")
+@click.option("--pixel-format", default="Mono8", show_default=True, help="Pixel format of both cameras.")
 @click.option("--black-level", default=0, show_default=True, type=click.IntRange(0, 1000), help="Counts in the dark.")
 @click.argument("command", nargs=-1, type=click.UNPROCESSED)
 def virtual_device(

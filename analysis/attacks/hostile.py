@@ -215,8 +215,10 @@ def _taken(call: Any) -> None:
 
 
 @click.command()
-@click.option("--messages", default=20_000, show_default=True, type=click.IntRange(100), help="That cannot be parsed.")
-@click.option("--requests", default=20_000, show_default=True, type=click.IntRange(100), help="Of every kind.")
+@click.option(
+    "--messages", default=20_000, show_default=True, type=click.IntRange(100), help="Messages that cannot be parsed."
+)
+@click.option("--requests", default=20_000, show_default=True, type=click.IntRange(100), help="Requests of every kind.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0))
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def main(messages: int, requests: int, seed: int, json_path: Path | None) -> None:

@@ -258,7 +258,9 @@ def _held(process: int) -> tuple[int, int]:
 
 
 @click.command()
-@click.option("--tries", default=20_000, show_default=True, type=click.IntRange(1), help="Of all kinds, in turns.")
+@click.option(
+    "--tries", default=20_000, show_default=True, type=click.IntRange(1), help="Tries of all kinds, in turns."
+)
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0))
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def main(tries: int, seed: int, json_path: Path | None) -> None:

@@ -86,8 +86,8 @@ class _Drives:
     """A bundle, and a file that is written with its pilots.
 
     Args:
-        decoder: of the bundle.
-        code: of the file's pages.
+        decoder: decoder of the bundle.
+        code: code of the file's pages.
     """
 
     def __init__(self, decoder: Decoder, code: Code) -> None:
@@ -151,7 +151,7 @@ class _Drives:
 @click.command()
 @click.option("--bundle", default="bench", show_default=True, help="A bundle's path, or the name of a shipped one.")
 @click.option("--code", "code_path", type=click.Path(path_type=Path), help="Code of the file; the bundle's.")
-@click.option("--share", default=0.5, show_default=True, help="Of a rough device's deviations.")
+@click.option("--share", default=0.5, show_default=True, help="Share of a rough device's deviations.")
 @click.option("--angle", type=float, help="Angle of every device's pipe about which it is drawn.  [default: nominal]")
 @click.option("--devices", default=20, show_default=True, type=click.IntRange(1))
 @click.option("--first-seed", default=0, show_default=True, type=click.IntRange(0))

@@ -165,7 +165,7 @@ def counted(outcomes: Counter[str]) -> Count:
 
 
 @click.command()
-@click.option("--pages", "count", default=30_000, show_default=True, type=click.IntRange(1), help="At the limit.")
+@click.option("--pages", "count", default=30_000, show_default=True, type=click.IntRange(1), help="Pages at the limit.")
 @click.option("--damaged", default=10_000, show_default=True, type=click.IntRange(1), help="Damaged pages.")
 @click.option("--corrections", default=3, show_default=True, type=click.IntRange(0, 32), help="t, so that words mend.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0))

@@ -60,10 +60,16 @@ def earlier(path: Path, asked: dict[str, object]) -> list[list[float]]:
 @click.option("--profile", "profile_name", default="bench", show_default=True, help="Shipped profile or TOML file.")
 @click.option("--symbol-size", type=click.IntRange(1), help="Pixels; the profile's if left out.")
 @click.option("--device", "state", type=click.Path(path_type=Path), help="True state (TOML).")
-@click.option("--set", "settings", multiple=True, metavar="TABLE.KEY=VALUE", help="Of the true state.")
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="TABLE.KEY=VALUE",
+    help="Number of the true state to change, TABLE.KEY=VALUE.",
+)
 @click.option("--levels", type=click.IntRange(MIN_LEVELS, MAX_LEVELS), default=MAX_LEVELS, show_default=True)
 @click.option("--pages", default=4, show_default=True, type=click.IntRange(1))
-@click.option("--symbols", default=100, show_default=True, type=click.IntRange(2), help="Of each page.")
+@click.option("--symbols", default=100, show_default=True, type=click.IntRange(2), help="Symbols of each page.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0))
 @click.option("--json", "json_path", type=OutputFile(), required=True)
 def main(

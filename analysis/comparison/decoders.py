@@ -91,17 +91,23 @@ DEFAULT_SIZE = f"{Hyperparameters.channels}x{Hyperparameters.blocks}x{Hyperparam
     help="A device without defects but the pipe's angle and noise, its lenses as in the profile.",
 )
 @click.option(
-    "--pages", type=click.IntRange(12), default=500, show_default=True, help="With 5% validation, 5% held out."
+    "--pages", type=click.IntRange(12), default=500, show_default=True, help="Pages, 5% for validation and 5% held out."
 )
 @click.option("--steps", type=click.IntRange(10), default=6000, show_default=True)
 @click.option(
     "--size", "sizes", type=Size(), multiple=True, default=(DEFAULT_SIZE,), show_default=True, help="Network."
 )
-@click.option("--refinements", type=click.IntRange(1, 4), default=1, show_default=True, help="Of the refined method.")
+@click.option(
+    "--refinements",
+    type=click.IntRange(1, 4),
+    default=1,
+    show_default=True,
+    help="Further passes of the refined method.",
+)
 @click.option(
     "--published-steps",
     type=click.IntRange(10),
-    help="Of the published decoders; their authors' 50 passes if left out.",
+    help="Steps of the published decoders; their authors' 50 passes if left out.",
 )
 @click.option(
     "--published-channels", type=click.IntRange(4), multiple=True, default=(32,), show_default=True, help="Network."

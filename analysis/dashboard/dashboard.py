@@ -30,7 +30,9 @@ DASHBOARD = DEPLOY / "grafana" / "lightpage.json"
 
 
 @click.command()
-@click.option("--seconds", default=60.0, show_default=True, type=click.FloatRange(5.0), help="Of each of four phases.")
+@click.option(
+    "--seconds", default=60.0, show_default=True, type=click.FloatRange(5.0), help="Seconds of each of four phases."
+)
 @click.option("--threads", default=1, show_default=True, type=click.IntRange(1), help="Threads of an inference.")
 @click.option("--out", required=True, type=OutputFile(), help="The picture, PNG.")
 def main(seconds: float, threads: int, out: Path) -> None:

@@ -77,7 +77,7 @@ def travels(kept: Path, library: Path | None) -> dict[str, Any]:
 @click.option("--reflections", default=4, show_default=True, help="Rounds to the field of the slower presets.")
 @click.option("--batch", "batches", multiple=True, type=int, default=(8, 1), show_default=True, help="Pages a batch.")
 @click.option("--provider", default=CUDA, show_default=True, type=click.Choice([CUDA, CPU]))
-@click.option("--seconds", default=480.0, show_default=True, help="All of it takes no longer.")
+@click.option("--seconds", default=480.0, show_default=True, help="Longest time of everything.")
 @click.option("--served", default=16, show_default=True, help="Pages a batch of the service and of bulk.")
 @click.option("--pages", "simulated", type=click.Path(path_type=Path), help="Folder for simulated pages; --out's.")
 @click.option("--library", type=click.Path(path_type=Path, exists=True), help="ONNX Runtime's archive, if it is sent.")

@@ -48,8 +48,8 @@ def rate(pages: Pages, callers: int, seconds: float, address: str = "") -> tuple
     Args:
         pages: decodes pages for each caller.
         callers: how many there are.
-        seconds: that count.
-        address: of the service's metrics; none without.
+        seconds: time that count.
+        address: address of the service's metrics; none without.
 
     Raises:
         Exception: what ended a caller.

@@ -21,8 +21,8 @@ class Course:
 
     Args:
         kept: takes the results.
-        folder: of the data set with kept decoders.
-        provider: that computes pages.
+        folder: folder of the data set with kept decoders.
+        provider: provider that computes pages.
         reflections: rounds to the field of the slower presets.
         simulated: folder for simulated pages.
     """

@@ -45,9 +45,9 @@ class Served:
     """A kept decoder as a bundle, and pages of its device as a recording, to be read by the product.
 
     Attributes:
-        folder, scene: of the data set.
+        folder, scene: folder and scene of the data set.
         reflections: rounds to the field.
-        provider: that computes pages.
+        provider: provider that computes pages.
         largest: pages of a batch at most.
         out: folder for both.
     """

@@ -41,8 +41,8 @@ class Scene:
     """Pages of a kept data set's device.
 
     Attributes:
-        profile, calibration: of the data set.
-        pairs, symbols, references: of its device, simulated.
+        profile, calibration: profile and calibration of the data set.
+        pairs, symbols, references: simulated pages of its device.
     """
 
     profile: Profile
@@ -77,7 +77,7 @@ class Form:
     """A decoder in its batched form.
 
     Attributes:
-        name: of the preset.
+        name: name of the preset.
         constants, batch: its two graphs, ONNX.
         defaults: its table.
         expected: what the form for one page says in float32, [2, ny, nx] of each page.
@@ -126,7 +126,7 @@ def form_of(folder: Path, scene: Scene, preset: str, reflections: int, device: t
     """A kept decoder in its batched form.
 
     Args:
-        folder, scene: of the data set.
+        folder, scene: folder and scene of the data set.
         preset: which.
         reflections: rounds to the field; 0 for descent.
         device: what the form for one page is run on, which tells what is expected.

@@ -27,13 +27,13 @@ class Kept:
     A part is named `WHAT, KIND` or `KIND`; parts of one kind take about the same time.
 
     Args:
-        path: of the file.
+        path: path of the file.
         head: what is said once: `card` at least.
-        seconds: that all of this run may take.
-        clock: by which they pass.
+        seconds: time that all of this run may take.
+        clock: clock by which they pass.
 
     Attributes:
-        path, whole: of the file, and what is in it.
+        path, whole: path and contents of the file.
         left_out: parts that were not begun.
 
     Raises:
@@ -86,8 +86,8 @@ class Kept:
         """A part, measured now unless it is there.
 
         Args:
-            name: of the part.
-            usual_s: that it takes as far as is known.
+            name: name of the part.
+            usual_s: time that it takes as far as is known.
             measure: gives the part, as JSON can hold it; a failure is told, and tried again the next time.
 
         Returns:

@@ -25,7 +25,7 @@ class Target:
 
     Attributes:
         what: with its unit.
-        value: that was measured; None where nothing was.
+        value: value that was measured; None where nothing was.
         target, stretch: what is aimed at, and what would be better still.
         at_least: whether more is better.
     """

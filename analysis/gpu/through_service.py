@@ -103,12 +103,12 @@ def measured(
     """Rates in this process, by shared memory and by streams, their ratios, and what the device did meanwhile.
 
     Args:
-        bundle: with the decoder for many pages.
+        bundle: bundle with the decoder for many pages.
         pairs, levels: pages that are decoded in turn.
-        provider: that computes them.
+        provider: provider that computes them.
         largest: pages of a batch at most.
-        callers: at a time.
-        seconds: of each rate.
+        callers: callers at a time.
+        seconds: seconds of each rate.
     """
     opened = Bundle.open(bundle)
     share_freed_memory()  # as a service does
@@ -140,13 +140,15 @@ def measured(
 
 
 @click.command()
-@click.option("--bundle", required=True, type=click.Path(exists=True, path_type=Path), help="With batches.")
+@click.option("--bundle", required=True, type=click.Path(exists=True, path_type=Path), help="Bundle with batches.")
 @click.option("--recording", required=True, type=click.Path(exists=True), help="Pages that are sent in turn.")
 @click.option("--provider", default="cuda", show_default=True)
 @click.option("--batches", default=16, show_default=True, type=click.IntRange(1, 64), help="Computed together at most.")
 @click.option("--callers", default=8, show_default=True, type=click.IntRange(1, 64))
 @click.option("--pages", default=4, show_default=True, type=click.IntRange(1, 64), help="Pages of the recording.")
-@click.option("--seconds", default=10.0, show_default=True, type=click.FloatRange(0.1, 600), help="Of each rate.")
+@click.option(
+    "--seconds", default=10.0, show_default=True, type=click.FloatRange(0.1, 600), help="Seconds of each rate."
+)
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def main(
     bundle: Path,

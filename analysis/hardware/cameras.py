@@ -341,8 +341,12 @@ def told(tick: dict[str, float]) -> str:
 
 @click.command()
 @click.option("--changes", default=200, show_default=True, type=click.IntRange(1, 100_000), help="Free run to trigger.")
-@click.option("--pairs", default=100, show_default=True, type=click.IntRange(1, 100_000), help="Of each pixel format.")
-@click.option("--shots", default=60, show_default=True, type=click.IntRange(1, 100_000), help="Of each packet size.")
+@click.option(
+    "--pairs", default=100, show_default=True, type=click.IntRange(1, 100_000), help="Pairs of each pixel format."
+)
+@click.option(
+    "--shots", default=60, show_default=True, type=click.IntRange(1, 100_000), help="Shots of each packet size."
+)
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def main(changes: int, pairs: int, shots: int, json_path: Path | None) -> None:
     """Print stale frames, frames that are equal to the byte, shots per second, another thread's ticks, unpacking."""

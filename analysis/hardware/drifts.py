@@ -141,7 +141,7 @@ def judged(seed: int, rows: Rows) -> dict[str, Any]:
 @click.option("--drifts", default=20, show_default=True, type=click.IntRange(0), help="Directions of drift.")
 @click.option("--quiet", default=2000, show_default=True, type=click.IntRange(0), help="Pages of a quiet device.")
 @click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
-@click.option("--out", required=True, type=OutputFolder(), help="Where every page's figures are kept.")
+@click.option("--out", required=True, type=OutputFolder(), help="Folder of every page's figures.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def main(drifts: int, quiet: int, threads: int | None, out: Path, json_path: Path | None) -> None:
     """Measure how long before the margin is gone the alarm comes, and how often it comes for nothing."""

@@ -84,7 +84,7 @@ def shoot(source: CameraSource, stage: Stage, shots: int, share: float, seed: in
 
 
 @click.command()
-@click.option("--shots", default=2000, show_default=True, type=click.IntRange(1, 60_000), help="With faults.")
+@click.option("--shots", default=2000, show_default=True, type=click.IntRange(1, 60_000), help="Shots with faults.")
 @click.option("--clean-shots", default=500, show_default=True, type=click.IntRange(0, 60_000), help="Without faults.")
 @click.option("--faults", default=0.35, show_default=True, type=click.FloatRange(0, 1), help="Share with a fault.")
 @click.option("--tolerance", default=0.02, show_default=True, type=click.FloatRange(0.001, 0.5), help="Seconds.")

@@ -86,7 +86,7 @@ def unplugged(
 
 
 @click.command()
-@click.option("--times", default=30, show_default=True, type=click.IntRange(1, 10_000), help="Of each.")
+@click.option("--times", default=30, show_default=True, type=click.IntRange(1, 10_000), help="Times of each.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def main(times: int, json_path: Path | None) -> None:
     """Print how soon a camera, and the serial line, are back in service, and the pages that were lost meanwhile."""

@@ -130,8 +130,8 @@ def timed(plane: DataPlane, pause_s: float = 0.0) -> float:
 
 
 @click.command()
-@click.option("--rounds", default=3, show_default=True, type=click.IntRange(1), help="Of all three.")
-@click.option("--load", default=1.0, show_default=True, type=click.FloatRange(0.05, 1.0), help="Of the reads.")
+@click.option("--rounds", default=3, show_default=True, type=click.IntRange(1), help="Rounds of all three.")
+@click.option("--load", default=1.0, show_default=True, type=click.FloatRange(0.05, 1.0), help="Load of the reads.")
 @click.option("--heal", is_flag=True, help="Recalibrate by lost pages.")
 @click.option("--threads", type=click.IntRange(1), help="Threads of the service's inference; by default all cores.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")

@@ -119,17 +119,23 @@ def table_of(rows: Rows, pages: int) -> list[str]:
 
 
 @click.command()
-@click.option("--pages", default=2000, show_default=True, type=click.IntRange(10), help="Of the week.")
+@click.option("--pages", default=2000, show_default=True, type=click.IntRange(10), help="Pages of the week.")
 @click.option("--stop-after", type=click.IntRange(1), help="End after so many pages of it; a later run goes on.")
-@click.option("--pages-during", default=2, show_default=True, type=click.IntRange(0), help="Of a recalibration.")
+@click.option(
+    "--pages-during",
+    default=2,
+    show_default=True,
+    type=click.IntRange(0),
+    help="Pages that are read during a recalibration.",
+)
 @click.option("--true-every", default=1, show_default=True, type=click.IntRange(1), help="Pages from one true AIR on.")
 @click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
-@click.option("--bundle", default=DEFAULT, show_default=True, help="That the service begins with.")
+@click.option("--bundle", default=DEFAULT, show_default=True, help="Bundle that the service begins with.")
 @click.option("--device", type=click.Path(path_type=Path), help="True state (TOML) at the beginning.")
 @click.option("--stroke", default=0.0, show_default=True, help="Change of the modulator's stroke, relative.")
 @click.option("--axial", default=0.0, show_default=True, help="Change of all places along the axis, rad.")
 @click.option("--shown/--not-shown", default=True, help="Show fully known pages, or recalibrate by user data alone.")
-@click.option("--out", required=True, type=OutputFolder(), help="Where pages, models and frames are kept.")
+@click.option("--out", required=True, type=OutputFolder(), help="Folder of pages, models and frames.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def main(
     pages: int,

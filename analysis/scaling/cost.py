@@ -203,15 +203,33 @@ def _first(limits: dict[str, float]) -> str:
 @click.option("--from", "from_path", type=click.Path(path_type=Path), help="Take what was measured from this file.")
 @click.option("--out", type=OutputFolder(), help="Measure this machine; archive and runs go here.")
 @click.option("--keep", type=OutputFile(), help="Write what was measured to this file.")
-@click.option("--pages", default=320, show_default=True, type=click.IntRange(8), help="Of the archive to measure on.")
+@click.option(
+    "--pages", default=320, show_default=True, type=click.IntRange(8), help="Pages of the archive to measure on."
+)
 @click.option("--fields", default=64, show_default=True, type=click.IntRange(1), help="Pages that are simulated.")
 @click.option("--range-pages", default=32, show_default=True, type=click.IntRange(1))
-@click.option("--nodes", multiple=True, type=click.IntRange(1), help="Of a cluster; may be given several times.")
-@click.option("--storage", default=ETHERNET_BYTES_PER_S, show_default=True, type=float, help="Of all, bytes a second.")
-@click.option("--link", default=ETHERNET_BYTES_PER_S, show_default=True, type=float, help="Of a node, bytes a second.")
+@click.option("--nodes", multiple=True, type=click.IntRange(1), help="Nodes of a cluster; may be given several times.")
+@click.option(
+    "--storage",
+    default=ETHERNET_BYTES_PER_S,
+    show_default=True,
+    type=float,
+    help="Bytes a second of the storage of all nodes.",
+)
+@click.option(
+    "--link", default=ETHERNET_BYTES_PER_S, show_default=True, type=float, help="Bytes a second of a node's link."
+)
 @click.option("--mtbf-hours", type=float, help="Mean time between failures of a node; without it none fails.")
-@click.option("--full-size-seconds", default=FULL_SIZE_S, show_default=True, type=float, help="Of a page, two cores.")
-@click.option("--full-size-bytes", default=FULL_SIZE_BYTES, show_default=True, type=float, help="Of its frame pair.")
+@click.option(
+    "--full-size-seconds",
+    default=FULL_SIZE_S,
+    show_default=True,
+    type=float,
+    help="Seconds of a full-size page, two cores.",
+)
+@click.option(
+    "--full-size-bytes", default=FULL_SIZE_BYTES, show_default=True, type=float, help="Bytes of a full-size frame pair."
+)
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0))
 @click.option("--picture", "picture_path", type=OutputFile(), help="Draw the curves, PNG.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")

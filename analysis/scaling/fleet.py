@@ -144,9 +144,11 @@ def deep(devices: int, steps: int, out: Path, threads: int) -> dict[str, Any]:
 @click.command()
 @click.option("--devices", default=30, show_default=True, type=click.IntRange(3), help="Two of which are spoilt.")
 @click.option("--deep", "deep_devices", default=0, show_default=True, type=click.IntRange(0), help="More of them.")
-@click.option("--steps", default=300, show_default=True, type=click.IntRange(10), help="With --deep.")
+@click.option(
+    "--steps", default=300, show_default=True, type=click.IntRange(10), help="Steps of training, with --deep."
+)
 @click.option("--workers", default=1, show_default=True, type=click.IntRange(1))
-@click.option("--threads", default=1, show_default=True, type=click.IntRange(1), help="Of a worker.")
+@click.option("--threads", default=1, show_default=True, type=click.IntRange(1), help="Threads of a worker.")
 @click.option("--out", required=True, type=OutputFolder(), help="Recordings, bundles and figures; gone on with.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def main(

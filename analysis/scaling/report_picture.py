@@ -129,7 +129,7 @@ def _wait(run: subprocess.Popen[bytes], folder: Path, ranges: int) -> None:
 
 
 @click.command()
-@click.option("--pages", default=16, show_default=True, type=click.IntRange(6), help="Of each device.")
+@click.option("--pages", default=16, show_default=True, type=click.IntRange(6), help="Pages of each device.")
 @click.option("--work", type=OutputFolder(), help="Recordings, run and page; a temporary folder by default.")
 @click.option("--out", required=True, type=OutputFile(), help="The picture, PNG.")
 def main(pages: int, work: Path | None, out: Path) -> None:

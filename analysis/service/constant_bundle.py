@@ -104,8 +104,8 @@ def _model(graph: onnx.GraphProto) -> bytes:
 
 @click.command()
 @click.option("--profile", "profile_name", default="paper", show_default=True, help="Name or file of the device.")
-@click.option("--out", type=NewPath(), required=True, help="Where the bundle goes, a .zip.")
-@click.option("--frames", type=NewPath(), help="Where a pair of frames goes, a .npz.")
+@click.option("--out", type=NewPath(), required=True, help="Bundle to write, a .zip.")
+@click.option("--frames", type=NewPath(), help="File for a pair of frames, .npz.")
 def main(profile_name: str, out: Path, frames: Path | None) -> None:
     """Write the bundle."""
     pair = constant_bundle(out, load_profile(profile_name))

@@ -122,7 +122,9 @@ def _note_end(ended: list[float], _: object) -> None:
 
 @click.command()
 @click.option("--starts", "start_count", default=5, show_default=True, type=click.IntRange(1))
-@click.option("--times", default=100, show_default=True, type=click.IntRange(2), help="That the same pair is sent.")
+@click.option(
+    "--times", default=100, show_default=True, type=click.IntRange(2), help="Times that the same pair is sent."
+)
 @click.option("--stops", "stop_count", default=10, show_default=True, type=click.IntRange(1))
 @click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")

@@ -167,9 +167,9 @@ def stalled(service: RunningService, pages: PagesToSend, streams: int, seconds: 
 
 @click.command()
 @click.option("--times", default=10.0, show_default=True, help="Load over capacity.")
-@click.option("--deadline", "deadline_s", default=2.0, show_default=True, help="Of every call, seconds.")
-@click.option("--rounds", default=3, show_default=True, type=click.IntRange(1), help="Of capacity and overload.")
-@click.option("--seconds", default=20.0, show_default=True, help="Of each part.")
+@click.option("--deadline", "deadline_s", default=2.0, show_default=True, help="Deadline of every call, seconds.")
+@click.option("--rounds", default=3, show_default=True, type=click.IntRange(1), help="Rounds of capacity and overload.")
+@click.option("--seconds", default=20.0, show_default=True, help="Seconds of each part.")
 @click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def main(

@@ -74,8 +74,12 @@ def commands(folder: Path, pages: int, recording: Path | None) -> dict[str, list
 
 @click.command()
 @click.option("--pages", default=2, show_default=True, type=click.IntRange(1), help="Simulated in a run.")
-@click.option("--rounds", default=3, show_default=True, type=click.IntRange(1), help="Of each command, either way.")
-@click.option("--recording", type=click.Path(path_type=Path, exists=True), help="Of a bench device, for the others.")
+@click.option(
+    "--rounds", default=3, show_default=True, type=click.IntRange(1), help="Rounds of each command, either way."
+)
+@click.option(
+    "--recording", type=click.Path(path_type=Path, exists=True), help="Recording of a bench device, for the others."
+)
 @click.option("--limit", default=1.2, show_default=True, type=FiniteRange(0), help="Ratio that is wanted.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def main(pages: int, rounds: int, recording: Path | None, limit: float, json_path: Path | None) -> None:

@@ -139,8 +139,8 @@ def _mb(count: int) -> str:
 @click.command()
 @click.option("--profile", "profile_name", default="paper", show_default=True, help="Shipped profile or TOML file.")
 @click.option("--decoder", "names", type=click.Choice(list(OWN)), multiple=True, help="Only these; all if left out.")
-@click.option("--pages", type=click.IntRange(1, 100), default=3, show_default=True, help="To decode.")
-@click.option("--threads", type=click.IntRange(1), help="Of one decode; the usable cores if left out.")
+@click.option("--pages", type=click.IntRange(1, 100), default=3, show_default=True, help="Pages to decode.")
+@click.option("--threads", type=click.IntRange(1), help="Threads of one decode; the usable cores if left out.")
 @click.option("--set", "settings", multiple=True, metavar="TABLE.KEY=VALUE", help="Change the realistic device.")
 @click.option(
     "--recording",

@@ -78,14 +78,21 @@ def lines(made: Made) -> list[str]:
 @click.command()
 @click.option("--bundle", "paths", multiple=True, required=True, type=click.Path(path_type=Path), help="Bundles.")
 @click.option("--recording", required=True, type=click.Path(path_type=Path), help="Pages with known symbols.")
-@click.option("--provider", "text", default="cpu", show_default=True, help=f"What computes pages: {WANTED}.")
-@click.option("--pages", default=2, show_default=True, type=click.IntRange(1, 1000), help="Of the recording.")
+@click.option("--provider", "text", default="cpu", show_default=True, help=f"Processor that computes pages: {WANTED}.")
+@click.option("--pages", default=2, show_default=True, type=click.IntRange(1, 1000), help="Pages of the recording.")
 @click.option("--precision", "precisions", multiple=True, type=click.Choice(PRECISIONS), default=PRECISIONS)
 @click.option(
-    "--callers", multiple=True, type=click.IntRange(1, 64), default=(1, 2, 4), show_default=True, help="At once."
+    "--callers",
+    multiple=True,
+    type=click.IntRange(1, 64),
+    default=(1, 2, 4),
+    show_default=True,
+    help="Callers at once.",
 )
 @click.option("--batches", default=1, show_default=True, type=click.IntRange(1, 64), help="Computed together at most.")
-@click.option("--seconds", default=5.0, show_default=True, type=click.FloatRange(0.01, 600), help="For each of them.")
+@click.option(
+    "--seconds", default=5.0, show_default=True, type=click.FloatRange(0.01, 600), help="Seconds for each of them."
+)
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def main(
     paths: tuple[Path, ...],

@@ -175,7 +175,9 @@ def exported(profile: Profile, name: str, precision: str, known: dict[str, Calla
 @click.option("--profile", "profile_name", default="paper", show_default=True, help="Shipped profile or TOML file.")
 @click.option("--decoder", "names", multiple=True, default=("refined",), show_default=True, help=_DECODERS)
 @click.option("--precision", "precisions", multiple=True, type=click.Choice(PRECISIONS), default=PRECISIONS)
-@click.option("--share", type=click.FloatRange(0.01, 1), default=0.4, show_default=True, help="Of the peaks reached.")
+@click.option(
+    "--share", type=click.FloatRange(0.01, 1), default=0.4, show_default=True, help="Share of the peaks reached."
+)
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def main(
     profile_name: str, names: tuple[str, ...], precisions: tuple[str, ...], share: float, json_path: Path | None

@@ -40,10 +40,12 @@ class Scaled:
 
 @click.command()
 @click.option("--profile", "profile_name", default="bench", show_default=True, help="The smallest device.")
-@click.option("--decoder", "name", default="coherent", show_default=True, help="As `analysis.speed.speed` names it.")
+@click.option(
+    "--decoder", "name", default="coherent", show_default=True, help="Decoder, as `analysis.speed.speed` names it."
+)
 @click.option("--factor", "factors", type=click.IntRange(1, 16), multiple=True, default=(1, 2, 4, 8), show_default=True)
 @click.option("--repeats", type=click.IntRange(1, 1000), default=5, show_default=True)
-@click.option("--threads", type=click.IntRange(1), help="Of one decode; the usable cores if left out.")
+@click.option("--threads", type=click.IntRange(1), help="Threads of one decode; the usable cores if left out.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def main(
     profile_name: str, name: str, factors: tuple[int, ...], repeats: int, threads: int | None, json_path: Path | None

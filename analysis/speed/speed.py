@@ -59,7 +59,7 @@ def weights(graph: nn.Module) -> int:
 @click.option("--profile", "profile_name", default="bench", show_default=True, help="Shipped profile or TOML file.")
 @click.option("--decoder", "names", multiple=True, help="Only these; ratios are over the first of them.")
 @click.option("--repeats", type=click.IntRange(1, 1000), default=15, show_default=True)
-@click.option("--threads", type=click.IntRange(1), help="Of one decode; the usable cores if left out.")
+@click.option("--threads", type=click.IntRange(1), help="Threads of one decode; the usable cores if left out.")
 @click.option("--parts/--no-parts", default=True, show_default=True, help="Show where each decoder's time goes.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def main(

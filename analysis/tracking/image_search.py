@@ -71,12 +71,12 @@ class FigureStore:
 
 
 @click.command()
-@click.option("--seeds", default=10, show_default=True, type=click.IntRange(1), help="Of every offset.")
-@click.option("--pages", default=WALKED, show_default=True, type=click.IntRange(10), help="Of a walk.")
+@click.option("--seeds", default=10, show_default=True, type=click.IntRange(1), help="Seeds of every offset.")
+@click.option("--pages", default=WALKED, show_default=True, type=click.IntRange(10), help="Pages of a walk.")
 @click.option("--wrong", default=WRONG_PAGES, show_default=True, type=click.IntRange(2), help="Pages of each kind.")
 @click.option("--point", "names", multiple=True, type=click.Choice(POINTS), default=POINTS, help="Only these.")
-@click.option("--bundle", type=click.Path(path_type=Path, exists=True), help="Of another device.")
-@click.option("--recording", type=click.Path(path_type=Path, exists=True), help="Of that device, walking.")
+@click.option("--bundle", type=click.Path(path_type=Path, exists=True), help="Bundle of another device.")
+@click.option("--recording", type=click.Path(path_type=Path, exists=True), help="Recording of that device, walking.")
 @click.option("--out", required=True, type=OutputFolder())
 def main(
     seeds: int, pages: int, wrong: int, names: tuple[str, ...], bundle: Path | None, recording: Path | None, out: Path

@@ -18,7 +18,9 @@ from lightpage.recording.reader import Recording
 @click.command()
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.option("--bundle", default="bench", show_default=True, help="A bundle's path, or the name of a shipped one.")
-@click.option("--page", "pages", multiple=True, default=(0, 10, 20, 29), type=int, help="In the order of the call.")
+@click.option(
+    "--page", "pages", multiple=True, default=(0, 10, 20, 29), type=int, help="Page, in the order of the call."
+)
 @click.option("--tracking/--no-tracking", default=True, help="Follow the image.")
 def main(recording: Path, bundle: str, pages: tuple[int, ...], tracking: bool) -> None:
     """Decode pages of RECORDING by the Python call, and compare them with what was written."""

@@ -26,9 +26,9 @@ class Cost:
     """Cost of a batch.
 
     Attributes:
-        kernels: that are launched for it.
-        bytes_a_page: that they read and write, each for itself; constants are shared by the pages.
-        flops_a_page: of products and convolutions.
+        kernels: kernels that are launched for it.
+        bytes_a_page: bytes that they read and write, each for itself; constants are shared by the pages.
+        flops_a_page: operations of products and convolutions.
         by_operator: bytes a page of each operator, the most first.
     """
 
@@ -43,7 +43,7 @@ class BatchFile:
 
     Args:
         model: serialised, as `lightpage.export.batched.batched_onnx` makes the second one.
-        pages: of a batch.
+        pages: number of pages of a batch.
     """
 
     def __init__(self, model: bytes, pages: int) -> None:
@@ -101,7 +101,7 @@ class BatchFile:
         """Planes in float32 that neither go into the sampling nor come from it, by name.
 
         Args:
-            page_shape: of p, which is float32.
+            page_shape: shape of p, which is float32.
         """
         sampled = {name for node in self.model.graph.node if node.op_type == "GridSample" for name in node.output}
         around = sampled | {

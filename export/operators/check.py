@@ -1,4 +1,4 @@
-"""Which nodes of a graph an execution provider has no kernel for, by its operator list and without its hardware."""
+"""Finds nodes of a graph that an execution provider has no kernel for, by its operator list, without its hardware."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Fallback:
     Attributes:
         node: its name, or that of its first output where it has none.
         operator: name, behind its domain where that is not ONNX's own.
-        version: of the operator, not of the whole set; 0 where it is unknown.
+        version: version of the operator, not of the whole set; 0 where it is unknown.
         got: what is in the graph.
         expected: what the provider has.
     """
@@ -249,7 +249,7 @@ def _wrong_types(kernel: Kernel, variables: Mapping[str, str], graph: _Graph) ->
 
 
 def _wrong_inputs(node: onnx.NodeProto, operator: Operator, schema: OpSchema, graph: _Graph) -> list[tuple[str, str]]:
-    """The same of inputs that are computed but must be constants, and of a first input with other axes than it may."""
+    """Return the mistakes of inputs that are computed but must be constants, and of a first input's axes."""
     wrong = []
     for name, formal in zip(node.input, schema.inputs, strict=False):
         if formal.name in operator.constant and name and name not in graph.constants:

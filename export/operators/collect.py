@@ -52,7 +52,7 @@ def cuda_operators(text: str, origin: str) -> OperatorList:
 
     Args:
         text: docs/OperatorKernels.md of onnxruntime.
-        origin: of the text.
+        origin: origin of the text.
 
     Raises:
         InvalidInputError: the text has no such section, or a row of it cannot be read.
@@ -108,7 +108,7 @@ def tensorrt_operators(text: str, origin: str) -> OperatorList:
 
     Args:
         text: docs/operators.md of onnx-tensorrt, from version 10 on.
-        origin: of the text.
+        origin: origin of the text.
 
     Raises:
         InvalidInputError: the text says no range of opset versions, or names an unknown type.

@@ -72,7 +72,7 @@ class OperatorList:
     Attributes:
         provider: its name in onnxruntime.
         origin: project, file and commit that the list was made from.
-        operators: by domain (empty for ONNX's own) and name.
+        operators: operators by domain (empty for ONNX's own) and name.
         opsets: first and last version of ONNX's operators that it reads; any where None.
     """
 

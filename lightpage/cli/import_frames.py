@@ -61,22 +61,28 @@ def _upright(camera: str) -> Decorator:
 @click.command(name="import")
 @_source("in-phase", "Frames of the in-phase camera.")
 @_source("quadrature", "Frames of the quadrature camera.")
-@_source("frames", "Or frames of both in one file.")
+@_source("frames", "Frames of both cameras in one file.")
 @click.option(
-    "--arrangement", type=click.Choice([each.value for each in Arrangement]), help="How --frames holds both cameras."
+    "--arrangement",
+    type=click.Choice([each.value for each in Arrangement]),
+    help="Arrangement of both cameras in --frames.",
 )
 @_source("reference-in-phase", "Frames of the reference beam alone; of several the mean is taken.")
-@_source("reference-quadrature", "The same of the quadrature camera.")
-@_source("references", "Or those of both in one file, arranged as --frames.")
-@_source("symbols", "What was written; PAGES.h5 of `encode`, or whole numbers [pages, ny, nx]. Unknown if left out.")
-@_source("pilots", "Where the known symbols are, zeros and others [ny, nx]; the profile's places if left out.")
-@_source("code", "What the pages hold, code.json of `unpack`.  [default: that of --symbols PAGES.h5]")
+@_source("reference-quadrature", "Frames of the reference beam alone, quadrature camera.")
+@_source("references", "Reference frames of both cameras in one file, arranged as --frames.")
+@_source(
+    "symbols", "Symbols that were written: PAGES.h5 of `encode`, or whole numbers [pages, ny, nx]. Unknown if left out."
+)
+@_source("pilots", "Mask of the known symbols [ny, nx], 0 elsewhere; the profile's places if left out.")
+@_source("code", "Description of the pages' code, code.json of `unpack`.  [default: that of --symbols PAGES.h5]")
 @click.option("--profile", "profile_name", metavar="P", help="Nominal device.  [default: that of --symbols PAGES.h5]")
-@click.option("--levels", type=click.IntRange(MIN_LEVELS, MAX_LEVELS), help="Of the symbols.  [default: 256]")
+@click.option(
+    "--levels", type=click.IntRange(MIN_LEVELS, MAX_LEVELS), help="Level count M of the symbols.  [default: 256]"
+)
 @click.option(
     "--bit-depth",
     type=click.IntRange(MIN_BIT_DEPTH, MAX_BIT_DEPTH),
-    help="Of a count; found in the frames if left out.",
+    help="Bits of a count; found in the frames if left out.",
 )
 @click.option("--black-level", type=click.IntRange(min=0), default=0, help="Counts of a camera in the dark.")
 @_upright("in-phase")

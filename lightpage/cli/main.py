@@ -230,9 +230,9 @@ def run(command: click.Command, arguments: Sequence[str] | None = None, name: st
     An error that nobody foresaw is raised: its traceback is what helps to mend it.
 
     Args:
-        command: what to run.
-        arguments: of it; those of this process if left out.
-        name: what it was started as.
+        command: command to run.
+        arguments: arguments of the command; those of this process if left out.
+        name: name that it was started as.
     """
     meta: dict[str, object] = {}
     termination = _Termination()

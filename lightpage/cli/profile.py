@@ -31,7 +31,7 @@ def profile() -> None:
 
 @profile.command()
 @click.option("--out", required=True, type=OutputFile(), help="The file to fill in, TOML.")
-@click.option("--like", default="bench", show_default=True, metavar="P", help="Whose numbers it starts with.")
+@click.option("--like", default="bench", show_default=True, metavar="P", help="Profile whose numbers it starts with.")
 @click.option("--force", is_flag=True, help="Overwrite a file that is there.")
 def new(out: Path, like: str, force: bool) -> None:
     """Write a profile with every key and its meaning."""
@@ -61,7 +61,7 @@ def show(name: str, json_path: Path | None) -> None:
 
 @profile.command()
 @_NAME
-@click.option("--recording", type=click.Path(path_type=Path), help="Whether it fits these frames too, R.h5.")
+@click.option("--recording", type=click.Path(path_type=Path), help="Recording whose frames it must fit, R.h5.")
 @JSON
 def check(name: str, recording: Path | None, json_path: Path | None) -> None:
     """Check keys and optics of a profile.

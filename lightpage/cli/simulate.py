@@ -27,21 +27,23 @@ from lightpage.simulator.recording_job import RecordingJob
     metavar="P",
     help="Nominal device: a shipped name or a file.  [default: that of --symbols]",
 )
-@click.option("--pages", type=click.IntRange(min=1), help="How many pages of random symbols.")
+@click.option("--pages", type=click.IntRange(min=1), help="Number of pages of random symbols.")
 @click.option("--symbols", type=click.Path(path_type=Path), help="Pages to write, PAGES.h5, as `encode` makes them.")
 @click.option("--out", required=True, type=OutputFile(), help="The recording, R.h5.")
 @click.option(
     "--levels",
     type=click.IntRange(MIN_LEVELS, MAX_LEVELS),
     show_default=f"{MAX_LEVELS}, or those of --symbols",
-    help="Of random symbols.",
+    help="Level count M of random symbols.",
 )
-@click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0), help="Of symbols, noise and drift.")
+@click.option(
+    "--seed", default=0, show_default=True, type=click.IntRange(min=0), help="Seed of symbols, noise and drift."
+)
 @click.option(
     "--device",
     "device_file",
     type=click.Path(),
-    help="Its true state: `rough`, or TOML; a realistic one if absent: a pipe 0.6 degree below the profile's.",
+    help="State of the device: `rough`, or TOML; if absent a realistic one, a pipe 0.6 degree below the profile's.",
 )
 @click.option("--set", "settings", multiple=True, metavar="TABLE.KEY=VALUE", help="Change one number of that state.")
 @click.option(
@@ -49,7 +51,7 @@ from lightpage.simulator.recording_job import RecordingJob
     default=CPU,
     show_default=True,
     metavar="cpu|cuda[:N]",
-    help="Where pages are computed; a GPU needs torch. It gives the same light, and draws other noise.",
+    help="Processor that computes pages; a GPU needs torch, gives the same light, and draws other noise.",
 )
 @click.option("--truth/--no-truth", default=True, help="Keep what only a simulator knows beside the pages.")
 @click.option("--force", is_flag=True, help="Overwrite a recording that exists, or pages begun with other settings.")

@@ -13,7 +13,7 @@ class LastingStream:
     """A text stream whose failure loses what is written to it, and stops nothing.
 
     Args:
-        stream: of the process.
+        stream: stream of the process.
 
     Attributes:
         failure: why something was lost; None where nothing was, or where the reader had seen enough.

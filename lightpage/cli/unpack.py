@@ -21,7 +21,11 @@ from lightpage.words import counted
 @click.argument("recording", metavar="R.h5", type=click.Path(path_type=Path))
 @click.option("--out", required=True, type=NewPath(), help="A new folder.")
 @click.option(
-    "--form", type=click.Choice([each.value for each in Form]), default="tiff", show_default=True, help="Of the files."
+    "--form",
+    type=click.Choice([each.value for each in Form]),
+    default="tiff",
+    show_default=True,
+    help="Format of the files.",
 )
 @JSON
 def unpack(recording: Path, out: Path, form: str, json_path: Path | None) -> None:

@@ -24,7 +24,7 @@ class Header:
         volume: a number that tells files on one medium apart, 32 bits.
         page: number of the page in its volume, 24 bits.
         volume_bytes: user bytes of the whole volume, 40 bits.
-        version: of this layout.
+        version: version of this layout.
     """
 
     code_id: int

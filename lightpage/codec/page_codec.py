@@ -35,8 +35,8 @@ class PageCodec:
     Args:
         code: its parameters.
         pilots: where the pilots are, bool [ny, nx].
-        levels: of the pages that are read, where they are uneven; as many as the code has.
-        threads: that share the work on a page where it is compiled.
+        levels: levels of the pages that are read, where they are uneven; as many as the code has.
+        threads: number of threads that share the work on a page where it is compiled.
 
     Raises:
         InvalidInputError: the page is too small for this code.
@@ -91,7 +91,7 @@ class PageCodec:
         Args:
             headers: one a page; their code id must be this code's.
             data: user bytes, uint8 [pages, user_bytes].
-            file: of the pages' file.
+            file: file of the pages' file.
             pilots: levels of the pilots in row order, uint8 [pilots].
 
         Returns:

@@ -83,7 +83,7 @@ class Volume:
         return [*data, *range(first + self.data_pages, first + self.group_pages)]
 
     def bytes_of(self, numbers: Iterable[int]) -> list[tuple[int, int]]:
-        """Return the bytes of the file that data pages hold: first, and behind the last; neighbours together."""
+        """Return the byte ranges [first, end) that data pages hold, adjacent ones merged."""
         spans: list[tuple[int, int]] = []
         for number in sorted(numbers):
             group, place = divmod(number, self.group_pages)

@@ -40,8 +40,8 @@ class LensPrescription:
     """A lens in air. Its focal lengths are paraxial.
 
     Args:
-        name: of the lens.
-        surfaces: in order; the last one has no thickness, and air behind it.
+        name: name of the lens.
+        surfaces: surfaces in order; the last one has no thickness, and air behind it.
         diameter_m: clear diameter of every surface, metres.
 
     Raises:

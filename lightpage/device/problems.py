@@ -45,8 +45,8 @@ class Problem:
 
     Attributes:
         place: the key, or the table, with dots; empty for the whole document.
-        got: what came.
-        expected: what would have been right.
+        got: value, or words about it, that the table has.
+        expected: words about a right value.
         kind: ``missing``, ``unknown``, ``value`` where `got` is what the key has, or else ``wrong``.
     """
 
@@ -56,7 +56,7 @@ class Problem:
     kind: str = "wrong"
 
     def __str__(self) -> str:
-        """The mistake in a word or two, for a list."""
+        """Return the short form of the mistake."""
         if self.kind == "missing":
             return f"no {self.place}"
         if self.kind == "unknown":
@@ -67,7 +67,7 @@ class Problem:
         return f"{self.place}: {self.got}{WANTED}{self.expected}".removeprefix(": ")
 
     def parted(self) -> tuple[str, str, str]:
-        """Place, what came and what was wanted, as an error has them."""
+        """Return place, `got` and `expected` as an error has them."""
         table, _, key = self.place.rpartition(".")
         if self.kind == "missing":
             return table, f"no {key}", self.expected
@@ -145,9 +145,9 @@ def _number(value: float) -> str:
 def _walk(
     model: type[BaseModel], parts: Sequence[int | str]
 ) -> tuple[str, list[type[BaseModel]], list[type[BaseModel]]]:
-    """The place as it is in the file, the table that it is in, and those that it may hold.
+    """Return the place as it is in the file, the kinds of tables around it, and those that it may hold.
 
-    Of a table that is one of several, what tells them apart is among the parts, and not in the file.
+    The tag of a table that is one of several is among the parts, and not in the file.
     """
     names: list[str] = []
     owners: list[type[BaseModel]] = []

@@ -25,12 +25,12 @@ class Key:
     """A key of a profile.
 
     Attributes:
-        table: that it stands in; empty for one of the document itself.
-        name: of the key, with its unit.
+        table: table that it stands in; empty for one of the document itself.
+        name: name of the key, with its unit.
         wanted: type and bounds of its value.
         default: value where it is left out, as TOML writes it; empty where it must be given, or means none.
         required: whether it must be given.
-        meaning: in a few words.
+        meaning: meaning in a few words.
     """
 
     table: str

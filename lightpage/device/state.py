@@ -227,7 +227,7 @@ class Device(TomlTable):
 
 
 def _alike(path: str, tables: Mapping[str, Mapping[str, Any]]) -> str:
-    """Which settings may have been meant by a TABLE.KEY that is none."""
+    """Return the settings that a wrong TABLE.KEY may have meant."""
     known = [f"{table}.{key}" for table, keys in tables.items() for key in keys]
     table, _, key = path.rpartition(".")
     by_key = {name.partition(".")[2]: name for name in known}
@@ -288,7 +288,7 @@ class Spread(NamedTuple):
     Attributes:
         low, high: ends of the range.
         deviation: standard deviation about `centre`; 0 where rough devices have what the realistic one has.
-        centre: of a rough device. Numbers that cannot be negative scatter to one side of it.
+        centre: centre of a rough device. Numbers that cannot be negative scatter to one side of it.
     """
 
     low: float
@@ -374,7 +374,7 @@ def draw_rough(rng: np.random.Generator, share: float = 1.0) -> Device:
 
     Args:
         rng: draws.
-        share: of a rough device's deviations.
+        share: share of a rough device's deviations.
     """
     values: dict[str, float] = {}
     for key, knob in CAPTURE_RANGE.items():

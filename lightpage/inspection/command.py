@@ -17,7 +17,7 @@ from lightpage.inspection.finding import Finding, printable
 
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path))
-@click.option("--profile", "profile_name", metavar="P", help="Whether it fits this device, and not only its own.")
+@click.option("--profile", "profile_name", metavar="P", help="Check the fit to this profile too.")
 @click.option("--picture", type=OutputFile(), help="Draw frames, references, fringes, a page and exposure to this PNG.")
 @JSON
 def inspect(file: Path, profile_name: str | None, picture: Path | None, json_path: Path | None) -> None:

@@ -15,7 +15,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import click
 from pydantic import BaseModel, ConfigDict
 
 from lightpage.failures import os_failure
@@ -99,12 +98,10 @@ def write_figures(path: Path | None, figures: dict[str, Any], **inputs: object) 
 
 
 def _options(out: Path) -> dict[str, object]:
-    """Return the options of the running command, files that it reads each by itself."""
-    context = click.get_current_context(silent=True)
-    given = {} if context is None else {name: str(value) for name, value in context.params.items()}
-    paths = {name: Path(value) for name, value in given.items() if len(value) < _LONGEST_NAME}
-    files = {name: path for name, path in paths.items() if path != out and path.is_file()}
-    return {"options": {name: value for name, value in given.items() if name not in files}, **files}
+    """Return the words of the running command, and the files among them."""
+    paths = [Path(word.rpartition("=")[2]) for word in sys.argv[1:] if len(word) < _LONGEST_NAME]
+    files = {path.name: path for path in paths if path != out and path.is_file()}
+    return {"options": sys.argv[1:], **files}
 
 
 def digest(value: object) -> str:

@@ -66,7 +66,7 @@ class PhaseRefit:
             concentration: von Mises kappa, [ny, nx].
             levels: M, or uneven levels.
             pilots: the known symbols of this page.
-            rounds: of expectation maximisation.
+            rounds: number of rounds of expectation maximisation.
         """
         known = np.full(self._shape, np.nan)
         known[pilots.mask] = pilots.phases
@@ -116,5 +116,5 @@ def _mean_distance(mu: NDArray[np.float64], kappa: NDArray[np.float64], levels: 
 
 
 def wrapped(angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The same angles, -pi to pi."""
+    """Return the angles within -pi to pi."""
     return np.asarray(angle - 2 * np.pi * np.rint(angle / (2 * np.pi)))

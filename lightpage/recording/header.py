@@ -75,12 +75,11 @@ class Header:
     def device(self, given: Profile | None, tell: Callable[[str], None] = warn) -> Profile:
         """The nominal profile of the pages: the one that was given, or else the recording's own.
 
-        A recording's own that cannot be read contradicts nothing: another program's notes are no reason to stop. A page
-        that is laid out in another way is one; other optics may be a data sheet's that were put right.
+        An unreadable own profile is ignored. Another page layout is an error; other optics are only a warning.
 
         Args:
             given: profile that was named, if one was.
-            tell: takes what its optics say otherwise than the recording's own.
+            tell: takes the warning of other optics.
 
         Raises:
             RecordingError: there is none, frames or page have another shape, or the page is laid out otherwise.

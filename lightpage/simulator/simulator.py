@@ -51,7 +51,7 @@ class SimulatedPage:
 
 @dataclass(frozen=True)
 class SeenPage:
-    """The same in the arrays of the engine that has computed it.
+    """A simulated page in the arrays of the engine that has computed it.
 
     Attributes:
         frames: counts of the in-phase and of the quadrature camera.

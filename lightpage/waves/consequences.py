@@ -29,8 +29,8 @@ class Cost:
     """Cost of a page on two cores, about.
 
     Attributes:
-        seconds: to decode it.
-        memory_gb: at the peak.
+        seconds: time to decode it.
+        memory_gb: memory at the peak.
     """
 
     seconds: float
@@ -42,17 +42,17 @@ class Consequences:
     """Consequences of a profile.
 
     Attributes:
-        symbols: of a page.
-        most_bits: that they can carry, 256 levels each.
+        symbols: number of symbols of a page.
+        most_bits: bits that they can carry, 256 levels each.
         pixels_per_symbol: camera pixels along a symbol's edge.
         image_px: width and height of the page's image on a camera, pixels.
-        magnification: of the page's image on the sensors.
+        magnification: magnification of the page's image on the sensors.
         aperture: numerical aperture of the page's corner, small angles.
         walls_met: most walls that light meets along x and along y.
         modes: sine modes of the pipe along x and along y that carry the page's light.
         carried: share of a symbol's first diffraction order that the pipe's width passes; below 1 symbols blur.
         pair_mb: megabytes of a frame pair, 8 bits a count.
-        cost: of a page, by preset of `lightpage train`.
+        cost: cost of a page, by preset of `lightpage train`.
         refused: why such a device cannot be read; empty where it can.
         doubts: what was never tried, or will cost information.
     """
@@ -104,7 +104,7 @@ def consequences(profile: Profile) -> Consequences:
 
 
 def _walls(step_m: float, width_m: float) -> int:
-    """Return how many walls light from the middle of the facet meets that moves `step_m` sideways in the pipe."""
+    """Return the number of walls that a ray from the facet's middle meets if it shifts by `step_m`."""
     return math.floor(step_m / width_m + 0.5)
 
 

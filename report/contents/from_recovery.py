@@ -230,7 +230,7 @@ def _facts(found: _Recovery) -> list[tuple[str, str]]:
 
 
 def _healed(pages: list[PageResult]) -> str:
-    """Which recorded pages the model read only once it was healed, and after how many rounds of fits to decisions."""
+    """Return the recorded pages that only the healed model read, and its rounds of fits to decisions."""
     if not pages:
         return "none"
     rounds = ranges(sorted({page.healed_rounds or 0 for page in pages}))

@@ -30,10 +30,10 @@ class RemoteFrame:
     """A camera's facts of a frame.
 
     Attributes:
-        serial: of the camera.
-        frame_id: its own count, which wraps.
-        device_time_s: by its clock, from any moment.
-        host_time_s: when the frame was complete, seconds since 1970.
+        serial: serial of the camera.
+        frame_id: number by the camera's own count, which wraps.
+        device_time_s: time by the camera's clock, from any moment.
+        host_time_s: time when the frame was complete, seconds since 1970.
     """
 
     serial: str
@@ -51,24 +51,24 @@ class RemotePage:
         confidence: float32 [ny, nx], posterior of each symbol; in steps of 1/255 where quantised.
         concentration: float32 [ny, nx], or None where not asked for.
         phase: float32 [ny, nx], radians, piston removed, or None where not asked for.
-        levels: M.
+        levels: level count M.
         level_phases: phase that stands for each level, radians; None where level s is 2 pi s / M, or no phase was asked
             for.
-        piston_rad: what was removed.
+        piston_rad: piston that was removed.
         pilot_coherence: agreement of the pilots, 0..1.
-        pilot_trust: share of the claimed concentration that they bear out, 0..1; in the fields above already.
+        pilot_trust: share of the claimed concentration that pilots bear out, 0..1; the fields above include it.
         claimed_bits, confirmed_bits: information per pilot that is claimed, and that the pilots confirm.
         recalibration_due: whether they confirm less than on a device that is as it was calibrated.
-        image: where the image lay, or None where the service does not follow it.
-        model_version: which model decoded it.
+        image: position of the image, or None where the service does not follow it.
+        model_version: version of the model that decoded it.
         timings: seconds in the service.
         page: number of the page in the source, or None where the caller sent the frames.
-        written: what the source knows to have been written, uint8 [ny, nx], or None.
-        pilot_mask: where the pilots are, bool [ny, nx]; given with `written`.
+        written: symbols that were written, uint8 [ny, nx], or None where the source does not know them.
+        pilot_mask: places of the pilots, bool [ny, nx]; given with `written`.
         user_data: the page's bytes, or None where not asked for.
-        recalibration_reasons: why a recalibration is due, as the contract names it without prefix.
-        frame_id, captured_s, correlation_id: as the caller gave them.
-        frames: of the in-phase and the quadrature camera; empty where the source has none.
+        recalibration_reasons: reasons why a recalibration is due, by the contract's names without prefix.
+        frame_id, captured_s, correlation_id: values that the caller gave.
+        frames: frames of the in-phase and the quadrature camera; empty where the source has none.
         replayed: whether this is the answer to an earlier call with the same request id.
     """
 
@@ -135,11 +135,11 @@ class ModelInfo:
     """A model that the service has.
 
     Attributes:
-        name, version, created, metrics: as its bundle says.
+        name, version, created, metrics: values of the bundle's manifest.
         current: whether it decodes now.
         pinned: whether it is never deleted.
         loaded: whether it is loaded.
-        origin: where it came from.
+        origin: origin of the model.
     """
 
     name: str
@@ -159,10 +159,10 @@ class ServiceLimits:
     Attributes:
         message_bytes, chunk_bytes, pair_bytes: largest message, chunk of frames, and pair of frames.
         concurrent_decodes: pages decoded at the same time; more wait.
-        replay_s, replay_bytes: how long, and how many bytes of, the answers of request ids are kept.
-        recalibration_pages: of one recalibration.
-        model_bytes: of an uploaded bundle.
-        range_pages: that are read in one call.
+        replay_s, replay_bytes: time and bytes for which answers of request ids are kept.
+        recalibration_pages: number of pages of one recalibration.
+        model_bytes: largest size of an uploaded bundle.
+        range_pages: number of pages that are read in one call.
         shared_bytes: memory that clients may share with it, 0 for none.
     """
 
@@ -196,10 +196,10 @@ class Description:
     pilot_phases: NDArray[np.float32] | None
     """Radians, one a True of `pilot_mask` in row order; None for the profile's pattern."""
     code_toml: str
-    """How user bytes are protected on this device's pages; empty where the model has no code."""
+    """Code of user bytes, TOML; empty where the model has none."""
     user_bytes_per_page: int
     default_levels: int
-    """What `levels` 0 stands for where no user bytes are asked for."""
+    """Level count that `levels` 0 stands for where no user bytes are asked for."""
     limits: ServiceLimits
 
     def __repr__(self) -> str:
@@ -228,8 +228,8 @@ class RemoteData:
 
     Attributes:
         page: number in the source; None where the bytes were restored from other pages of the group.
-        user_data: what the page gave; its header says which page of which volume it is.
-        error: why it was not decoded, for people; empty where it was.
+        user_data: bytes of the page; its header says which page of which volume it is.
+        error: reason why it was not decoded, for people; empty where it was.
     """
 
     page: int | None
@@ -293,7 +293,7 @@ class JobState(StrEnum):
     INTERRUPTED = "INTERRUPTED"
     """The service ended while it ran; nothing was changed."""
     UNKNOWN = "UNKNOWN"
-    """Of a service that is newer than this client."""
+    """State of a service that is newer than this client."""
 
 
 @dataclass(frozen=True)
@@ -301,15 +301,15 @@ class JobInfo:
     """A recalibration as a job of the service.
 
     Attributes:
-        id: by which the service knows it.
-        state: how it stands.
-        step, fraction: what is, or was last, being done, and how far all of it is, 0..1.
-        created_s: when it began, seconds since 1970.
-        pages_of: where its pages came from, for people.
-        ended_s: when it ended, None while it runs.
-        result: of a job that is done.
-        error: why one that has ended is not done.
-        correlation_id: the text of whoever started it.
+        id: name of the job in the service.
+        state: state of the job.
+        step, fraction: step that runs or ran last, and share of the whole that is done, 0..1.
+        created_s: time of the start, seconds since 1970.
+        pages_of: origin of its pages, for people.
+        ended_s: time of the end, None while it runs.
+        result: result of a job that is done.
+        error: error that it ended with, None without one.
+        correlation_id: text of the caller who started it.
     """
 
     id: str

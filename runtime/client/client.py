@@ -41,7 +41,7 @@ class LightpageClient:
         target: where the service is.
         timeout_s: deadline of a call.
         tls: certificates to connect with; None for a service without TLS.
-        clock: by which a watch of a job ends, and waits for a service that is away.
+        clock: clock by which a watch of a job ends, and waits for a service that is away.
 
     Attributes:
         target: as given.

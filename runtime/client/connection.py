@@ -32,7 +32,7 @@ class Connection:
 
     Attributes:
         target, clock: as given.
-        session: of frames that name none. At a Unix socket it is the client's own, for the service cannot tell
+        session: session of frames that name none. At a Unix socket it is the client's own, for the service cannot tell
             connections apart there; elsewhere it is empty.
 
     Raises:
@@ -103,7 +103,7 @@ class SubClient:
     """A client's part for one kind of calls.
 
     Args:
-        connection: to the service.
+        connection: connection to the service.
     """
 
     def __init__(self, connection: Connection) -> None:

@@ -73,9 +73,9 @@ class FramesClient(SubClient):
 
         Args:
             pairs: taken as fast as the service reads them.
-            timeout_s: for all of them.
-            levels: of every pair, as for `decode`.
-            options: of every pair, as for `decode`.
+            timeout_s: time for all of them.
+            levels: levels of every pair, as for `decode`.
+            options: options of every pair, as for `decode`.
 
         Raises:
             FrameError: frames that cannot be sent.

@@ -27,13 +27,13 @@ _AGAIN_S = 0.5
 
 
 class RecalibrationOptions(TypedDict, total=False):
-    """Which pages a recalibration has, and which model it replaces. All but the pages may be left out.
+    """Pages of a recalibration, and the model that it replaces. All but the pages may be left out.
 
     Attributes:
         count: how many of the source's next pages; or of the recording's first ones, 0 for all of them.
         pages: which pages of the source.
         recording: its name in the service's recordings folder.
-        expected_version: that must be in service; empty for any.
+        expected_version: version that must be in service; empty for any.
     """
 
     count: int
@@ -65,8 +65,8 @@ class JobsClient(SubClient):
 
         Args:
             progress: told what is being done, and how far all of it is, 0..1.
-            timeout_s: for all of it.
-            options: with which pages, and instead of which model; see `RecalibrationOptions`.
+            timeout_s: time for all of it.
+            options: pages to use, and model to replace; see `RecalibrationOptions`.
 
         Raises:
             RecalibrationRefusedError: the new model would not be better; the old one stays.
@@ -131,9 +131,9 @@ class JobsClient(SubClient):
             bit_depth: bits of a camera count; by default those of the service's camera.
             black_level: counts that the cameras add to every pixel.
             pilot_mask: where the pilots are, [ny, nx]; None for the device's own.
-            expected_version: that must be in service; empty for any.
+            expected_version: version that must be in service; empty for any.
             correlation_id: as for `start`.
-            timeout_s: for sending it all.
+            timeout_s: time for sending it all.
 
         Raises:
             FrameError: frames that cannot be sent, or that the service refuses.

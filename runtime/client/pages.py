@@ -75,10 +75,10 @@ class PagesClient(SubClient):
 
         Args:
             pages: their numbers; none for the next `count`.
-            timeout_s: for all of them.
-            levels: of every page, as for `read`.
-            want_written: of every page, as for `read`.
-            options: of every page, as for `read`.
+            timeout_s: time for all of them.
+            levels: levels of every page, as for `read`.
+            want_written: choice of every page, as for `read`.
+            options: options of every page, as for `read`.
 
         Raises:
             SourceError: the service has no source.

@@ -9,7 +9,7 @@ PROVIDER = click.option(
     envvar="LIGHTPAGE_SERVICE__PROVIDER",
     show_envvar=True,
     show_default=CPU,
-    help=f"What computes pages: {WANTED}.",
+    help=f"Processor that computes pages: {WANTED}.",
 )
 
 CODE_THREADS = click.option(

@@ -28,8 +28,8 @@ class Actions:
     """Does what the console asks for with a service's models and recalibrator.
 
     Args:
-        plane: whose models.
-        recalibrator: of the service.
+        plane: data plane with the models.
+        recalibrator: recalibrator of the service.
         pages: numbers of the source's fully known pages, as self-calibration has them; none for the first two that the
             source has.
     """

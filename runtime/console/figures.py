@@ -71,10 +71,10 @@ class ServiceFigures:
     """Figures of a service; NaN where it says nothing.
 
     Attributes:
-        model_version: of the model in service.
+        model_version: version of the model in service.
         up_s: seconds since it started.
         seconds: between the scrapes, which all rates are means over.
-        restarts: of the service, since it has been scraped.
+        restarts: number of restarts of the service, since it has been scraped.
     """
 
     model_version: str

@@ -21,19 +21,19 @@ class PageRow:
 
     Attributes:
         time_s: seconds since 1970.
-        subject: for people.
+        subject: subject for people.
         page_index: its number in the source.
         model_version: what decoded it.
-        seconds: that it took.
+        seconds: time that it took.
         lost: why it was not given out, None where it was.
         unread: why its bytes could not be read, None where they were, or nobody asked.
         margin_bits: beyond what its code needs, a symbol.
-        air_bits: that a symbol is claimed to carry, as far as the pilots bear it out.
+        air_bits: information that a symbol is claimed to carry, as far as the pilots bear it out.
         trust, share: what the pilots bear out of the concentration, and of the information.
-        shift_x_px, shift_y_px: of the image since calibration, camera pixels.
-        piston_rad: of the page.
+        shift_x_px, shift_y_px: shift of the image since calibration, camera pixels.
+        piston_rad: piston of the page.
         residual_rad: smooth phase error that was taken off.
-        stroke_relative: of the modulator since calibration, as the page's pilots show it.
+        stroke_relative: change of the stroke of the modulator since calibration, as the page's pilots show it.
         recalibration_due: whether the page by itself says so.
     """
 

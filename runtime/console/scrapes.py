@@ -38,9 +38,9 @@ def fetch(subject: str, address: str, path: str, tls: TlsFiles | None = None) ->
     """A page of the service whose `--metrics-port` is at HOST:PORT, its first 16 MiB.
 
     Args:
-        subject: of the error.
+        subject: subject of the error.
         address: HOST:PORT.
-        path: of the page, without a slash in front.
+        path: path of the page, without a slash in front.
         tls: certificates to connect with; None for a service without TLS.
 
     Raises:
@@ -172,7 +172,7 @@ class Change:
         return sum(rise for _, rise in self._risen(name, **labels))
 
     def rate(self, name: str, **labels: str) -> float:
-        """The same a second; NaN where no time has passed."""
+        """Return the growth a second; NaN where no time has passed."""
         return self.rise(name, **labels) / self.seconds if self.seconds > 0 else math.nan
 
     def rises(self, name: str, label: str) -> dict[str, float]:

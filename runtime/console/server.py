@@ -50,8 +50,8 @@ def serving(
     Args:
         routes: what to serve.
         port: 0 takes a free one.
-        host: to listen on, IPv6 with or without brackets; ``::`` stands for all addresses, of IPv4 too.
-        certificates: with which callers are met, who must have some too; None for no TLS.
+        host: host to listen on, IPv6 with or without brackets; ``::`` stands for all addresses, of IPv4 too.
+        certificates: certificates with which callers are met, who must have some too; None for no TLS.
         names: further names of this machine by which it may be asked, see `names_machine`.
 
     Raises:

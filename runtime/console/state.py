@@ -28,7 +28,7 @@ class ConsoleState:
         last_pages: what is known of them.
         models: the models.
         monitor: says whether a recalibration is due.
-        source: of the pages, for people.
+        source: source of the pages, for people.
         actions: what callers may do who prove that they may; None for nothing.
         clock: seconds since 1970.
     """

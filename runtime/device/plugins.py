@@ -23,8 +23,8 @@ def driver_of(group: str, name: str, subject: str) -> Callable[..., Any]:
     """Return what opens a thing by a driver.
 
     Args:
-        group: of entry points.
-        name: of the driver.
+        group: group of entry points.
+        name: name of the driver.
         subject: what names it, for an error.
 
     Raises:

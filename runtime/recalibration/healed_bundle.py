@@ -40,7 +40,7 @@ def recalibrate_by_lost(
     """Heal a model, and write it as a new bundle, judged by pages that came right and were not fitted on.
 
     Args:
-        pages: that the model does not read.
+        pages: pages that the model does not read.
         decoder, out, version, fit, progress, tracker: as for `recalibrate`.
         start: the model that is healed, if not `decoder` itself.
 
@@ -88,7 +88,7 @@ def recalibrate_by_recording(
     """Recalibrate by the first recorded pages that show light.
 
     Args:
-        recording: of pages with their symbols, or else of user data.
+        recording: recording of pages with their symbols, or else of user data.
         count: pages with symbols that are taken; of others `TOGETHER` are.
         code: gives that of user data.
         decoder, out, version, fit, progress: as for `recalibrate`.

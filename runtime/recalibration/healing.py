@@ -67,7 +67,7 @@ class LostPages:
 
     Attributes:
         pairs: frame pairs, one a page.
-        code: of the pages.
+        code: code of the pages.
         expected: the page of its volume that each should be, None where that is unknown; none for none of them.
         references: reference-only frames taken with them, or None: then those that the model decodes with hold.
         image_px: where the image was last seen against the model's calibration, (x, y), camera pixels.
@@ -85,11 +85,11 @@ class Healed:
     """A model that reads its device again.
 
     Attributes:
-        decoder: of the re-fitted bundle, which lies in memory.
+        decoder: decoder of the re-fitted bundle, which lies in memory.
         result: what was re-fitted, with the verdict on it. It may be wrong: pages that come right are right even so.
         known: pages that come right, with their symbols; those that were fitted are the first.
-        rounds: of fits to decisions; 0 where only the image had moved.
-        seconds: that it took.
+        rounds: number of rounds of fits to decisions; 0 where only the image had moved.
+        seconds: time that it took.
     """
 
     decoder: Decoder
@@ -113,7 +113,7 @@ def heal(
         pages: at most `TOGETHER` are taken, the first ones; repeated ones count once.
         progress: told of every step. It may raise to stop the work.
         fit: how to fit by known pages.
-        twin: of the bundle's profile; the bundle's own if left out.
+        twin: twin of the bundle's profile; the bundle's own if left out.
 
     Raises:
         RecalibrationRefusedError: the frames do not show this device, no page came right, or the bundle has no

@@ -75,7 +75,7 @@ class KnownPages:
         """The pages whose frames show light; of each other one is warned.
 
         Args:
-            bit_depth: of the counts.
+            bit_depth: bits of the counts.
 
         Raises:
             FrameError: too few show light.

@@ -26,7 +26,7 @@ def of_other_device(decoder: Decoder, pages: LostPages, progress: Progress) -> D
 
     Args:
         decoder: calibrated for some device; its geometry and modulator are left aside.
-        pages: of the other device; `MOST_PAGES` are looked at, the first ones; repeated ones count once.
+        pages: pages of the other device; `MOST_PAGES` are looked at, the first ones; repeated ones count once.
         progress: told of every step. It may raise to stop the work.
 
     Raises:

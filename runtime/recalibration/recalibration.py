@@ -44,8 +44,8 @@ class RefitReport:
 
     Attributes:
         angle_deg: fitted pipe angle.
-        coherence_before: of the pages with the old geometry, 0..1.
-        coherence_after: with the new one.
+        coherence_before: coherence of the pages with the old geometry, 0..1.
+        coherence_after: coherence with the new one.
         image: where the image was found before the fit, against the earlier calibration.
         goodness: how well the new geometry explains the light.
     """

@@ -40,11 +40,11 @@ def refit(
     The table holds the re-traced geometry and the reference frames that it was fitted with.
 
     Args:
-        bundle: whose calibration and twin.
+        bundle: bundle with calibration and twin.
         pages: known pages; the first finds the geometry, the coherences are the mean of all.
         progress: told of every stage.
         decoder: the bundle's, whose graph recovers the field.
-        twin: of the bundle's profile; the bundle's own if left out.
+        twin: twin of the bundle's profile; the bundle's own if left out.
         solve_field: recovers fields; the decoder's graph if left out.
 
     Raises:
@@ -117,8 +117,8 @@ def traced(
 
     Args:
         decoder: takes it.
-        twin: of the bundle's profile.
-        references: that the geometry was fitted with.
+        twin: twin of the bundle's profile.
+        references: references that the geometry was fitted with.
         fitted: the geometry.
         image: where its image was found, None where it was not, or not looked for.
     """

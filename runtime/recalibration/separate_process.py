@@ -54,10 +54,10 @@ def recalibrate_apart(
 
     Args:
         decoder: the model in service.
-        tracker: of the service; the worker goes on from what it has learnt.
+        tracker: tracker of the service; the worker goes on from what it has learnt.
         pages: pages with known symbols, or pages that the model does not read.
         out: a new path.
-        version: of the new bundle.
+        version: version of the new bundle.
         progress: told of every step.
         check: called several times a second; what it raises ends the work.
         limit_s: longest time that it may take, seconds.

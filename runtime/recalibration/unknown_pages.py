@@ -36,9 +36,9 @@ class UnknownPages:
     Args:
         pairs: frame pairs, one a page.
         expected: the page of its volume that each should be, None where that is unknown.
-        code: of the pages.
+        code: code of the pages.
         pilots: levels of the pilots that all of them carry.
-        twin: of their profile.
+        twin: twin of their profile.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class UnknownPages:
         """Decode the pages, and read their bytes.
 
         Args:
-            decoder: of a model.
+            decoder: decoder of a model.
             fitted: the page that it was fitted to, from which the image is followed to the others as a service follows
                 it; None for a model that was fitted to none of them.
 

@@ -57,7 +57,7 @@ def yield_more(clock: Clock = SYSTEM, worked: Callable[[], float] = time.process
     work runs into its limit of time, and the next one begins as this one did.
 
     Args:
-        clock: by which the time passes over which it is taken.
+        clock: clock by which the time passes over which it is taken.
         worked: processor time that this process has had, seconds.
     """
 

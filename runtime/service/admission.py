@@ -54,7 +54,7 @@ class Slots:
         count: slots.
         what: they are for, for the error, e.g. ``"decodes"``.
         deadline_s: longest wait, seconds.
-        clock: by which callers wait.
+        clock: clock by which callers wait.
 
     Attributes:
         count: how many there are.

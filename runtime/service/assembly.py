@@ -40,10 +40,10 @@ class Assembly:
 
     Attributes:
         plane: its logic.
-        recalibrator: of its models.
-        monitor: of its device.
+        recalibrator: recalibrator of its models.
+        monitor: monitor of its device.
         kept: the last pages of its device, where it recalibrates itself by them; else None.
-        source_name: for people.
+        source_name: name for people.
     """
 
     plane: DataPlane
@@ -58,8 +58,8 @@ def assembled(settings: ServiceSettings, observer: Observer) -> Iterator[Assembl
     """Yield the service that is meant by settings; what it holds is closed at the end.
 
     Args:
-        settings: of it.
-        observer: is told of every page, before log and flight recorder are.
+        settings: settings of the service.
+        observer: observer of every page, told, before log and flight recorder are.
 
     Raises:
         LightpageError: bundle, store or source are not there, or do not go together.

@@ -43,9 +43,9 @@ class Identity:
     """A caller.
 
     Attributes:
-        name: the common name of its certificate; empty on a connection that needs none.
-        roles: of it.
-        until: when the certificate ends, seconds since 1970.
+        name: common name of its certificate; empty on a connection that needs none.
+        roles: roles that the certificate names.
+        until: end of the certificate, seconds since 1970.
     """
 
     name: str
@@ -60,7 +60,7 @@ class Identity:
         """Check that it may do something.
 
         Args:
-            role: that this needs.
+            role: role that this needs.
             what: it does, e.g. ``call Rollback``.
             now: seconds since 1970.
 
@@ -150,7 +150,7 @@ class Caller:
 
     Args:
         seconds_left: how long the caller still waits, infinite without a deadline.
-        session: whose pages are followed together, see `Sessions`; empty for the device's own.
+        session: session whose pages are followed together, see `Sessions`; empty for the device's own.
         stateless: whether every page is decoded as if it were the first.
         actor: who it is, for records.
     """
@@ -217,7 +217,7 @@ class Call:
         peer: address and connection that it came from.
         correlation_id: the caller's own text for the log, empty where it gave none.
         begun: when its first byte came, by `time.perf_counter`.
-        times: of its pages.
+        times: times of its pages.
         identity: who calls.
     """
 

@@ -137,7 +137,7 @@ class Place:
 
     Attributes:
         tracker: follows them.
-        turn: of the page.
+        turn: turn of the page.
     """
 
     tracker: Tracker
@@ -156,7 +156,7 @@ class DataPlane:
         monitor: says by all pages of the service's own device whether a recalibration is due: those of the source, and
             those of `device_sessions`. Other sessions of callers get monitors of their own with the same settings.
         device_sessions: sessions of callers whose frames are of the device, by their names in `Caller.session`.
-        clock: by which callers wait for slots and answers, and what hangs is known.
+        clock: clock by which callers wait for slots and answers, and what hangs is known.
 
     Raises:
         InvalidInputError: the source is not for this device.
@@ -336,7 +336,7 @@ class DataPlane:
 
 
 def _inferred(page: DecodedPage, stages: Stages) -> None:
-    """Tell what of a decode, which has run as inference until now, was inference, and what was waiting.
+    """Split a finished decode's time between the stages inference, queue and post-processing.
 
     The graph may run more than once, with post-processing between: all its runs count as if they were the first part.
     """
@@ -348,17 +348,17 @@ def _inferred(page: DecodedPage, stages: Stages) -> None:
 
 
 def levels_for(decoder: Decoder, asked: int | None, usual: int, user_data: bool) -> int:
-    """The level count to decode a page at.
+    """Return the level count to decode a page at.
 
     Args:
-        decoder: of the model.
-        asked: by the caller; None leaves the choice.
-        usual: that None stands for where only symbols are asked for.
-        user_data: whether its bytes are asked for: then it must be that of the code.
+        decoder: decoder of the model.
+        asked: level count that the caller asks for; None leaves the choice.
+        usual: level count if `asked` is None and no user bytes are wanted.
+        user_data: whether user bytes are wanted: then the level count must be that of the code.
 
     Raises:
-        BundleError: user bytes are asked for, and the model has no code.
-        InvalidInputError: they are, and another level count.
+        BundleError: user bytes are wanted, and the model has no code.
+        InvalidInputError: user bytes are wanted, and `asked` is not the code's level count.
     """
     if not user_data:
         return usual if asked is None else asked

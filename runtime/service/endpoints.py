@@ -22,8 +22,8 @@ class Endpoints:
     """The addresses of a service.
 
     Attributes:
-        target: for calls.
-        health: for health checks; None where they are off.
+        target: address for calls.
+        health: address for health checks; None where they are off.
     """
 
     target: str
@@ -36,7 +36,7 @@ def listening(settings: ServiceSettings, assembly: Assembly, certificates: Certi
 
     Args:
         settings, assembly: the service.
-        certificates: with which it meets its callers; None for no TLS.
+        certificates: certificates with which it meets its callers; None for no TLS.
 
     Raises:
         InvalidInputError: an address cannot be listened on.

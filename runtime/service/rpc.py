@@ -14,7 +14,7 @@ class Rpc:
     """Way in which an RPC is served.
 
     Attributes:
-        role: that its callers need.
+        role: role that its callers need.
         is_watch: whether it lasts as long as its caller likes: it holds no thread, is no load, and ends with the
             service.
         is_upload: whether it changes something once its caller has closed the stream.

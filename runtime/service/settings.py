@@ -84,7 +84,7 @@ class ServiceTable(SettingsTable):
         1, ge=1, le=64, description="Threads that share the code of a page, where it is compiled."
     )
     provider: Annotated[str, checked(Provider.parse)] = CPU
-    """What computes pages: cpu, cuda or tensorrt, with :N behind it for another GPU than the first."""
+    """Processor that computes pages: cpu, cuda or tensorrt, with :N behind it for another GPU than the first."""
     engine_cache: Folder | None = None
     """Folder where TensorRT keeps its engines; without, it builds them at each start, for minutes."""
     tracking: bool = Field(True, description="Follow the image, and find it again.")
@@ -281,7 +281,7 @@ def service_settings(
         file: TOML, None for none.
         environment: variables, by default those of this process; those named `_PREFIX` + TABLE__KEY count, and before
             them, where it is not named so, `_STORE`.
-        options: of the command line.
+        options: options of the command line.
 
     Raises:
         InvalidInputError: the file cannot be read, or a setting is wrong.

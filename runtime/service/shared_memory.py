@@ -164,9 +164,9 @@ class SharedMemory:
     """Gives out regions at a socket, to whoever may open it; use it in a `with` statement.
 
     Args:
-        path: of the socket.
-        most_bytes: of all regions together.
-        most_regions: at once.
+        path: path of the socket.
+        most_bytes: largest size of all regions together.
+        most_regions: largest number at once.
         silence_s: a client that does not say how much it wants is hung up on after so long.
     """
 

@@ -221,10 +221,7 @@ class _Curve:
         return np.where(np.isnan(anew) & enough, air, anew)
 
     def within(self, name: str) -> Range | None:
-        """The range within which no more than `LOSS` is lost of what is read of the device that was trained on.
-
-        None where nothing but that was measured.
-        """
+        """Return the values that lose at most `LOSS` against the trained device; None if only that one was measured."""
         if not self.measured(name):
             return None
         airs = self.trained_airs if name == "anew" else self.airs(name)

@@ -115,13 +115,11 @@ def measure(faults: list[Fault], given: argparse.Namespace, temporary: Path) -> 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     known = [fault.id for fault in load("fault")]
-    parser.add_argument(
-        "--only", action="append", choices=known, metavar="ID", help="a fault; several times for several"
-    )
+    parser.add_argument("--only", action="append", choices=known, metavar="ID", help="a fault; may be repeated")
     parser.add_argument("--tests", metavar="REV", help="take tests/ from this git revision")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="keeps results: the same command goes on")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="for the results")
-    parser.add_argument("--timeout", type=float, metavar="S", help="of a fault; 60, and 5 times as long as without it")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="file for the results")
+    parser.add_argument("--timeout", type=float, metavar="S", help="seconds; 60, and 5 times as long as without it")
     given = parser.parse_args()
     faults = [fault for fault in load("fault") if fault.id in (given.only or [fault.id])]
     for fault in faults:

@@ -21,7 +21,7 @@ def executed(name: str, parameters: str | None = None, without: str = "") -> Any
     """Return a notebook as a run from end to end leaves it.
 
     Args:
-        name: of the notebook.
+        name: name of the notebook.
         parameters: source that stands in for the cell with this tag.
         without: tag of cells that are passed over.
 

@@ -39,7 +39,7 @@ MAX_PAGES = 4
 @click.command()
 @profile_option
 @click.option("--recording", required=True, type=click.Path(path_type=Path), help="Pages with known symbols, R.h5.")
-@click.option("--out", required=True, type=OutputFile(), help="Where the calibration goes, TOML.")
+@click.option("--out", required=True, type=OutputFile(), help="TOML file to write the calibration to.")
 @click.option(
     "--pages", default=DEFAULT_PAGES, show_default=True, type=click.IntRange(1, MAX_PAGES), help="Pages used."
 )
@@ -48,13 +48,17 @@ MAX_PAGES = 4
     default="profile",
     show_default=True,
     type=click.Choice(["profile", "any"]),
-    help="any: take frames of a camera that shows the image mirrored or turned, each camera by itself.",
+    help="Orientation of the cameras; `any` takes mirrored or turned ones, each by itself.",
 )
 @click.option(
     "--picture", type=OutputFile(), help="Draw to this PNG where the light lies that the fit does not explain."
 )
 @click.option(
-    "--compute", default="cpu", show_default=True, metavar="cpu|cuda[:N]", help="Where the light's field is recovered."
+    "--compute",
+    default="cpu",
+    show_default=True,
+    metavar="cpu|cuda[:N]",
+    help="Processor that recovers the light's field.",
 )
 @JSON
 def calibrate(

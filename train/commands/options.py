@@ -73,7 +73,7 @@ CHOICES = (
     Choice(
         "--preset",
         click.Choice(list(PRESETS)),
-        "How much time the decoder may take for a page: one quick pass, one pass, or two passes.",
+        "Decoder by its time for a page: one quick pass, one pass, or two passes.",
         ACCURATE,
         localizers=LOCALIZERS,
     ),
@@ -95,7 +95,7 @@ CHOICES = (
     Choice(
         "--channels",
         click.IntRange(min=4),
-        "Of the network.",
+        "Channels of the network.",
         published="32, and twice as many below sample pitch",
     ),
     Choice(
@@ -108,7 +108,7 @@ CHOICES = (
     Choice(
         "--depth",
         click.IntRange(min=0, max=4),
-        "How often the network halves its resolution below symbol pitch; 0 is the flat one.",
+        "Number of times that the network halves its resolution below symbol pitch; 0 is the flat one.",
         localizers=LOCALIZERS,
         of_preset=True,
     ),
@@ -131,7 +131,7 @@ CHOICES = (
     Choice(
         "--field-rounds",
         click.IntRange(min=0, max=20),
-        "Of descent to the field, in place of --reflections: fewer are faster, and lose most in bright light.",
+        "Rounds of descent to the field, in place of --reflections: fewer are faster, and lose most in bright light.",
         localizers=LOCALIZERS,
         of_preset=True,
     ),
@@ -160,7 +160,7 @@ CHOICES = (
     Choice(
         "--interpolation",
         click.Choice([BICUBIC, BILINEAR]),
-        "How it reads them off its grid: bilinear is quicker and less exact.",
+        "Interpolation between the field's samples: bilinear is quicker and less exact.",
         localizers=_COHERENT,
         of_preset=True,
     ),
@@ -174,15 +174,15 @@ CHOICES = (
     Choice(
         "--learning-rate",
         float,
-        "Peak of the one-cycle schedule, or that of the published network.",
+        "Peak learning rate of the one-cycle schedule, or the published network's rate.",
         published=f"{PublishedChoices.decoder_rate:g}",
     ),
     Choice(
         "--precision",
         click.Choice(PRECISIONS),
-        "Of the network's arithmetic; auto is bf16-mixed where the processor has it, else 32-true.",
+        "Precision of the network's arithmetic; auto is bf16-mixed where the processor has it, else 32-true.",
     ),
-    Choice("--seed", click.IntRange(min=0), "Of initial weights, batches and rotations."),
+    Choice("--seed", click.IntRange(min=0), "Seed of initial weights, batches and rotations."),
     Choice(
         "--synthetic-pages",
         click.IntRange(min=0),

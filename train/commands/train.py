@@ -29,7 +29,13 @@ from lightpage.words import counted
 
 @click.command()
 @profile_option
-@click.option("--recording", "recording_path", required=True, type=click.Path(path_type=Path), help="Known pages.")
+@click.option(
+    "--recording",
+    "recording_path",
+    required=True,
+    type=click.Path(path_type=Path),
+    help="HDF5 recording with known symbols.",
+)
 @click.option(
     "--localizer",
     type=click.Choice([*PUBLISHED, *LOCALIZERS]),
@@ -37,7 +43,12 @@ from lightpage.words import counted
     "and way of training. [default: the preset's]",
 )
 @click.option("--out", required=True, type=OutputFolder(), help="Folder of the run; resumed if it is there.")
-@click.option("--calibration", "calibration_path", type=click.Path(path_type=Path), help="Made here if left out.")
+@click.option(
+    "--calibration",
+    "calibration_path",
+    type=click.Path(path_type=Path),
+    help="Calibration of the device; made from the recording if left out.",
+)
 @click.option(ACCEPT, "accept_wrong_fit", is_flag=True, help="Train with a calibration whose fit is wrong too.")
 @click.option(
     "--validation-share",
@@ -46,7 +57,13 @@ from lightpage.words import counted
     show_default=True,
     help="Share of the pages that training is judged by.",
 )
-@click.option("--test-share", type=FiniteRange(0, 0.5), default=0.08, show_default=True, help="Left for evaluate.")
+@click.option(
+    "--test-share",
+    type=FiniteRange(0, 0.5),
+    default=0.08,
+    show_default=True,
+    help="Share of the pages that is left for `evaluate`.",
+)
 @with_choices
 @click.option(
     "--devices",
@@ -59,7 +76,7 @@ from lightpage.words import counted
     type=click.Choice(STRATEGIES),
     default=AUTO,
     show_default=True,
-    help="Lightning's, of several processes; auto is ddp where there are several.",
+    help="Lightning's strategy of several processes; auto is ddp.",
 )
 @JSON
 def train(

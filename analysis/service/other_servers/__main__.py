@@ -139,9 +139,9 @@ def verdict(one: dict[str, Any]) -> str:
     help="Folder of the environments.",
 )
 @click.option("--calls", default=40, show_default=True, type=click.IntRange(3), help="Calls of each way, one by one.")
-@click.option("--rounds", default=3, show_default=True, type=click.IntRange(1), help="Of callers at once.")
+@click.option("--rounds", default=3, show_default=True, type=click.IntRange(1), help="Rounds of callers at once.")
 @click.option("--threads", type=click.IntRange(1), help="Threads of one run; by default all cores.")
-@click.option("--seed", default=0, show_default=True, help="Of the order in which they are called.")
+@click.option("--seed", default=0, show_default=True, help="Seed of the order in which they are called.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def main(out: Path, calls: int, rounds: int, threads: int | None, seed: int, json_path: Path | None) -> None:
     """Print what calls cost beside the graph, and pages a second, of all servers."""

@@ -42,7 +42,7 @@ class SeenPages:
     """Known pages as a decoder reads them, from which pages of any symbols are drawn.
 
     Attributes:
-        decoder: that read them.
+        decoder: decoder that read them.
         mask: where their pilots are, [ny, nx].
         errors: see `phase_errors`, a page each.
         concentrations: kappa, [ny, nx], a page each.
@@ -95,8 +95,8 @@ def choose_code(
     """Choose a code by the pages of a recording that the bundle has not seen.
 
     Args:
-        decoder: of the device.
-        recording: with known symbols.
+        decoder: decoder of the device.
+        recording: recording with known symbols.
         tracker: follows the device from page to page.
         headroom, drift: see `lightpage.codec.choose.choose`.
 

@@ -20,7 +20,7 @@ def decode_recording(decoder: Decoder, recording: Recording) -> Iterator[Decoded
 
     Args:
         decoder: a bundle's, e.g. of `lightpage.load`.
-        recording: of its kind of device.
+        recording: recording of its kind of device.
 
     Yields:
         Each page, or why it is not given out: it cannot be decoded, or its pilots contradict what was decoded.

@@ -28,10 +28,10 @@ class Shown:
     """A page that is on its way.
 
     Attributes:
-        index: its number in the recording.
-        read: its frames and, where they are known, its symbols.
-        tracker: that it is decoded with.
-        turn: of that.
+        index: number of the page in the recording.
+        read: frames and, where they are known, symbols of the page.
+        tracker: tracker that decodes it.
+        turn: turn of the page.
     """
 
     index: int
@@ -52,7 +52,7 @@ def decoded_ahead(
     What was decoded ahead is dropped once another model is in use, which then sees the pages from there on in order.
 
     Args:
-        recording: of the pages.
+        recording: recording of the pages.
         pages: their numbers.
         tracker: gives that of the model in use.
         together: pages that are computed together at most.

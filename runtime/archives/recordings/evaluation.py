@@ -155,9 +155,9 @@ def decode_unseen(
 
     Args:
         decoder, recording, tracker: see `evaluate`.
-        mask: where the pilots are, see `pilots_of`.
-        frames, symbols: the page.
-        turn: of it.
+        mask: places of the pilots, see `pilots_of`.
+        frames, symbols: frames and symbols of the page.
+        turn: turn of the page.
 
     Raises:
         InvalidInputError, LostPageError: see `Tracker.decode`.

@@ -53,11 +53,11 @@ class RecoveredPage:
         margin_bits: information of a symbol's coded bits beyond what the code needs; None where there was no light.
         corrected: Reed-Solomon symbols that were mended.
         failed_blocks: LDPC blocks that did not converge.
-        iterations: mean of the LDPC blocks.
+        iterations: mean number of iterations of the LDPC blocks.
         air_bits: AIR of the page as delivered, bits a data symbol; None where its symbols are not known.
-        seconds: of the optical decode, without waiting for other pages.
-        code_seconds: of the code.
-        healed_rounds: rounds of the healing before which it gave no bytes; None where it needed none.
+        seconds: time of the optical decode, without waiting for other pages.
+        code_seconds: time of the code.
+        healed_rounds: rounds of the healing that made it readable; None where it needed none.
     """
 
     page: int
@@ -81,8 +81,8 @@ class Healings:
 
     Attributes:
         model: decoder of the last healed model and its tracker; None for the bundle's own.
-        together: pages that are not read for which the next healing waits: the more, the more have brought nothing.
-        passed: those of earlier readings, which were not tried.
+        together: number of lost pages at which the next healing starts; each failure doubles it.
+        passed: number of lost pages of earlier readings that no healing has tried.
     """
 
     model: Model | None = None
@@ -109,11 +109,11 @@ class PageReader:
     Args:
         decoder, recording, tracker, code: see `lightpage.runtime.archives.recordings.recovery.recover`.
         give_up: whether pages that storage does not give are unread, as those that are lost.
-        healings: of earlier readings of pages of this device, and for later ones; None where there are none, and the
-            last pages are tried whatever was tried before.
+        healings: outcome of healings of this device, for earlier and later readings; with None the last pages are
+            tried whatever was tried before.
 
     Attributes:
-        codec: of the pages.
+        codec: codec of the pages.
 
     Raises:
         RecordingError: another device's recording, or one of other levels or pilots.
@@ -139,7 +139,7 @@ class PageReader:
         self._next = Successor()
         self._healings, self._ends = healings or Healings(), healings is None
         self._own: Model | None = None
-        """The bundle's own model, as long as an earlier healing's is in use and has read nothing."""
+        """The bundle's own model, while an earlier healed model is in use and has read nothing."""
         if self._healings.model is None:
             self._use(decoder, tracker)
         else:
@@ -161,7 +161,7 @@ class PageReader:
         readings too.
 
         Args:
-            pages: their numbers in the recording.
+            pages: numbers of the pages in the recording.
             take: takes a page's number in the recording and its bytes, and says which volume they belong to.
             heals: whether models are healed.
 
@@ -196,14 +196,14 @@ class PageReader:
             yield from self._by_own(waiting, take) or [page for page, _ in waiting]
 
     def _tried(self, waiting: Waiting, right: int | None, take: Take) -> list[RecoveredPage]:
-        """Pages that were not read, by the model that reads some of them, or as they were if none does."""
+        """Read lost pages again by the bundle's own or a healed model; unchanged if neither reads any."""
         found = self._by_own(waiting, take) or self._healed(waiting, right, take)
         if not found:
             self._healings.failed()
         return found or [page for page, _ in waiting]
 
     def _by_own(self, waiting: Waiting, take: Take) -> list[RecoveredPage] | None:
-        """Pages that an earlier healing's model does not read, by the bundle's own; None where that reads none."""
+        """Read pages that an earlier healed model lost with the bundle's own model; None if that reads none."""
         own, self._own = self._own, None
         found = None if own is None else self._again(waiting, own, None, take)
         if found is not None:
@@ -211,7 +211,7 @@ class PageReader:
         return found
 
     def _healed(self, waiting: Waiting, right: int | None, take: Take) -> list[RecoveredPage] | None:
-        """Pages that were not read, as a model reads them that is healed by them; None where none reads any."""
+        """Heal the model by lost pages and read them again; None if that reads none."""
         note(f"{counted(len(waiting), 'page')} not read: the model is fitted to the device by them")
         try:
             healed = heal(self._decoder, self._lost(waiting, right))
@@ -229,7 +229,7 @@ class PageReader:
         return found
 
     def _again(self, waiting: Waiting, model: Model, rounds: int | None, take: Take) -> list[RecoveredPage] | None:
-        """Pages that were not read, by a model of so many rounds, which stays in use; None where it reads none."""
+        """Read lost pages with a model of so many rounds, and keep it in use; None if it reads none."""
         following, before, found = self._next, (self._decoder, self._tracker), list[RecoveredPage]()
         self._use(*model)
         decoded = self._decoded([page.page for page, _ in waiting])
@@ -275,7 +275,7 @@ class PageReader:
         """Read a page.
 
         Args:
-            index: of it in the recording.
+            index: index of it in the recording.
             result: gives it decoded, with its symbols where they are known.
             expected: the page of its volume that it should be.
             take: see `read`.

@@ -49,7 +49,7 @@ def beside(
     Args:
         work: what is done with a page.
         pages: their numbers, or whatever names them.
-        threads: that work.
+        threads: number of threads that work.
         over: is told of each page once its work is done or dropped; with one thread, when the next one is asked for.
     """
     if threads == 1:

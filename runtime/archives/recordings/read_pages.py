@@ -25,9 +25,9 @@ class ReadPages:
     """Symbols of the pages of a recording that give their bytes.
 
     Args:
-        recording: of the pages.
-        decoder: of their device.
-        code: of the pages.
+        recording: recording of the pages.
+        decoder: decoder of their device.
+        code: code of the pages.
 
     Attributes:
         symbols: uint8 [ny, nx], by the page's number in the recording.
@@ -61,9 +61,9 @@ def write_read_pages(decoder: Decoder, recording: Recording, code: Code, out: Pa
     """Read pages of user data, healing the model where need be, and write those that were read as known ones.
 
     Args:
-        decoder: of the device.
-        recording: of the pages.
-        code: of the pages.
+        decoder: decoder of the device.
+        recording: recording of the pages.
+        code: code of the pages.
         out: the new recording.
         most: pages that are enough; None for all.
 

@@ -37,14 +37,14 @@ class Recovery:
     """A file that was read back, or what is left of it.
 
     Attributes:
-        code: of the pages.
-        volume: of the file; None where no page could be read.
+        code: code of the pages.
+        volume: volume of the file; None where no page could be read.
         pages: every page of the recording.
         restored, lost: see `lightpage.codec.volume_file.Restored`.
         missing: numbers of pages of the volume that gave no bytes, parity included.
         foreign: pages of other volumes, by "id:checksum", and of "others" beyond the number that is collected.
         repeated: pages that came again.
-        user_bytes_per_page: that a page holds.
+        user_bytes_per_page: user that a page holds.
         symbols_per_page: all of them, pilots included.
         data_symbols_per_page: without pilots.
         blocks_per_page: LDPC blocks that a page holds.
@@ -159,10 +159,10 @@ def recover(
     """Read the file of one volume back; pages that storage does not give are unread, as those that are lost.
 
     Args:
-        decoder: of the device.
-        recording: of its pages, in any order.
+        decoder: decoder of the device.
+        recording: recording of its pages, in any order.
         tracker: follows the device from page to page.
-        code: of the pages.
+        code: code of the pages.
         out: the file; written whole, or not at all: what is there stays then.
         volume_id, checksum: which volume; if left out, the recording must hold only one.
         holes: write zeros where data are lost, in place of no file.

@@ -1,7 +1,6 @@
 """Drift that pages of a code survive, judged by pages that were recorded before the device drifted.
 
-A decoder whose table is traced for a geometry that is off reads them as a right one reads a device that has drifted as
-far the other way.
+A table traced for a shifted geometry stands in for a device that has drifted the other way.
 """
 
 from collections.abc import Mapping
@@ -26,15 +25,15 @@ from lightpage.runtime.recalibration.recalibration import refitted_bundle
 from lightpage.runtime.recalibration.refit import REFITTED, traced
 
 _PAGES = FEWEST_PAGES
-"""That are read again for every drift: what a drift costs is much the same for all."""
+"""Number of pages that are read again for every drift, which costs all pages much the same."""
 
 _STEPS = 6
 _NEAR = 1.05
-"""Times an amount that is read, beyond which no larger one is looked for."""
+"""Ratio of the next amount to the largest that is read, below which the search ends."""
 _AIM = 0.95
-"""Share of what a code can spare that a step aims at: one that is short of it is found to be read."""
+"""Share of the code's reserve that a step aims at, so that it stays readable."""
 _STRIDE = 8.0
-"""Times an amount, or parts of it, that one step takes at most."""
+"""Largest factor, or divisor, of one step."""
 _LEAST_COST = 1e-6
 
 
@@ -43,10 +42,10 @@ class Kind:
     """Something that drifts.
 
     Attributes:
-        told: for people.
-        unit: of an amount.
-        usual: an amount that is tried first.
-        parameters: by how much an amount of 1 moves each of a calibration.
+        told: name for people.
+        unit: unit of an amount.
+        usual: amount that is tried first.
+        parameters: change of each parameter of a calibration by an amount of 1.
     """
 
     told: str
@@ -77,12 +76,12 @@ class DriftedReading:
     """Reads the first pages of a recording as if the device had drifted.
 
     Args:
-        decoder: of the device.
-        recording: with known symbols.
+        decoder: decoder of the device.
+        recording: recording with known symbols.
 
     Attributes:
-        recording: that is read.
-        kinds: of `KINDS`, those that the decoder knows of.
+        recording: recording that is read.
+        kinds: names in `KINDS` that the decoder knows.
 
     Raises:
         BundleError: a decoder that holds its geometry itself, or has no calibration.

@@ -25,15 +25,15 @@ class Progressed:
     """Progress of one run.
 
     Attributes:
-        pages: that were read, or are lost.
-        lost: of these, those that are lost.
-        ranges: that have a result now.
+        pages: pages that were read, or are lost.
+        lost: number of these that are lost.
+        ranges: ranges that have a result now.
         failed: ranges, or recordings, without one.
         given_up: recordings that could not be opened, and are lost.
         problems: why, of the first of them.
         failures: why, of each device that is recalibrated, by its name and first recording.
         restarts: workers that died.
-        seconds: that it took.
+        seconds: time that it took.
     """
 
     pages: int = 0
@@ -113,12 +113,12 @@ def run(
     and left to the next run; all else goes on.
 
     Args:
-        ledger: of the job, which belongs to this process, or a part of it.
+        ledger: ledger of the job, which belongs to this process, or a part of it.
         job: what was asked.
         engine: makes the engine; not called where nothing is missing.
         watch: is told how it fares.
         give_up: whether pages of recordings that cannot be read in the end are lost.
-        clock: of the pauses.
+        clock: clock of the pauses.
 
     Raises:
         WorkerError: there are no workers.
@@ -200,13 +200,13 @@ def _steps(
     """Do tasks; once for every page that is behind.
 
     Args:
-        engine: does them.
-        tasks: what is wanted.
-        ledger: of the run.
-        made, watch: count what becomes of them.
+        engine: engine of the run.
+        tasks: tasks to do.
+        ledger: ledger of the run.
+        made, watch: counters of outcomes.
         later: whether a failure is added to `failed`, in place of being counted.
-        failed: takes failures that are tried again.
-        counted: takes those that are not.
+        failed: list of failures that are tried again.
+        counted: list of failures that are not.
     """
     given_up: set[tuple[str, Path]] = set()
     died = made.restarts

@@ -83,7 +83,7 @@ class Attempts:
         """Note that a worker has died; the task's outcome where it has cost too many, and else it comes again.
 
         Args:
-            attempt: that it was at.
+            attempt: attempt that it was at.
             got: how it died, for people.
         """
         if attempt.number + 1 < ATTEMPTS:

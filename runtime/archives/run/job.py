@@ -27,10 +27,10 @@ class Source(Plain):
 
     Attributes:
         device: its name in the fleet; empty without a fleet.
-        path: of the file, absolute.
+        path: path of the file, absolute.
         bundle: place of its bundle among the run's.
-        stamp: of the file when the run began; None where it could not be opened.
-        pages: that it has.
+        stamp: stamp of the file when the run began; None where it could not be opened.
+        pages: pages that it has.
         problem: why it could not be opened, or why its device lacks what it needs; None where all is there.
         run: folder of the training run that its device's bundle was made from, where the fleet names it.
         given_up: whether it is lost for its problem, and not tried again.
@@ -50,7 +50,7 @@ class Job(Plain):
     """The question of a run.
 
     Attributes:
-        format, version: of this file.
+        format, version: format and version of this file.
         choices: how.
         bundles: what to decode with.
         sources: what to decode.
@@ -91,7 +91,7 @@ class Job(Plain):
             raise InvalidInputError(f"job {path}", error, expected) from None
 
     def with_bundles_of(self, asked: Job) -> Job:
-        """The same; bundles that could not be read before, or lie elsewhere now, are taken from the same question."""
+        """Return the job with bundles that could not be read before, or lie elsewhere now, from the same question."""
         now = {(source.device, source.path): asked.bundles[source.bundle] for source in asked.sources}
         places: dict[NamedBundle, int] = {}
         sources = []
@@ -104,7 +104,7 @@ class Job(Plain):
         return self.model_copy(update={"bundles": tuple(places), "sources": tuple(sources)})
 
     def looked_at_again(self, *, given_up: bool = False) -> Job:
-        """The same; recordings and bundles that could not be opened before are tried once more.
+        """Return the job after trying again recordings and bundles that could not be opened before.
 
         Args:
             given_up: whether recordings that were given up are tried too.
@@ -127,10 +127,10 @@ class Job(Plain):
         return any(problem is not None and problem.passes for problem in tried)
 
     def unopened_given_up(self, places: Iterable[int]) -> Job:
-        """The same; recordings that could not be opened are given up, unless it is their bundle that is lacking.
+        """Return the job without recordings that could not be opened, unless only their bundle is lacking.
 
         Args:
-            places: of the recordings that are meant.
+            places: places of the recordings that are meant.
         """
         sources = list(self.sources)
         for place in places:
@@ -208,7 +208,7 @@ def bundle_as_it_is(path: Path, known: Mapping[Path, NamedBundle] | None = None)
     """A bundle of a fleet, without SHA-256 and version where it cannot be read, and why.
 
     Args:
-        path: of it, absolute.
+        path: path of the bundle, absolute.
         known: bundles as they were before; one whose file is as it was is not read again.
     """
     try:

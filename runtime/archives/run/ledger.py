@@ -38,7 +38,7 @@ class Part(Plain):
     """Every `count`th recording from `index`; of a fleet, every `count`th device with all its recordings.
 
     Attributes:
-        index: from 0.
+        index: index from 0.
         count: how many parts there are.
     """
 
@@ -78,9 +78,9 @@ class Ledger:
     """The folder of a run; in a `with` statement it belongs to this process, or a part of its recordings does.
 
     Args:
-        folder: of the run, there or yet to be made.
-        part: what this process does of it.
-        clock: by which another part is waited for.
+        folder: folder of the run, there or yet to be made.
+        part: part of the run that this process does.
+        clock: clock that bounds the wait for another part.
 
     Attributes:
         doubted: paths of shards whose ranges are read again; until then they count as having no result.
@@ -164,7 +164,7 @@ class Ledger:
         Args:
             source: place of the recording among the run's.
             first: the range's first page.
-            number: of the round, 0 for the first reading.
+            number: number of the round, 0 for the first reading.
         """
         again = f"{_AGAIN}{number}" if number else ""
         return self.folder / _SHARDS / f"{source:06d}" / f"{first:08d}{again}"
@@ -191,8 +191,8 @@ class Ledger:
         """Pages that were not read well before a round, and have no result in it, range by range.
 
         Args:
-            job: with that round.
-            number: of the round, from 1.
+            job: job with that round.
+            number: number of the round, from 1.
 
         Raises:
             InvalidInputError: a shard that cannot be read.

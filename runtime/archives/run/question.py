@@ -31,12 +31,12 @@ def asked_job(
     """Return what is asked; that of the folder, where it is the same question or none.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         before: what it was asked before; None for nothing.
         choices: how.
         recordings, fleet, bundle: what is named now; empty or None for nothing.
         retry_lost: whether recordings that were given up are tried again.
-        clock: of the pauses before what could not be opened is tried again.
+        clock: clock of the pauses before what could not be opened is tried again.
 
     Raises:
         InvalidInputError: neither asked now nor before, or something else before.
@@ -83,7 +83,7 @@ def found_recordings(patterns: Sequence[str], folder: Path | None = None) -> lis
 
     Args:
         patterns: names, or patterns of `glob`; ``~`` is the home folder where nothing has that name.
-        folder: that they are relative to; by default the working folder.
+        folder: folder that they are relative to; by default the working folder.
 
     Raises:
         InvalidInputError: a pattern that names none, or a name that is not UTF-8.
@@ -106,7 +106,7 @@ def of_recordings(choices: Choices, patterns: Sequence[str], bundle: str, before
 
     Args:
         choices: how.
-        patterns: of the recordings' names.
+        patterns: patterns of the recordings' names.
         bundle: a path, or the name of a shipped one.
         before: what the folder was asked before; recordings that are in it are not opened.
 
@@ -136,7 +136,7 @@ def of_fleet(choices: Choices, path: Path, before: Job | None) -> Job:
 
     Args:
         choices, before: see `of_recordings`.
-        path: of the file.
+        path: path of the file.
 
     Raises:
         InvalidInputError: the file cannot be read, or two devices have one name.

@@ -47,7 +47,7 @@ class PageRecord(Plain):
         reason: the same for people.
         recalibration_due: whether it shows that the device has changed.
         confirmed_bits: information a symbol that its pilots confirm; None where that is not told.
-        figures: what else the operation says of it.
+        figures: further figures of the page, by operation.
     """
 
     page: int
@@ -75,8 +75,8 @@ class Findings(Plain):
 
     Attributes:
         pages: one each, in order.
-        confidence_bins: of an evaluation, see `lightpage.metrics.accumulator`.
-        summary: of a recalibration, what `lightpage recalibrate --json` says; else empty.
+        confidence_bins: bins of confidence of an evaluation, see `lightpage.metrics.accumulator`.
+        summary: summary of a recalibration, as `lightpage recalibrate --json` has it; else empty.
     """
 
     pages: tuple[PageRecord, ...]
@@ -99,10 +99,10 @@ class ShardRecord(Findings):
 
     Attributes:
         model: what read the pages.
-        seconds: that it took.
+        seconds: time that it took.
         finished_s: when it was done, seconds since 1970 by the worker's clock.
         worker: who did it, host and process.
-        read_bytes: of frames, as they lie in the recording.
+        read_bytes: bytes read of frames, as they lie in the recording.
     """
 
     model: NamedBundle

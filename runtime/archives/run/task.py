@@ -46,7 +46,7 @@ class Problem(Plain):
         return cls(subject=error.subject, got=error.got, expected=error.expected, passes=may_pass(error))
 
     def about(self, device: str) -> Problem:
-        """The same, and of which device of a fleet it is; itself without a fleet."""
+        """Return the problem with the name of its device in a fleet; itself without a fleet."""
         return self.model_copy(update={"subject": f"device {device}: {self.subject}"}) if device else self
 
     def __str__(self) -> str:
@@ -74,10 +74,10 @@ class NamedBundle(Plain):
     """A bundle, and how to know it again.
 
     Attributes:
-        path: where it lies.
-        sha256: see `bundle_sha256`; empty of one that could not be read when the run began.
-        version: of its manifest; likewise.
-        stamp: of the file that was read; None of one that could not be.
+        path: path of the bundle.
+        sha256: hash by `bundle_sha256`; empty if it could not be read when the run began.
+        version: version in its manifest; empty likewise.
+        stamp: stamp of the file that was read; None if it could not be.
     """
 
     path: Path
@@ -97,10 +97,10 @@ class FineTuning(Plain):
     """Settings of fine-tuning a device's network, once its geometry is found.
 
     Attributes:
-        steps: of the optimiser.
-        learning_rate: at its peak.
-        synthetic_pages: trained on beside the known ones.
-        seed: of batches and rotations.
+        steps: number of steps of the optimiser.
+        learning_rate: peak of the learning rate.
+        synthetic_pages: number of simulated pages beside the known ones.
+        seed: seed of batches and rotations.
     """
 
     steps: int = 600
@@ -110,8 +110,8 @@ class FineTuning(Plain):
 
 
 RANGE_PAGES = 32
-"""Of a range, unless told otherwise: what a worker that dies costs at most, and often enough that its first page, whose
-image is looked for, costs little."""
+"""Default number of pages of a range: few enough that a worker that dies costs little, and so many that the search for
+the image on the first page does."""
 
 KNOWN_PAGES = 2
 """Pages that a device is recalibrated with, unless told otherwise."""
@@ -121,18 +121,18 @@ class Choices(Plain):
     """Choices beside recordings and bundles.
 
     Attributes:
-        operation: what is done.
+        operation: operation on each page or device.
         range_pages: pages of a range.
         tracking: whether the image is followed within a range.
         symbols: whether decoding keeps symbols and confidences.
         heals: whether the model is re-fitted by pages whose user bytes it does not read.
-        code: of the pages whose user bytes are read; None for each recording's, or else its bundle's.
-        provider: what pages are computed with.
-        batches: pages that are computed together at most.
-        code_threads: that share the code of a page, where it is compiled.
-        known_pages: that a device is recalibrated with; None for `KNOWN_PAGES`, or all of them with `fine_tuning`.
-        fine_tuning: how devices are trained on after the fit of their geometry; None to fit the geometry alone.
-        parts: that processes do independently of each other.
+        code: code of the pages whose user bytes are read; None for each recording's, or else its bundle's.
+        provider: provider that computes pages.
+        batches: largest number of pages that are computed together.
+        code_threads: number of threads that share the code of a page, where it is compiled.
+        known_pages: number of pages that recalibrate a device; None for `KNOWN_PAGES`, or all with `fine_tuning`.
+        fine_tuning: settings of training after the fit of the geometry; None to fit the geometry alone.
+        parts: number of parts that processes do independently of each other.
     """
 
     operation: Operation
@@ -164,7 +164,7 @@ class Task(Plain):
         pages: their numbers; to recalibrate, as many known pages as are wanted.
         bundle: what to decode with.
         shard: path of the result, without the end of its name.
-        run: of a device that is recalibrated deeply: folder of the training run that its bundle was made from.
+        run: folder of the training run of a device that is recalibrated deeply.
         give_up: whether pages that storage does not give are lost, in place of the range having no result.
     """
 
@@ -225,8 +225,8 @@ class Done(Plain):
         task: what was asked.
         lost: pages that are lost, by cause.
         left_out: pages that the bundle was made from.
-        seconds: that it took the worker.
-        read_bytes: of frames, as they lie in the recording.
+        seconds: time that it took the worker.
+        read_bytes: bytes read of frames, as they lie in the recording.
     """
 
     task: Task

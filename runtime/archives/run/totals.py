@@ -79,11 +79,11 @@ class Counts:
     Attributes:
         pages: all of them; of a fleet that is recalibrated, its devices.
         read, left_out: how many were.
-        lost: by cause.
+        lost: lost pages by cause.
         healed: read, by a model that was healed.
         recalibration_due: read, and show that the device has changed.
         models: pages by the version of what read them.
-        figures: of those that were read.
+        figures: figures of those that were read.
     """
 
     pages: int = 0
@@ -133,10 +133,10 @@ class Round:
 
     Attributes:
         model: what read.
-        pages: that were read again.
-        pages_won: that were lost before, and are read now.
-        pages_better: that were read before, and are read better now.
-        pages_lost_still: that are lost still.
+        pages: pages that were read again.
+        pages_won: number of pages that were lost before, and are read now.
+        pages_better: number of pages that were read before, and are read better now.
+        pages_lost_still: number of pages that are lost still.
         air_before, air_after: mean AIR of all of them where it is known, a lost page counting nothing.
     """
 
@@ -172,10 +172,10 @@ class Reading:
 
     Attributes:
         finished_s: when, seconds since 1970.
-        seconds: that it took.
+        seconds: time that it took.
         pages: how many, or one device.
         worker: who did it.
-        read_bytes: of frames, as they lie in the recording.
+        read_bytes: bytes read of frames, as they lie in the recording.
     """
 
     finished_s: float
@@ -195,7 +195,7 @@ class Group(Counts):
     """Findings of a device, or of a recording where there is no fleet.
 
     Attributes:
-        recordings: that it has.
+        recordings: recordings that it has.
         told: the first problem that anything of it had, for people; empty without one.
     """
 
@@ -208,13 +208,13 @@ class Totals(Counts):
     """Findings of a run.
 
     Attributes:
-        confidence_bins: of all pages of an evaluation together.
+        confidence_bins: bins of confidence of all pages of an evaluation together.
         rounds: what later readings have brought.
         recordings: a row each, unless devices are recalibrated.
         devices: a row each, where they are.
         told: the first lost pages, or devices, and why.
         examples: the first one of each cause.
-        groups: by device, unless devices are recalibrated; by recording where there is no fleet.
+        groups: groups by device, unless devices are recalibrated; by recording where there is no fleet.
         readings: all ranges that were done, a few numbers each.
     """
 
@@ -251,7 +251,7 @@ def totals(ledger: Ledger, job: Job, failures: Mapping[tuple[str, Path], Problem
     """Add up what the shards of a job say, or of the ledger's part of it; a shard is read at a time.
 
     Args:
-        ledger: of the job.
+        ledger: ledger of the job.
         job: what was asked.
         failures: why devices have no result, see `lightpage.runtime.archives.run.driver.Progressed`.
 

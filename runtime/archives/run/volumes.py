@@ -22,10 +22,10 @@ FOLDER, TOLD, HOLES = "files", "files.json", ".holes"
 
 @dataclass(frozen=True)
 class Wanted:
-    """Which files are made.
+    """Choice of the files to make.
 
     Attributes:
-        volume_id, checksum: of one volume alone; None for any.
+        volume_id, checksum: number and checksum of one volume alone; None for any.
         holes: whether a file is made too where data are lost, with zeros in their place and `HOLES` behind its name.
     """
 

@@ -46,8 +46,8 @@ def recalibrated(
 
     Args:
         task: which device.
-        recording: with its known pages, or pages of user data.
-        decoder: of its bundle.
+        recording: recording with its known pages, or pages of user data.
+        decoder: decoder of its bundle.
         fit, deep, tell: see `lightpage.runtime.archives.workers.work.Worker`.
 
     Raises:
@@ -92,9 +92,9 @@ class StepLog:
     """Tells of steps in lines; see `lightpage.progress.Reporter`.
 
     Args:
-        path: of the log, which is gone on with.
+        path: path of the log, which is gone on with.
         tell: called with each line.
-        clock: by which lines are told now and then.
+        clock: clock by which lines are told now and then.
     """
 
     def __init__(self, path: Path, tell: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> None:

@@ -13,9 +13,9 @@ def engine_of(name: str, address: str | None, workers: int | None, threads: int 
 
     Args:
         name: `LOCAL` or `RAY`.
-        address: of a cluster of Ray; None to start one here.
+        address: address of a cluster of Ray; None to start one here.
         workers, threads: how many, and of each one's inferences; None for what the machine, or cluster, suffices for.
-        provider: of the workers.
+        provider: provider of the workers.
 
     Raises:
         ProviderError: there is no such provider here.

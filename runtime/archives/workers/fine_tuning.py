@@ -25,9 +25,9 @@ class DeepRecalibration(Protocol):
         """Check that a device has what it needs, without looking at its pages.
 
         Args:
-            bundle: in service.
+            bundle: bundle in service.
             run: folder of the training run that it was made from; None where it is not named.
-            pages: with known symbols.
+            pages: pages with known symbols.
 
         Raises:
             LightpageError: it has not.
@@ -47,8 +47,8 @@ class DeepRecalibration(Protocol):
         """Recalibrate a device, or go on with it, and write a new bundle to `out` if it is not worse.
 
         Args:
-            decoder: of the bundle in service.
-            recording: with known symbols.
+            decoder: decoder of the bundle in service.
+            recording: recording with known symbols.
             run: folder of the training run that the bundle was made from.
             folder: where the work is kept; what is finished in it is not done again.
             out: a new path.

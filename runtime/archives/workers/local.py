@@ -31,7 +31,7 @@ class LocalEngine:
 
     Attributes:
         workers: how many.
-        threads: of each one's inferences.
+        threads: number of threads of each one's inferences.
         start: starts one with so many threads.
     """
 

@@ -33,11 +33,11 @@ class PageRange:
     """A range of pages for a worker to read.
 
     Attributes:
-        task: which pages, and what is done with them.
-        recording: of the pages.
-        decoder: of the task's bundle.
-        tracker: of that, which has learnt nothing yet.
-        healings: of earlier ranges of the device.
+        task: pages, and operation on them.
+        recording: recording of the pages.
+        decoder: decoder of the task's bundle.
+        tracker: tracker of that decoder, at its start.
+        healings: healings of earlier ranges of the device.
     """
 
     task: Task

@@ -43,12 +43,12 @@ class RayEngine:
     node.
 
     Args:
-        address: of a cluster, `auto` for one that runs on this machine; None to start one here, for this run.
+        address: address of a cluster, `auto` for one that runs on this machine; None to start one here, for this run.
         workers: most ranges at once; by default as many as the cluster's CPUs allow at any time.
         threads: CPUs of a worker, and threads of its inferences; by default `THREADS_OF_WORKER`, or what a node has.
         work: what a worker does with a task and so many threads.
-        gpus: of a worker, 0 or 1: Ray shows it that one alone.
-        clock: by which a worker is too late.
+        gpus: number of GPUs of a worker, 0 or 1: Ray shows it that one alone.
+        clock: clock by which a worker is too late.
     """
 
     def __init__(

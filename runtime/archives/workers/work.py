@@ -34,7 +34,7 @@ class Worker:
     """Reads ranges one after the other; the decoder of the last one's bundle stays warm.
 
     Args:
-        threads: of an inference.
+        threads: number of threads of an inference.
         fit: how a device is re-fitted.
         deep: gives what recalibrates deeply.
 

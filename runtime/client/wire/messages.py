@@ -81,7 +81,7 @@ def answer_of(kind: Callable[..., D], *messages: Message, shape: tuple[int, int]
 
     Args:
         kind: the dataclass; its annotations say what becomes of a field.
-        messages: with its fields. A field of the dataclass that is in none has its default.
+        messages: messages with its fields. A field of the dataclass that is in none has its default.
         shape: (rows, columns) of the arrays in them.
         given: fields.
 

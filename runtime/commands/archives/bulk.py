@@ -53,7 +53,7 @@ def bulk() -> None:
 
 def _tuning(name: str, kind: click.ParamType[Any], what: str) -> Decorator:
     """Return an option of `FineTuning`."""
-    told = f"With --deep: {what}; {getattr(FineTuning(), name):g} by default."
+    told = f"{what}, with --deep; {getattr(FineTuning(), name):g} by default."
     return click.option(f"--{name.replace('_', '-')}", type=kind, help=told)
 
 
@@ -73,7 +73,7 @@ _options = _together(
     PROVIDER,
     BATCHES,
     click.option("--workers", type=click.IntRange(1), help="Number of workers; by default one for every two cores."),
-    click.option("--address", help="With --engine ray: address of the cluster, `auto` for the one here."),
+    click.option("--address", help="Address of the Ray cluster, with --engine ray; `auto` for the one here."),
     click.option("--engine", type=click.Choice([LOCAL, RAY]), default=LOCAL, show_default=True, help="Runs workers."),
     click.option("--bundle", help=f"A bundle's path, or the name of a shipped one; {DEFAULT} by default."),
     click.option("--fleet", type=_FILE, help="TOML file of devices: name, bundle, recordings."),
@@ -107,7 +107,7 @@ def decode(**asked: Any) -> None:
 @click.option("--code", "code_path", type=_FILE, help="Code; by default the recordings' or the bundles'.")
 @click.option("--heal/--no-heal", "heals", default=None, help="Re-fit by pages that are not read; the default.")
 @click.option("--volume", metavar="ID[:CHECKSUM]", help="Write the file of this volume alone.")
-@click.option("--holes", is_flag=True, help="Where data are lost, write FILE.holes with zeros in their place.")
+@click.option("--holes", is_flag=True, help="Write FILE.holes, with zeros in place of lost data.")
 def recover(code_path: Path | None, volume: str | None, holes: bool, **asked: Any) -> None:
     """Read files back. Pages of a file may be in several recordings."""
     code = None if code_path is None else load_code(code_path)
@@ -126,10 +126,10 @@ def evaluate(**asked: Any) -> None:
 @_options
 @click.option("--pages", type=click.IntRange(2), help=f"Known pages to use; {KNOWN_PAGES} by default, all with --deep.")
 @click.option("--deep", is_flag=True, help="Train the network on, too, from the run that the fleet names; needs torch.")
-@_tuning("steps", click.IntRange(10), "steps of the optimiser, of a second pass a quarter")
-@_tuning("learning_rate", FiniteRange(0, min_open=True), "peak learning rate of a one-cycle schedule")
-@_tuning("synthetic_pages", click.IntRange(0), "pages to simulate after drifts, trained on too")
-@_tuning("seed", click.IntRange(0), "seed of batches and rotations")
+@_tuning("steps", click.IntRange(10), "Steps of the optimiser; a second pass takes a quarter")
+@_tuning("learning_rate", FiniteRange(0, min_open=True), "Peak learning rate of a one-cycle schedule")
+@_tuning("synthetic_pages", click.IntRange(0), "Pages to simulate after drifts, trained on too")
+@_tuning("seed", click.IntRange(0), "Seed of batches and rotations")
 def recalibrate(pages: int | None, deep: bool, fleet: Path | None, **asked: Any) -> None:
     """Recalibrate devices. Each has recordings of its own; the new bundles are in OUT."""
     given = {name: value for name in FineTuning.model_fields if (value := asked.pop(name)) is not None}

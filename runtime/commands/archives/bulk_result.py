@@ -25,7 +25,7 @@ class Result:
         part: what this process does of it.
         made: what it has done now.
         found: what there is of the part.
-        files: of a recovery of the whole.
+        files: files of a recovery of the whole.
     """
 
     job: Job

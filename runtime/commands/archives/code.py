@@ -35,7 +35,7 @@ _UNITS = ", ".join(f"{name} ({kind.unit})" for name, kind in KINDS.items())
 )
 @click.option("--out", type=OutputFile(), help="Write the code to this TOML file.")
 @click.option("--out-bundle", type=NewPath(), help="Write the bundle with this code in it: a folder, or a .zip.")
-@click.option("--version", help="Of that bundle.")
+@click.option("--version", help="Version of the new bundle.")
 @click.option(
     "--headroom",
     type=click.FloatRange(0, 0.5),

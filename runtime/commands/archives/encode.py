@@ -73,9 +73,9 @@ def _opened(file: Path) -> BinaryIO:
 
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
-@click.option("--bundle", help="A bundle of the device: its path, or the name of a shipped one.")
-@click.option("--profile", "profile_name", metavar="P", help="Or its nominal profile: a shipped name or a file.")
-@click.option("--code", "code_path", type=click.Path(path_type=Path), help="Its pages' code; the bundle's by default.")
+@click.option("--bundle", help="Bundle of the device: its path, or the name of a shipped one.")
+@click.option("--profile", "profile_name", metavar="P", help="Profile in its place: a shipped name or a file.")
+@click.option("--code", "code_path", type=click.Path(path_type=Path), help="Code of pages; the bundle's by default.")
 @click.option("--out", required=True, type=OutputFile(), help="The pages to write, PAGES.h5.")
 @click.option("--volume", "volume_id", type=int, help="Number that tells files on a medium apart; random if left out.")
 @click.option("--data-pages", default=DATA_PAGES, show_default=True, help="Data pages of a group.")

@@ -33,7 +33,7 @@ _SHOT_S = 30.0
 
 @click.command()
 @click.option("--source", "spec", required=True, help="camera:CONFIG.toml, simulator:PROFILE or recording:FILE.")
-@click.option("--pages", type=click.IntRange(1), help="How many; by default all that --symbols holds.")
+@click.option("--pages", type=click.IntRange(1), help="Number of pages; by default all that --symbols holds.")
 @click.option("--symbols", type=click.Path(path_type=Path), help="Pages to show, PAGES.h5, as `encode` makes them.")
 @click.option("--profile", "profile_name", metavar="P", help="Nominal device, where the source does not know it.")
 @click.option("--out", required=True, type=OutputFile(), help="The recording, R.h5.")

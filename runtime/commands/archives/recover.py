@@ -26,7 +26,7 @@ from lightpage.words import counted
 @click.option("--recording", required=True, type=click.Path(), help="HDF5 recording of the file's pages.")
 @click.option("--code", "code_path", type=click.Path(path_type=Path), help="Code; the recording's or the bundle's.")
 @click.option("--out", required=True, type=OutputFile(), help="The file.")
-@click.option("--volume", metavar="ID[:CHECKSUM]", help="Which volume, where the recording holds several.")
+@click.option("--volume", metavar="ID[:CHECKSUM]", help="Volume to read, where the recording holds several.")
 @click.option("--holes", is_flag=True, help="Write zeros where data are lost, in place of no file.")
 @click.option("--give-up", is_flag=True, help="Take pages that storage does not give for lost.")
 @click.option(
@@ -108,7 +108,7 @@ def _volume(result: Recovery) -> str:
 
 
 def _healed(result: Recovery) -> str:
-    """Which pages a re-fitted model has read."""
+    """Return the pages that a re-fitted model has read."""
     if not result.healed:
         return "none"
     most = max(page.healed_rounds or 0 for page in result.healed)

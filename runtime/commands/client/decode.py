@@ -43,7 +43,7 @@ _FIGURES = (
 @with_tls
 @click.option("--recording", type=click.Path(), help="Send the pages of this recording.")
 @click.option("--source", is_flag=True, help="Have the service read pages from its own source.")
-@click.option("--pages", type=click.IntRange(1), help="How many pages; all of a recording, or one of the source.")
+@click.option("--pages", type=click.IntRange(1), help="Page count; all of a recording, or one of the source.")
 @click.option("--levels", type=click.IntRange(2, 256), help="Level count; that of the recording or source by default.")
 @click.option("--out", type=OutputFile(), help="Write symbols and confidences to this HDF5 file.")
 @click.option("--force", is_flag=True, help="Overwrite a file that exists.")

@@ -30,7 +30,7 @@ from lightpage.runtime.commands.client.recalibrate import summary, table, watche
     default=RECALIBRATION_S,
     show_default=True,
     type=FiniteRange(0, min_open=True),
-    help="With --watch: seconds to wait for the end; the job goes on after them.",
+    help="Seconds that --watch waits for the end; the job goes on after them.",
 )
 @JSON
 def jobs(

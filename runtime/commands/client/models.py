@@ -13,7 +13,7 @@ from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.client.wire.channel import TlsFiles
 from lightpage.runtime.commands.client.connection import TARGET, with_tls
 
-_EXPECT = click.option("--expect", metavar="VERSION", default="", help="Only if this version is in service.")
+_EXPECT = click.option("--expect", metavar="VERSION", default="", help="Refuse unless this version is in service.")
 _VERSION = click.argument("version")
 
 
@@ -30,7 +30,7 @@ def models(ctx: click.Context, target: str, tls: TlsFiles | None, json_path: Pat
 
 
 @models.command("list")
-@click.option("--stored", is_flag=True, help="Those of the store too.")
+@click.option("--stored", is_flag=True, help="List the models of the store too.")
 @JSON
 @click.pass_obj
 def list_models(client: LightpageClient, json_path: Path | None, stored: bool = False) -> None:

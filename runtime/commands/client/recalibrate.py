@@ -37,12 +37,12 @@ DEFAULT_PAGES = 2
 
 
 @click.command()
-@click.option("--bundle", help="Offline: the bundle to start from, a path or a shipped name.")
+@click.option("--bundle", help="Bundle to start from, offline: a path or a shipped name.")
 @click.option(
     "--recording",
     help="Pages with known symbols: a file, or with --target and without --send a name in the service's folder.",
 )
-@click.option("--out", type=NewPath(), help="Offline: where the new bundle goes; a zip where it ends in .zip.")
+@click.option("--out", type=NewPath(), help="New bundle, offline: a folder, or a .zip.")
 @target_option(required=False, help="Recalibrate this running service instead of a bundle.")
 @with_tls
 @click.option(
@@ -57,11 +57,11 @@ DEFAULT_PAGES = 2
     "timeout_s",
     type=FiniteRange(0, min_open=True),
     show_default=f"{RECALIBRATION_S:.0f}",
-    help="With --target: seconds to wait for the result.",
+    help="Seconds to wait for the result, with --target.",
 )
-@click.option("--version", help="Offline: version of the new bundle; by default the next one.")
-@click.option("--send", is_flag=True, help="With --target: --recording is a file here, whose frames are sent.")
-@click.option("--detach", is_flag=True, help="With --target: print the job's id and leave it to itself.")
+@click.option("--version", help="Version of the new bundle, offline; by default the next one.")
+@click.option("--send", is_flag=True, help="Send the frames of --recording, a file here, to --target.")
+@click.option("--detach", is_flag=True, help="Print the job's id and return, with --target.")
 @click.option(
     "--other-device",
     is_flag=True,
@@ -219,7 +219,7 @@ def _offline(
 @click.command()
 @TARGET
 @with_tls
-@click.option("--expect", metavar="VERSION", default="", help="Only if this version is in service.")
+@click.option("--expect", metavar="VERSION", default="", help="Refuse unless this version is in service.")
 @JSON
 def rollback(target: str, tls: TlsFiles | None, expect: str, json_path: Path | None) -> None:
     """Put a service's previous model back in service; `lightpage models forward` undoes it."""

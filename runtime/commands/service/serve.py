@@ -68,9 +68,8 @@ def _option(name: str, key: str, setting: dict[str, Any]) -> Callable[[_Command]
     elif "format" in value:
         kind = click.Path(file_okay=value["format"] == "path", path_type=Path)
     shown, unset = str(default) if default else None, () if multiple else None
-    return click.option(
-        name, type=kind, multiple=multiple, default=unset, show_default=shown, help=setting["description"]
-    )
+    told = setting["description"] + " May be given repeatedly." * multiple
+    return click.option(name, type=kind, multiple=multiple, default=unset, show_default=shown, help=told)
 
 
 def _settings_options(command: _Command) -> _Command:

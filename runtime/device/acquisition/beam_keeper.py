@@ -21,10 +21,10 @@ class BeamKeeper:
     Beams that could not be opened are tried again by a thread until they are open, except those that a person moves.
 
     Args:
-        beams: of the source.
+        beams: beams of the source.
         lock: held while they are moved or in use; its owner may take it again.
-        name: of the source, for the log.
-        clock: by which it waits between two attempts.
+        name: name of the source, for the log.
+        clock: clock by which it waits between two attempts.
     """
 
     def __init__(self, beams: Beams, lock: AbstractContextManager[object], name: str, clock: Clock = SYSTEM) -> None:

@@ -18,8 +18,8 @@ from lightpage.runtime.device.modulator.screen.raster import ScreenSettings
 from lightpage.runtime.device.modulator.shutters import Shutter
 from lightpage.runtime.device.trigger.pulse_generator import PulseGeneratorSettings
 
-KEYS = "reference/camera-keys.md of the documentation"
-"""Page that lists the keys."""
+KEYS = "reference/camera-keys, a page of the site that `make site` builds"
+"""Page that lists the keys, in words of an error."""
 
 
 class CameraTable(View, CameraSettings):
@@ -41,7 +41,7 @@ class PluginTable(StrictTable):
 
 
 class PluginCameraTable(View, PluginTable):
-    """Camera by such a driver, and how it sees the image."""
+    """A camera by a driver of another package, and its view of the image."""
 
 
 def _kind_of_camera(table: object) -> object:
@@ -151,9 +151,9 @@ class DeviceTable(StrictTable):
     ] = OperatorTable()
     """Shutters of both beams, for dark and reference frames."""
     pairing: PairingSettings = PairingSettings()
-    """How frames of one shot are told from others."""
+    """Tolerances that tell frames of one shot from others."""
     exposures: Exposures = Exposures()
-    """How many frames are taken."""
+    """Numbers and times of exposures."""
 
     @model_validator(mode="after")
     def _two_cameras(self) -> Self:
@@ -200,4 +200,4 @@ def _told(subject: str, problems: list[Problem]) -> InvalidInputError:
         return InvalidInputError(f"{subject}: {place}" if place else subject, got, f"{expected} ({KEYS})")
     parts = (problem.parted() for problem in problems)
     told = (f"{place}: {got} (wanted {expected})".removeprefix(": ") for place, got, expected in parts)
-    return InvalidInputError(subject, f"{len(problems)} mistakes: {'; '.join(told)}", f"what {KEYS}, says")
+    return InvalidInputError(subject, f"{len(problems)} mistakes: {'; '.join(told)}", f"what {KEYS}, lists")

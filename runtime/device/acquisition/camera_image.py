@@ -32,7 +32,7 @@ class CameraImage:
     """Turns a camera's frames upright, and mends what is known of their counts.
 
     Args:
-        camera: whose frames.
+        camera: camera of the frames.
         view: how it sees the image.
 
     Attributes:

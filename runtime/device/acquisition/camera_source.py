@@ -72,8 +72,8 @@ class CameraSource(FrameSource):
         pairing: how strictly frames are told apart.
         exposures: how they are taken.
         views: how each camera sees the image.
-        name: for people.
-        clock: by which it waits; that of the trigger.
+        name: name for people.
+        clock: clock by which it waits; that of the trigger.
 
     Raises:
         SourceError: the cameras' bit depths differ.

@@ -24,7 +24,7 @@ class PageStore:
 
     Attributes:
         levels: M of all pages; None before it is known.
-        most_bytes: of uploaded pages; more are refused.
+        most_bytes: largest size of uploaded pages; more are refused.
 
     Raises:
         RecordingError: pages for another profile.

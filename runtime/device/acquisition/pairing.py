@@ -89,7 +89,7 @@ class _Channel:
 
     Attributes:
         last_id: number of its last frame, None where it is not known.
-        step: by which its numbers grow from shot to shot, None where it is not known.
+        step: step by which its numbers grow from shot to shot, None where it is not known.
         reference_s: device time less trigger time of a good shot, None before a synchronisation.
         opened: how often the camera was opened when that was learnt.
         came: frames so far, whole or not.
@@ -122,7 +122,7 @@ class Pairing:
         cameras: in-phase and quadrature, armed.
         trigger: armed.
         settings: how strict.
-        clock: by which it waits, and `trigger` tells the time of its shots.
+        clock: clock by which it waits, and `trigger` tells the time of its shots.
     """
 
     cameras: Sequence[Camera]
@@ -203,7 +203,7 @@ class Pairing:
         return frames
 
     def _check_times(self, offsets_s: tuple[float, ...]) -> None:
-        """Rule 4; the references follow where it holds."""
+        """Check both frames' times against the trigger (rule 4), and update the reference times."""
         deviations = [offset - (one.reference_s or 0.0) for one, offset in zip(self._channels, offsets_s, strict=True)]
         if max(map(abs, deviations)) > self.settings.tolerance_s:
             told = ", ".join(

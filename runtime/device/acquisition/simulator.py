@@ -25,7 +25,7 @@ class SimulatorSource(FrameSource):
         device: true state.
         levels: M of random pages.
         seed: it and the number fix a random page's symbols.
-        name: for people.
+        name: name for people.
         written: pages that the modulator shows in place of random ones; their level count holds.
 
     Raises:

@@ -43,7 +43,7 @@ class Shot:
         page_index: which page.
         symbols: what was written, uint8 [ny, nx], or None where nobody knows.
         pilot_mask: where the pilots are, bool [ny, nx], or None for the device's usual positions.
-        infos: of the in-phase and the quadrature frame, or None where there were no cameras.
+        infos: information of the in-phase and the quadrature frame, or None where there were no cameras.
     """
 
     pair: FramePair
@@ -60,7 +60,7 @@ class FrameSource(ABC):
     else it can do.
 
     Attributes:
-        name: for people, e.g. ``recording:R.h5``.
+        name: name for people, e.g. ``recording:R.h5``.
         levels: level count of its pages.
         bit_depth: bits of a camera count.
         frame_shape: (rows, columns) of its frames.
@@ -68,7 +68,7 @@ class FrameSource(ABC):
         page_shape: (rows, columns) of its pages where it knows them, else None.
         profile: nominal device, where it knows it.
         pages: what its modulator shows, where it has one that shows what it is given.
-        modulator, beams: of a device that has them.
+        modulator, beams: modulator and beams of a device that has them.
         operator: is asked to do by hand what the device cannot; returns once that is done.
         on_lost: is told of every lost shot and its page's number, of those too that a further shot made good.
     """

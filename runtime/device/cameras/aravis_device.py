@@ -40,14 +40,14 @@ class AravisConnection:
 
     Args:
         settings: which camera.
-        name: of the camera, for errors.
+        name: name of the camera, for errors.
         known: whether it was open before. If one with an address is gone, then nobody looks for what else is there.
 
     Attributes:
-        handle: of the ArvCamera.
+        handle: handle of the ArvCamera.
         is_gige: whether it is a GigE camera.
         serial: its number.
-        address: of a GigE camera, else empty.
+        address: address of a GigE camera, else empty.
 
     Raises:
         SourceError: no library, no such camera, or another program controls it.

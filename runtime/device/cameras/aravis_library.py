@@ -109,8 +109,8 @@ class AravisError(Exception):
 
     Attributes:
         domain: which part of the library.
-        code: of the error in its domain.
-        message: for people.
+        code: code of the error in its domain.
+        message: message for people.
     """
 
     def __init__(self, domain: str, code: int, message: str) -> None:
@@ -122,7 +122,7 @@ class AravisLibrary:
     """The library, loaded. Functions are called by their names in C; those that report an error raise it.
 
     Args:
-        path: of libaravis.
+        path: path of libaravis.
 
     Raises:
         SourceError: it is missing, or is another version.

@@ -83,7 +83,7 @@ class DrivenCamera:
     Args:
         settings: which camera, and how it is set up.
         frame_shape: (rows, columns) of the region that is read.
-        role: for people, e.g. ``in-phase camera``.
+        role: role for people, e.g. ``in-phase camera``.
     """
 
     def __init__(self, settings: CameraSettings, frame_shape: tuple[int, int], role: str = "camera") -> None:

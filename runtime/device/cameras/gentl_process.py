@@ -119,7 +119,7 @@ class GenTLDevice(Helper):
         """Open the camera.
 
         Args:
-            name: of the camera, for errors.
+            name: name of the camera, for errors.
             settings: which one, and how it is set up.
             frame_shape: (rows, columns) of the region that is read.
             memory: file descriptor of the shared memory that takes one frame as the camera packs it.
@@ -282,9 +282,9 @@ def pixel_bytes(buffer: Any, shape: tuple[int, int], name: str, unknown: tuple[t
     """The bytes of a buffer's pixels, without what is before, between and behind them.
 
     Args:
-        buffer: of harvesters.
+        buffer: buffer of harvesters.
         shape: (rows, columns).
-        name: of the pixel format.
+        name: name of the pixel format.
         unknown: what a producer raises that does not tell an offset or a padding; then there is none.
 
     Raises:

@@ -29,7 +29,7 @@ class PixelFormat:
 
     Attributes:
         name: as GenICam has it.
-        code: of the format on the wire.
+        code: code of the format on the wire.
         bit_depth: bits of a count.
         group_bytes: bytes of four pixels.
         spread: four packed pixels in the low bits of each word to 16 bits for each; None where they lie so already.
@@ -116,7 +116,7 @@ def without_padding(raw: NDArray[np.uint8], shape: tuple[int, int], name: str, p
     Args:
         raw: bytes of one frame; the last line need not be padded.
         shape: (rows, columns).
-        name: of the pixel format.
+        name: name of the pixel format.
         padding: bytes behind each line.
 
     Raises:
@@ -141,7 +141,7 @@ def unpack(raw: NDArray[np.uint8], shape: tuple[int, int], name: str) -> Counts:
     Args:
         raw: bytes of one frame; what follows its pixels is left out.
         shape: (rows, columns).
-        name: of the pixel format.
+        name: name of the pixel format.
 
     Returns:
         [row, column], uint8 or uint16 in native byte order, right-aligned.

@@ -61,7 +61,7 @@ class CameraSetup(ABC):
     Args:
         settings: what it is to be set to.
         frame_shape: (rows, columns) of the region that is read.
-        name: of the camera, for errors.
+        name: name of the camera, for errors.
         is_gige: whether it is a GigE camera.
 
     Every method raises `SourceError` where the camera does not take a setting, and the driver's error where it is gone.

@@ -17,7 +17,7 @@ class Announcement(Generic[T]):
     """An order to a controller, and its answer. Its methods may be called from many threads.
 
     Args:
-        clock: by which it is waited.
+        clock: clock by which it is waited.
     """
 
     def __init__(self, clock: Clock = SYSTEM) -> None:
@@ -77,7 +77,7 @@ class ExternalModulator(Announcement[int]):
     liquid crystal settled, or None. A page may be announced before it is asked for.
 
     Args:
-        clock: by which it waits.
+        clock: clock by which it waits.
     """
 
     name = "the controller's modulator"
@@ -113,7 +113,7 @@ class ExternalBeams(Announcement[BeamState]):
 
     Args:
         timeout_s: longest wait for it.
-        clock: by which it waits.
+        clock: clock by which it waits.
     """
 
     name = "the controller's beams"

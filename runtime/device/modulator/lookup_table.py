@@ -166,7 +166,7 @@ def levels_text(curve: dict[int, float], levels: int, subject: str) -> str:
 
 
 def _different(greys: NDArray[np.uint8], subject: str) -> NDArray[np.uint8]:
-    """The same, each grey value that of one level alone."""
+    """Return the table with a grey value of its own for each level."""
     values, counts = np.unique(greys, return_counts=True)
     if (counts > 1).any():
         shared = int(values[counts > 1][0])

@@ -33,9 +33,9 @@ class ShutterBeams:
     """Satisfies `Beams`.
 
     Args:
-        generator: whose channels move the shutters; it may be the cameras' trigger as well.
+        generator: generator whose channels move the shutters; it may be the cameras' trigger as well.
         signal, reference: the shutters.
-        clock: by which they settle.
+        clock: clock by which they settle.
     """
 
     def __init__(self, generator: PulseGenerator, signal: Shutter, reference: Shutter, clock: Clock = SYSTEM) -> None:

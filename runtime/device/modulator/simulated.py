@@ -30,7 +30,7 @@ class SimulatedModulator:
     """Satisfies `Modulator` and `Beams`.
 
     Args:
-        address: of the simulated device's socket.
+        address: address of the simulated device's socket.
     """
 
     def __init__(self, address: Path) -> None:

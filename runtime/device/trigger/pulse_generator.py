@@ -68,7 +68,7 @@ class PulseGenerator:
 
     Args:
         settings: see there.
-        clock: by which it waits, and tells the time of a shot.
+        clock: clock by which it waits, and tells the time of a shot.
     """
 
     def __init__(self, settings: PulseGeneratorSettings, clock: Clock = SYSTEM) -> None:
@@ -120,7 +120,7 @@ class PulseGenerator:
     def disarm(self) -> None:
         """See `Trigger`: stops T0, and switches off the cameras' channels. A device that has gone fires no more anyway.
 
-        Channels that stayed on would fire for whoever uses the device next, and hide that theirs are others.
+        Channels that stayed on would fire for the next user, and hide that the next user's channels differ.
         """
         with self._lock:
             ready, self._ready = self._ready, None

@@ -34,7 +34,7 @@ class ScpiLine:
         port: device path, e.g. ``/dev/ttyUSB0``, or pyserial URL, e.g. ``socket://127.0.0.1:2101``.
         baud: bits per second of a serial port.
         times: how long is waited.
-        clock: by which it is waited.
+        clock: clock by which it is waited.
     """
 
     def __init__(self, port: str, baud: int = 115200, times: LineTimes | None = None, clock: Clock = SYSTEM) -> None:

@@ -84,9 +84,9 @@ class ScpiPort:
 
     Args:
         port: device path or pyserial URL.
-        baud: of a tty.
+        baud: speed of a tty.
         times: how long is waited.
-        clock: by which it is waited.
+        clock: clock by which it is waited.
 
     Attributes:
         session: grows whenever the port is synchronised. As long as it stays, every message was answered.

@@ -43,7 +43,7 @@ class SoftwareTrigger:
     whatever else the machine does meanwhile. Light that changes in that time is seen differently by both.
 
     Args:
-        cameras: that are set up to be triggered by a command, first to last.
+        cameras: cameras that are set up to be triggered by a command, first to last.
         clock: tells the time of a shot.
     """
 

@@ -43,7 +43,7 @@ def read_files(path: Path, content: bytes | None = None) -> dict[str, bytes]:
 
     Args:
         path: a folder or a zip file.
-        content: of the zip, where it has been read.
+        content: content of the zip, where it has been read.
 
     Raises:
         BundleError: nothing there, not a zip, a name that is a path, a link, a folder inside, or too much data.

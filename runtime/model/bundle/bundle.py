@@ -103,9 +103,9 @@ class Bundle:
         """Read the folder or zip at `path` and check every file against the manifest.
 
         Args:
-            path: of it.
-            key: that a zip must be signed with; None for any or none.
-            signature: of the zip; empty for that in the file beside it.
+            path: path of the bundle.
+            key: key that a zip must be signed with; None for any or none.
+            signature: signature of the zip; empty for that in the file beside it.
 
         Raises:
             BundleError: a missing, extra, changed or misplaced file, a newer schema, or no bundle at all; or with a
@@ -310,7 +310,7 @@ def read_manifest(path: Path) -> Manifest:
 
 
 def shows_page(coarse: float, limit: float) -> bool:
-    """Return whether frames in few counts may stand for a page: how badly they fit the homodyne equations tells.
+    """Return whether coarse frames still fit the homodyne equations well enough to hold a page.
 
     Args:
         coarse: residual of the frames `in_few_counts`.

@@ -15,7 +15,7 @@ class BundleKey:
     """A public key of an elliptic curve. Signatures are ECDSA over SHA-256, as ``openssl dgst -sha256 -sign`` has them.
 
     Args:
-        path: of the key, PEM.
+        path: path of the key, PEM.
 
     Raises:
         InvalidInputError: there is no such key.
@@ -43,8 +43,8 @@ class BundleKey:
         """Check that a bundle is signed.
 
         Args:
-            content: of its zip.
-            signature: of that; empty for none.
+            content: bytes of the bundle's zip.
+            signature: signature of the zip; empty for none.
             subject: the bundle, for errors.
 
         Raises:

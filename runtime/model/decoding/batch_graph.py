@@ -15,7 +15,7 @@ from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import BATCH, CONSTANTS, FLOAT16
 from lightpage.runtime.model.decoding.golden import check_golden
 from lightpage.runtime.model.decoding.page import OUTPUTS, Inference
-from lightpage.runtime.model.execution.device_memory import ON_NO_DEVICE, DeviceTwins
+from lightpage.runtime.model.execution.device_memory import ON_NO_DEVICE, Copies
 from lightpage.runtime.model.execution.session import BoundSession, OnDevice, open_session, running
 from lightpage.runtime.model.execution.table_graph import TableGraph
 
@@ -35,7 +35,7 @@ class Constants:
     """Tensors that follow from a table alone, where the graph computes.
 
     Attributes:
-        registration: in the table, [2, 2, 10].
+        registration: registration in the table, [2, 2, 10].
         bound: the graph, run with them.
         reach_px: see `REACH`.
     """
@@ -58,16 +58,16 @@ class FrameBuffer:
     For a GPU it is pinned, and a page is copied there once it is written, while a run from another buffer is on.
 
     Args:
-        pages: at most.
-        frame_shape, dtype: of a frame.
-        twins: makes its twin on a device.
+        pages: largest number of pages.
+        frame_shape, dtype: shape and type of a frame.
+        copies: maker of the copy on a device.
     """
 
-    def __init__(self, pages: int, frame_shape: tuple[int, int], dtype: str, twins: DeviceTwins = ON_NO_DEVICE) -> None:
+    def __init__(self, pages: int, frame_shape: tuple[int, int], dtype: str, copies: Copies = ON_NO_DEVICE) -> None:
         both = np.zeros((2, pages, *frame_shape), dtype)
         self.pages, self.frames = pages, dict(zip(("in_phase", "quadrature"), both, strict=True))
         self.shift = np.zeros((pages, 2, 2), np.float32)
-        self._twin = twins.of(both)
+        self._copy = copies.of(both)
 
     def put(self, place: int, pair: FramePair, shift: NDArray[np.float32]) -> None:
         """Write a page.
@@ -77,13 +77,13 @@ class FrameBuffer:
         """
         self.frames["in_phase"][place], self.frames["quadrature"][place] = pair.in_phase, pair.quadrature
         self.shift[place] = shift
-        if self._twin is not None:
-            self._twin.send(*(frames[place] for frames in self.frames.values()))
+        if self._copy is not None:
+            self._copy.send(*(frames[place] for frames in self.frames.values()))
 
     def feeds(self, pages: slice) -> dict[str, NDArray[np.generic] | OnDevice]:
         """Inputs of some pages, by name; what was written before stands where nothing was since."""
-        frames, twin = {name: array[pages] for name, array in self.frames.items()}, self._twin
-        there = frames if twin is None else {name: twin.of(part) for name, part in frames.items()}
+        frames, copy = {name: array[pages] for name, array in self.frames.items()}, self._copy
+        there = frames if copy is None else {name: copy.of(part) for name, part in frames.items()}
         return {**there, SHIFT: self.shift[pages]}
 
 
@@ -93,14 +93,14 @@ class BatchGraph:
     The golden page is decoded alone, and among the most pages, in the first and in the last place.
 
     Args:
-        bundle: that has such a graph.
-        graph: of its decoder, with its provider and its table.
-        pages: of a run, at most.
-        threads: of a run on the CPU.
+        bundle: bundle that has such a graph.
+        graph: graph of its decoder, with its provider and its table.
+        pages: largest number of pages of a run.
+        threads: number of threads of a run on the CPU.
 
     Attributes:
         subject: what it is, for errors.
-        pages: of a run, at most; fewer than were wanted where there is no memory for so many.
+        pages: largest number of pages of a run; fewer than were wanted where there is no memory for so many.
         constants_of_bundle: those of the graph's table.
 
     Raises:
@@ -112,7 +112,7 @@ class BatchGraph:
         self.subject = f"{bundle.subject}: {BATCH}"
         if missing := _FILES - bundle.files.keys():
             raise BundleError(f"{bundle.subject}: files", f"no {', '.join(sorted(missing))}", "a graph for batches")
-        self._bundle, self._provider, self._twins = bundle, graph.provider, DeviceTwins(graph.provider)
+        self._bundle, self._provider, self._copies = bundle, graph.provider, Copies(graph.provider)
         self._session = open_session(bundle.files[BATCH], self.subject, threads, provider=graph.provider, rounded=True)
         if SHIFT not in {node.name for node in self._session.get_inputs()}:
             raise BundleError(self.subject, f"no input {SHIFT}", "an export by this version of Lightpage")
@@ -143,14 +143,14 @@ class BatchGraph:
     def buffer(self) -> FrameBuffer:
         """Memory for the frames of a run."""
         manifest = self._bundle.manifest
-        return FrameBuffer(self.pages, self._bundle.profile.frame_shape, manifest.frame_dtype, self._twins)
+        return FrameBuffer(self.pages, self._bundle.profile.frame_shape, manifest.frame_dtype, self._copies)
 
     def constants(self, graph: TableGraph, registration: NDArray[np.float32] | None = None) -> Constants:
         """Constants of a table, computed on the CPU.
 
         Args:
-            graph: with that table.
-            registration: in place of the table's.
+            graph: graph with that table.
+            registration: registration in place of the table's.
         """
         names = [node.name for node in self._first.get_outputs()]
         table = {node.name: graph.value(node.name) for node in self._first.get_inputs()}
@@ -195,8 +195,8 @@ def with_proven_batches(bundle: Bundle, graph: TableGraph) -> Bundle:
     """The bundle, without its graph for batches and a warning where that does not decode the golden page as it should.
 
     Args:
-        bundle: in memory.
-        graph: of its decoder, with its table.
+        bundle: bundle in memory.
+        graph: graph of its decoder, with its table.
     """
     if not holds_batches(bundle):
         return bundle

@@ -53,8 +53,8 @@ class Batching:
 
     Attributes:
         largest: pages of a run, at most; 1 for none together.
-        longest_wait_s: for which a run waits while others are known to come.
-        pages: that are under way, of all models that gather them so.
+        longest_wait_s: longest time for which a run waits while others are known to come.
+        pages: pages that are under way, of all models that gather them so.
     """
 
     largest: int = 1
@@ -110,8 +110,8 @@ class HeldConstants:
     """Constants of the tables in use, a few of them; those of a table that nothing decodes with any more are let go.
 
     Args:
-        graph: that runs with them.
-        table: whose constants it has already.
+        graph: graph that runs with them.
+        table: table whose constants it has already.
         beside: has constants made, which takes as long as some pages do, while pages go on.
     """
 
@@ -132,7 +132,7 @@ class HeldConstants:
 
         Args:
             table: which.
-            registration: of the page; None for the table's.
+            registration: registration of the page; None for the table's.
         """
         with self._lock:
             self._asked += 1
@@ -200,9 +200,9 @@ class OneByOne:
         """The graph's answer to a page that is computed with others; None where it must be computed alone.
 
         Args:
-            table: that it is decoded with.
+            table: table that it is decoded with.
             pair: its frames, checked.
-            registration: of the page; None for the table's.
+            registration: registration of the page; None for the table's.
 
         Raises:
             BundleError, ProviderError, SurroundingsError: see `BatchGraph.run`; each page of the run hears of it.
@@ -217,10 +217,10 @@ class Batches(OneByOne):
     that come while a run is on wait for its end, and are computed together then.
 
     Args:
-        graph: that is run.
-        table: of the bundle.
+        graph: graph that is run.
+        table: table of the bundle.
         batching: how pages are gathered.
-        clock: by which runs wait.
+        clock: clock by which runs wait.
     """
 
     def __init__(self, graph: BatchGraph, table: TableGraph, batching: Batching, clock: Clock = SYSTEM) -> None:

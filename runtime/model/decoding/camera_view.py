@@ -22,7 +22,7 @@ class CameraView:
 
     Args:
         profile: the nominal device.
-        registration: of the model, [2, 2, 10]; None where it is unknown, and all symbols count as shown.
+        registration: registration of the model, [2, 2, 10]; None where it is unknown, and all symbols count as shown.
         places: along every branch, the direct one first, grid samples (column, row) [B, 2, ny, nx]; None as above.
     """
 
@@ -36,8 +36,8 @@ class CameraView:
         """The inference without a concentration where a camera does not show the symbol.
 
         Args:
-            inference: of a page.
-            registration: of the page, where its image has moved.
+            inference: inference of a page.
+            registration: registration of the page, where its image has moved.
         """
         registration = self._registration if registration is None else registration
         if self._places is None or registration is None or self._shown(registration, self._rim).all():

@@ -78,11 +78,11 @@ class Decoder:
     Args:
         bundle: an opened bundle.
         threads: threads of one inference; by default the cores that this process may use.
-        graph: of the bundle, where it is open already; then neither it nor the golden page is looked at.
+        graph: graph of the bundle, where it is open already; then neither it nor the golden page is looked at.
         provider: what pages are computed with; all else is computed on the CPU.
         code_threads: threads that share the code of a page, where it is compiled.
         batching: how its pages are gathered with those of other callers.
-        batches: that gather them, where they are open already.
+        batches: batches that gather them, where they are open already.
 
     Raises:
         ProviderError: there is no such provider here.
@@ -368,7 +368,7 @@ class BundleFieldSolver:
 
     Args:
         bundle: an opened bundle.
-        graph: of its decoder.
+        graph: graph of its decoder.
         threads: threads of one run; by default the cores that this process may use.
 
     Raises:

@@ -22,8 +22,8 @@ class FollowingDecoder(Decoder):
 
     Args:
         bundle: opened and checked.
-        threads: of an inference; all cores if None.
-        provider: that computes the graph.
+        threads: number of threads of an inference; all cores if None.
+        provider: provider that computes the graph.
         tracking: whether the image is followed; else each page is decoded where calibration saw it.
 
     Raises:
@@ -68,8 +68,8 @@ def load(
     """Return a bundle's decoder: it follows the image from page to page, and raises where pilots contradict a page.
 
     Args:
-        name_or_path: of a bundle, or the name of a shipped one.
-        threads: of an inference; by default all cores.
+        name_or_path: path of a bundle, or the name of a shipped one.
+        threads: number of threads of an inference; by default all cores.
         provider: what pages are computed with: ``cpu``, ``cuda``, ``tensorrt``, or ``cuda:1`` for the second GPU.
         engine_cache: folder where TensorRT keeps its engines; without, it builds them each time.
         tracking: whether the image is followed; else each page is decoded where calibration saw it.

@@ -113,8 +113,8 @@ class DriftModel:
         """Measure the slopes on a thread of its own: a service is ready before that ends, and its first page waits.
 
         Args:
-            decoder: of a bundle.
-            twin: of that bundle.
+            decoder: decoder of a bundle.
+            twin: twin of that bundle.
 
         Raises:
             CalibrationError: the bundle holds no calibration.
@@ -178,8 +178,8 @@ def drift_slopes(decoder: Decoder, twin: Twin, parameters: Real, pair: FramePair
     What shift does shows on a page, with four runs of the graph; what tilt does follows from the twin.
 
     Args:
-        decoder: of a bundle.
-        twin, parameters: of its device.
+        decoder: decoder of a bundle.
+        twin, parameters: twin and parameters of its device.
         pair: a page that it reads; the golden page by default.
 
     Raises:
@@ -248,8 +248,8 @@ class BundleTables:
     """The tables of a bundle's device under drift.
 
     Args:
-        decoder: of the bundle as it is.
-        twin: of the bundle.
+        decoder: decoder of the bundle as it is.
+        twin: twin of the bundle.
 
     Raises:
         CalibrationError: the bundle holds no calibration.
@@ -283,8 +283,8 @@ class BundleSearch:
     """The search for the image of a page of one bundle's device; calls come from many threads.
 
     Args:
-        decoder: of the bundle; its field graph, references and angle between the arms are used.
-        twin: of the bundle.
+        decoder: decoder of the bundle; its field graph, references and angle between the arms are used.
+        twin: twin of the bundle.
 
     Raises:
         CalibrationError: the bundle holds no calibration.
@@ -301,7 +301,7 @@ class BundleSearch:
         """Look for the image of a page within reach of all of `around_px`.
 
         Args:
-            pair, pilots: of the page.
+            pair, pilots: pair and pilots of the page.
             around_px: [K, 2], shifts (x, y) in camera pixels against calibration; by default where that saw the image.
             references: reference-only frames taken with the page, if not those that the decoder decodes with.
 

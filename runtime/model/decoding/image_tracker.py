@@ -109,15 +109,15 @@ class ImageState:
 
     Attributes:
         drift: estimate since calibration, [4], see `lightpage.runtime.model.decoding.image_drift`.
-        covariance: of the drift of the next page about it, [4, 4].
-        decoder: whose table holds `traced_tilt` of it.
+        covariance: covariance of the drift of the next page about it, [4, 4].
+        decoder: decoder whose table holds `traced_tilt` of it.
         table: tensors that are fed for the page.
         looked_px: shift that is in `table`, [2].
         traced_tilt: [2].
         walk: variance of the drift from one page to the next, as the last pages showed it, [4].
         settled: whether a page was confirmed yet. Until then the image is looked for before anything is decoded.
         jump_px: shift since the last page, (x, y), of which it is not known whether the reference has come along.
-        share: of the claimed information, what pilots lately confirmed; 1 before any page.
+        share: share of the claimed information that pilots lately confirmed; 1 before any page.
     """
 
     drift: Real
@@ -169,7 +169,7 @@ class ImageTracker:
     """Kalman filter of the image's drift, which walks from page to page, with a search where that is lost.
 
     Args:
-        decoder: of the bundle as it is.
+        decoder: decoder of the bundle as it is.
         model: reads drift from decoded phases.
         tables: applies it.
         search: finds an image that was lost, None where the bundle cannot.
@@ -460,7 +460,7 @@ def tracker_for(decoder: Decoder, memory: TrackerMemory | None = None) -> Tracke
     """The tracker that a bundle's decoder is run with, in service and in evaluation.
 
     Args:
-        decoder: of the bundle.
+        decoder: decoder of the bundle.
         memory: what another tracker of the same bundle has learnt, None to start anew.
 
     Raises:

@@ -66,17 +66,17 @@ class Timings:
 
     @property
     def waited_s(self) -> float:
-        """All waiting for other pages."""
+        """Time that the page waited for other pages."""
         return self.waiting_s + self.turn_s
 
     @property
     def worked_s(self) -> float:
-        """All but that."""
+        """Time of the page's own work, without waiting."""
         return self.check_s + self.inference_s + self.decision_s + self.search_s
 
     @property
     def total_s(self) -> float:
-        """All of it."""
+        """Time of the decode, waiting included."""
         return self.worked_s + self.waited_s
 
 
@@ -142,7 +142,7 @@ def check_residual(residual: float, limit: float | None, *, doubtful: bool = Fal
     """Check how badly a pair of frames fits the homodyne equations.
 
     Args:
-        residual, limit: of the page, and the bundle's.
+        residual, limit: residual of the page, and limit of the bundle.
         doubtful: see `lightpage.runtime.model.decoding.decoder.Decoder.infer`.
 
     Raises:

@@ -21,12 +21,12 @@ class TrackerMemory(BaseModel):
 
     Attributes:
         drift: shift x, y (camera pixels) and tilt x, y (radians) since calibration, [4].
-        covariance: of the drift of the next page about it, [4, 4].
+        covariance: covariance of the drift of the next page about it, [4, 4].
         walk: variance of the drift from one page to the next, [4].
         traced_tilt: radians, tilt that the table was traced with, [2].
         settled: whether a page was confirmed yet.
         jump_px: shift of which it is not known whether the reference has come along, (x, y).
-        share: of the claimed information, what pilots lately confirmed.
+        share: share of the claimed information that pilots lately confirmed.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -57,7 +57,7 @@ class Tracker(Protocol):
 
         Args:
             pair, levels, pilots: as for `Decoder.decode`.
-            turn: of the page; by default it comes behind all that have begun. It is closed at the end.
+            turn: turn of the page; by default it comes behind all that have begun. It is closed at the end.
 
         Raises:
             UnconfirmedPageError: the page's pilots do not bear out what the decoder claims of it.
@@ -72,10 +72,10 @@ class Tracker(Protocol):
         """Return what it has learnt until now, for `tracker_for` in another process; None where it learns nothing."""
 
     def anew(self) -> Tracker:
-        """Another one for the same bundle that has learnt nothing."""
+        """Return a new tracker for the same bundle, without state."""
 
     def fork(self) -> Tracker:
-        """Another one that has learnt the same, and learns on its own from there."""
+        """Return a copy that goes on by itself."""
 
     def refitted(self, decoder: Decoder) -> Tracker:
         """A new one for the decoder of a re-fitted bundle of the same device.
@@ -107,18 +107,18 @@ class NoTracker:
 
     @property
     def image_px(self) -> tuple[float, float]:
-        """Return where calibration saw it."""
+        """Return the image's calibrated position."""
         return 0.0, 0.0
 
     def memory(self) -> None:
         """See `Tracker`."""
 
     def anew(self) -> NoTracker:
-        """Itself: it learns nothing."""
+        """Return this tracker, which has no state to copy."""
         return self
 
     def fork(self) -> NoTracker:
-        """Itself: it learns nothing."""
+        """Return this tracker, which has no state to copy."""
         return self
 
     def refitted(self, decoder: Decoder) -> NoTracker:

@@ -18,8 +18,8 @@ class Turn:
     """A page's place among others; closed once the next one may go on. In a `with` statement, it is its turn.
 
     Args:
-        turns: that it is one of.
-        number: of it.
+        turns: all turns of the device.
+        number: number of this turn.
         waiting: see `Turns.take`.
     """
 

@@ -26,8 +26,8 @@ class CudaRuntime:
     """CUDA's runtime library. Its calls release the interpreter's lock.
 
     Args:
-        library: by ctypes.
-        provider: whose GPU is used.
+        library: library by ctypes.
+        provider: provider whose GPU is used.
     """
 
     def __init__(self, library: Any, provider: Provider) -> None:
@@ -60,15 +60,15 @@ class CudaRuntime:
         getattr(self._library, name)(*arguments)
 
 
-class DeviceTwin:
-    """An array's twin on a device, to which parts are copied on a stream of its own, whatever else runs there.
+class DeviceCopy:
+    """An array's copy on a device, to which parts are copied on a stream of its own, whatever else runs there.
 
     The array is pinned, which makes copies several times as fast. Both are released with this. Parts may be sent from
     many threads at once, but not while a graph reads them.
 
     Args:
-        runtime: of the device.
-        array: in C order; zero on the device until it is sent.
+        runtime: runtime of the device.
+        array: array in C order; zero on the device until it is sent.
 
     Raises:
         ProviderError: it cannot be pinned, or there is no room on the device.
@@ -110,11 +110,11 @@ class DeviceTwin:
         return OnDevice(self._device + part.ctypes.data - self._array.ctypes.data, part.dtype, part.shape)
 
 
-class DeviceTwins:
-    """Makes arrays' twins where pages are computed on a GPU, as long as that goes well.
+class Copies:
+    """Makes arrays' copies where pages are computed on a GPU, as long as that goes well.
 
     Args:
-        provider: that computes them.
+        provider: provider that computes them.
         runtime: gives the device's library.
     """
 
@@ -122,19 +122,19 @@ class DeviceTwins:
         self._provider, self._runtime = provider, runtime
         self._is_wanted = provider.memory != ON_CPU.memory
 
-    def of(self, array: NDArray[Any]) -> DeviceTwin | None:
-        """The twin of an array; None on the CPU, and from the first failure on, which is logged."""
+    def of(self, array: NDArray[Any]) -> DeviceCopy | None:
+        """The copy of an array; None on the CPU, and from the first failure on, which is logged."""
         if not self._is_wanted:
             return None
         try:
-            return DeviceTwin(self._runtime(self._provider), array)
+            return DeviceCopy(self._runtime(self._provider), array)
         except (OSError, ProviderError) as error:
             self._is_wanted = False
             _log.warning("frames of %s are not pinned, and wait to be copied: %s", self._provider, error)
             return None
 
 
-ON_NO_DEVICE = DeviceTwins(ON_CPU)
+ON_NO_DEVICE = Copies(ON_CPU)
 
 
 def _pointer(array: NDArray[Any]) -> ctypes.c_void_p:

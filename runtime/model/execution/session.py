@@ -55,8 +55,8 @@ class OnDevice:
     """An array in the memory of what computes, row after row.
 
     Attributes:
-        pointer: to its first element.
-        dtype, shape: of it.
+        pointer: address of the first element.
+        dtype, shape: type and shape of the array.
     """
 
     pointer: int

@@ -111,9 +111,9 @@ async def uploaded_pages(
     """Level count M and pages [page, ny, nx].
 
     Args:
-        messages: that the caller sends.
+        messages: messages that the caller sends.
         page_shape: symbols as (rows, columns).
-        most_bytes: of all pages together.
+        most_bytes: largest size of all pages together.
 
     Raises:
         MalformedError: messages in the wrong order.

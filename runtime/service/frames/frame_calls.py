@@ -224,12 +224,12 @@ class FrameCalls:
         """Decode a pair that has come, whose header was checked; raises as `DataPlane.decode`.
 
         Args:
-            pair: its frames.
-            header: of it.
-            call: that it came with.
-            stages: times it.
-            version: of the model that must be in service; empty for any.
-            order: of the pairs of its call; by default it is alone.
+            pair: frames of the pair.
+            header: header of the pair.
+            call: call that brought it.
+            stages: clock of its stages.
+            version: version of the model that must be in service; empty for any.
+            order: order of the pairs of its call; by default it is alone.
         """
         options = header.options
         answer = decode(

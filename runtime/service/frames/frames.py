@@ -78,7 +78,7 @@ class PairReceiver:
     Args:
         shape: (rows, columns) of a frame.
         dtype: "uint8" or "uint16" (little-endian on the wire).
-        budget: that it takes its bytes from until it is closed.
+        budget: budget that it takes its bytes from until it is closed.
 
     Attributes:
         size: bytes of the pair.
@@ -189,9 +189,9 @@ def decode(
         caller: who waits; nothing is computed for one who has gone.
         pilots: known symbols where they differ from the device's pattern.
         user_data: whether to read the page's bytes too.
-        version: of the model that must be in service; empty for any.
+        version: version of the model that must be in service; empty for any.
         stages: times the page.
-        order: of the pages of its call, in which they are followed; by default it is alone.
+        order: order of the pages of its call, in which they are followed; by default it is alone.
 
     Raises:
         BundleError: user bytes are asked for, and the model has no code.

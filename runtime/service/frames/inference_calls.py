@@ -270,7 +270,7 @@ class _Sent:
 
     Args:
         data: its message.
-        budget: that takes its bytes.
+        budget: budget that takes its bytes.
         most_beside: as for `take_apart`, which says what is raised too.
 
     Raises:

@@ -43,7 +43,7 @@ class Tensor:
 
     Attributes:
         datatype: one of `RAW_TYPES`.
-        shape: of it.
+        shape: shape of the input.
         wrong: class of the error where another one comes.
         optional: whether it may be left out.
     """
@@ -61,7 +61,7 @@ def inputs_of(request: Request, raw: Sequence[memoryview], expected: Mapping[str
     """The input tensors by name; those with raw contents are views of these, which cannot be written to.
 
     Args:
-        request: that came.
+        request: request that came.
         raw: its raw contents.
         expected: what the model takes, by name.
 
@@ -142,7 +142,7 @@ def parameters_of(request: Request, kinds: Mapping[str, type]) -> dict[str, Any]
     """The parameters of a request by name.
 
     Args:
-        request: that came.
+        request: request that came.
         kinds: int, str or bool, by name.
 
     Raises:

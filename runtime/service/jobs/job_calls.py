@@ -29,7 +29,7 @@ class JobCalls:
 
     Args:
         plane: says what frames and how many bytes are taken.
-        recalibrator: of the service.
+        recalibrator: recalibrator of the service.
         clock: seconds that never go back.
     """
 

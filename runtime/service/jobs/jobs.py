@@ -39,8 +39,8 @@ class RunningJob:
     """The job that runs, as whoever works on it sees it.
 
     Attributes:
-        id: of the job.
-        caller: on whose behalf it waits for slots; leaves when the job is to end.
+        id: id of the job.
+        caller: caller on whose behalf it waits for slots; leaves when the job is to end.
         cancelled: whether somebody has cancelled it.
     """
 
@@ -95,7 +95,7 @@ class Jobs:
 
         Args:
             pages_of: where its pages come from, for people.
-            caller: on whose behalf it runs; made to leave when it is cancelled.
+            caller: caller on whose behalf it runs; made to leave when it is cancelled.
             correlation_id: the caller's own text.
 
         Raises:

@@ -30,7 +30,7 @@ class KeptPages:
     and what was decoded, some 2 MB of a bench device and 50 MB of a full-size one.
 
     Args:
-        most_bytes: of all frames; older ones go first.
+        most_bytes: largest size of all frames; older ones go first.
     """
 
     def __init__(self, most_bytes: int) -> None:
@@ -75,7 +75,7 @@ class KeptPages:
         those that were read before show a device that has changed since.
 
         Args:
-            decoder: in service.
+            decoder: decoder in service.
             image_px: where its image was last seen.
         """
         if (code := decoder.bundle.code) is None:

@@ -96,12 +96,12 @@ class Recalibrator:
     itself. Iterators begin with their first step.
 
     Args:
-        plane: whose model, source, store and limits.
+        plane: data plane with model, source, store and limits.
         fit: how to fit, in this process; None for the real re-fit in a process of its own, at a low priority.
         recordings: folder whose recordings a caller may name, or None for none.
 
     Attributes:
-        jobs: that run or have ended.
+        jobs: jobs that run or have ended.
     """
 
     def __init__(self, plane: DataPlane, fit: Refit | None = None, recordings: Path | None = None) -> None:

@@ -28,7 +28,7 @@ from lightpage.runtime.service.table import Rule, Seconds, SettingsTable, Text
 _log = logging.getLogger(__name__)
 
 _TO_ANSWER_S = 1.0
-"""Of a caller's time, which is left to it when waiting for a recalibration ends."""
+"""Part of a caller's time that is left to it when waiting for a recalibration ends."""
 
 WORTH_BITS = 0.02
 """Information a symbol that a recalibration must bring for the next one to come as soon. Those of a simulated week of a
@@ -36,7 +36,7 @@ bench device bring 0.03 and more. One that brings less cures nothing that the mo
 
 
 class SelfCalibrationSettings(SettingsTable):
-    """When and with what a service recalibrates itself: the table [self_calibration] of its settings."""
+    """Occasions and pages of automatic recalibrations: the table [self_calibration] of the service's settings."""
 
     enabled: bool | None = Field(
         None, description="Recalibrate when the monitor says so; by default where calibration pages are named."
@@ -47,8 +47,8 @@ class SelfCalibrationSettings(SettingsTable):
     pages: tuple[Annotated[int, Field(ge=0, le=2**32 - 1)], ...] = Field(
         (),
         strict=False,
-        description="Number of a page of the source whose symbols are known; repeat it. Without, the last pages that "
-        "were read serve, or those that were lost, or the next two.",
+        description="Pages of the source whose symbols are known, by number. Without, the last pages that were read "
+        "serve, or those that were lost, or the next two.",
     )
     least_s: Seconds = 60.0
     """Shortest time between two recalibrations: a device that drifts faster needs a mechanic."""
@@ -82,11 +82,11 @@ class SelfCalibration:
     photographed between those that are read.
 
     Args:
-        plane: of the service.
+        plane: plane of the service.
         monitor: says when it is due.
-        recalibrator: of the service.
+        recalibrator: recalibrator of the service.
         settings: when and with what.
-        clock: by which it waits.
+        clock: clock by which it waits.
         kept: the last pages of the device; None where none are kept.
     """
 
@@ -163,7 +163,7 @@ class SelfCalibration:
 
         Args:
             caller: waits for as long as it has time. Where it leaves, the work goes on.
-            version: of the model that has lost the pages.
+            version: version of the model that has lost the pages.
             lost: how many it has lost.
 
         Returns:

@@ -27,7 +27,7 @@ class SentPages:
     """Takes reference frames, then symbols and frames of each page, within the service's budget of memory.
 
     Args:
-        header: of the call.
+        header: header of the call.
         plane: says what frames and how many bytes are taken.
 
     Raises:
@@ -82,7 +82,7 @@ class SentPages:
             raise MalformedError("pages that came", len(self._symbols), f"{self._header.pages}, as the header says")
 
     def known(self) -> KnownPages:
-        """All of it, once it has been received."""
+        """Return all that was sent, once it has been received."""
         references, *pairs = (self._pair(receiver) for receiver in self._receivers)
         return KnownPages(tuple(pairs), tuple(self._symbols), self._header.levels, references, self._mask)
 

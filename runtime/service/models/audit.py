@@ -20,28 +20,28 @@ from lightpage.runtime.service.caller import Actor
 from lightpage.runtime.service.models.store import Store
 
 AUDIT_BYTES = 10 << 20
-"""Of a record of model changes before a new one is begun: some 40,000 changes."""
+"""Size of a record of model changes before a new one is begun: some 40,000 changes."""
 AUDIT_KEPT = 10
 """Earlier records that stay."""
 _NEWEST = 10_000
 """Entries that the database keeps: so many wait at most while the file cannot be written."""
 _LAST_BYTES = 1 << 20
-"""Of the file, in which a line is looked for that may have been appended."""
+"""Length of the file's end in which a line is looked for that may have been appended."""
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A change, or one that did not come about.
+    """A change of models, done or failed.
 
     Attributes:
-        what: of `recalibrate`, `rollback`, `roll forward`, `activate`, `upload`, `pin`, `unpin`.
-        actor: who.
+        what: one of `recalibrate`, `rollback`, `roll forward`, `activate`, `upload`, `pin`, `unpin`.
+        actor: caller who changed the models.
         before: version in service before.
-        after: version that the change is about; after all but an upload and a pin it is in service.
-        failure: why it did not come about.
-        time: in UTC, as ISO 8601 has it.
+        after: version that the change is about; it is in service afterwards, except of an upload and a pin.
+        failure: reason of a failed change.
+        time: time of the change, in UTC by ISO 8601.
     """
 
     what: str
@@ -53,14 +53,14 @@ class Entry:
 
     @property
     def line(self) -> str:
-        """Itself in JSON, in one line; what is no text is escaped."""
+        """Entry as one line of JSON; unprintable characters are escaped."""
         who = {"who": self.actor.name, "correlation_id": self.actor.correlation_id}
         entry = {"time": self.time, "what": self.what, **who, "from": self.before, "to": self.after}
         how = {"outcome": "failed", "detail": self._detail} if self.failure else {"outcome": "done"}
         return json.dumps(entry | how, ensure_ascii=False).encode(errors="backslashreplace").decode()
 
     def log(self) -> None:
-        """Have it in the service's log."""
+        """Write the entry to the service's log."""
         told = {"peer": self.actor.name, "correlation_id": self.actor.correlation_id, "method": self.what}
         change = f"from {self.before} to {self.after}" if self.after else f"of {self.before}"
         level, how = (logging.WARNING, f"failed: {self._detail}") if self.failure else (logging.INFO, "done")
@@ -79,11 +79,10 @@ class AuditLog:
     file that has become too large is put aside as `NAME.1`, the one before it as `NAME.2`, and so on.
 
     Args:
-        store: whose database it is.
-        path: of the file, None for none. Its folder is made if absent; one that goes later, as that of a disk that is
-            taken out, is not made again.
-        most_bytes: of the file.
-        kept: files put aside that stay.
+        store: store with the database.
+        path: file of the lines, None for none. Its folder is made if absent at the start, and not again later.
+        most_bytes: largest size of the file.
+        kept: number of files put aside that stay.
     """
 
     def __init__(
@@ -91,7 +90,7 @@ class AuditLog:
     ) -> None:
         self._store, self._path, self._most_bytes, self._kept = store, path, most_bytes, kept
         self._waiting: list[str] = []
-        """Lines that the database could not be given."""
+        """Lines that wait for the database."""
         self._last = 0
         """Number of the entry that was appended last."""
         if path is not None:
@@ -115,7 +114,7 @@ class AuditLog:
         self._export()
 
     def failed(self, entry: Entry) -> None:
-        """Keep an entry of a change that did not come about; where the database cannot be written, it waits."""
+        """Record a failed change; queue the entry while the database cannot be written."""
         try:
             with self._store.transaction() as database:
                 self.write(entry, database)

@@ -39,7 +39,7 @@ class Contents:
 
     Attributes:
         base: digest of the base bundle that the history begins with.
-        state: of the models.
+        state: state of the models.
         jobs: messages of jobs by id, the oldest first.
         lost: why it is not known what was in service, empty where it is.
         sources: files of an earlier version that it was read from.
@@ -56,11 +56,11 @@ class Database:
     """A file that is opened for each transaction: nobody writes to one that was taken away or replaced.
 
     Args:
-        folder: where it lies; None for a database in memory.
+        folder: folder of the database; None for a database in memory.
         has_locks: whether other programs can be kept out by locks while it is written.
 
     Attributes:
-        path: of it.
+        path: path of the database.
     """
 
     def __init__(self, folder: Path | None, has_locks: bool) -> None:

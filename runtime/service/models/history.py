@@ -78,9 +78,9 @@ class Known:
     """Facts of a bundle.
 
     Attributes:
-        origin: where it came from, None where that is not known.
-        key: of a recalibration of this service, the fingerprint of the bundle key that it was made under, empty for
-            none; of any other bundle None.
+        origin: source of the bundle, None where it is not known.
+        key: fingerprint of the bundle key under which this service recalibrated it, empty for none; None of any other
+            bundle.
         pinned: whether it is never deleted.
     """
 

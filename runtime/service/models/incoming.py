@@ -32,12 +32,12 @@ class Incoming:
     it, it is.
 
     Args:
-        models: of a service that has a store.
-        most_bytes: of a bundle.
+        models: models of a service that has a store.
+        most_bytes: largest size of a bundle.
         uploads: the slot for one.
         folder: is looked at for files that end in .zip.
         look_s: how often.
-        clock: by which it waits between two looks.
+        clock: clock by which it waits between two looks.
     """
 
     def __init__(

@@ -45,11 +45,11 @@ class Loader:
 
     Args:
         make_tracker: makes the tracker of each model.
-        key: that bundles must be signed with which come from elsewhere; None for none.
+        key: key that bundles from elsewhere must be signed with; None for none.
 
     Attributes:
         wants_signatures: whether there is such a key.
-        fingerprint: of that key; empty for none.
+        fingerprint: fingerprint of the key; empty for none.
     """
 
     def __init__(self, make_tracker: TrackerFactory = NoTracker, key: BundleKey | None = None) -> None:
@@ -70,8 +70,8 @@ class Loader:
         """Return the model of a bundle.
 
         Args:
-            version: that it must have.
-            path: of the bundle.
+            version: version that it must have.
+            path: path of the bundle.
             current: the decoder in service.
             made_under: fingerprint of the key under which this service recalibrated it, empty for no key, None where
                 it did not. Under the present key it needs no signature.

@@ -19,8 +19,8 @@ class ModelCalls:
     """Handlers of the calls about models.
 
     Args:
-        models: of the service.
-        limits: of uploads.
+        models: models of the service.
+        limits: limits of uploads.
         uploads: the slot for one.
     """
 

@@ -42,7 +42,7 @@ class ModelEntry:
     """Facts of a model.
 
     Attributes:
-        manifest: of its bundle.
+        manifest: manifest of its bundle.
         current: whether it decodes now.
         pinned: whether it is never deleted.
         loaded: whether it is loaded.
@@ -91,7 +91,7 @@ class Models:
         first: the decoder that the operator gave.
         store: where models are kept; by default they end with the service.
         loader: loads the others.
-        audit: of the store; keeps every change, and those that failed.
+        audit: audit of the store; keeps every change, and those that failed.
         kept: models held loaded at most; others of the history are loaded again when they are gone to.
 
     Attributes:
@@ -273,7 +273,7 @@ class Models:
             what: it is called in the record.
             actor: who makes it.
             make: returns the state after it, and the model that comes into service, None where the present one stays.
-            version: that it is about; empty for that in service after it.
+            version: version that it is about; empty for that in service after it.
             more: is written too.
 
         Returns:

@@ -35,14 +35,14 @@ class Store(AbstractContextManager["Store"]):
         folder: one service at a time uses it; None for none.
         base: the bundle that the operator gave; another base has its own history.
         kept: how many of the newest bundles stay.
-        clock: by which it is tried again now and then.
+        clock: clock by which it is tried again now and then.
 
     Attributes:
-        folder: of the bundles.
+        folder: folder of the bundles.
         kept: as above; without a folder none but those that are held.
         changing: held while models, jobs or the record of changes are changed: one change at a time.
-        contents: of the database at the start.
-        room_bytes: that a store which is well has for more.
+        contents: contents of the database at the start.
+        room_bytes: room that a store which is well has for more.
         health: tells how it is without waiting for its disk.
 
     Raises:

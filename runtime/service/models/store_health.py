@@ -41,7 +41,7 @@ class StoreHealth:
     Args:
         trouble: says what is wrong with the store, nothing where it is well.
         longest_s: a look that takes longer has hung.
-        clock: by which a look is timed and waited for.
+        clock: clock by which a look is timed and waited for.
     """
 
     def __init__(self, trouble: Callable[[], object], longest_s: float = LONGEST_S, clock: Clock = SYSTEM) -> None:

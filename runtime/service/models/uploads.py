@@ -21,11 +21,11 @@ def take_in(
     """Check a bundle that lies in the store under another name, and give it its own.
 
     Args:
-        models: that it is added to.
-        path: of the zip.
+        models: models that it is added to.
+        path: path of the zip.
         actor: who brings it, for the record.
         here: called before it gets its name; what it raises leaves it as it is.
-        signature: of the zip, which is kept beside it where it was asked for; empty for none.
+        signature: signature of the zip, which is kept beside it where it was asked for; empty for none.
 
     Raises:
         StoreError: the store cannot be written.
@@ -79,12 +79,12 @@ class Upload:
     """A bundle that comes in pieces into a hidden file of the store. It is dropped unless `finish` returns.
 
     Args:
-        models: that it is added to.
-        most_bytes: of its zip.
-        caller: who sends it.
-        size: bytes of its zip.
-        digest: SHA-256 of them, empty where that is not known.
-        signature: of them; empty for none.
+        models: models that it is added to.
+        most_bytes: largest size of its zip.
+        caller: sender of the bundle.
+        size: size of its zip, bytes.
+        digest: SHA-256 of the zip, empty where it is not known.
+        signature: signature of the zip; empty for none.
 
     Raises:
         StoreError: there is no store.

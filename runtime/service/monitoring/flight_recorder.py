@@ -44,7 +44,7 @@ class FileRing:
     Args:
         folder: made if absent.
         count: files at most.
-        most_bytes: of them all.
+        most_bytes: largest size of them all.
 
     Raises:
         InvalidInputError: the folder cannot be made.

@@ -37,7 +37,7 @@ class LogSettings(SettingsTable):
 
 
 class PageLog:
-    """Logs lost pages, an `Observer`: those of calls that go on too, which read many."""
+    """Logs lost pages, an `Observer`: also those of calls that continue after a lost page."""
 
     def observe(self, observation: Observation) -> None:
         """See `Observer`."""
@@ -64,13 +64,13 @@ def _word(text: str) -> str:
 class LogHandler(logging.StreamHandler[TextIO]):
     """Writes a record and its `told`, what else is said of it, as a line: at most so many of one kind a second.
 
-    Then a line says how many were left out. Of one kind are lines of one method and reason, and other lines that differ
-    in their values only.
+    Then a line says how many were left out. Lines are of one kind if method and reason agree, or else if only their
+    values differ.
 
     Args:
-        settings: how lines look, and how many are written.
-        stream: where they go.
-        clock: by which seconds pass.
+        settings: format and number of the lines.
+        stream: file that takes the lines.
+        clock: clock that limits lines by the second.
     """
 
     def __init__(self, settings: LogSettings, stream: TextIO, clock: Clock = SYSTEM) -> None:

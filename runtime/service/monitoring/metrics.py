@@ -157,7 +157,7 @@ class ServiceMetrics:
             self.image.labels("y").set(page.image.shift_y_px)
 
     def user_data(self, found: PageBytes, *, shown: bool = True) -> None:
-        """Count a page whose bytes were read, or not, and have it `shown` as the last one."""
+        """Count a page of user bytes; `shown`: set the last-page gauges by it."""
         self.data_pages.labels(_READ if found.loss is None else found.loss.value).inc()
         self.corrected.inc(found.corrected)
         if shown:
@@ -165,7 +165,7 @@ class ServiceMetrics:
             self.code_iterations.set(found.iterations)
 
     def lost(self, error: LostPageError, *, tells: bool = True) -> None:
-        """Count a page that was not given out; where it `tells` of the device, that is a sign of drift too."""
+        """Count a lost page; where it `tells` of the device, set the gauges of drift by it."""
         self.lost_pages.labels(error.reason.value).inc()
         if tells and isinstance(error, UnconfirmedPageError):
             self._check(unconfirmed_page(error))

@@ -34,23 +34,22 @@ SHOWS_DEVICE = (Reason.PILOTS_DISAGREE, Reason.IMAGE_NOT_FOUND, Reason.TOO_FEW_P
 not."""
 
 _UNREADABLE = (Loss.BODY, Loss.CHECKSUM)
-"""Likewise of user bytes: a page without a header of this code may have none."""
+"""Losses of user bytes that do too; a page without a header of this code may hold no user bytes."""
 
 
 @dataclass(frozen=True)
 class Sign:
     """A figure of pages, and when it says that a recalibration is due.
 
-    The median of the last pages counts, so one odd page changes nothing. It must leave the baseline, the best median
-    among the first pages of a model, or the middle one where either way tells, by `raise_by` for the sign to be raised.
-    To be taken back, it must come back to within `clear_by`. Where pages differ much, it must leave it by `deviations`
-    of their noise at least.
+    The baseline is the best median among the first pages of a model, or the middle one where rise and fall count. The
+    sign is raised when the median of the last pages differs from the baseline by more than `raise_by`, and by at least
+    `deviations` of their noise. It is cleared when the difference falls below `clear_by`.
 
     Attributes:
-        name: of the figure.
-        window: pages whose median counts.
-        raise_by, clear_by: how far from the baseline, in the figure's unit.
-        rises: whether it is its rise that tells, and not its fall.
+        name: name of the figure.
+        window: number of pages whose median counts.
+        raise_by, clear_by: distances from the baseline, in the figure's unit.
+        rises: whether a rise raises the sign, and not a fall.
         either: whether both do.
         relative: whether `raise_by` and `clear_by` are shares of the baseline.
         absolute: whether the baseline is 0 whatever the first pages show.
@@ -135,7 +134,7 @@ class SignState:
     """State of a sign of drift.
 
     Attributes:
-        name: of the sign.
+        name: name of the sign.
         value: what counts of the last pages, None before there are enough.
         baseline: what is usual, None before it is known.
         raise_at: where the sign is raised, None before the baseline is known.
@@ -162,8 +161,8 @@ class MonitorState:
 
     Attributes:
         due: whether a recalibration is.
-        model_version: that the pages were decoded with.
-        pages: that were seen since it is in service.
+        model_version: version that the pages were decoded with.
+        pages: pages that were seen since it is in service.
         signs: each sign.
     """
 
@@ -338,8 +337,8 @@ class Monitor:
         """Take note of a page by its figures; an empty page says nothing.
 
         Args:
-            version: of the model that decoded it; other pages than those of the model in service say nothing.
-            figures: by the names of signs.
+            version: version of the model that decoded it; other pages than those of the model in service say nothing.
+            figures: figures by the names of signs.
         """
         with self._lock:
             if not figures or (self._version and version != self._version):
@@ -399,7 +398,7 @@ class Monitors:
         self.begin("")
 
     def begin(self, version: str) -> None:
-        """Start anew with a model that is put in service; without a version, those of sessions alone."""
+        """Reset all monitors for a new model; with an empty version only those of sessions."""
         if self.device is not None and version:
             self.device.begin(version)
         self._sessions = Sessions(partial(self._begun, version), self._most)

@@ -18,13 +18,13 @@ class Observation:
     """An observation of one page.
 
     Attributes:
-        subject: for people, e.g. ``page 3 of recording:R.h5``.
+        subject: subject for people, e.g. ``page 3 of recording:R.h5``.
         page_index: its number in the source, None where a caller sent its frames, or nobody knows.
         model_version: what decoded it.
         time_s: seconds since 1970.
-        seconds: that it took, waiting for a slot left out.
+        seconds: time that it took, waiting for a slot left out.
         lost: why it was not given out, None where it was.
-        detail: of the loss, for people.
+        detail: detail of the loss, for people.
         tells: whether it says something of the device. A lost page whose pilots a caller sent does not: they
             may be wrong.
         of_device: whether it is of the service's own device, and not of frames of a caller's own session.

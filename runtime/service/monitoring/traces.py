@@ -84,11 +84,11 @@ class Traces:
         """Make the spans of a call that has ended.
 
         Args:
-            call: whose `times` are those of its pages.
+            call: call whose `times` are those of its pages.
             service: full name of its service.
-            headers: of it; `traceparent` names the span of its caller.
+            headers: headers of the call; `traceparent` names the span of its caller.
             code: its status.
-            reason: of an error, as callers read it, else empty.
+            reason: reason of an error, as callers read it, else empty.
             ended: when it has, `time.perf_counter` seconds.
         """
         try:

@@ -28,7 +28,7 @@ class PageCalls:
 
     Args:
         plane: reads and decodes.
-        clock: by which callers wait; that of the service if None.
+        clock: clock by which callers wait; that of the service if None.
 
     Attributes:
         replays: answers that are given again to whoever asks with the same request id.

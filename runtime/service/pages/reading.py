@@ -114,7 +114,7 @@ def read_page(
         user_data: whether to read the page's bytes too.
         expected: the page of its volume that should be there, where that is known.
         stages: times the page.
-        order: of the pages of its call, in which they are taken from the source; by default it is alone.
+        order: order of the pages of its call, in which they are taken from the source; by default it is alone.
 
     Raises:
         BundleError, InvalidInputError: see `decode`.
@@ -168,9 +168,9 @@ class Unread:
     """Pages of a range that came to nothing, and might be read by a model that fits the device.
 
     Attributes:
-        model_version: of the model that lost the last of them.
+        model_version: version of the model that lost the last of them.
         pages: by their numbers in the source, the page of its volume that each is or should be, None where unknown.
-        groups: that lack pages, with those that were read.
+        groups: groups that lack pages, with those that were read.
     """
 
     model_version: str = ""
@@ -224,7 +224,7 @@ def read_data(
 
     Args:
         plane: reads and decodes.
-        first, count: of the source's pages.
+        first, count: first page and number of the source's pages.
         caller: who waits.
         timed: begins to time a page.
         unread: takes the pages that came to nothing.
@@ -289,7 +289,7 @@ def read_again(
 
     Args:
         plane, caller, timed: as for `read_data`.
-        unread: of the range.
+        unread: pages of the range that gave no bytes.
     """
     for index, expected in list(unread.pages.items()):
         try:

@@ -26,7 +26,7 @@ class _Entry:
     Attributes:
         request: tells whether it is the same request.
         done: whether the answer or the failure is there.
-        answer: of a request that went well.
+        answer: answer of a request that went well.
         failure: a serialised `ErrorDetail`; None where it went well.
         ended_at: when it was done, by the clock.
         size: bytes that are counted for it.
@@ -46,7 +46,7 @@ class Replays:
     Args:
         keep_s: how long, seconds.
         keep_bytes: how much of all answers, with their requests; the oldest go first.
-        clock: by which answers age and callers wait.
+        clock: clock by which answers age and callers wait.
     """
 
     def __init__(self, keep_s: float, keep_bytes: int, clock: Clock = SYSTEM) -> None:

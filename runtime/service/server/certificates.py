@@ -37,7 +37,7 @@ class Certificates:
     would take them, the earlier ones stay, and the log says why.
 
     Args:
-        files: whose `ca` is that of the callers.
+        files: files whose `ca` is that of the callers.
 
     Raises:
         InvalidInputError: see `TlsFiles.read`.

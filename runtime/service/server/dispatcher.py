@@ -50,9 +50,9 @@ class Served:
     """A service that is served.
 
     Attributes:
-        descriptor: of it.
+        descriptor: descriptor of the service.
         handlers: objects whose methods answer.
-        prefix: of its methods' names in metrics and logs.
+        prefix: prefix of its methods' names in metrics and logs.
     """
 
     descriptor: ServiceDescriptor
@@ -70,7 +70,7 @@ class _Method:
 
     Attributes:
         service: full name of its service.
-        name: in metrics and logs.
+        name: name in metrics and logs.
         handler: answers it.
         served: how.
         many: whether its callers send many messages.
@@ -89,9 +89,9 @@ class Dispatcher:
     """Hands calls to their handlers. Lives on one event loop.
 
     Args:
-        services: that are served.
+        services: services that are served.
         pool: threads for handlers that block, as many as there may be calls.
-        limits: of the service.
+        limits: limits of the service.
         metrics: what is counted.
         traces: are told of every call, None for none.
         secured: whether callers have certificates; then one without has no role.

@@ -42,7 +42,7 @@ class HealthServer:
     Args:
         address: HOST:PORT; port 0 takes a free one.
         states: called twice a second: each service by name, and whether it serves. Where it hangs, nothing does.
-        tls: with which it answers, whoever asks; None for no TLS.
+        tls: certificate with which it answers, whoever asks; None for no TLS.
     """
 
     def __init__(self, address: str, states: Callable[[], Mapping[str, bool]], tls: TlsFiles | None = None) -> None:

@@ -10,7 +10,7 @@ SERVING, NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.Health
 
 
 class HealthServicer(health.aio.HealthServicer):  # type: ignore[misc,name-defined]  # without types
-    """The library's, which also lists its services, and whose watchers can be sent home."""
+    """The library's servicer, which also lists its services and can end all watches."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -18,7 +18,7 @@ class HealthServicer(health.aio.HealthServicer):  # type: ignore[misc,name-defin
         self._ending = False
 
     async def tell(self, states: dict[str, bool]) -> None:
-        """Say of each service whether it serves."""
+        """Set the state of each named service."""
         for name, serves in states.items():
             await self.set(name, SERVING if serves else NOT_SERVING)
 
@@ -48,7 +48,7 @@ class HealthServicer(health.aio.HealthServicer):  # type: ignore[misc,name-defin
         return bool(self._watchers)
 
     def end_watches(self) -> None:
-        """End them."""
+        """End all watches."""
         self._ending = True
         for task in self._watchers:
             task.cancel()

@@ -34,7 +34,7 @@ class MessageGate(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]  # gene
     method is dropped as soon as it has come.
 
     Args:
-        limits: of the service.
+        limits: limits of the service.
         large: by the full name of a method that takes larger messages than others, e.g. ``"/package.Service/Method"``,
             the bytes of its largest one. It may take as long as a frame pair.
         streams: full names of the methods whose callers send many messages.
@@ -85,11 +85,11 @@ class _Messages:
     """The messages of one call.
 
     Args:
-        gate: that they come through.
-        places: of the call's service.
+        gate: gate that they come through.
+        places: places of the call's service.
         method: full name of it.
-        parse: of a message, None for the bytes themselves.
-        data: from the library.
+        parse: parser of a message, None for the bytes themselves.
+        data: bytes from the library.
     """
 
     def __init__(

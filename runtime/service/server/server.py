@@ -52,7 +52,7 @@ class LightpageServer:
         plane: the service's logic.
         recalibrator: what recalibrates it.
         address: HOST:PORT; port 0 takes a free one.
-        certificates: with which it meets its callers, who must have some too; None for no TLS.
+        certificates: certificates with which it meets its callers, who must have some too; None for no TLS.
         inference: whether the Open Inference Protocol is served too.
         traces: are told of every call, None for none.
     """

@@ -68,7 +68,7 @@ class Raster:
 
 
 def _span(what: str, page_px: int, modulator_px: int, offset_px: int) -> slice:
-    """Which of the modulator's rows or columns the page takes; what cannot be centred lies half a pixel further up."""
+    """Return the modulator's rows or columns that the page takes; an odd rest puts it half a pixel further up."""
     start = (modulator_px - page_px) // 2 + offset_px
     if start < 0 or start + page_px > modulator_px:
         got = f"pixels {start} to {start + page_px - 1} at offset {offset_px}"

@@ -31,7 +31,7 @@ class ScreenModulator:
         profile: how large page and symbols are.
         table_of: makes a lookup table, the grey value of each level, for a number of levels.
         window: opens a window, in a process of its own, see `opening_window`.
-        clock: by which it waits; that of the window.
+        clock: clock by which it waits; that of the window.
 
     Raises:
         InvalidInputError: the page does not lie on the modulator.

@@ -1,4 +1,4 @@
-"""The process of a modulator's window: what the X server keeps it waiting for is not to happen where pages are read."""
+"""Runs the window in its own process, so that a slow X server never delays reading."""
 
 from __future__ import annotations
 

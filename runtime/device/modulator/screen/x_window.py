@@ -34,7 +34,7 @@ class CompleteNotifyEvent(xcffib.Event):
 
     Attributes:
         kind: `present.CompleteKind`.
-        serial: that of the request.
+        serial: serial number of the request.
         msc: count of the display's refreshes.
     """
 

@@ -1,4 +1,4 @@
-"""Frames in pinned memory and their twins on a device, by a library that stands in for CUDA's."""
+"""Frames in pinned memory and their copies on a device, by a library that stands in for CUDA's."""
 
 import ctypes
 from typing import Any
@@ -10,7 +10,7 @@ import pytest
 from lightpage.errors import ProviderError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.decoding.batch_graph import FrameBuffer
-from lightpage.runtime.model.execution.device_memory import CudaRuntime, DeviceTwins
+from lightpage.runtime.model.execution.device_memory import Copies, CudaRuntime
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
 from lightpage.runtime.model.execution.session import BoundSession, open_session
 
@@ -25,7 +25,7 @@ class FakeCuda:
 
     def __init__(self, failing: str = "") -> None:
         self.names, self.devices, self.failing, self._held = list[str](), set[int](), failing, list[Any]()
-        self.twins = DeviceTwins(Provider.parse("cuda:1"), lambda provider: CudaRuntime(self, provider))
+        self.copies = Copies(Provider.parse("cuda:1"), lambda provider: CudaRuntime(self, provider))
 
     def __getattr__(self, name: str) -> Any:
         def call(*given: Any) -> Any:
@@ -44,7 +44,7 @@ class FakeCuda:
 
 def test_pages_are_sent_to_their_buffer_s_own_memory_and_a_graph_takes_them_from_there() -> None:
     cuda, session = FakeCuda(), open_session(onnx.parser.parse_model(GRAPH).SerializeToString(), "graph", 1)
-    buffers = [FrameBuffer(2, (1, 3), "uint8", cuda.twins) for _ in range(2)]
+    buffers = [FrameBuffer(2, (1, 3), "uint8", cuda.copies) for _ in range(2)]
     for place, buffer in enumerate(buffers):
         buffer.put(place, PAIR, STILL)
         buffer.frames["in_phase"][:] = 0  # it lies there by now
@@ -63,7 +63,7 @@ def test_frames_that_cannot_be_pinned_stay_on_the_host_which_is_told_once(
     failing: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     cuda = FakeCuda(failing)
-    assert {type(FrameBuffer(1, (1, 3), "uint8", cuda.twins).feeds(slice(0, 1))["in_phase"]) for _ in "ab"} == {
+    assert {type(FrameBuffer(1, (1, 3), "uint8", cuda.copies).feeds(slice(0, 1))["in_phase"]) for _ in "ab"} == {
         np.ndarray
     }
     assert [failing in record.getMessage() for record in caplog.records] == [cuda.names.count(failing) == 1]
@@ -73,5 +73,5 @@ def test_frames_that_cannot_be_pinned_stay_on_the_host_which_is_told_once(
 def test_a_device_that_fails_under_way_is_named() -> None:
     cuda = FakeCuda("cudaStreamSynchronize")
     with pytest.raises(ProviderError):
-        FrameBuffer(1, (1, 3), "uint8", cuda.twins).put(0, PAIR, STILL)
+        FrameBuffer(1, (1, 3), "uint8", cuda.copies).put(0, PAIR, STILL)
     assert "cudaGetLastError" in cuda.names
