@@ -17,9 +17,8 @@ from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.device.profile import Profile
 from lightpage.device.state import Device
 from lightpage.metrics.information import achievable_rate
-from lightpage.page.correction import corrected
+from lightpage.page.correction import PhaseRefit, corrected
 from lightpage.page.levels import MAX_LEVELS
-from lightpage.page.phase_refit import PhaseRefit
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import pilot_mask
 from lightpage.progress import reporting

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lightpage.cli.main import run
 from lightpage.errors import InvalidInputError
 from lightpage.metrics.information import achievable_rate
-from lightpage.page.phase_refit import ROUNDS, PhaseRefit
+from lightpage.page.correction import ROUNDS, PhaseRefit
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import symbol_phases
 from lightpage.progress import track

@@ -20,9 +20,8 @@ from lightpage.errors import (
     raised_as,
 )
 from lightpage.metrics.information import decide_with_confidence
-from lightpage.page.correction import corrected
+from lightpage.page.correction import PhaseRefit, corrected
 from lightpage.page.levels import MAX_LEVELS, check_levels
-from lightpage.page.phase_refit import PhaseRefit
 from lightpage.page.pilots import Pilots
 from lightpage.recording.exposure import check_light
 from lightpage.recording.frame_pair import FramePair, check_pair

@@ -24,8 +24,8 @@ from lightpage.calibration.phases import tilt_of_shift
 from lightpage.calibration.sampling_table import SamplingTable, sampling_table, shifted, symbol_centres
 from lightpage.device.profile import Profile
 from lightpage.errors import BundleError, FrameError
+from lightpage.page.correction import wrapped
 from lightpage.page.levels import Levels
-from lightpage.page.phase_refit import wrapped
 from lightpage.page.pilots import Pilots, read_pilots
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.decoding.decoder import Decoder

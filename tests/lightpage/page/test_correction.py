@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from lightpage.page.correction import ROUNDS, PhaseRefit
 from lightpage.page.levels import Levels
-from lightpage.page.phase_refit import ROUNDS, PhaseRefit
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import symbol_phases
 from tests.lightpage.uneven import overlapping, uneven
