@@ -14,6 +14,7 @@ from lightpage.device.profile import parse_profile
 from lightpage.errors import InvalidInputError
 from lightpage.files import write_json
 from lightpage.metrics.provenance import PROVENANCE, Provenance
+from lightpage.study.knobs import KNOBS
 
 Figures = dict[str, Any]
 
@@ -29,7 +30,7 @@ COMPARISONS = (
     "ideal",
 )
 """Folders of `make bench-decoders`."""
-EVALUATION, DEMO, IMAGE_SEARCH, LEDGER = "evaluation", "demo", "image-search", "ledger"
+EVALUATION, DEMO, IMAGE_SEARCH, LEDGER, TOLERANCES = "evaluation", "demo", "image-search", "ledger", "tolerances"
 PAGE_CODE = "page-code"
 SPEED = "speed-"
 """Before the name of a profile."""
@@ -173,6 +174,13 @@ def ledger(figures: Figures) -> Figures:
     return {name: {key: of[key] for key in of if key != "margins"} for name, of in figures.items() if of["pages"]}
 
 
+def tolerances(figures: Figures) -> Figures:
+    """Keep the table of `lightpage study tolerances`, which must have a row for each knob."""
+    if len(figures["rows"]) <= len(KNOBS):
+        raise KeyError(f"{1 + len(KNOBS)} rows")
+    return {key: figures[key] for key in ("header", "rows", "seed")}
+
+
 def speed(figures: Figures) -> Figures:
     """Keep the figures of `analysis.speed.speed` that the pages need."""
     return {key: figures[key] for key in ("profile", "threads", "repeats", "decoders")}
@@ -198,4 +206,5 @@ _TAKE: dict[str, Callable[[Figures], Figures]] = {
     DEMO: demo,
     IMAGE_SEARCH: image_search,
     LEDGER: ledger,
+    TOLERANCES: tolerances,
 }

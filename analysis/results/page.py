@@ -28,6 +28,7 @@ from analysis.results.measurements import (
     KEPT,
     LEDGER,
     SPEED,
+    TOLERANCES,
     Figures,
     Measurement,
     collected,
@@ -41,7 +42,8 @@ from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device
-from lightpage.files import replace_text
+from lightpage.files import read_text, replace_text
+from lightpage.study.study import aligned
 
 _DATA_SET = ("angle_deg", "full_well_e", "exposure", "symbol_size_px")
 """Keys of a data set that tell its light."""
@@ -194,6 +196,12 @@ def bound_name(figures: Figures) -> str:
     return f"{BOUND}{figures['profile']}_{angle}deg_{well}e_{exposure}x_{size}px"
 
 
+def with_table(page: str, figures: Figures) -> str:
+    """Return the page of tolerances with the table of the kept figures in its last block of code."""
+    *before, _, end = page.split("```\n")
+    return "```\n".join([*before, aligned(figures["header"], figures["rows"]) + "\n", end])
+
+
 @click.command()
 @click.option(
     "--from",
@@ -219,6 +227,7 @@ def bound_name(figures: Figures) -> str:
     multiple=True,
     help="Collect a JSON of `analysis.speed.speed`.",
 )
+@click.option("--tolerances", type=click.Path(path_type=Path), help="Collect the study.json of that study.")
 @click.option(
     "--kept",
     type=click.Path(exists=True, file_okay=False, path_type=Path),
@@ -235,11 +244,12 @@ def main(
     image_search: Path | None,
     ledger: Path | None,
     speeds: tuple[Path, ...],
+    tolerances: Path | None,
     kept: Path,
     out: Path,
 ) -> None:
-    """Write docs/results/index.md and its picture from the kept figures."""
-    given = {EVALUATION: evaluation, DEMO: demo, IMAGE_SEARCH: image_search, LEDGER: ledger}
+    """Write docs/results/index.md, its picture, and the table of tolerances.md from the kept figures."""
+    given = {EVALUATION: evaluation, DEMO: demo, IMAGE_SEARCH: image_search, LEDGER: ledger, TOLERANCES: tolerances}
     found = {name: path for name, path in given.items() if path is not None}
     found |= {bound_name(slim(BOUND, read_object(path))): path for path in bounds}
     found |= {f"{SPEED}{read_object(path).get('profile')}": path for path in speeds}
@@ -259,6 +269,9 @@ def main(
         click.echo(f"{name}: {measurement.provenance.time}, commit {measurement.provenance.commit[:7]}")
     results = Results(kept_measurements(kept))
     replace_text(out, render(results), "page")
+    beside = out.with_name(f"{TOLERANCES}.md")
+    if beside.exists() and (table := results.figures(TOLERANCES)):
+        replace_text(beside, with_table(read_text(beside, f"page {beside}", "Markdown"), table), "page")
     if pictured := results.figures(PICTURED):
         (data_set,) = pictured["data_sets"]
         light = results.bound(PICTURED, data_set)

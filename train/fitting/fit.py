@@ -139,7 +139,7 @@ def fit(
     with _without_hints():
         trainer = L.Trainer(
             max_steps=steps,
-            precision=lightning_precision(precision),  # type: ignore[arg-type]
+            precision=lightning_precision(precision, processes.device),  # type: ignore[arg-type]
             logger=TensorBoardLogger(str(run), name="", version=TENSORBOARD),
             callbacks=[*callbacks, best, timer, newest, _Steps()],
             accelerator=processes.accelerator,

@@ -5,7 +5,7 @@ from typing import Any
 from click.testing import CliRunner, Result
 
 from analysis.results.measurements import Measurement, kept_measurements
-from analysis.results.page import PAGE, ROOT, Results, main, render
+from analysis.results.page import PAGE, ROOT, Results, main, render, with_table
 from lightpage.codec.code import Code
 from lightpage.metrics.provenance import PROVENANCE, Provenance
 from lightpage.run_files import BEGUN
@@ -83,6 +83,11 @@ def test_kept_figures_say_where_they_are_from() -> None:
     adding_it = {"measurements.py", "kept_parts.py"}
     for path in (ROOT / "analysis").rglob("*.py"):
         assert path.name in adding_it or " write_json(" not in path.read_text("utf-8"), path
+
+
+def test_the_table_of_tolerances_is_that_of_the_kept_figures() -> None:
+    page = (ROOT / "docs" / "results" / "tolerances.md").read_text("utf-8")
+    assert with_table(page, kept_measurements()["tolerances"].figures) == page
 
 
 def test_the_ledger_is_that_of_the_shipped_code() -> None:

@@ -155,12 +155,12 @@ class TracedAtEachStep(RayLocalizer):
         return torch.as_tensor(self.registration(landed.reshape(self.places.shape).float()))
 
 
-def course(localizer: RayLocalizer) -> tuple[list[float], list[float], float]:
+def course(localizer: RayLocalizer, angle_rate: float) -> tuple[list[float], list[float], float]:
     """Losses and angles of a short training on one made-up page, and the angle's first gradient."""
     profile, generator = small_profile(), torch.Generator().manual_seed(3)
     torch.manual_seed(0)
     references = FramePair(*np.full((2, *profile.frame_shape), 100, dtype=np.uint8))
-    choices = PublishedChoices(channels=(4, 8), steps=50)
+    choices = PublishedChoices(channels=(4, 8), steps=50, angle_rate=angle_rate)
     decoder = PublishedDecoder(profile, references, localizer, choices.channels)
     module = PublishedTraining(decoder, choices, pilot_mask(profile), 256)
     module.log = lambda *_, **__: None  # type: ignore[assignment,method-assign]
@@ -181,12 +181,15 @@ def course(localizer: RayLocalizer) -> tuple[list[float], list[float], float]:
     return losses, angles, gradients[0]
 
 
-def test_rays_traced_once_train_as_those_traced_at_each_step() -> None:
+@pytest.mark.parametrize(("angle_rate", "count"), [(PublishedChoices.angle_rate, 1), (0.8 * TRACED_ANEW_RAD, 2)])
+def test_rays_traced_now_and_then_train_as_those_traced_at_each_step(angle_rate: float, count: int) -> None:
     traces: list[object] = []
     rays, anew = (kind(small_profile(), SAMPLES) for kind in (RayLocalizer, TracedAtEachStep))
     rays.tracer.register_forward_hook(lambda *_: traces.append(_))
-    (losses, angles, slope), (known_losses, known_angles, known_slope) = map(course, (rays, anew))
-    assert len(traces) == 1
+    (losses, angles, slope), (known_losses, known_angles, known_slope) = (
+        course(each, angle_rate) for each in (rays, anew)
+    )
+    assert len(traces) == count
     assert slope == pytest.approx(known_slope, rel=1e-4)
     np.testing.assert_allclose(losses, known_losses, rtol=1e-5)
     # of a page of noise a few rays that meet other walls, of twenty thousand, are a few percent of the gradient
