@@ -6,10 +6,8 @@ import signal
 from collections.abc import Callable
 from pathlib import Path
 
-import click
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.document import Calibration
@@ -20,6 +18,7 @@ from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import TWIN
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.simulator.true_optics import true_parameters
+from tests.lightpage.command import run
 from tests.lightpage.small import EXPLAINED, small_profile
 from tests.runtime import toy
 
@@ -42,7 +41,7 @@ def small_device(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
         profile, state = small_profile(), Device()
         (folder / "small.toml").write_text(profile.to_toml())
         made = f"--profile {folder}/small.toml --pages {SMALL_PAGES} --seed 4 --out {folder}/R.h5"
-        _command(simulate, *made.split())
+        run(simulate, *made.split())
         truth, turn = true_parameters(profile, state), state.homodyne.turn_rad
         right = Registered(truth, np.ones(len(NAMES)), turn, 0.0, 0.5, 1.0, 0.5, goodness=EXPLAINED)
         Calibration.from_registered(right, profile, ["0" * 64]).save(folder / "C.toml")
@@ -60,7 +59,7 @@ def small_run(small_device: list[str], tmp_path_factory: pytest.TempPathFactory)
         from lightpage.train.commands.train import train
 
         size = "--channels 12 --blocks 1 --synthetic-pages 0 --validation-share 0.25 --test-share 0.25 --steps 120"
-        _command(train, *small_device, *size.split(), "--out", out)
+        run(train, *small_device, *size.split(), "--out", out)
 
     return _made_once(tmp_path_factory, "small-run", make)
 
@@ -93,13 +92,9 @@ def ray_run(small_device: list[str], tmp_path_factory: pytest.TempPathFactory) -
     def make(out: Path) -> None:
         from lightpage.train.commands.train import train
 
-        _command(train, *small_device[2:], "--localizer", "ray", "--channels", 4, "--steps", 12, "--out", out)
+        run(train, *small_device[2:], "--localizer", "ray", "--channels", 4, "--steps", 12, "--out", out)
 
     return _made_once(tmp_path_factory, "ray-run", make)
-
-
-def _command(command: click.Command, *words: object) -> None:
-    CliRunner().invoke(command, [str(word) for word in words], standalone_mode=False, catch_exceptions=False)
 
 
 def _made_once(tmp_path_factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from lightpage.demo.command import demo
 from lightpage.demo.demo import run_demo
@@ -22,6 +21,7 @@ from lightpage.runtime.client.answers import RemotePage, RemoteTimings
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.refit import refit
 from lightpage.runtime.recalibration.separate_process import recalibrate_apart
+from tests.lightpage.command import run
 from tests.runtime import toy
 from tests.runtime.recalibration.toy_worker import known, quiet
 
@@ -79,8 +79,7 @@ def test_a_picture_is_lost_by_drift_and_won_back_by_its_pages_with_the_shipped_b
     apart = partial(recalibrate_apart, worker="tests.runtime.recalibration.toy_worker:Unyielding")
     monkeypatch.setattr("lightpage.runtime.service.jobs.recalibrator.recalibrate_apart", apart)
     monkeypatch.setattr("lightpage.runtime.service.jobs.kept_pages._KEPT", 5)  # what was read before the drift is gone
-    result = CliRunner().invoke(demo, ["--out", str(tmp_path)], standalone_mode=False, catch_exceptions=False)
-    assert result.exception is None
+    run(demo, "--out", tmp_path)
     figures = json.loads((tmp_path / "demo.json").read_text())
     fresh, lost, again = figures["phases"]
     assert figures["pages"] == 5

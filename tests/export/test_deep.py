@@ -7,7 +7,6 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
-from click.testing import CliRunner
 
 from lightpage.calibration.document import Calibration
 from lightpage.cli.main import run as run_command
@@ -22,6 +21,7 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.train.commands.train import train
 from lightpage.train.models.hyperparameters import Hyperparameters
 from lightpage.train.runs import WEIGHTS, Run
+from tests.lightpage.command import run
 from tests.lightpage.small import UNEXPLAINED, small_profile
 from tests.runtime import toy
 
@@ -47,7 +47,7 @@ def test_a_device_without_what_it_needs_is_told(tmp_path: Path) -> None:
     good, other = made_run(tmp_path / "good", own), made_run(tmp_path / "other", small_profile().to_toml())
     DEEP.check(bundle, good, 8)
     stranger = toy.write_toy_bundle(tmp_path / "stranger.zip")
-    for model, run, pages, told in (
+    for model, trained, pages, told in (
         (bundle, None, 40, "^run"),
         (bundle, good, 7, "known pages"),
         (bundle, tmp_path / "none", 40, "none"),
@@ -55,7 +55,7 @@ def test_a_device_without_what_it_needs_is_told(tmp_path: Path) -> None:
         (stranger, good, 40, r"stranger\.zip"),
     ):
         with pytest.raises(InvalidInputError, match=told):
-            DEEP.check(model, run, pages)
+            DEEP.check(model, trained, pages)
 
 
 def test_a_wrong_geometry_found_from_nominal_is_refused(
@@ -78,18 +78,13 @@ def test_a_drifted_device_is_found_trained_on_and_judged_by_pages_of_its_own(
 ) -> None:
     from lightpage.export.from_run import export_run
 
-    run = tmp_path / "run"
     small = [*small_device, "--channels", "8", "--blocks", "1", "--refinements", "0", "--synthetic-pages", "0"]
-    CliRunner().invoke(
-        train, [*small, "--steps", "240", "--out", str(run)], standalone_mode=False, catch_exceptions=False
-    )
-    export_run(run, tmp_path / "bundle.zip", version="small-1")
-    profile = small_device[1]
+    run(train, *small, "--steps", 240, "--out", tmp_path / "run")
+    export_run(tmp_path / "run", tmp_path / "bundle.zip", version="small-1")
     drifted = ["--set", "geometry.pipe_angle_deg=-0.58", "--set", "in_phase_camera.shift_x_px=5"]
     for name, pages, seed in (("a", 6, 31), ("b", 6, 32)):
-        words = ["--profile", profile, "--pages", str(pages), "--seed", str(seed), *drifted, "--no-truth"]
-        out = ["--out", str(tmp_path / f"{name}.h5")]
-        CliRunner().invoke(simulate, [*words, *out], standalone_mode=False, catch_exceptions=False)
+        words = [*small_device[:2], "--pages", pages, "--seed", seed, *drifted, "--no-truth"]
+        run(simulate, *words, "--out", tmp_path / f"{name}.h5")
     lines = ["[[device]]", 'name = "a"', 'bundle = "bundle.zip"', 'recordings = ["a.h5", "b.h5"]', 'run = "run"']
     (tmp_path / "fleet.toml").write_text("\n".join(lines))
     words = ["recalibrate", str(tmp_path / "out"), "--fleet", str(tmp_path / "fleet.toml"), "--workers", "1"]

@@ -35,6 +35,7 @@ from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
 from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.train.runs import GOLDEN, REFERENCES, WEIGHTS, load_run
 from lightpage.waves.grid import field_grid
+from tests.lightpage.command import run
 from tests.lightpage.small import UNEXPLAINED, small_profile
 
 
@@ -191,8 +192,7 @@ def test_an_interrupted_export_leaves_nothing_and_works_again(
         with pytest.raises(KeyboardInterrupt):
             export_run(small_run, tmp_path / "small.zip")
     assert list(tmp_path.iterdir()) == []
-    words = [str(small_run), "--out", str(tmp_path / "small.zip"), "--json", str(tmp_path / "F")]
-    assert CliRunner().invoke(export, words).exit_code == 0
+    run(export, small_run, "--out", tmp_path / "small.zip", "--json", tmp_path / "F")
     figures = json.loads((tmp_path / "F").read_text())
     assert 0 < figures["parity_error"] <= 1e-3
     assert sorted(path.name for path in tmp_path.iterdir()) == ["F", "small.zip"]
@@ -209,10 +209,10 @@ def test_a_run_file_that_was_cut_off_is_named(small_run: Path, tmp_path: Path, n
 
 
 def test_a_run_with_a_wrong_fit_is_not_exported_unasked(small_run: Path, tmp_path: Path) -> None:
-    folder, run = tmp_path / "run", load_run(small_run)
+    folder, given = tmp_path / "run", load_run(small_run)
     folder.mkdir()
-    wrong = run.calibration.model_copy(update={"goodness": UNEXPLAINED})
-    replace(run, calibration_toml=wrong.to_toml()).save(folder)
+    wrong = given.calibration.model_copy(update={"goodness": UNEXPLAINED})
+    replace(given, calibration_toml=wrong.to_toml()).save(folder)
     for words, message in (((), "wrong fit"), (("--accept-wrong-fit",), "arrays")):
         result = CliRunner().invoke(export, [str(folder), "--out", str(tmp_path / "b.zip"), *words])
         assert message in str(result.exception)
@@ -241,15 +241,12 @@ def test_half_precision_reads_as_much_and_stays_on_the_provider(
     small_run: Path, small_bundle: Path, small_device: list[str], tmp_path: Path
 ) -> None:
     half = tmp_path / "half.zip"
-    words = [str(small_run), "--out", str(half), "--precision", "float16", "--recording", small_device[3]]
-    done = CliRunner().invoke(export, words)
-    assert done.exit_code == 0, done.output
+    run(export, small_run, "--out", half, "--precision", "float16", "--recording", small_device[3])
     for provider in PROVIDERS:
         assert fallbacks(page_part(Bundle.open(half).files[DECODER]), provider) == [], provider
     rates = []
     for bundle in (small_bundle, half):
-        asked = ["--bundle", str(bundle), "--recording", small_device[3], "--json", str(tmp_path / "E.json")]
-        CliRunner().invoke(evaluate, asked, standalone_mode=False, catch_exceptions=False)
+        run(evaluate, "--bundle", bundle, "--recording", small_device[3], "--json", tmp_path / "E.json")
         rates.append(json.loads((tmp_path / "E.json").read_text())["air_bits_per_symbol"])
     # as calibrated concentrations read the run's validation pages; a dozen pilots show the piston
     assert rates[0] > load_run(small_run).validation_air - 0.6 > 1

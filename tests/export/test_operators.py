@@ -5,7 +5,6 @@ from pathlib import Path
 
 import onnx
 import pytest
-from click.testing import CliRunner
 from onnx import TensorProto, helper, parser
 
 from lightpage.calibration.sampling_table import sampling_table
@@ -23,6 +22,7 @@ from lightpage.simulator.true_optics import true_parameters
 from lightpage.train.models.decoder import SymbolDecoder
 from lightpage.train.models.presets import FAST, PRESETS
 from lightpage.train.models.twin import RayTwin, TorchTwin
+from tests.lightpage.command import run
 from tests.lightpage.small import small_profile
 
 ORIGIN = "someone/project docs/file.md at 0000000 (1.0)"
@@ -133,8 +133,7 @@ def made(document: str, provider: str, folder: Path) -> OperatorList:
     """The list of a document, by way of the command and its file."""
     (folder / "D.md").write_text(document)
     out = folder / "L.json"
-    options = [str(folder / "D.md"), "--provider", provider, "--origin", ORIGIN, "--out", str(out)]
-    CliRunner().invoke(collect, options, standalone_mode=False, catch_exceptions=False)
+    run(collect, folder / "D.md", "--provider", provider, "--origin", ORIGIN, "--out", out)
     return OperatorList.from_json(out.read_text())
 
 

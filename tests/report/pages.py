@@ -4,10 +4,8 @@ import re
 from html.parser import HTMLParser
 from pathlib import Path
 
-import click
-from click.testing import CliRunner
-
 from lightpage.report.command import report
+from tests.lightpage.command import run
 
 
 class Seen(HTMLParser):
@@ -30,11 +28,6 @@ class Seen(HTMLParser):
             assert given["alt"]
             self.pictures.setdefault(self.sections[-1], []).append(given["src"])
         self.fetched += [given[name] for name in ("src", "href", "srcset", "data", "action") if name in given]
-
-
-def run(command: click.Command, *words: object) -> str:
-    arguments = [str(word) for word in words]
-    return CliRunner().invoke(command, arguments, standalone_mode=False, catch_exceptions=False).output
 
 
 def page_of(source: Path, out: Path, *more: object) -> tuple[str, Seen]:

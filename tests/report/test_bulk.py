@@ -63,12 +63,8 @@ def test_pages_that_were_read_again_and_devices_of_a_fleet(archive: Archive, tmp
 
 
 def test_files_that_came_back_and_files_that_did_not(archive: Archive, tmp_path: Path) -> None:
-    bundle = coded.bundle(archive.folder / "coded.zip")
-    pages = coded.pages(bundle, archive.folder)
-    (archive.folder / "pages.h5").rename(archive.folder / "pages.sent")
-    coded.recording(archive.folder / "a.h5", pages[:8], {2: coded.dark}, code=None)
-    coded.recording(archive.folder / "b.h5", pages[8:])
-    archive.run("recover", "--no-tracking", "--bundle", str(bundle))
+    _, options = archive.shows_a_file({2: coded.dark})
+    archive.run("recover", *options)
     text, seen = page_of(archive.out, tmp_path / "r.html")
     check_whole(text, seen, [*SECTIONS[:-1], "files", "workers"])
     assert "1 whole, 0 not" in told(text)

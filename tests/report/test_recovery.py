@@ -19,7 +19,8 @@ from lightpage.report.command import report
 from lightpage.report.contents.from_recovery import report_of_recovery
 from lightpage.report.json_file import JsonFile
 from lightpage.runtime.archives.recordings.recovery import RecoveredPage, Recovery
-from tests.report.pages import check_whole, page_of, run
+from tests.lightpage.command import run
+from tests.report.pages import check_whole, page_of
 
 SECTIONS = ["figures", "pages", "causes", "unread"]
 BLOCKS = 3

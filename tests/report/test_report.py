@@ -26,9 +26,10 @@ from lightpage.runtime.commands.archives.evaluate import evaluate
 from lightpage.runtime.model.bundle.bundle import in_few_counts
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.train.runs import load_run
+from tests.lightpage.command import run
 from tests.lightpage.small import small_profile
 from tests.lightpage.uneven import UNEVEN, uneven
-from tests.report.pages import check_whole, page_of, run
+from tests.report.pages import check_whole, page_of
 
 SECTIONS = ["figures", "geometry", "maps", "zones", "reliability", "training", "page", "rays"]
 DATA_SYMBOLS = int(np.count_nonzero(~pilot_mask(small_profile())))

@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
-from click.testing import CliRunner
 
 from lightpage.codec.code import Code
 from lightpage.errors import PageError
@@ -13,6 +12,7 @@ from lightpage.recording.pages import Pages
 from lightpage.recording.writer import RecordingWriter
 from lightpage.runtime.commands.archives.encode import encode
 from lightpage.runtime.device.acquisition.source import SHOT_S, FrameSource, Shot
+from tests.lightpage.command import run
 from tests.runtime import toy
 
 CODE = Code(levels=32, coded_bits=2, rate_per_mille=500, corrections=1, needed_information=0.6)
@@ -27,9 +27,8 @@ def bundle(path: Path, code: Code | None = CODE) -> Path:
 def pages(bundle_path: Path, folder: Path, content: bytes = CONTENT, *options: str) -> np.ndarray:
     """The symbols of a file's pages in groups of 3 + 2, written to folder / pages.h5."""
     (folder / "sent.bin").write_bytes(content)
-    asked = [str(folder / "sent.bin"), "--bundle", str(bundle_path), "--out", str(folder / "pages.h5")]
-    asked += options or ("--data-pages", "3", "--parity-pages", "2", "--volume", "9")
-    CliRunner().invoke(encode, asked, standalone_mode=False, catch_exceptions=False)
+    options = options or ("--data-pages", "3", "--parity-pages", "2", "--volume", "9")
+    run(encode, folder / "sent.bin", "--bundle", bundle_path, "--out", folder / "pages.h5", *options)
     with Pages.open(folder / "pages.h5") as written:
         return np.stack(list(written))
 

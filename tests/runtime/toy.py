@@ -240,7 +240,12 @@ def fit_references(bundle: Bundle, pages: KnownPages, progress: Progress, decode
 
 
 class ToySource(FrameSource):
-    """A source of toy pages whose device may drift."""
+    """A source of toy pages whose device may drift.
+
+    Attributes:
+        asked: pages that were asked for, None for the next one.
+        shown: pages that were shown.
+    """
 
     name = "toy:device"
     bit_depth = 8
@@ -248,12 +253,16 @@ class ToySource(FrameSource):
 
     def __init__(self, device: ToyDevice, levels: int = 16, pages: int | None = None) -> None:
         self.device, self.levels, self.pages = device, levels, pages
+        self.asked: list[int | None] = []
+        self.shown: list[int] = []
         self._next, self._lock = 0, threading.Lock()
 
     def shot(self, timeout_s: float = SHOT_S, page: int | None = None) -> Shot:
         with self._lock:
+            self.asked.append(page)
             if page is None:
                 page, self._next = self._next, self._next + 1
+            self.shown.append(page)
             symbols = symbols_of(self.levels, page)[0]
             return Shot(self.device.page(symbols, self.levels, 0.1 * page), page, symbols)
 

@@ -219,11 +219,7 @@ class TestRefusals:
             wrong_edges.append(edges.copy())
             wrong_edges[-1][place] = value
         graphs: list[tuple[object, ...]] = [(degrees, wrong, 7, 136, 204) for wrong in wrong_edges]
-        graphs += [
-            (degrees + 1, edges, 7, 136, 204),
-            (degrees * 0, edges, 7, 136, 204),
-            (degrees[:3], edges, 7, 136, 204),
-        ]
+        graphs += [(wrong, edges, 7, 136, 204) for wrong in (degrees + 1, degrees * 0, degrees[:3])]
         graphs += [(degrees, edges[:-1], 7, 136, 204), (degrees, edges.ravel()[:-1].copy(), 7, 136, 204)]
         graphs += [(degrees, edges, z, 136, 204) for z in (0, -1, 385, 6)]
         graphs += [(degrees, edges, 7, information, 204) for information in (0, 155)]
@@ -242,25 +238,15 @@ class TestRefusals:
         for of in (Levels, uneven):
             packed = table_of(of(32), 2).packed
             call(packed)
-            for place, value in (
-                (0, 31),
-                (0, 512),
-                (0, 0),
-                (1, 0),
-                (1, 6),
-                (2, not packed[2]),
-                (3, -2),
-                (3, 32),
-                (4, np.zeros(0)),
-                (5, np.zeros(3)),
-            ):
-                with pytest.raises((ValueError, TypeError)):
-                    call((*packed[:place], value, *packed[place + 1 :]))
+            wrong: dict[int, list[object]] = {0: [31, 512, 0], 1: [0, 6], 2: [not packed[2]], 3: [-2, 32]}
+            wrong |= {4: [np.zeros(0)], 5: [np.zeros(3)]}
             for place in (8, 9):
                 near: tuple[object, ...] = packed[place]  # type: ignore[assignment]
-                for width in (0, 3, 64, -16):
+                wrong[place] = [(width, *near[1:]) for width in (0, 3, 64, -16)]
+            for place, values in wrong.items():
+                for value in values:
                     with pytest.raises((ValueError, TypeError)):
-                        call((*packed[:place], (width, *near[1:]), *packed[place + 1 :]))
+                        call((*packed[:place], value, *packed[place + 1 :]))
             with pytest.raises(ValueError, match="1e6"):
                 call(packed, phase=np.full(9, 1e7))
             with pytest.raises((ValueError, TypeError)):

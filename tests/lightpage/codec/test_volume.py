@@ -125,13 +125,12 @@ def collect(path: Path, pages: Iterator[PageBytes] | list[PageBytes]) -> tuple[b
     return path.read_bytes(), file
 
 
-class TestEncoding:
-    def test_a_file_that_shrank_or_grew_is_noticed(self, written: Written) -> None:
-        for size in (-1, -5, -6, -SIZE - 5):
-            with refused("file", len(written.file) + size):
-                list(encode_volume(CODEC, written.volume, BytesIO(written.file[:size]), PILOTS))
-        with refused("file", "more bytes"):
-            list(encode_volume(CODEC, written.volume, BytesIO(written.file + b"\0"), PILOTS))
+def test_a_file_that_shrank_or_grew_is_noticed(written: Written) -> None:
+    for size in (-1, -5, -6, -SIZE - 5):
+        with refused("file", len(written.file) + size):
+            list(encode_volume(CODEC, written.volume, BytesIO(written.file[:size]), PILOTS))
+    with refused("file", "more bytes"):
+        list(encode_volume(CODEC, written.volume, BytesIO(written.file + b"\0"), PILOTS))
 
 
 class TestFile:

@@ -118,6 +118,16 @@ def shuffle_data(path: Path) -> None:
         file["symbols"][...] = symbols
 
 
+def test_json_goes_to_stdout_alone_and_all_else_to_stderr(
+    toy_zip: Path, recording: tuple[Path, np.ndarray], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("evaluate", "--bundle", toy_zip, "--recording", recording[0], "--json", "-") == 0
+    told = capsys.readouterr()
+    assert json.loads(told.out)["pages"] == 4
+    assert "AIR" in told.err
+    assert not Path("-").exists()
+
+
 def test_evaluate_leaves_out_pages_that_the_bundle_has_seen_and_says_so(
     recording: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -145,19 +155,16 @@ def store_as_sixteen_bits(path: Path) -> None:
 def test_evaluate_uses_the_recordings_own_pilots_and_refuses_another_bit_depth(toy_zip: Path, tmp_path: Path) -> None:
     """A device whose symbols know nothing of the seeded pattern."""
     symbols = np.random.default_rng(3).integers(16, size=(2, *toy.PAGE)).astype(np.uint8)
-    mask = np.zeros(toy.PAGE, bool)
-    mask[::5, ::5] = True
     device, path = toy.ToyDevice(), tmp_path / "foreign.h5"
     with RecordingWriter(path, toy.PROFILE, 16, 8, device.references()) as writer:
         for index, page in enumerate(symbols):
             writer.append(page, device.page(page, 16, 1.0 + index))
     with h5py.File(path, "r+") as file:
-        if "pilots" in file:
-            del file["pilots"]
-        file["pilots"] = mask
+        file.pop("pilots", None)
+        file["pilots"] = toy.OWN_MASK
     data = evaluate(toy_zip, path)
     assert data["symbol_error_rate"] == 0
-    assert data["symbols_per_page"] == int((~mask).sum())
+    assert data["symbols_per_page"] == int((~toy.OWN_MASK).sum())
     store_as_sixteen_bits(path)
     with h5py.File(path, "r+") as file:
         file.attrs["camera_bit_depth"] = 10
@@ -320,8 +327,7 @@ def test_decode_uses_the_devices_own_pilots_and_refuses_pages_where_they_disagre
             writer.append(page, pair)
     with h5py.File(path, "r+") as file:
         for name in ("symbols", "pilots"):
-            if name in file:
-                del file[name]
+            file.pop(name, None)
     bundle, out = toy.write_own_pilots_bundle(tmp_path / "own.zip"), tmp_path / "out.h5"
     service = start(bundle, source=open_source(f"recording:{path}"))
     for where in (["--recording", path], ["--source", "--pages", "2"]):

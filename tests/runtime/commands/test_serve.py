@@ -197,7 +197,7 @@ def test_each_signal_but_an_ignored_hangup_stops_and_leaves_the_handlers_that_we
         signal.signal(kind, before)
 
 
-def test_the_exit_code_of_the_health_probe_is_its_answer() -> None:
+def test_the_exit_code_of_the_health_probe_is_its_answer_and_silence_is_not_waited_for() -> None:
     grpc_server, servicer = grpc.server(futures.ThreadPoolExecutor(max_workers=2)), health.HealthServicer()
     health_pb2_grpc.add_HealthServicer_to_server(servicer, grpc_server)
     target, runner = f"127.0.0.1:{grpc_server.add_insecure_port('127.0.0.1:0')}", CliRunner()
@@ -212,8 +212,5 @@ def test_the_exit_code_of_the_health_probe_is_its_answer() -> None:
     grpc_server.stop(grace=None).wait(5)
     serving, said = is_serving(target, timeout_s=2.0)
     assert (serving, "UNAVAILABLE" in said or "DEADLINE_EXCEEDED" in said) == (False, True)
-
-
-def test_a_silent_server_is_not_healthy_and_is_not_waited_for() -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
         assert not is_serving(f"127.0.0.1:{silent.getsockname()[1]}", timeout_s=0.2)[0]

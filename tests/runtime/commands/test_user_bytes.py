@@ -168,11 +168,10 @@ def test_a_file_that_storage_keeps_back_is_not_lost_unless_it_is_given_up(
 
 
 def test_an_evaluation_ends_with_the_status_that_asks_for_another_try(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    toy_zip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    bundle = toy.write_toy_bundle(tmp_path / "toy.zip")
     toy.write_toy_recording(tmp_path / "R.h5", toy.ToyDevice(), 16, 3)
-    asked = f"evaluate --bundle {bundle} --recording {tmp_path / 'R.h5'} --json {tmp_path / 'E.json'}".split()
+    asked = f"evaluate --bundle {toy_zip} --recording {tmp_path / 'R.h5'} --json {tmp_path / 'E.json'}".split()
     for lacking in ({0, 1, 2}, {1}):
         with monkeypatch.context() as patched:
             toy.frames_fail(patched, STORAGE, *lacking)
@@ -181,17 +180,6 @@ def test_an_evaluation_ends_with_the_status_that_asks_for_another_try(
         assert figures["pages"] == 3 - len(lacking)
         assert {page["page"]: page["cause"] for page in figures["refused_pages"]} == dict.fromkeys(lacking, "storage")
     assert run(lightpage, asked) == 0
-
-
-def test_json_goes_to_stdout_alone_and_all_else_to_stderr(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    bundle = toy.write_toy_bundle(tmp_path / "toy.zip")
-    toy.write_toy_recording(tmp_path / "R.h5", toy.ToyDevice(), 16, 3)
-    asked = ["--bundle", str(bundle), "--json", "-"]
-    assert run(lightpage, ["evaluate", "--recording", str(tmp_path / "R.h5"), *asked]) == 0
-    told = capsys.readouterr()
-    assert json.loads(told.out)["pages"] == 3
-    assert "AIR" in told.err
-    assert not Path("-").exists()
 
 
 def test_pages_are_not_overwritten_unless_that_is_asked_for(bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:

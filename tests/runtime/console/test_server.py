@@ -34,7 +34,6 @@ from lightpage.runtime.console.pictures import SIDE_PX, air_png, frame_png
 from lightpage.runtime.console.scrapes import fetch
 from lightpage.runtime.console.server import serving
 from lightpage.runtime.console.state import POINTS, RECENT, ConsoleState
-from lightpage.runtime.device.acquisition.source import Shot
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import Actor, Caller
 from lightpage.runtime.service.dataplane import DataPlane
@@ -305,23 +304,11 @@ def test_new_certificates_count_from_the_next_connection_on(decoder: Decoder, tm
 ROLL_BACK = {"action": "roll back", "expected": "toy-2"}
 
 
-class Numbered(toy.ToySource):
-    """Notes which pages are asked for; None stands for the next one."""
-
-    def __init__(self) -> None:
-        super().__init__(toy.ToyDevice())
-        self.asked: list[int | None] = []
-
-    def shot(self, timeout_s: float = 1.0, page: int | None = None) -> Shot:
-        self.asked.append(page)
-        return super().shot(timeout_s, page)
-
-
 class Asked:
     """A console with TLS of a service that has an earlier model."""
 
     def __init__(self, decoder: Decoder, folder: Path, stack: ExitStack) -> None:
-        self.source, self.clock = Numbered(), HandClock(time.time())
+        self.source, self.clock = toy.ToySource(toy.ToyDevice()), HandClock(time.time())
         self.plane = DataPlane(Models(decoder), self.source)
         self.plane.models.adopt(Decoder.load(toy.write_toy_bundle(folder / "c.zip", version="toy-2"), 1))
         self.recalibrator = Recalibrator(self.plane, toy.fit_references)

@@ -9,7 +9,6 @@ from unittest.mock import Mock, patch
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from lightpage.cli.simulate import simulate
 from lightpage.codec.code import Code
@@ -47,6 +46,7 @@ from lightpage.runtime.service.monitoring.monitor import Monitor
 from lightpage.runtime.service.monitoring.observation import Observation
 from lightpage.runtime.service.pages.page_calls import PageCalls
 from lightpage.simulator.simulator import Simulator
+from tests.lightpage.command import run
 from tests.lightpage.small import UNEXPLAINED
 
 CODE = Code(levels=8, coded_bits=2, rate_per_mille=500, corrections=2)
@@ -69,12 +69,6 @@ def drifted(small_bundle: Path, small_device: list[str], tmp_path_factory: pytes
 def lost_pages(path: Path, count: int) -> LostPages:
     with Recording.open(path) as recording:
         return LostPages(tuple(map(recording.frames, range(count))), CODE, references=recording.references())
-
-
-def run(command: object, *words: object) -> str:
-    result = CliRunner().invoke(command, [*map(str, words)], catch_exceptions=False)  # type: ignore[arg-type]
-    assert result.exit_code == 0, result.output
-    return result.output
 
 
 def test_a_file_that_no_page_gave_comes_back_by_itself(small_bundle: Path, drifted: Path) -> None:

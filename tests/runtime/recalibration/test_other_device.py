@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from lightpage.cli.simulate import simulate
-from lightpage.codec.code import Code
 from lightpage.errors import RecalibrationRefusedError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
@@ -19,9 +18,9 @@ from lightpage.runtime.model.bundle.manifest import PILOTS
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.recalibration.healing import LostPages
 from lightpage.runtime.recalibration.other_device import of_other_device
-from tests.runtime.recalibration.test_healing import run
+from tests.lightpage.command import run
+from tests.runtime.recalibration.test_healing import CODE
 
-CODE = Code(levels=8, coded_bits=2, rate_per_mille=500, corrections=2)
 CONTENT = bytes(range(250)) * 5
 OTHER = [
     "geometry.pipe_angle_deg=-0.3",

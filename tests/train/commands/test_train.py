@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,6 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner
 
 from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.device.profile import Profile
@@ -32,6 +32,7 @@ from lightpage.train.models.presets import PRESETS, REFLECTIONS
 from lightpage.train.published.training import PublishedChoices
 from lightpage.train.runs import FORMAT, begin, check_begun, load_run, sole_writer
 from lightpage.train.trainers.whole_run import own_pilots
+from tests.lightpage import command
 from tests.lightpage.small import UNEXPLAINED, small_profile
 from tests.told import Told
 
@@ -51,9 +52,7 @@ def recording(device: list[str], tmp_path: Path) -> Path:
     return Path(shutil.copy(device[3], tmp_path / "R.h5"))
 
 
-def run(*arguments: object) -> str:
-    words = [str(word) for word in arguments]
-    return CliRunner().invoke(train, words, standalone_mode=False, catch_exceptions=False).output
+run = partial(command.run, train)
 
 
 def options(*words: str) -> tuple[str, Any]:

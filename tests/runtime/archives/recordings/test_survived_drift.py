@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from lightpage.cli.simulate import simulate
 from lightpage.codec.choose import Draw
@@ -19,13 +18,13 @@ from lightpage.runtime.archives.recordings.survived_drift import KINDS, DriftedR
 from lightpage.runtime.commands.archives.code import code
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
+from tests.lightpage.command import run
 
 
 def recorded(small_device: list[str], out: Path, *settings: str) -> Path:
     """Some pages of the small device that no bundle has seen, changed by settings."""
     more = [word for setting in settings for word in ("--set", setting)]
-    asked = [*small_device[:2], "--pages", "4", "--seed", "9", "--out", str(out), *more]
-    CliRunner().invoke(simulate, asked, standalone_mode=False, catch_exceptions=False)
+    run(simulate, *small_device[:2], "--pages", 4, "--seed", 9, "--out", out, *more)
     return out
 
 
@@ -82,11 +81,10 @@ def test_the_command_keeps_what_a_drift_costs(
     reading: DriftedReading, small_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(survived_drift, "KINDS", {"angle": KINDS["angle"]})
-    named = ["--bundle", str(small_bundle), "--recording", str(reading.recording.path)]
+    asked = ["--bundle", small_bundle, "--recording", reading.recording.path, "--out", tmp_path / "C.toml"]
     figures = []
     for more in ([], ["--survive", "angle", "0.1"]):
-        asked = [*named, "--out", str(tmp_path / "C.toml"), "--json", str(tmp_path / "J.json"), *more]
-        told = CliRunner().invoke(code, asked, standalone_mode=False, catch_exceptions=False).output
+        told = run(code, *asked, "--json", tmp_path / "J.json", *more)
         assert "survives: the pipe's angle off by " in told
         figures.append(json.loads((tmp_path / "J.json").read_text()))
     plain, sure = figures

@@ -4,7 +4,7 @@ import ctypes
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
@@ -27,6 +27,7 @@ ADDRESS = "127.0.0.1"
 SERIAL = "CAM-I"
 WAIT_S = 30.0
 
+F = TypeVar("F", Frame, BrokenFrame)
 Counts = NDArray[np.unsignedinteger[Any]]
 
 pytestmark = pytest.mark.own_network
@@ -46,23 +47,16 @@ class Scene:
     camera: AravisCamera
     seen: list[Counts]
 
-    def take(self) -> Frame:
-        """One edge, one whole frame."""
+    def take(self, kind: type[F]) -> F:
+        """One edge, one frame: a whole one, or one of which parts are missing."""
         assert self.fake.edge()
         frame = self.camera.frame(WAIT_S)
-        assert isinstance(frame, Frame), frame
-        return frame
-
-    def take_broken(self) -> BrokenFrame:
-        """One edge, one frame of which parts are missing."""
-        assert self.fake.edge()
-        frame = self.camera.frame(WAIT_S)
-        assert isinstance(frame, BrokenFrame), frame
+        assert isinstance(frame, kind), frame
         return frame
 
     def info(self) -> FrameInfo:
         """Of the next frame, which is complete and shows to the byte what the camera sees."""
-        frame = self.take()
+        frame = self.take(Frame)
         assert frame.pixels.dtype == self.seen[0].dtype
         rows, columns = frame.pixels.shape
         assert (frame.pixels == self.seen[0][:rows, :columns]).all()
@@ -107,7 +101,7 @@ def test_every_format_arrives_to_the_byte(pixel_format: str) -> None:
 def test_a_region_is_cut_out_where_it_was_asked_for() -> None:
     with scene((24, 40), offset_x_px=16, offset_y_px=7, gain_db=3) as stage:
         stage.camera.arm()
-        pixels = stage.take().pixels
+        pixels = stage.take(Frame).pixels
         assert (pixels == stage.seen[0][7:31, 16:56]).all()
 
 
@@ -144,7 +138,7 @@ def test_a_frame_with_lost_packets_is_incomplete_and_the_next_is_whole() -> None
         stage.info()
         stage.fake.lose(0.5)
         for _ in range(6):
-            assert stage.take_broken().detail
+            assert stage.take(BrokenFrame).detail
         stage.fake.lose(0.0)
         stage.info()
         assert stage.camera.whole_frames == 2
@@ -267,7 +261,7 @@ def test_a_frame_that_ends_too_soon_is_incomplete(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(AravisLibrary, "__call__", shorter)
     with scene() as stage:
         stage.camera.arm()
-        assert "12287 bytes" in stage.take_broken().detail
+        assert "12287 bytes" in stage.take(BrokenFrame).detail
 
 
 @pytest.mark.parametrize(("own", "other"), [("Mono8", "Mono16"), ("Mono16", "Mono8")])
@@ -280,4 +274,4 @@ def test_a_camera_whose_pixel_format_somebody_changes_is_set_up_again(own: str, 
         gone(lambda: stage.camera.frame(WAIT_S))
         stage.camera.arm()
         assert stage.camera.opened == 1
-        stage.take()
+        stage.take(Frame)

@@ -2,9 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from lightpage.calibration.document import parse_calibration
 from lightpage.device.profile import PageLayout
 from lightpage.errors import InvalidInputError
 from lightpage.runtime.commands.lookup_table import lookup_table
@@ -12,6 +10,7 @@ from lightpage.runtime.device.modulator.lookup_table import linear_table, read_t
 from lightpage.runtime.device.modulator.screen.raster import Raster, ScreenSettings
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.shipped import bundle_path
+from tests.lightpage.command import run
 from tests.lightpage.small import small_profile
 from tests.lightpage.uneven import OVERLAPPING, modulation
 
@@ -103,14 +102,14 @@ def test_a_page_that_leaves_the_modulator_is_refused(settings: dict[str, int], e
 def test_a_corrected_table_makes_the_levels_even(levels: int | None, in_use: str | None, tmp_path: Path) -> None:
     if in_use is not None and levels is None:
         return
-    calibration = parse_calibration(Bundle.open(bundle_path("bench")).manifest.calibration)
+    calibration = Bundle.open(bundle_path("bench")).calibration
     told = calibration.model_copy(update={"modulation": OVERLAPPING.as_dict()})
     told.save(tmp_path / "c.toml")
     (tmp_path / "in_use.csv").write_text(in_use or "")
-    options = ["--levels", str(levels)] if levels else []
-    options += ["--in-use", str(tmp_path / "in_use.csv")] if in_use else []
-    told_by = ["--calibration", str(tmp_path / "c.toml"), "--out", str(tmp_path / "new.csv"), *options]
-    assert CliRunner().invoke(lookup_table, told_by, catch_exceptions=False).exit_code == 0
+    told_by = ["--calibration", tmp_path / "c.toml", "--out", tmp_path / "new.csv"]
+    told_by += ["--levels", levels] if levels else []
+    told_by += ["--in-use", tmp_path / "in_use.csv"] if in_use else []
+    run(lookup_table, *told_by)
     greys = read_table(tmp_path / "new.csv", 16)
     known = np.arange(256) if in_use is None else read_table(tmp_path / "in_use.csv", 16)
     shown = np.interp(greys, known, OVERLAPPING.phase(2 * np.pi * np.arange(len(known)) / len(known)))
@@ -118,7 +117,7 @@ def test_a_corrected_table_makes_the_levels_even(levels: int | None, in_use: str
     assert np.abs(shown - shown[0] - 2 * np.pi * np.arange(16) / 16).max() < 1.2 * 1.5 * np.pi / 256
     calibration.save(tmp_path / "c.toml")
     with pytest.raises(InvalidInputError, match="no modulation"):
-        CliRunner().invoke(lookup_table, told_by, catch_exceptions=False)
+        run(lookup_table, *told_by)
 
 
 @pytest.mark.parametrize(("stroke", "sine", "levels"), [(-0.015, 0.15, 128), (-0.05, 0.0, 256)])
@@ -126,12 +125,11 @@ def test_levels_share_a_stroke_that_is_a_little_short(
     stroke: float, sine: float, levels: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     of = modulation(stroke_relative=stroke, phase_sin_1_rad=sine)
-    calibration = parse_calibration(Bundle.open(bundle_path("bench")).manifest.calibration)
+    calibration = Bundle.open(bundle_path("bench")).calibration
     calibration.model_copy(update={"modulation": of.as_dict()}).save(tmp_path / "c.toml")
-    command = ["--calibration", str(tmp_path / "c.toml"), "--out", str(tmp_path / "new.csv")]
-    for options in ([], ["--levels", str(levels)]):
+    for options in ([], ["--levels", levels]):
         caplog.clear()
-        CliRunner().invoke(lookup_table, [*command, *options], catch_exceptions=False)
+        run(lookup_table, "--calibration", tmp_path / "c.toml", "--out", tmp_path / "new.csv", *options)
         assert caplog.records
         greys = read_table(tmp_path / "new.csv", levels)
         steps = np.diff(of.phases(256)[greys])

@@ -28,11 +28,10 @@ from lightpage.runtime.device.acquisition.source import Shot, open_source
 from lightpage.runtime.recalibration.recalibration import RefitResult
 from lightpage.runtime.service.models.models import KEPT_MODELS
 from tests.runtime import toy
+from tests.runtime.recalibration.toy_worker import DRIFTED
 from tests.runtime.service.stage import Running, Start, refused
 from tests.runtime.slow_fit import SlowFit
 from tests.waiting import eventually
-
-DRIFTED = (150.0, 62.0)
 
 
 def recorded(path: Path, pages: int, **changes: Callable[[Any], Any]) -> np.ndarray:

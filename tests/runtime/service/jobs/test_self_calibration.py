@@ -18,7 +18,6 @@ import pytest
 from lightpage.codec.page_bytes import Loss, PageBytes
 from lightpage.errors import CalibrationError, CallerLeft, InvalidInputError, Reason, SourceError, UnconfirmedPageError
 from lightpage.recording.frame_pair import FramePair
-from lightpage.runtime.device.acquisition.source import SHOT_S, Shot
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_position import ImagePosition
 from lightpage.runtime.model.decoding.page import DecodedPage
@@ -304,23 +303,12 @@ BUSY_S = 5.0
 OWN = SelfCalibrationSettings(pages=(100, 101), busy_s=BUSY_S)
 
 
-class RecordedSource(toy.ToySource):
-    def __init__(self) -> None:
-        super().__init__(toy.ToyDevice())
-        self.shown: list[int] = []
-
-    def shot(self, timeout_s: float = SHOT_S, page: int | None = None) -> Shot:
-        found = super().shot(timeout_s, page)
-        self.shown.append(found.page_index)
-        return found
-
-
 @dataclass
 class Loop:
     decoder: Decoder
     fit: Refit
     settings: SelfCalibrationSettings = OWN
-    source: RecordedSource = field(default_factory=RecordedSource)
+    source: toy.ToySource = field(default_factory=lambda: toy.ToySource(toy.ToyDevice()))
     clock: HandClock = field(default_factory=HandClock)
 
     def __post_init__(self) -> None:
@@ -427,14 +415,10 @@ def test_a_pinned_model_stays_in_service_until_it_is_let_go_of(loop: Loop) -> No
     assert not [page for page in loop.source.shown if page >= 100]
     loop.plane.models.pin("toy-1", False)
     assert loop.look(BUSY_S) == "toy-1+r1"
-
-
-def test_a_caller_with_lost_pages_is_told_at_once_that_a_pinned_model_stays(loop: Loop) -> None:
-    loop.plane.models.pin("toy-1", True)
-    with loop.running:
+    loop.plane.models.pin("toy-1+r1", True)
+    with loop.running:  # a caller with lost pages is told at once
         assert loop.plane.heal is not None
-        assert not loop.plane.heal(Caller(), "toy-1", 2)
-    assert loop.version == "toy-1"
+        assert not loop.plane.heal(Caller(), "toy-1+r1", 2)
 
 
 def refusing(*_: object) -> RefitResult:
@@ -453,13 +437,21 @@ def test_after_a_refusal_it_waits_twice_as_long_each_time_and_nothing_changes(ma
     assert loop.version == "toy-1"
 
 
-def test_a_success_is_followed_by_the_least_interval(loop: Loop) -> None:
+@pytest.mark.parametrize(("takes_s", "most_share", "pause_s"), [(0, 0.1, 60.0), (30, 0.05, 570.0)])
+def test_a_success_is_followed_by_the_least_interval_and_takes_no_more_than_its_share_of_the_time(
+    takes_s: float, most_share: float, pause_s: float, make: Make
+) -> None:
+    def slow(*given: Any) -> RefitResult:
+        loop.clock.advance(takes_s)
+        return toy.fit_references(*given)
+
+    loop = make(slow, SelfCalibrationSettings(pages=(100, 101), most_share=most_share))
     loop.drift()
     assert loop.look() == "toy-1+r1"
     loop.source.device.offsets = toy.OFFSETS
     loop.read(10)
     assert loop.monitor.due
-    assert loop.look(59.9) == "toy-1+r1"
+    assert loop.look(pause_s - 0.1) == "toy-1+r1"
     assert loop.look(0.1) == "toy-1+r2"
 
 
@@ -506,20 +498,6 @@ def test_a_caller_waits_no_longer_than_it_has_time_and_not_where_it_has_left(mak
         gone.leave()
         with pytest.raises(CallerLeft):
             loop.plane.heal(gone, "toy-1", 2)
-
-
-def test_recalibrations_take_no_more_than_their_share_of_the_time(make: Make) -> None:
-    def slow(*given: Any) -> RefitResult:
-        loop.clock.advance(30)
-        return toy.fit_references(*given)
-
-    loop = make(slow, SelfCalibrationSettings(pages=(100, 101), most_share=0.05))
-    loop.drift()
-    assert loop.look() == "toy-1+r1"
-    loop.source.device.offsets = toy.OFFSETS
-    loop.read(10)
-    assert loop.look(569.9) == "toy-1+r1"
-    assert loop.look(0.1) == "toy-1+r2"
 
 
 def test_never_while_another_recalibration_runs(make: Make) -> None:

@@ -8,7 +8,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from lightpage.errors import BundleError, CalibrationError, ModelExistsError, OtherModelError, StoreError
+from lightpage.errors import BundleError, CalibrationError, ModelExistsError, StoreError
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.service.caller import NOBODY
 from lightpage.runtime.service.models.history import HISTORY
@@ -74,14 +74,6 @@ def test_models_beyond_those_kept_are_loaded_again_where_they_can_be(make: Make,
     assert [models.rollback()[0].version for _ in range(2)] == ["toy-2", "toy-1"]
     assert loaded(models) == ["toy-1", "toy-2"]
     assert models.current.decoder.threads == 1
-
-
-def test_a_step_is_made_only_from_the_version_that_is_expected(make: Make) -> None:
-    models = make("toy-2")
-    for change in (models.rollback, models.roll_forward, lambda expected: models.activate("toy-1", expected)):
-        with pytest.raises(OtherModelError, match="got toy-2"):
-            change("toy-1")
-    assert models.rollback("toy-2")[0].version == "toy-1"
 
 
 def test_a_model_anywhere_can_be_put_in_service_and_the_one_before_stays(make: Make) -> None:

@@ -73,7 +73,7 @@ def test_an_uploaded_model_is_kept_put_in_service_and_rolled_back(stored: Start,
             client.models.upload(bundle)
     assert client.models.activate("toy-2", "toy-1") == ("toy-2", "toy-1")
     for change in (partial(client.models.activate, "toy-2"), client.models.roll_back, client.models.roll_forward):
-        with pytest.raises(OtherModelError):  # a call that is repeated steps once
+        with pytest.raises(OtherModelError, match="got toy-2"):  # a call that is repeated steps once
             change("toy-1")
     assert client.pages.read().model_version == "toy-2"
     client.jobs.recalibrate(count=2)

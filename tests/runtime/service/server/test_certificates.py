@@ -138,22 +138,16 @@ def test_the_first_end_is_told(authority: Authority, tmp_path: Path) -> None:
     assert certificates.ends_s() == until(between.certificate), "of a chain"
 
 
-def test_a_certificate_says_who_and_what(tmp_path: Path) -> None:
-    files = Authority(tmp_path).caller("controller 1", ["decode", "recalibrate", "king"])
+def test_a_certificate_says_who_and_what_and_counts_until_it_ends(authority: Authority) -> None:
+    files = authority.caller("controller 1", ["decode", "recalibrate", "king"], timedelta(hours=1))
     identity = identity_of(files.certificate.read_bytes())
     assert (identity.name, identity.roles) == ("controller 1", {Role.DECODE, Role.RECALIBRATE})
-
-
-def test_a_certificate_that_ends_while_connected_is_refused(tmp_path: Path) -> None:
-    files = Authority(tmp_path).caller("one", ["admin"], timedelta(hours=1))
-    identity = identity_of(files.certificate.read_bytes())
     identity.check(Role.READ, "call X", identity.until - 1)
     with pytest.raises(NotAllowedError, match="expired"):
         identity.check(Role.READ, "call X", identity.until)
 
 
-def test_a_name_cannot_make_a_line_of_its_own(tmp_path: Path) -> None:
-    authority = Authority(tmp_path)
+def test_a_name_cannot_make_a_line_of_its_own(authority: Authority, tmp_path: Path) -> None:
     authority.caller("a\nFAKE\x1b[31m", ["read"]).certificate.rename(tmp_path / "odd.pem")
     assert identity_of((tmp_path / "odd.pem").read_bytes()).name == "a\\nFAKE\\x1b[31m"
 
