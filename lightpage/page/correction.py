@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.page.crosstalk import of_decoded_neighbours
 from lightpage.page.levels import Levels
 from lightpage.page.pilots import PilotReading, Pilots, read_pilots, remove_piston, stroke_error
 
@@ -160,7 +161,7 @@ def corrected(
     reading = read_pilots(_vectors(phase, concentration), pilots)
     if any(levels.crosstalk):
         still = _vectors(remove_piston(phase, reading.piston.angle_rad), concentration)
-        phase = remove_piston(phase, levels.of_neighbours(still))
+        phase = remove_piston(phase, of_decoded_neighbours(still, levels.crosstalk))
         reading = read_pilots(_vectors(phase, concentration), pilots)
     phase = remove_piston(phase, reading.piston.angle_rad)
     smooth = refit.error(phase, concentration, levels, pilots)

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lightpage.errors import PageError
-from lightpage.von_mises import mean_resultant
 
 MIN_LEVELS = 2
 MAX_LEVELS = 256
@@ -30,24 +29,6 @@ def check_levels(levels: int, subject: str = "levels") -> None:
     whole = isinstance(levels, (int, np.integer)) and not isinstance(levels, bool)
     if not whole or not MIN_LEVELS <= levels <= MAX_LEVELS:
         raise PageError(subject, repr(levels), f"a whole number from {MIN_LEVELS} to {MAX_LEVELS}")
-
-
-def of_neighbours(phases: NDArray[np.floating], shares: tuple[float, float], certainty: Real | float = 1.0) -> Real:
-    """Phase that crosstalk adds to each symbol of a page, radians [ny, nx].
-
-    It is a share of what both neighbours' phases, 0 to 2 pi, have beyond pi. A symbol at the edge of the page stands in
-    for the neighbour that it lacks.
-
-    Args:
-        phases: phases of the symbols, radians, any winding, [ny, nx].
-        shares: shares along x and along y.
-        certainty: of each phase, 0 to 1: of what is not known, the mean counts.
-    """
-    if not any(shares):
-        return np.zeros(phases.shape)
-    beyond = np.pad(certainty * (np.mod(phases.astype(np.float64), 2 * np.pi) - np.pi), 1, mode="edge")
-    along_x, along_y = beyond[1:-1, :-2] + beyond[1:-1, 2:], beyond[:-2, 1:-1] + beyond[2:, 1:-1]
-    return np.asarray(shares[0] * along_x + shares[1] * along_y)
 
 
 @dataclass(frozen=True)
@@ -95,19 +76,6 @@ class Levels:
         if self.uneven is None:
             return np.asarray(np.arange(self.count) * (2 * np.pi / self.count), np.float64)
         return np.array(self.uneven, np.float64)
-
-    def of_neighbours(self, p: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Phase that neighbours add to each symbol of a decoded page, radians [ny, nx]: to be taken off.
-
-        Args:
-            p: piston removed, [2, ny, nx]; its angle is the phase, its length the concentration.
-        """
-        phase, added = np.arctan2(p[1], p[0]), np.zeros(p.shape[1:], np.float32)
-        if any(self.crosstalk):
-            certainty = mean_resultant(np.hypot(p[0], p[1]))
-            for _ in range(2):  # what is added takes some phases past the end of a turn
-                added = of_neighbours(phase - added, self.crosstalk, certainty).astype(np.float32)
-        return added
 
     def every(self, step: int, first: int = 0) -> Self:
         """Every so manieth of these levels, from level `first` on; at least two must be left."""

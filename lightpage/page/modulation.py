@@ -14,7 +14,8 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.page.levels import Levels, of_neighbours
+from lightpage.page.crosstalk import of_neighbours
+from lightpage.page.levels import Levels
 from lightpage.page.symbols import symbol_phases
 
 Real = NDArray[np.float64]

@@ -11,7 +11,8 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from lightpage.errors import InvalidInputError
-from lightpage.page.levels import Levels, of_neighbours
+from lightpage.page.crosstalk import of_neighbours
+from lightpage.page.levels import Levels
 from lightpage.train.data.feature_store import FeatureStore
 from lightpage.train.data.pages import Page
 from lightpage.train.models.hyperparameters import Hyperparameters

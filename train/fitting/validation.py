@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from lightpage.metrics.information import achievable_rate, decide
+from lightpage.page.crosstalk import of_decoded_neighbours
 from lightpage.page.levels import Levels
 from lightpage.page.pilots import Pilots, estimate_piston
 from lightpage.train.models.parts import turned
@@ -42,5 +43,5 @@ def without_piston(
     """
     piston = estimate_piston(p, Pilots(mask, phases[mask].astype(np.float64))).angle_rad
     still = np.asarray(turned(torch.tensor(p), -piston).numpy(), dtype=np.float32)
-    beside = Levels.of(levels).of_neighbours(still)
+    beside = of_decoded_neighbours(still, Levels.of(levels).crosstalk)
     return np.asarray(turned(torch.tensor(still), torch.tensor(-beside)).numpy(), dtype=np.float32)

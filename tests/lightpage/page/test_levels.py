@@ -8,6 +8,7 @@ import pytest
 from lightpage.device.profile import load_profile
 from lightpage.device.state import SlmDefects
 from lightpage.errors import PageError
+from lightpage.page.crosstalk import of_decoded_neighbours
 from lightpage.page.levels import Levels
 from lightpage.page.modulation import NOMINAL, Modulation
 from lightpage.page.symbols import symbol_phases
@@ -83,7 +84,7 @@ def test_what_crosstalk_adds_is_seen_in_a_decoded_page() -> None:
     light, levels = modulation.page_light(written), modulation.page_levels(256)
     np.testing.assert_allclose(light, np.exp(1j * (written + added)), atol=1e-12)
     p = 1e4 * np.stack([light.real, light.imag])
-    off = levels.of_neighbours(p) - added
+    off = of_decoded_neighbours(p, levels.crosstalk) - added
     assert np.sqrt(np.mean(off[1:-1, 1:-1] ** 2)) < 0.15 * np.std(added)
-    assert np.abs(levels.of_neighbours(1e-8 * p)).max() < 1e-5
-    assert not Levels(256).of_neighbours(p).any()
+    assert np.abs(of_decoded_neighbours(1e-8 * p, levels.crosstalk)).max() < 1e-5
+    assert not of_decoded_neighbours(p, Levels(256).crosstalk).any()
