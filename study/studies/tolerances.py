@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.document import Calibration
 from lightpage.device.state import Device
-from lightpage.errors import CalibrationError
+from lightpage.errors import CalibrationError, InvalidInputError
 from lightpage.progress import Progress
 from lightpage.recording.reader import Recording
 from lightpage.simulator.true_optics import perfectly_calibrated
@@ -168,7 +168,7 @@ def _read(settings: Settings, kept: Path, device: Device, work: Path, progress: 
 
     Returns:
         air, told, anew: bits a symbol, re-fitted, told and trained anew; not a number where that was not trained, and
-            0 where calibration refuses the pages; refused: what it says then.
+            0 where calibration refuses the pages; refused: what it says then, or training of pages that are saturated.
     """
     profile, decoder = settings.profile, KeptDecoder.of(kept)
     progress("simulate", 0.5)
@@ -184,7 +184,7 @@ def _read(settings: Settings, kept: Path, device: Device, work: Path, progress: 
             progress("train anew", 0.8)
             trained = taught(work, profile, device, _ANEW, settings.seed, lambda _: calibration, kept)
             result["anew"] = trained.air(found, judged)
-    except CalibrationError as error:
+    except (CalibrationError, InvalidInputError) as error:
         result["refused"] = str(error)
     return result
 
