@@ -30,6 +30,8 @@ Complex = NDArray[np.complexfloating]
 _OWN_ERROR_RAD = 0.02
 """Error of phase of a symbol that the standard decoder adds to that of noise, about: so bits that are lost come out as
 measured where light passes the pipe three times, or planes or tilts were not fitted."""
+_MOST_MODULATOR_NOISE_RAD2 = 1.0
+"""Variance of a sample's phase that a modulator's noise may have; no light is left to read where it has more."""
 _SMOOTHED = 9
 """Symbols, side of the squares over whose mean a symbol's error does not count: a network learns what is smooth."""
 _EDGE = 2
@@ -81,7 +83,9 @@ def measure_goodness(
     amplitude, phase = np.maximum(here - frames, 0)
     leak = modulator[0] / modulator[1]
     unexplained = max(0.0, float((amplitude - leak * phase) / (1 - leak)))
-    amount = max(0.0, float(phase - unexplained)) / modulator[1]
+    beyond = max(0.0, float(phase - unexplained))
+    amount = min(beyond / modulator[1], _MOST_MODULATOR_NOISE_RAD2)
+    unexplained += beyond - amount * modulator[1]
     noise = frames + amount * modulator
     wrong = unexplained + by_level + by_neighbours
     lost = float(np.log2(1 + wrong / (noise[1] + _OWN_ERROR_RAD**2))) / 2

@@ -64,6 +64,7 @@ def test_a_device_whose_profile_is_of_another_one_is_not_good_though_all_light_i
 
 def test_the_modulators_noise_is_told_from_light_that_nothing_explains() -> None:
     assert goodness_of("slm.phase_noise_rad=0.1").modulator_noise_rad == pytest.approx(0.1, rel=0.2)
+    assert goodness_of("slm.phase_noise_rad=3").bits_lost > 3  # no modulator has as much
 
 
 @pytest.mark.parametrize(
