@@ -18,10 +18,11 @@ from lightpage.cli.progress_bar import percent_bar
 from lightpage.device.profile import load_profile
 from lightpage.errors import InvalidInputError, MissingResultsError
 from lightpage.metrics.provenance import digest, write_figures
+from lightpage.progress import Progress
 from lightpage.run_files import BEGUN
 from lightpage.study import STUDIES
 from lightpage.study.lights import Lights
-from lightpage.study.study import RESULTS, Case, Result, Settings, Study, left, measured, written
+from lightpage.study.study import RESULTS, Case, Settings, Study, left, load_result, measured, written
 from lightpage.train.data.torch_engine import torch_device
 from lightpage.train.fitting.memory import keep_freed_memory
 from lightpage.train.runs import begin, check_begun, sole_writer
@@ -136,24 +137,20 @@ def study(
         raise InvalidInputError(f"study {out}", "results of unknown origin", expected)
     begin(out, begun)
     results_folder.mkdir(exist_ok=True)
-    results: list[Result] = []
     try:
         with percent_bar() as progress, _stopped_after(minutes, f"study {name}"):
             for number, case in enumerate(cases):
-                results.append(
-                    measured(
-                        chosen,
-                        settings,
-                        case,
-                        results_folder,
-                        lambda what, share, n=number, c=case: progress(
-                            f"{c['name']}: {what}", (n + share) / len(cases)
-                        ),  # type: ignore[misc]
-                    )
-                )
+                measured(chosen, settings, case, results_folder, _of_case(progress, case, number, len(cases)))
     finally:
-        if results and (chosen.parts or len(results) == len(cases)):
-            _write(out, chosen, begun, settings, cases[: len(results)], results, json_path)
+        lacking = left(cases, results_folder)
+        done = [case for case in cases if case["name"] not in lacking]
+        if done and (chosen.parts or not lacking):
+            _write(out, chosen, begun, settings, done, json_path)
+
+
+def _of_case(progress: Progress, case: Case, number: int, count: int) -> Progress:
+    """Return the progress of one case of so many."""
+    return lambda what, share: progress(f"{case['name']}: {what}", (number + share) / count)
 
 
 def _write(
@@ -162,10 +159,10 @@ def _write(
     begun: dict[str, Any],
     settings: Settings,
     cases: Sequence[Case],
-    results: Sequence[Result],
     json_path: Path | None,
 ) -> None:
     """Write table, picture and figures of the cases that are measured, and print the table."""
+    results = [load_result(out / _RESULTS / f"{case['name']}.json") for case in cases]
     share, channels = settings.share, settings.channels
     how = "" if share == 1 else f"; {share:.0%} of the authors' steps"
     how += "" if channels == Settings.channels else f"; network of {channels}/{2 * channels} channels"

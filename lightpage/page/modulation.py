@@ -89,10 +89,6 @@ class Modulation:
         """Complex light of a page of nominal phases [ny, nx], in their shape."""
         return np.asarray(self.light(phases) * np.exp(1j * of_neighbours(phases, self.crosstalk)))
 
-    def page_phase(self, phases: Real) -> Real:
-        """Phase of the light of a page of nominal phases [ny, nx], radians, in their shape: near each."""
-        return np.asarray(self.phase(phases) + of_neighbours(phases, self.crosstalk))
-
     def phases(self, count: int) -> Real:
         """Phase of each of so many levels' light, radians, unwrapped, [M]; exactly 2 pi s / M nominally."""
         return self.phase(symbol_phases(np.arange(count), count))

@@ -40,8 +40,7 @@ SOUND_SHARE = 0.85
 _NOISE_DEVIATIONS = 3.0
 """Standard deviations of the pilots' noise that are allowed for before a device is said to have changed."""
 _CHANCE = 2.0
-"""Times its variance that a stroke's squared error must be beyond, and by which it is drawn to zero: on a page without
-flicker what 12 pilots show of it then costs less than 0.001 bit."""
+"""Times its variance that a stroke's squared error must be beyond, and by which it is drawn to zero."""
 _NOTHING = 1e-9
 """Below it a sum of weights, or a mean square of radians, is rounding."""
 

@@ -18,6 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from lightpage.device.profile import load_profile
 from lightpage.device.state import Device
 from lightpage.progress import Progress
 from lightpage.study.lights import DataSet
@@ -29,8 +30,6 @@ _LOCKED = 0.3
 """Training AIR, bits a symbol, from which a decoder counts as locked; `none` comes to it too, if later, by heart."""
 
 
-_FULL_COLUMNS_PX = 5472
-"""Columns of the camera that the authors trained with."""
 _COURSES: dict[str, dict[str, Any]] = {
     "authors": {},
     "held": {"held_share": 0.3},
@@ -51,42 +50,29 @@ def _cases(settings: Settings) -> list[Case]:
         {"name": "none", "localizer": "none", "matched": False, "true_deg": true},
         {"name": "ray-matched", "localizer": "ray", "matched": True, "true_deg": true},
     ]
-    times = _times_smaller(settings)
+    usual = {"localizer": "ray", "true_deg": _times_smaller(settings) * true, "by_name": True}
     cases += [
-        {
-            "name": f"{course}-{reference}-{seed}",
-            "localizer": "ray",
-            "matched": reference == "matched",
-            "course": course,
-        }
-        | {"seed": seed, "true_deg": true * times, "by_name": True}
+        {**usual, "name": f"{course}-{reference}-{seed}", "course": course, "matched": matched, "seed": seed}
         for course in _COURSES
-        for reference in ("flat", "matched")
+        for reference, matched in (("flat", False), ("matched", True))
         for seed in range(1 if settings.quick else _SEEDS)
     ]
     return cases
 
 
 def _times_smaller(settings: Settings) -> float:
-    """How many times fewer pixels a camera of the study has than the authors', along x."""
-    return _FULL_COLUMNS_PX / settings.profile.camera.columns_px
+    """Return how many times more pixels along x the authors' camera has than that of the study."""
+    return load_profile("paper").camera.columns_px / settings.profile.camera.columns_px
 
 
 def _enlarged(settings: Settings, device: Device) -> Device:
-    """A small device on which angle and registration move the picture by as many pixels as at full size."""
+    """Return a small device on which angle and registration move the picture by as many pixels as at full size."""
+    cameras, keys = ("in_phase_camera", "quadrature_camera"), ("scale_relative_error", "rotation_deg")
+    numbers = [("geometry", "pipe_angle_deg"), *((camera, key) for camera in cameras for key in keys)]
     times = _times_smaller(settings)
-    poses = {
-        name: pose.model_copy(
-            update={
-                "scale_relative_error": times * pose.scale_relative_error,
-                "rotation_deg": times * pose.rotation_deg,
-            }
-        )
-        for name in ("in_phase_camera", "quadrature_camera")
-        for pose in (getattr(device, name),)
-    }
-    angle = times * device.geometry.pipe_angle_deg
-    return device.model_copy(update=poses).with_settings([f"geometry.pipe_angle_deg={angle!r}"])
+    return device.with_settings(
+        [f"{table}.{key}={times * getattr(getattr(device, table), key)!r}" for table, key in numbers]
+    )
 
 
 def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> Result:
@@ -126,14 +112,8 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
     for number, (axis, case, result) in enumerate(zip(maps, cases, results, strict=True)):
         name, step_angles = str(case["name"]), result["angles"]
         if len(step_angles):
-            angles.plot(
-                step_angles[:, 0],
-                step_angles[:, 1] / case["true_deg"],
-                ".-",
-                markersize=3,
-                color=f"C{number}",
-                label=name,
-            )
+            shares = step_angles[:, 1] / case["true_deg"]
+            angles.plot(step_angles[:, 0], shares, ".-", markersize=3, color=f"C{number}", label=name)
         rates.plot(*result["training_curve"].T, color=f"C{number}", linewidth=0.8, alpha=0.6)
         rates.plot(*result["validation_curve"].T, "o-", color=f"C{number}", markersize=3, label=name)
         axis.imshow(result["own_mi_map"], vmin=0, vmax=top, cmap="viridis")
