@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from lightpage.calibration.sampling_table import APART
 from lightpage.errors import BundleError, InvalidInputError
 from lightpage.export.batched import files_for_batches
-from lightpage.export.graph import APART, FRAME_INPUTS, DecoderGraph, FieldGraph
+from lightpage.export.graph import FRAME_INPUTS, DecoderGraph, FieldGraph
 from lightpage.export.half import LARGEST_DEVIATION, check_deviation, in_half, rounded
 from lightpage.export.onnx_files import decoder_onnx, field_onnx, twin_onnx
 from lightpage.export.parity import check_parity
@@ -131,7 +132,7 @@ def export_run(
     )
     field = {}
     if isinstance(graph, DecoderGraph):
-        recovers = FieldGraph(profile, graph.recovery.reflections, apart=APART in defaults)
+        recovers = FieldGraph(profile, graph.recovery.reflections, tuple(name for name in APART if name in defaults))
         field = {FIELD: field_onnx(recovers, frame_dtype, defaults)}
     files = {
         DECODER: decoder,

@@ -21,8 +21,7 @@ ANSWERS = ("p", "phase", "concentration")
 """What every decoder says."""
 TABLE_INPUTS = ("reference_in_phase", "reference_quadrature", "registration", "homodyne")
 """Inputs of every decoder at symbol pitch that carry the calibrated table as their default and may be fed instead;
-behind them come `APART`, where cameras stand apart, and those of `SymbolDecoder.table_inputs`."""
-APART = "apart"
+behind them come those of `CalibratedDevice.apart_inputs`, and of `SymbolDecoder.table_inputs`."""
 PUBLISHED_TABLE_INPUTS = ("grid", "levels")
 """The same of a published decoder: where it samples the frames, and the references there."""
 _SERIES = 15
@@ -41,12 +40,14 @@ class DecoderGraph(nn.Module):
         profile: the nominal device.
         decoder: trained; the weights of its parts in `HALVED` are rounded to float16.
         kappa_scale: factor on p that makes its length a calibrated concentration.
-        apart: whether the cameras stand apart, see `CalibratedDevice.stands_apart`.
+        apart: see `CalibratedDevice.apart_inputs`.
     """
 
     outputs = OUTPUTS
 
-    def __init__(self, profile: Profile, decoder: SymbolDecoder, kappa_scale: float, *, apart: bool = False) -> None:
+    def __init__(
+        self, profile: Profile, decoder: SymbolDecoder, kappa_scale: float, apart: tuple[str, ...] = ()
+    ) -> None:
         super().__init__()
         self.recovery = decoder.choices.field_recovery(profile)
         self.decoder = decoder
@@ -54,7 +55,7 @@ class DecoderGraph(nn.Module):
         with torch.no_grad():
             for parameter in itertools.chain(*(getattr(decoder, part).parameters() for part in HALVED)):
                 parameter.copy_(parameter.half())
-        self.measured_by = (*TABLE_INPUTS, *((APART,) if apart else ()))
+        self.measured_by = (*TABLE_INPUTS, *apart)
         self.table_inputs = (*self.measured_by, *decoder.table_inputs)
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
@@ -72,15 +73,15 @@ class FieldGraph(nn.Module):
     Args:
         profile: the nominal device.
         reflections: rounds, see `FieldRecovery`.
-        apart: whether the cameras stand apart.
+        apart: see `CalibratedDevice.apart_inputs`.
     """
 
     outputs = ("field", "unexplained")
 
-    def __init__(self, profile: Profile, reflections: int = 0, *, apart: bool = False) -> None:
+    def __init__(self, profile: Profile, reflections: int = 0, apart: tuple[str, ...] = ()) -> None:
         super().__init__()
         self.recovery = FieldRecovery(profile, reflections=reflections)
-        self.table_inputs = (*TABLE_INPUTS, *((APART,) if apart else ()))
+        self.table_inputs = (*TABLE_INPUTS, *apart)
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
         """Frames and `table_inputs` to field and what is left, see `FieldRecovery`."""

@@ -34,7 +34,7 @@ def graph_of(folder: Path, run: Run, references: FramePair, twin: RayTwin) -> tu
         published = PublishedGraph(load_weights(folder, decoder), run.kappa_scale).eval()
         return published, published_tensors(decoder)
     table = sampling_table(TorchTwin(twin), calibration.vector, calibration.turn_rad, profile)
-    apart = calibration.device(profile, references).stands_apart
+    apart = calibration.device(profile, references).apart_inputs
     graph = DecoderGraph(profile, load_decoder(folder, run), run.kappa_scale, apart=apart).eval()
     return graph, table_tensors(graph, table, references)
 

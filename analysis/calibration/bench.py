@@ -17,7 +17,7 @@ from lightpage.calibration.coherence import page_coherence
 from lightpage.calibration.known_pages import known_pages
 from lightpage.calibration.parameters import NAMES, as_dict, as_vector
 from lightpage.calibration.samplers import FieldSampler
-from lightpage.calibration.sampling_table import cameras_apart, registration_coefficients, stand_apart
+from lightpage.calibration.sampling_table import apart_inputs, cameras_apart, registration_coefficients
 from lightpage.device.profile import Profile
 from lightpage.device.state import Device
 from lightpage.errors import CalibrationError
@@ -161,7 +161,8 @@ class Bench:
     ) -> float:
         registration = registration_coefficients(self.twin, parameters, self.profile)
         homodyne = np.array([np.cos(quadrature_phase), np.sin(quadrature_phase)], dtype=np.float32)
-        apart = cameras_apart(parameters, self.profile) if stand_apart(parameters) else None
-        field, _ = self.solve(page.pair, references, registration, homodyne, apart)
+        apart = cameras_apart(parameters, self.profile)
+        needed = {name: apart[name] for name in apart_inputs(parameters)}
+        field, _ = self.solve(page.pair, references, registration, homodyne, needed)
         sampler = FieldSampler(field, field_grid(self.profile))
         return page_coherence(sampler, self.twin, parameters, self.profile, page.symbols)

@@ -66,7 +66,7 @@ def full_size(seeds: int) -> Figures:
         pair, references = simulator.page(page), simulator.references()
         begun = time.perf_counter()
         with torch.no_grad():
-            field, _ = solve(pair, references, registration, homodyne)
+            field, _ = solve(pair, references, registration, homodyne, {})
         recovered = time.perf_counter()
         found = search.find(field, pilots)
         rows.append(

@@ -28,7 +28,7 @@ from lightpage.calibration.patches import (
     search_window,
 )
 from lightpage.calibration.samplers import FieldSampler, FrameSampler
-from lightpage.calibration.sampling_table import cameras_apart, registration_coefficients, stand_apart
+from lightpage.calibration.sampling_table import apart_inputs, cameras_apart, registration_coefficients
 from lightpage.calibration.waves.cameras_apart import related_apart
 from lightpage.calibration.waves.wave_fit import LevelPrior, WaveFit
 from lightpage.calibration.waves.wave_model import LaunchConditions
@@ -587,8 +587,9 @@ class _Registration:
         registration = registration_coefficients(self.twin, parameters, self.profile)
         quadrature_phase = self.quadrature_phase if quadrature_phase is None else quadrature_phase
         homodyne = np.array([np.cos(quadrature_phase), np.sin(quadrature_phase)], dtype=np.float32)
-        kernel = cameras_apart(parameters, self.profile) if stand_apart(parameters) else None
-        return self.solve_field(page.pair, self.references, registration, homodyne, kernel)
+        apart = cameras_apart(parameters, self.profile)
+        needed = {name: apart[name] for name in apart_inputs(parameters)}
+        return self.solve_field(page.pair, self.references, registration, homodyne, needed)
 
     def _frame_samplers(self, page: KnownPage) -> list[FrameSampler]:
         frames = (page.pair.in_phase, page.pair.quadrature)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.calibration.sampling_table import stand_apart
+from lightpage.calibration.sampling_table import apart_inputs
 from lightpage.device.profile import Profile
 from lightpage.page.modulation import NOMINAL, Modulation
 from lightpage.recording.frame_pair import FramePair
@@ -32,6 +32,6 @@ class CalibratedDevice:
     modulation: Modulation = NOMINAL
 
     @property
-    def stands_apart(self) -> bool:
-        """Return whether the cameras' axial places differ so much that each needs a defocus of its own."""
-        return stand_apart(self.parameters)
+    def apart_inputs(self) -> tuple[str, ...]:
+        """See `lightpage.calibration.sampling_table.apart_inputs`."""
+        return apart_inputs(self.parameters)

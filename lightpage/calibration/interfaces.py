@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -86,7 +87,7 @@ class FieldSolver(Protocol):
         references: FramePair,
         registration: NDArray[np.float32],
         homodyne: NDArray[np.float32],
-        apart: NDArray[np.float32] | None = None,
+        apart: Mapping[str, NDArray[np.float32]],
     ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
         """Field [ny, nx] over the mean reference amplitude, and what is left of the homodyne equations, [2, ny, nx].
 
@@ -94,7 +95,6 @@ class FieldSolver(Protocol):
             pair, references: frames [H, W].
             registration: [2, 2, 10], see `lightpage.calibration.sampling_table`.
             homodyne: [2], cosine and sine of the turn between the arms.
-            apart: [2, taps], see `lightpage.calibration.sampling_table.cameras_apart`; None where both cameras see the
-                same plane.
+            apart: what `apart_inputs` names of `lightpage.calibration.sampling_table.cameras_apart`, in its order.
         """
         ...

@@ -75,14 +75,17 @@ PARAMETERS: tuple[Parameter, ...] = (
     # how much larger that defocus is at the right and at the lower edge of the page than in its middle, as a tilted
     # plane has it: the modulator's, and both cameras' on average
     *(Parameter(f"{plane}_axial_{axis}_rad", 0.2, "tilt") for plane in ("modulator", "cameras") for axis in "xy"),
+    # half of what that is for the in-phase camera beyond the quadrature one
+    *(Parameter(f"cameras_apart_{axis}_rad", 0.2, "tilt_apart") for axis in "xy"),
 )
 
 NAMES: tuple[str, ...] = tuple(p.name for p in PARAMETERS)
-KNOWN = (NAMES.index("modulator_axial_rad"), NAMES.index("modulator_axial_x_rad"), len(NAMES))
-"""Counts of parameters that twins know: those of bundles of before, which took planes for those of the profile, or knew
-their axial places alone; all."""
+_FIRST_UNKNOWN = ("modulator_axial_rad", "modulator_axial_x_rad", "cameras_apart_x_rad")
+KNOWN = (*map(NAMES.index, _FIRST_UNKNOWN), len(NAMES))
+"""Counts of parameters that twins know: those of bundles of before, which took planes for those of the profile, knew
+their axial places alone, or one tilt for both cameras; all."""
 PRIORS: Real = np.array([p.prior for p in PARAMETERS])
-_STEPS = {"axial": 1e-2, "tilt": 0.1}
+_STEPS = {"axial": 1e-2, "tilt": 0.1, "tilt_apart": 0.1}
 STEPS: Real = PRIORS * [_STEPS.get(p.group, 3e-3) for p in PARAMETERS]
 """Steps of finite differences of the light: long enough for what rounding adds, though a plane's tilt changes little,
 and short enough for the light to be straight along them."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.parameters import as_dict, as_vector
-from lightpage.calibration.waves.wave_model import axial_of_cameras, defocus, fitted_geometry
+from lightpage.calibration.waves.wave_model import axial_of_cameras, defocus, fitted_geometry, tilts_of_cameras_apart
 from lightpage.device.profile import Profile
 from lightpage.waves.defocus import defocus_taps
 from lightpage.waves.grid import field_grid
@@ -22,11 +22,15 @@ Real = NDArray[np.float64]
 SamplingTable = dict[str, NDArray[Any]]
 """Tensors by their names as inputs of an exported decoder, float32 where `sampling_table` makes them."""
 
+APART = ("apart", "apart_beside", "apart_tilt")
+"""Names of what tells a decoder that cameras do not see the same plane, see `cameras_apart`."""
 _FIT_POINTS = 9
 _LEAST_APART_RAD = 0.06
 """Half of the distance of the cameras' axial places, as a phase at the facet's wall, from which on it is dealt with. A
 decoder loses 0.08 bit at 0.04 radian where it is not, and four times that at twice as much. It loses 0.2 bit where it
 was trained without, and takes longer."""
+_LEAST_VARYING_RAD = 0.03
+"""Root mean square over the page of what tilts change of that distance, from which on it is dealt with as well."""
 _PLACE_BITS = 14
 """Fractional bits of places and gradients, grid samples. A float32 of thousands of samples has 12."""
 _PHASE_BITS = 16
@@ -59,17 +63,33 @@ def registration_coefficients(twin: Twin, parameters: Real, profile: Profile) ->
     return np.stack(coefficients).astype(np.float32)
 
 
-def stand_apart(parameters: Real) -> bool:
-    """Return whether the cameras' axial places differ so much that each field must be refocused by its own defocus."""
-    return bool(abs(axial_of_cameras(as_dict(parameters))[1]) >= _LEAST_APART_RAD)
-
-
-def cameras_apart(parameters: Real, profile: Profile) -> NDArray[np.float32]:
-    """Kernel of the in-phase camera's defocus beyond the mean of both, along either axis of the grid, [2, taps]."""
+def apart_inputs(parameters: Real) -> tuple[str, ...]:
+    """Names of what a decoder must know of `cameras_apart`: none where both cameras see the same plane."""
     value = as_dict(parameters)
-    geometry = fitted_geometry(profile, value)
-    beyond = defocus(axial_of_cameras(value)[1], geometry.pipe_width_m)
-    return defocus_taps(geometry, beyond, field_grid(profile).pitch_m)
+    middle, tilts = axial_of_cameras(value)[1], tilts_of_cameras_apart(value)
+    varying = float(np.hypot(*tilts)) / np.sqrt(3)
+    if np.hypot(middle, varying) < _LEAST_APART_RAD:
+        return ()
+    return APART if varying >= _LEAST_VARYING_RAD else APART[:1]
+
+
+def cameras_apart(parameters: Real, profile: Profile) -> dict[str, NDArray[np.float32]]:
+    """Defocus of the in-phase camera beyond the mean of both, by the names in `APART`.
+
+    Returns:
+        apart [2, taps], the kernel along either axis of the grid in the page's middle; apart_beside [2, 2, taps], the
+        kernels where tilts of the cameras make it least and most; apart_tilt [2], by how much x and y over the page's
+        corner radius lead from the one (-1) to the other (1).
+    """
+    value = as_dict(parameters)
+    geometry, pitch = fitted_geometry(profile, value), field_grid(profile).pitch_m
+    middle, tilts = axial_of_cameras(value)[1], np.array(tilts_of_cameras_apart(value))
+    most = max(float(np.abs(tilts).sum()), _LEAST_VARYING_RAD)
+    edges = np.array([profile.page_width_m, profile.page_height_m]) / 2
+    at = defocus(np.array([middle, middle - most, middle + most]), geometry.pipe_width_m)
+    kernels = [defocus_taps(geometry, float(each), pitch) for each in at]
+    slopes = tilts / most * profile.corner_m / edges
+    return dict(zip(APART, (kernels[0], np.stack(kernels[1:]), slopes.astype(np.float32)), strict=True))
 
 
 def orientations(linear: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -116,11 +136,10 @@ def sampling_table(twin: Twin, parameters: Real, quadrature_phase: float, profil
         profile: the nominal device.
 
     Returns:
-        registration [2, 2, 10]; homodyne [2] (cosine and sine of the turn); apart [2, taps], see `cameras_apart`;
-        parameters [P] themselves; with one symbol
-        pitch as the unit of offset: places [B, 2, ny, nx] in grid samples (column, row), place_gradients [B, 4, ny, nx]
-        as (dx/dx, dx/dy, dy/dx, dy/dy), phases [B, 6, ny, nx] as (value, d/dx, d/dy, d2/dx2, d2/dxdy, d2/dy2), the
-        value within +-pi; positions [2, ny, nx], exit centroid over the pipe's width.
+        registration [2, 2, 10]; homodyne [2] (cosine and sine of the turn); those of `cameras_apart`; parameters [P]
+        themselves; with one symbol pitch as the unit of offset: places [B, 2, ny, nx] in grid samples (column, row),
+        place_gradients [B, 4, ny, nx] as (dx/dx, dx/dy, dy/dx, dy/dy), phases [B, 6, ny, nx] as (value, d/dx, d/dy,
+        d2/dx2, d2/dxdy, d2/dy2), the value within +-pi; positions [2, ny, nx], exit centroid over the pipe's width.
     """
     grid = field_grid(profile)
     rows, columns = profile.page_shape
@@ -156,7 +175,7 @@ def sampling_table(twin: Twin, parameters: Real, quadrature_phase: float, profil
     return {
         "registration": registration_coefficients(twin, parameters, profile),
         "homodyne": np.array([np.cos(quadrature_phase), np.sin(quadrature_phase)], dtype=np.float32),
-        "apart": cameras_apart(parameters, profile),
+        **cameras_apart(parameters, profile),
         "parameters": parameters.astype(np.float32),
         "places": as_maps(middle, _PLACE_BITS),
         "place_gradients": as_maps(gradients, _PLACE_BITS),

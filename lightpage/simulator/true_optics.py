@@ -36,7 +36,9 @@ _GRID_MARGIN = 1.04
 """Computed camera plane over the sensor, so that rotated and shifted pixels still look inside."""
 
 _CAMERA_TILTS = "cameras_axial_x_rad", "cameras_axial_y_rad"
-"""Parameters of both cameras' tilt."""
+"""Parameters of both cameras' tilt on average."""
+_TILTS_APART = "cameras_apart_x_rad", "cameras_apart_y_rad"
+"""Parameters of what the cameras' tilts differ in."""
 
 _RIPPLE = 1
 """The random stream of the reference's ripple; a simulator draws others from a seed of its own."""
@@ -320,8 +322,7 @@ def _like_taper(profile: Profile, device: Device) -> tuple[float, float, float]:
 def true_parameters(profile: Profile, device: Device) -> NDArray[np.float64]:
     """The truth as a ray twin's parameter vector [P] (see `lightpage.calibration.parameters`).
 
-    A taper is told by what it does to other parameters, tilts of the cameras by their mean. Walls of two distances and
-    ghosts have none.
+    A taper is told by what it does to other parameters. Walls of two distances and ghosts have none.
     """
     g, pitch = device.geometry, profile.slm.pitch_m
     longer, at_modulator, at_cameras = _like_taper(profile, device)
@@ -361,6 +362,9 @@ def true_parameters(profile: Profile, device: Device) -> NDArray[np.float64]:
             f"{camera}_keystone_x_relative": pose.keystone_x_relative,
             f"{camera}_keystone_y_relative": pose.keystone_y_relative,
         }
-    tilts = ((pose.tilt_x_rad, pose.tilt_y_rad) for pose in (device.in_phase_camera, device.quadrature_camera))
-    values |= zip(_CAMERA_TILTS, np.mean([*tilts], axis=0).tolist(), strict=True)
+    one, other = (
+        np.array([pose.tilt_x_rad, pose.tilt_y_rad]) for pose in (device.in_phase_camera, device.quadrature_camera)
+    )
+    values |= zip(_CAMERA_TILTS, ((one + other) / 2).tolist(), strict=True)
+    values |= zip(_TILTS_APART, ((one - other) / 2).tolist(), strict=True)
     return as_vector(values)

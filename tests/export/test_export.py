@@ -13,7 +13,7 @@ import torch
 from click.testing import CliRunner
 
 from lightpage.calibration.parameters import NAMES, nominal
-from lightpage.calibration.sampling_table import sampling_table
+from lightpage.calibration.sampling_table import APART, apart_inputs, sampling_table
 from lightpage.device.state import Device
 from lightpage.errors import BundleError, InvalidInputError
 from lightpage.export import from_run, run_graph
@@ -106,7 +106,7 @@ def test_the_fields_own_graph_shows_the_decoders_field(
     table = sampling_table(TorchTwin(RayTwin(small_profile())), nominal(), np.pi / 2, small_profile())
     with np.load(small_run / REFERENCES) as kept:
         references = FramePair(kept["in_phase"], kept["quadrature"])
-    asked = bundle.golden.pair, references, table["registration"], table["homodyne"]
+    asked = bundle.golden.pair, references, table["registration"], table["homodyne"], {}
     field, left = decoder.field_solver(*asked)
     expected, expected_left = without.field_solver(*asked)
     assert np.sqrt(np.mean(np.abs(expected) ** 2)) > 0.1  # of the light that a symbol of full modulation brings
@@ -119,21 +119,27 @@ def test_the_fields_own_graph_shows_the_decoders_field(
         without.field_solver(*asked)
 
 
+@pytest.mark.parametrize("tilt_rad", [0.0, -0.4])
 def test_a_fields_graph_takes_the_defocus_of_cameras_that_stand_apart(
-    exported: Bundle, small_run: Path, monkeypatch: pytest.MonkeyPatch
+    tilt_rad: float, exported: Bundle, small_run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lightpage.train.models.field.ROUNDS_APART", 2)  # of many alike
     profile, parameters, pair = small_profile(), nominal(), exported.golden.pair
     parameters[[NAMES.index(f"{camera}_axial_rad") for camera in ("in_phase", "quadrature")]] = 0.8, -0.7
+    parameters[NAMES.index("cameras_apart_x_rad")] = tilt_rad
+    apart = apart_inputs(parameters)
+    assert apart == (APART if tilt_rad else APART[:1])
     table = sampling_table(TorchTwin(RayTwin(profile)), parameters, np.pi / 2, profile)
     with np.load(small_run / REFERENCES) as kept:
         references = FramePair(kept["in_phase"], kept["quadrature"])
     tensors = {"reference_in_phase": references.in_phase, "reference_quadrature": references.quadrature, **table}
-    session = open_session(field_onnx(FieldGraph(profile, apart=True), "uint8", tensors), "field", 1)
+    session = open_session(field_onnx(FieldGraph(profile, apart=apart), "uint8", tensors), "field", 1)
     fed = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **tensors}
     (field,) = session.run(["field"], {port.name: fed[port.name] for port in session.get_inputs()})
     at, recover = (table["registration"], table["homodyne"]), TorchFieldSolver(FieldRecovery(profile))
-    expected, together = (recover(pair, references, *at, apart)[0] for apart in (table["apart"], None))
+    expected, together = (
+        recover(pair, references, *at, {name: table[name] for name in names})[0] for names in (apart, apart[: len(apart) // 2])
+    )
     np.testing.assert_allclose(field[0] + 1j * field[1], expected, atol=1e-3)
     assert np.abs(expected - together).max() > 0.1
 

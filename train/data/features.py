@@ -94,7 +94,7 @@ class FeatureExtractor:
         self.device = device
         self._twin = TorchTwin(RayTwin(profile))
         self.table: SamplingTable = sampling_table(self._twin, parameters, device.quadrature_phase_rad, profile)
-        self._apart = self.table["apart"] if device.stands_apart else None
+        self._apart = {name: self.table[name] for name in device.apart_inputs}
         self.recovery = choices.field_recovery(profile, with_signal_power=with_signal_power)
         self._solve = TorchFieldSolver(self.recovery if compute == CPU else deepcopy(self.recovery).to(compute))
         self._coherent = choices.coherent_localizer(profile).to(compute)
@@ -118,7 +118,7 @@ class FeatureExtractor:
         registration = shifted(self.table["registration"], np.array(shift_px))
         seen = (pair.in_phase, pair.quadrature, self.device.references.in_phase, self.device.references.quadrature)
         tensors = [*(frame.astype(np.float32) for frame in seen), registration, self.table["homodyne"]]
-        tensors += [] if self._apart is None else [self._apart]
+        tensors += self._apart.values()
         measured = self.recovery.measure(*map(torch.from_numpy, tensors))
         return measured, self.recovery.solve(measured)[0]
 

@@ -10,6 +10,7 @@ where `quadrature_phase` is +90 or -90 degrees, by the sign of Q, plus the quadr
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +25,14 @@ from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.train.models.apart import ROUNDS as ROUNDS_APART
-from lightpage.train.models.apart import CamerasApart, CamerasTogether, reflected
+from lightpage.train.models.apart import (
+    Cameras,
+    CamerasApart,
+    CamerasTilted,
+    CamerasTogether,
+    recovered_linearly,
+    reflected,
+)
 from lightpage.train.models.filters import BLOCK, SeparableFilter
 from lightpage.waves.defocus import resampled_taps
 from lightpage.waves.grid import GRID_STEP_PX, FieldGrid, field_grid
@@ -60,7 +68,7 @@ class Measured(NamedTuple):
     sin: Tensor
     amplitude: Tensor
     lit: Tensor
-    apart: CamerasApart | None = None
+    apart: Cameras | None = None
 
     def left(self, e: Tensor) -> Tensor:
         """Return the residual of both equations at e, [2, ny, nx], a camera each."""
@@ -194,7 +202,7 @@ class FieldRecovery(nn.Module):
         reference_quadrature: Tensor,
         registration: Tensor,
         homodyne: Tensor,
-        apart: Tensor | None = None,
+        *apart: Tensor,
     ) -> Measured:
         """Measure the field on the common grid by both cameras.
 
@@ -204,15 +212,24 @@ class FieldRecovery(nn.Module):
             registration: [2, 2, 10], pixel (column, row) of each camera as a cubic in the grid's (x, y), each over
                 the page's corner radius.
             homodyne: [2], cosine and sine of the turn between the two arms.
-            apart: kernel of the in-phase camera's defocus on the usual grid, see
-                `lightpage.calibration.sampling_table.cameras_apart`; None where both cameras see the same plane.
+            apart: those of `lightpage.calibration.sampling_table.cameras_apart`, on the usual grid, that
+                `apart_inputs` names.
         """
         references = self.in_blocks(reference_in_phase, reference_quadrature)
         seen = self.references(references, registration)
         beyond = self.filtered(self.in_blocks(in_phase, quadrature) - references)
         a, b = seen.lit * sampled(beyond, seen.where) / (2 * seen.reference)
-        defocus = None if apart is None else CamerasApart.of(apart @ self.to_taps.T)
-        return Measured(a, b, homodyne[0], homodyne[1], seen.amplitude, seen.lit, defocus)
+        cameras = self._apart(*apart) if apart else None
+        return Measured(a, b, homodyne[0], homodyne[1], seen.amplitude, seen.lit, cameras)
+
+    def _apart(self, taps: Tensor, *tilted: Tensor) -> Cameras:
+        """Cameras that stand apart, by what `measure` takes."""
+        taps = taps @ self.to_taps.T
+        if not tilted:
+            return CamerasApart.of(taps)
+        beside, tilt = tilted
+        along = tilt[0] * self.u[1] + (tilt[1] * self.v[1])[:, None]
+        return CamerasTilted.of(taps, beside @ self.to_taps.T, along)
 
     def in_blocks(self, in_phase: Tensor, quadrature: Tensor) -> Tensor:
         """Two frames in blocks of pixels, [2, rows, columns]."""
@@ -273,7 +290,7 @@ class FieldRecovery(nn.Module):
         a, b, cos, sin, amplitude, _, apart = measured
         if apart is not None and not self.with_signal_power:
             both = torch.stack([a, b])
-            return apart.recovered_linearly(both, measured.arms, amplitude, inverse_amplitude, self.band)
+            return recovered_linearly(apart, both, measured.arms, amplitude, inverse_amplitude, self.band)
         start = self.band(torch.stack([a, (b - cos * a) / sin]) * amplitude) * inverse_amplitude
         if not self.with_signal_power:
             return torch.as_tensor(start)
@@ -377,14 +394,15 @@ class TorchFieldSolver:
         references: FramePair,
         registration: NDArray[np.float32],
         homodyne: NDArray[np.float32],
-        apart: NDArray[np.float32] | None = None,
+        apart: Mapping[str, NDArray[np.float32]],
     ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
         """See `lightpage.calibration.interfaces.FieldSolver`."""
         frames = (pair.in_phase, pair.quadrature, references.in_phase, references.quadrature)
         device = next(self._recovery.buffers()).device
-        seen = (torch.from_numpy(each.astype(np.float32)).to(device) for each in (*frames, registration, homodyne))
+        table = registration, homodyne, *apart.values()
+        seen = (torch.from_numpy(each.astype(np.float32)).to(device) for each in (*frames, *table))
         exact = torch.backends.cudnn.flags(enabled=True, allow_tf32=False)  # 10 bits would be seen
         with torch.no_grad(), exact:
-            field, residual = self._recovery(*seen, None if apart is None else torch.from_numpy(apart).to(device))
+            field, residual = self._recovery(*seen)
         real, imaginary = field.cpu().numpy()
         return np.asarray(real + 1j * imaginary, dtype=np.complex64), residual.cpu().numpy()

@@ -60,7 +60,9 @@ _USUAL_BLUR, _BLUR_PRIOR, _BLUR_STEP = 0.1, 0.5, 0.01
 _CAMERAS = ("in_phase", "quadrature")
 _AT_CAMERA = frozenset(indices("camera_phase"))
 """Parameters whose change of the light needs no propagation."""
-_BEHIND_PIPE = frozenset(index for index in indices("axial", "tilt") if not NAMES[index].startswith("modulator"))
+_BEHIND_PIPE = frozenset(
+    index for index in indices("axial", "tilt", "tilt_apart") if not NAMES[index].startswith("modulator")
+)
 """Parameters that change the light only behind the pipe."""
 _OF_REAL_LENSES = (NAMES.index("lens_path_relative"),)
 """Parameters that do nothing where the profile's lenses are ideal."""

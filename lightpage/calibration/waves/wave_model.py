@@ -60,6 +60,11 @@ def axial_of_cameras(value: Mapping[str, Any]) -> tuple[Any, Any]:
     return (one + other) / 2, (one - other) / 2
 
 
+def tilts_of_cameras_apart(value: Mapping[str, Any]) -> tuple[Any, Any]:
+    """Half of what in-phase's axial place grows more than quadrature's to the page's right and to its lower edge."""
+    return value["cameras_apart_x_rad"], value["cameras_apart_y_rad"]
+
+
 def modulator_axes(profile: Profile, samples: int) -> tuple[Real, Real]:
     """Places of so many samples per symbol and axis from the page's centre, [nx samples] and [ny samples], metres."""
     rows, columns = (count * samples for count in profile.page_shape)
@@ -156,8 +161,9 @@ class FittedWaves:
             blur,
         )
         self.channel: WaveChannel
-        if like is not None and like._sampling == self._sampling:
-            self.channel = like.channel
+        shared = like if like is not None and like._sampling == self._sampling else None
+        if shared is not None:
+            self.channel = shared.channel
         else:
             self.channel = WaveChannel(
                 geometry,
@@ -174,6 +180,12 @@ class FittedWaves:
         self.launch: Complex = np.exp(1j * at_launch)
         self.against_reference: Complex = np.exp(1j * at_camera)
         self._apart = defocus(axial_of_cameras(value)[1], geometry.pipe_width_m)
+        self._tilts = tilts_of_cameras_apart(value)
+        self._channels: tuple[WaveChannel, WaveChannel]
+        if shared is not None and shared._tilts == self._tilts:
+            self._channels = shared._channels
+        else:
+            self._channels = self._tilted(profile, 1), self._tilted(profile, -1)
         self._camera = self.against_reference / stride  # samples that stand for more area are larger
 
     def to_exit(self, field: Complex, passed: NDArray[Any] | float = 1.0) -> Complex:
@@ -190,15 +202,16 @@ class FittedWaves:
 
     def from_exit(self, leaving: Complex) -> Complex:
         """Field on the exit facet's grid to the common grid as either camera sees it, [2, Gy, Gx]."""
-        beyond = self._beyond if self._apart else (0.0,)
-        seen = [self.channel.camera_field(leaving, each) * self._camera for each in beyond]
-        return np.stack([seen[0], seen[-1]])
+        if not self._apart and not any(self._tilts):
+            return np.stack([self.channel.camera_field(leaving) * self._camera] * 2)
+        both = zip(self._channels, self._beyond, strict=True)
+        return np.stack([channel.camera_field(leaving, beyond) * self._camera for channel, beyond in both])
 
     def back_to_exit(self, seen: Complex) -> Complex:
         """Fields that either camera sees, [2, Gy, Gx], back to the exit facet's grid, by the adjoint of `from_exit`."""
-        beyond = self._beyond if self._apart else (0.0, 0.0)
-        fields = [self.channel.to_exit(one * self._camera.conj(), each) for one, each in zip(seen, beyond, strict=True)]
-        return np.asarray(fields[0] + fields[1])
+        cameras = zip(self._channels, seen, self._beyond, strict=True)
+        one, other = (channel.to_exit(field * self._camera.conj(), beyond) for channel, field, beyond in cameras)
+        return np.asarray(one + other)
 
     def back_to_page(self, leaving: Complex) -> Complex:
         """Field on the exit facet's grid back to the modulator, by the adjoint of `to_exit`."""
@@ -212,6 +225,18 @@ class FittedWaves:
     def _beyond(self) -> tuple[float, float]:
         """Defocus of either camera beyond that of both on average, rad/m^2."""
         return self._apart, -self._apart
+
+    def _tilted(self, profile: Profile, sign: int) -> WaveChannel:
+        """The channel to the camera that is tilted like this beyond both on average."""
+        if not any(self._tilts):
+            return self.channel
+        geometry, edges = self.channel.geometry, (profile.page_width_m / 2, profile.page_height_m / 2)
+        x, y = (
+            sign * defocus(tilt, geometry.pipe_width_m) / edge for tilt, edge in zip(self._tilts, edges, strict=True)
+        )
+        path = geometry.camera_path  # of a lens whose adjoint is used
+        path = path._replace(tilt_x=path.tilt_x - x, tilt_y=path.tilt_y - y)
+        return replace(self.channel, geometry=replace(geometry, camera_path=path))
 
 
 def on_modulator(page: NDArray[Any], samples: int) -> NDArray[Any]:

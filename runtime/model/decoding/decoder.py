@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.calibration.sampling_table import SamplingTable
+from lightpage.calibration.sampling_table import APART, SamplingTable
 from lightpage.errors import (
     BundleError,
     FrameError,
@@ -389,7 +390,7 @@ class BundleFieldSolver:
         references: FramePair,
         registration: NDArray[np.float32],
         homodyne: NDArray[np.float32],
-        apart: NDArray[np.float32] | None = None,
+        apart: Mapping[str, NDArray[np.float32]],
     ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
         """Field and what is left of the equations, see `FieldSolver`; whatever the page's residual is.
 
@@ -403,8 +404,9 @@ class BundleFieldSolver:
             "registration": registration,
             "homodyne": homodyne,
         }
-        if "apart" in self._graph.ports:
-            table["apart"] = _together(self._graph.value("apart")) if apart is None else apart
+        for name in APART:
+            if name in self._graph.ports:
+                table[name] = apart[name] if name in apart else _together(name, self._graph.value(name))
         self._graph.check(table)
         feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **table}
         if not self._alone:
@@ -417,8 +419,9 @@ class BundleFieldSolver:
         return np.asarray(real + 1j * imaginary, np.complex64), left
 
 
-def _together(apart: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The kernel of cameras that see the same plane, in the shape of another one."""
-    kernel = np.zeros_like(apart)
-    kernel[0, apart.shape[1] // 2] = 1
-    return kernel
+def _together(name: str, apart: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Value of a table's entry of `APART` for cameras that see the same plane, in the shape of another one."""
+    same = np.zeros_like(apart)
+    if name != APART[-1]:
+        same[..., 0, apart.shape[-1] // 2] = 1
+    return same

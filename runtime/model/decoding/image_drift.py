@@ -21,7 +21,7 @@ from lightpage.calibration.image_search import FoundImage, ImageSearch
 from lightpage.calibration.interfaces import BRANCHES, Twin
 from lightpage.calibration.parameters import NAMES
 from lightpage.calibration.phases import tilt_of_shift
-from lightpage.calibration.sampling_table import SamplingTable, sampling_table, shifted, symbol_centres
+from lightpage.calibration.sampling_table import APART, SamplingTable, sampling_table, shifted, symbol_centres
 from lightpage.device.profile import Profile
 from lightpage.errors import BundleError, FrameError
 from lightpage.page.correction import wrapped
@@ -293,6 +293,7 @@ class BundleSearch:
     def __init__(self, decoder: Decoder, twin: Twin) -> None:
         self._decoder, self._references = decoder, decoder.references
         self._registration, self._homodyne = (decoder.graph.value(name) for name in ("registration", "homodyne"))
+        self._apart = {name: decoder.graph.value(name) for name in APART if name in decoder.graph.ports}
         self._search = ImageSearch(twin, decoder.bundle.calibration.vector, decoder.bundle.profile)
 
     def find(
@@ -309,5 +310,5 @@ class BundleSearch:
             BundleError: no graph of the bundle shows the field.
         """
         references = references or self._references
-        field, _ = self._decoder.field_solver(pair, references, self._registration, self._homodyne)
+        field, _ = self._decoder.field_solver(pair, references, self._registration, self._homodyne, self._apart)
         return self._search.find(field, pilots, around_px)

@@ -48,7 +48,7 @@ def field_of(pair: FramePair, references: FramePair) -> NDArray[np.complexfloati
     registration = registration_coefficients(TWIN, PARAMETERS, PROFILE)
     turn = DEVICE.homodyne.turn_rad
     homodyne = np.array([np.cos(turn), np.sin(turn)], np.float32)
-    return TorchFieldSolver(FieldRecovery(PROFILE))(pair, references, registration, homodyne)[0]
+    return TorchFieldSolver(FieldRecovery(PROFILE))(pair, references, registration, homodyne, {})[0]
 
 
 def test_the_image_is_found_wherever_it_lies(

@@ -66,6 +66,8 @@ def test_its_maps_have_the_names_and_shapes_that_a_decoder_takes_and_no_digits_t
         "registration": (2, 2, 10),
         "homodyne": (2,),
         "apart": (2, 25),
+        "apart_beside": (2, 2, 25),
+        "apart_tilt": (2,),
         "parameters": (len(NAMES),),
         "places": (branches, 2, *page),
         "place_gradients": (branches, 4, *page),

@@ -8,7 +8,7 @@ import torch
 
 from analysis.comparison.methods.oracle import without_signal_power
 from lightpage.calibration.samplers import FieldSampler
-from lightpage.calibration.sampling_table import cameras_apart, monomial_powers
+from lightpage.calibration.sampling_table import apart_inputs, cameras_apart, monomial_powers
 from lightpage.device.state import Aberration, CameraPose, Device, Drift, Homodyne, Reference, Sensor
 from lightpage.errors import InvalidInputError
 from lightpage.recording.frame_pair import FramePair
@@ -35,15 +35,23 @@ class Recorded:
     turn: float
     exit_field: np.ndarray
     optics: TrueOptics
-    apart: np.ndarray | None
+    apart: dict[str, np.ndarray]
 
 
 def record(
-    sign: int = 1, ratio: float = 1.6, full_well_e: float = 15_000.0, axial: tuple[float, float] = (0.0, 0.0)
+    sign: int = 1,
+    ratio: float = 1.6,
+    full_well_e: float = 15_000.0,
+    axial: tuple[float, float] = (0.0, 0.0),
+    tilt_rad: float = 0.0,
 ) -> Recorded:
     device = Device(
-        in_phase_camera=CameraPose(shift_x_px=SHIFTS_PX[0], axial_rad=axial[0]),
-        quadrature_camera=CameraPose(shift_x_px=SHIFTS_PX[1], axial_rad=axial[1]),
+        in_phase_camera=CameraPose(
+            shift_x_px=SHIFTS_PX[0], axial_rad=axial[0], tilt_x_rad=tilt_rad, tilt_y_rad=tilt_rad / 2
+        ),
+        quadrature_camera=CameraPose(
+            shift_x_px=SHIFTS_PX[1], axial_rad=axial[1], tilt_x_rad=-tilt_rad, tilt_y_rad=-tilt_rad / 2
+        ),
         aberration=Aberration(distortion_relative=0),
         reference=Reference(amplitude_ratio=ratio),
         homodyne=Homodyne(quadrature_error_deg=ERROR_DEG, quadrature_sign=sign),
@@ -58,7 +66,9 @@ def record(
     x, y = np.meshgrid(grid.x_m, grid.y_m)
     real, imaginary = (resample(part, *optics.camera_axes_m, x, y) for part in (field.real, field.imag))
     turn = sign * np.pi / 2 + np.deg2rad(ERROR_DEG)
-    apart = cameras_apart(true_parameters(PROFILE, device), PROFILE) if any(axial) else None
+    parameters = true_parameters(PROFILE, device)
+    kernels = cameras_apart(parameters, PROFILE)
+    apart = {name: kernels[name] for name in apart_inputs(parameters)}
     truth = real + 1j * imaginary
     return Recorded(page.pair, simulator.references(), truth, turn, page.exit_field, optics, apart)
 
@@ -87,6 +97,7 @@ def solve(
         recorded.references,
         registration() if where is None else where,
         np.array([np.cos(angle), np.sin(angle)], np.float32),
+        {},
     )
 
 
@@ -147,12 +158,14 @@ class TestAccuracy:
         assert found == pytest.approx(expected_db, abs=0.5)
 
     @pytest.mark.parametrize(
-        ("full_well_e", "step_px", "expected_db"), [(15_000, 2, -25.6), (15_000, 3, -15.6), (32, 2, -9.0)]
+        ("full_well_e", "step_px", "tilt_rad", "expected_db"),
+        [(15_000, 2, 0.0, -25.6), (15_000, 3, 0.0, -15.6), (32, 2, 0.0, -9.0), (15_000, 2, 0.3, -25.6)],
     )
     def test_cameras_that_stand_apart_show_one_field(
-        self, full_well_e: float, step_px: int, expected_db: float
+        self, full_well_e: float, step_px: int, tilt_rad: float, expected_db: float
     ) -> None:
-        page, grid = record(full_well_e=full_well_e, axial=(0.8, -0.7)), field_grid(PROFILE, step_px)
+        page = record(full_well_e=full_well_e, axial=(0.8, -0.7), tilt_rad=tilt_rad)
+        grid = field_grid(PROFILE, step_px)
         assert error_db(recovered(page, FieldRecovery(PROFILE, grid=grid)), page.truth) == pytest.approx(
             expected_db, abs=0.5
         )
