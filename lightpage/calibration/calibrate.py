@@ -160,7 +160,8 @@ _COMPLEX = (
 )
 _PHASES = (_Stage("phases", 2, 1, _ALL_GROUPS, COHERENT_BRANCHES, use_phase=True),) * 2
 """Each round halves what is left of the error, since patches are measured about the current geometry; two bring it
-within reach of the waves."""
+within reach of the waves. On a small page they may take a phase for another a turn away: where the light is not
+explained, the waves begin anew without them."""
 _DRIFTED = (_Stage("follow the drift", 6, 2, _ALL_GROUPS, COHERENT_BRANCHES, half_rate=True),)
 """Stages from an earlier calibration: the complex field is right from the start, so no camera is searched alone."""
 _DRIFT_SHARES = {"angle": 1.0, "lengths": 0.2, "in_phase": 0.3, "quadrature": 0.3, "axial": 0.2}
@@ -209,6 +210,7 @@ def calibrate(
         work.complex_field(stage)
     work.estimate_turn()
     work.waves("relation of the cameras", ("in_phase", "quadrature"))
+    without_phases = work.parameters, work.quadrature_phase, work.modulation
     for stage in _PHASES:
         work.complex_field(stage)
     before = work.parameters, work.quadrature_phase, work.modulation
@@ -218,14 +220,15 @@ def calibrate(
         found.append(work.result())
     except CalibrationError as error:
         failure = error
-    for axis in (0, 1):
+    for start, axis in ((without_phases, None), (before, 0), (before, 1)):
         if found and (min(map(_bits_lost, found)) <= USABLE or _by_modulator(found[0])):
             break
-        work.parameters, work.quadrature_phase, work.modulation = before
-        work.total += 4
+        work.parameters, work.quadrature_phase, work.modulation = start
+        work.total += 3 if axis is None else 4
         with suppress(CalibrationError):
-            _relate_apart(work, axis)
-            work.waves("waves of cameras apart", _ALL_GROUPS)
+            if axis is not None:
+                _relate_apart(work, axis)
+            work.waves("waves without phases" if axis is None else "waves of cameras apart", _ALL_GROUPS)
             found.append(work.result())
     if failure is not None and not found:
         raise failure
