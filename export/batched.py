@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from onnxscript import ir, optimizer
 from torch import Tensor, nn
 
-from lightpage.calibration.sampling_table import APART
 from lightpage.export.graph import ANSWERS, FRAME_INPUTS, DecoderGraph, answers
 from lightpage.export.onnx_files import FOLDED, OPSET, anonymous, halved, sharing
 from lightpage.progress import warn
@@ -92,7 +91,7 @@ def batched_onnx(
         defaults: the calibrated table, by name.
         dtype: type in which pages are computed, float16 or float32.
     """
-    if APART[0] in defaults:
+    if graph.apart:
         return None
     decoder = BatchedDecoder(graph.recovery, graph.decoder, 8 * np.dtype(frame_dtype).itemsize, dtype).eval()
     constants = ConstantsGraph(decoder, tuple(defaults)).eval()

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from lightpage.calibration.sampling_table import APART
 from lightpage.errors import BundleError, InvalidInputError
 from lightpage.export.batched import files_for_batches
 from lightpage.export.graph import FRAME_INPUTS, DecoderGraph, FieldGraph
@@ -132,7 +131,7 @@ def export_run(
     )
     field = {}
     if isinstance(graph, DecoderGraph):
-        recovers = FieldGraph(profile, graph.recovery.reflections, tuple(name for name in APART if name in defaults))
+        recovers = FieldGraph(profile, graph.recovery.reflections, graph.apart)
         field = {FIELD: field_onnx(recovers, frame_dtype, defaults)}
     files = {
         DECODER: decoder,

@@ -55,6 +55,7 @@ class DecoderGraph(nn.Module):
         with torch.no_grad():
             for parameter in itertools.chain(*(getattr(decoder, part).parameters() for part in HALVED)):
                 parameter.copy_(parameter.half())
+        self.apart = apart
         self.measured_by = (*TABLE_INPUTS, *apart)
         self.table_inputs = (*self.measured_by, *decoder.table_inputs)
 

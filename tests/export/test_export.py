@@ -114,7 +114,7 @@ def test_the_fields_own_graph_shows_the_decoders_field(
     np.testing.assert_allclose(field, expected, atol=1e-4)
     np.testing.assert_allclose(left, expected_left, atol=1e-4)
     # as a decoder that looks at the field more coarsely would have it
-    monkeypatch.setattr("lightpage.runtime.model.decoding.decoder.field_grid", partial(field_grid, step_px=3))
+    monkeypatch.setattr("lightpage.runtime.model.decoding.field_solver.field_grid", partial(field_grid, step_px=3))
     with pytest.raises(BundleError, match="output field"):
         without.field_solver(*asked)
 
@@ -138,7 +138,8 @@ def test_a_fields_graph_takes_the_defocus_of_cameras_that_stand_apart(
     (field,) = session.run(["field"], {port.name: fed[port.name] for port in session.get_inputs()})
     at, recover = (table["registration"], table["homodyne"]), TorchFieldSolver(FieldRecovery(profile))
     expected, together = (
-        recover(pair, references, *at, {name: table[name] for name in names})[0] for names in (apart, apart[: len(apart) // 2])
+        recover(pair, references, *at, {name: table[name] for name in names})[0]
+        for names in (apart, apart[: len(apart) // 2])
     )
     np.testing.assert_allclose(field[0] + 1j * field[1], expected, atol=1e-3)
     assert np.abs(expected - together).max() > 0.1

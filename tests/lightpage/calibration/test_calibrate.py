@@ -12,6 +12,7 @@ from lightpage.page.symbols import symbol_phases
 from lightpage.progress import Progress
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
+from lightpage.study.known import Known
 from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
 from lightpage.train.models.twin import RayTwin, TorchTwin
 from tests.lightpage.refused import refused
@@ -74,3 +75,21 @@ def test_cameras_far_apart_behind_an_astigmatic_launch_are_found_at_a_second_sta
     assert found.goodness.verdict == "good"
     assert as_dict(found.parameters)["in_phase_axial_rad"] == pytest.approx(-1.4346, abs=0.01)
     assert shares == sorted(shares)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"slm.falloff_relative": 0.4},
+        {"in_phase_camera.tilt_x_rad": 0.2, "quadrature_camera.tilt_x_rad": -0.2},
+    ],
+)
+def test_phases_of_a_small_page_that_were_a_turn_off_are_left_out(changed: dict[str, float]) -> None:
+    profile = load_profile("analysis/comparison/eighth.toml")
+    device = Device().of_profile(profile).with_values(changed)
+    found = Known.of(profile, device, 4, 0).part(slice(2)).calibration(profile, lambda what, share: None)
+    assert found.goodness is not None
+    assert found.goodness.verdict == "good"
+    apart = found.parameters["cameras_apart_x_rad"]
+    assert apart == pytest.approx(changed.get("in_phase_camera.tilt_x_rad", 0.0), abs=0.01)
