@@ -14,13 +14,7 @@ from lightpage.codec.code import Code, problems_of
 from lightpage.codec.page_bytes import LOSSES, Loss, PageBytes
 from lightpage.codec.volume import Volume
 from lightpage.codec.volume_file import Restored, VolumeFiles, ranges
-from lightpage.errors import (
-    InvalidInputError,
-    LightpageError,
-    LostDataError,
-    MissingResultsError,
-    RecordingError,
-)
+from lightpage.errors import InvalidInputError, LightpageError, LostDataError, MissingResultsError, RecordingError
 from lightpage.progress import track
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.page_reader import PageReader, RecoveredPage

@@ -12,13 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.calibration.sampling_table import SamplingTable
-from lightpage.errors import (
-    BundleError,
-    FrameError,
-    InvalidInputError,
-    NoCodeError,
-    raised_as,
-)
+from lightpage.errors import BundleError, FrameError, InvalidInputError, NoCodeError, raised_as
 from lightpage.metrics.information import decide_with_confidence
 from lightpage.page.correction import PhaseRefit, corrected
 from lightpage.page.levels import MAX_LEVELS, check_levels
