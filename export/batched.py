@@ -116,7 +116,7 @@ def files_for_batches(
     """Both graphs in float16 as files of a bundle; none, with a warning, for a device that they do not decode."""
     made = batched_onnx(graph, frame_dtype, defaults, torch.float16)
     if made is None:
-        warn("no decoder for many pages: the cameras of this device stand apart")
+        warn("no decoder for many pages: the cameras of this device stand apart, or are tilted against each other")
         return {}
     return dict(zip((CONSTANTS, BATCH), made, strict=True))
 

@@ -25,6 +25,7 @@ GROUPS = {
     "axial": "Axial places, as phases at the pipe's wall",
     "keystone": "Keystone, at the page's edges",
     "tilt": "Tilts of modulator and cameras",
+    "tilt_apart": "Half of what the cameras' tilts differ in",
 }
 """Headings of the groups of `lightpage.calibration.parameters`."""
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -172,6 +172,8 @@ has learned the earlier calibration's errors, and loses 0.1 bit a symbol where a
 _LEAST_OF_BEST = 0.8
 """Share of the best page's coherence that every page must have: a fifth of its symbols may be others."""
 
+_APART = "waves of cameras apart"
+_STATE = ("parameters", "deviations", "quadrature_phase", "modulation", "conditions", "fit", "_looked", "_found")
 _HELD = 1e-6
 """Share of a prior that leaves a parameter where it is."""
 
@@ -210,31 +212,43 @@ def calibrate(
         work.complex_field(stage)
     work.estimate_turn()
     work.waves("relation of the cameras", ("in_phase", "quadrature"))
-    without_phases = work.parameters, work.quadrature_phase, work.modulation
-    for stage in _PHASES:
-        work.complex_field(stage)
-    before = work.parameters, work.quadrature_phase, work.modulation
-    work.waves("waves", _ALL_GROUPS)
-    found, failure = list[Registered](), None
-    try:
-        found.append(work.result())
-    except CalibrationError as error:
-        failure = error
-    for start, axis in ((without_phases, None), (before, 0), (before, 1)):
-        if found and (min(map(_bits_lost, found)) <= USABLE or _by_modulator(found[0])):
-            break
-        work.parameters, work.quadrature_phase, work.modulation = start
-        work.total += 3 if axis is None else 4
-        with suppress(CalibrationError):
-            if axis is not None:
-                _relate_apart(work, axis)
-            work.waves("waves without phases" if axis is None else "waves of cameras apart", _ALL_GROUPS)
-            found.append(work.result())
-    if failure is not None and not found:
-        raise failure
-    best = min(found, key=_bits_lost)
+    best = _best_of_starts(work)
     check_agreement(best.coherences)
     return best
+
+
+def _best_of_starts(work: _Registration) -> Registered:
+    """Fit the waves from where the phases of patches lead, and from other starts until one explains the light.
+
+    Raises:
+        CalibrationError: no start leads to a device.
+    """
+    related, found, failures = _state(work), list[tuple[float, Registered, dict[str, Any]]](), list[CalibrationError]()
+    for what, axis in (("waves", None), ("waves without phases", None), *((_APART, axis) for axis in (0, 1))):
+        lost, best, start = min(found, key=lambda one: one[0], default=(math.inf, None, related))
+        if lost <= USABLE or (axis is not None and best is not None and _by_modulator(best)):
+            break
+        vars(work).update(start if what == _APART else related)
+        work.total += {"waves": 0, _APART: 4}.get(what, 3)
+        try:
+            for stage in _PHASES if what == "waves" else ():
+                work.complex_field(stage)
+            start = _state(work)
+            if axis is not None:
+                _relate_apart(work, axis)
+            work.waves(what, _ALL_GROUPS)
+            outcome = work.result()
+            found.append((_bits_lost(outcome), outcome, start))
+        except CalibrationError as error:
+            failures.append(error)
+    if not found:
+        raise failures[0]
+    return min(found, key=lambda one: one[0])[1]
+
+
+def _state(work: _Registration) -> dict[str, Any]:
+    """What the stages of a registration change, by name."""
+    return {name: vars(work)[name] for name in _STATE}
 
 
 def _relate_apart(work: _Registration, axis: int) -> None:

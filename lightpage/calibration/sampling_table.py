@@ -26,11 +26,13 @@ APART = ("apart", "apart_beside", "apart_tilt")
 """Names of what tells a decoder that cameras do not see the same plane, see `cameras_apart`."""
 _FIT_POINTS = 9
 _LEAST_APART_RAD = 0.06
-"""Half of the distance of the cameras' axial places, as a phase at the facet's wall, from which on it is dealt with. A
-decoder loses 0.08 bit at 0.04 radian where it is not, and four times that at twice as much. It loses 0.2 bit where it
-was trained without, and takes longer."""
+"""Half of the difference of the cameras' defocus, as a phase at the facet's wall and root mean square over the page,
+from which on it is dealt with. A decoder loses 0.08 bit at 0.04 radian where it is not, and four times that at twice as
+much. It loses 0.2 bit where it was trained without, and takes longer."""
 _LEAST_VARYING_RAD = 0.03
-"""Root mean square over the page of what tilts change of that distance, from which on it is dealt with as well."""
+"""Root mean square of what tilts change of that over the page, from which on the change is dealt with as well."""
+_LEAST_SPAN_RAD = 0.03
+"""Least change from the middle of the page to where it is largest, for kernels that differ."""
 _PLACE_BITS = 14
 """Fractional bits of places and gradients, grid samples. A float32 of thousands of samples has 12."""
 _PHASE_BITS = 16
@@ -78,13 +80,13 @@ def cameras_apart(parameters: Real, profile: Profile) -> dict[str, NDArray[np.fl
 
     Returns:
         apart [2, taps], the kernel along either axis of the grid in the page's middle; apart_beside [2, 2, taps], the
-        kernels where tilts of the cameras make it least and most; apart_tilt [2], by how much x and y over the page's
-        corner radius lead from the one (-1) to the other (1).
+        kernels where tilts of the cameras make it least and most; apart_tilt [2], slopes of the place between
+        these, -1 to 1, along x and y over the page's corner radius.
     """
     value = as_dict(parameters)
     geometry, pitch = fitted_geometry(profile, value), field_grid(profile).pitch_m
     middle, tilts = axial_of_cameras(value)[1], np.array(tilts_of_cameras_apart(value))
-    most = max(float(np.abs(tilts).sum()), _LEAST_VARYING_RAD)
+    most = max(float(np.abs(tilts).sum()), _LEAST_SPAN_RAD)
     edges = np.array([profile.page_width_m, profile.page_height_m]) / 2
     at = defocus(np.array([middle, middle - most, middle + most]), geometry.pipe_width_m)
     kernels = [defocus_taps(geometry, float(each), pitch) for each in at]

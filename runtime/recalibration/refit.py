@@ -6,11 +6,11 @@ from lightpage.calibration.calibrate import LEAST_KEPT, KnownPage, refine
 from lightpage.calibration.document import Calibration
 from lightpage.calibration.image_search import REACH_PX
 from lightpage.calibration.interfaces import FieldSolver, Twin
-from lightpage.calibration.sampling_table import moved_cameras, sampling_table
+from lightpage.calibration.sampling_table import apart_inputs, moved_cameras, sampling_table
 from lightpage.errors import BundleError, CalibrationError
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import symbol_phases
-from lightpage.progress import Progress
+from lightpage.progress import Progress, warn
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import hash_frames
 from lightpage.runtime.model.bundle.bundle import Bundle
@@ -123,6 +123,8 @@ def traced(
         image: where its image was found, None where it was not, or not looked for.
     """
     profile = decoder.bundle.profile
+    if not set(apart_inputs(fitted.vector)) <= decoder.graph.ports.keys():
+        warn(f"{decoder.bundle.subject}: the cameras stand further apart than its decoder can take off; train anew")
     table = {
         "reference_in_phase": references.in_phase,
         "reference_quadrature": references.quadrature,

@@ -139,7 +139,7 @@ def test_a_fields_graph_takes_the_defocus_of_cameras_that_stand_apart(
     at, recover = (table["registration"], table["homodyne"]), TorchFieldSolver(FieldRecovery(profile))
     expected, together = (
         recover(pair, references, *at, {name: table[name] for name in names})[0]
-        for names in (apart, apart[: len(apart) // 2])
+        for names in (apart, apart[:1] if tilt_rad else ())
     )
     np.testing.assert_allclose(field[0] + 1j * field[1], expected, atol=1e-3)
     assert np.abs(expected - together).max() > 0.1

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lightpage.calibration.sampling_table import monomial_powers
+from lightpage.calibration.sampling_table import APART, monomial_powers
 from lightpage.calibration.waves.wave_fit import READ_NOISE
 from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError
@@ -399,7 +399,7 @@ class TorchFieldSolver:
         """See `lightpage.calibration.interfaces.FieldSolver`."""
         frames = (pair.in_phase, pair.quadrature, references.in_phase, references.quadrature)
         device = next(self._recovery.buffers()).device
-        table = registration, homodyne, *apart.values()
+        table = registration, homodyne, *(apart[name] for name in APART if name in apart)
         seen = (torch.from_numpy(each.astype(np.float32)).to(device) for each in (*frames, *table))
         exact = torch.backends.cudnn.flags(enabled=True, allow_tf32=False)  # 10 bits would be seen
         with torch.no_grad(), exact:

@@ -61,7 +61,7 @@ def axial_of_cameras(value: Mapping[str, Any]) -> tuple[Any, Any]:
 
 
 def tilts_of_cameras_apart(value: Mapping[str, Any]) -> tuple[Any, Any]:
-    """Half of what in-phase's axial place grows more than quadrature's to the page's right and to its lower edge."""
+    """Half of how much more in-phase's axial place grows than quadrature's, to the right and lower edges; radians."""
     return value["cameras_apart_x_rad"], value["cameras_apart_y_rad"]
 
 
@@ -227,7 +227,7 @@ class FittedWaves:
         return self._apart, -self._apart
 
     def _tilted(self, profile: Profile, sign: int) -> WaveChannel:
-        """The channel to the camera that is tilted like this beyond both on average."""
+        """The channel to the in-phase camera (sign 1) or to the quadrature camera (-1), tilted as it is."""
         if not any(self._tilts):
             return self.channel
         geometry, edges = self.channel.geometry, (profile.page_width_m / 2, profile.page_height_m / 2)

@@ -144,8 +144,8 @@ def test_a_nominal_modulator_stays_nominal_and_axial_places_and_tilts_are_found_
     tilted = Geometry(modulator_tilt_x_rad=-0.2, modulator_tilt_y_rad=0.4)
     device = Device(geometry=tilted, in_phase_camera=pose, quadrature_camera=other, drift=Drift(shift_px=0))
     truth = true_parameters(PROFILE, device)
-    start, axial = truth.copy(), indices("axial", "tilt")
-    start[axial] += [0.4, -0.2, 0.1, 0.2, -0.4, -0.3, 0.05]
+    start, axial = truth.copy(), indices("axial", "tilt", "tilt_apart")
+    start[axial] += [0.4, -0.2, 0.1, 0.2, -0.4, -0.3, 0.05, 0.2, -0.1]
     found = seen_by(device, 5).fit(start, device.homodyne.turn_rad, EVERY, levels=LevelPrior())
     assert found.modulation is NOMINAL
     assert all(found.modulation_deviations)

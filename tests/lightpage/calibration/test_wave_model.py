@@ -61,7 +61,11 @@ def test_a_coarser_grid_has_the_same_light_and_keeps_the_adjoint() -> None:
 def test_waves_share_the_work_of_others_with_their_geometry_and_of_no_others() -> None:
     page = np.exp(2j * np.pi * np.random.default_rng(2).random([SAMPLES * count for count in PROFILE.page_shape]))
     first = FittedWaves(PROFILE, nominal(), SAMPLES)
-    for name in ("launch_coma_x_rad", "camera_tilt_x_rad", "pipe_angle_rad", "page_centre_x_m"):
+    for name in ("launch_coma_x_rad", "camera_tilt_x_rad", "pipe_angle_rad", "page_centre_x_m", "cameras_apart_y_rad"):
         changed = as_vector(as_dict(nominal()) | {name: 1e-3})
-        shared, alone = (FittedWaves(PROFILE, changed, SAMPLES, like=like).to_camera(page) for like in (first, None))
-        assert np.array_equal(shared, alone)
+        shared, alone = (FittedWaves(PROFILE, changed, SAMPLES, like=like) for like in (first, None))
+        seen = alone.to_cameras(page)
+        assert np.array_equal(shared.to_cameras(page), seen)
+        assert np.array_equal(FittedWaves(PROFILE, changed, SAMPLES, like=alone).to_cameras(page), seen)
+        leaving = alone.to_exit(page)
+        assert np.vdot(alone.back_to_exit(seen), leaving) == pytest.approx(np.vdot(seen, seen), rel=1e-4)
