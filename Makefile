@@ -63,8 +63,11 @@ PLANTED_ARGS ?=
 planted: $(STAMP)  ## plant 60 faults, one at a time, and print which of them the tests find; PLANTED_ARGS="--out FOLDER" resumes
 	$(ONE_THREAD) $(BIN)/python -m tests.planted.plant $(PLANTED_ARGS)
 
-notebooks: $(STAMP)  ## run docs/notebooks anew, and keep what they print and draw: half an hour
+notebooks: $(STAMP) build/full-size.zip  ## run docs/notebooks anew, and keep what they print and draw: two hours
 	$(BIN)/python -m tests.system.notebooks
+
+build/full-size.zip: $(STAMP)
+	$(BIN)/python -m analysis.comparison.kept_bundle --kept analysis/weights/paper/-0.6deg-32e-4px --out $@
 
 messages: $(STAMP)  ## write anew what the command line says in the failures that people meet most: tests/messages
 	$(PYTEST) tests/messages --snapshot-update
