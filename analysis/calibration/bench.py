@@ -17,7 +17,7 @@ from lightpage.calibration.coherence import page_coherence
 from lightpage.calibration.known_pages import known_pages
 from lightpage.calibration.parameters import NAMES, as_dict, as_vector
 from lightpage.calibration.samplers import FieldSampler
-from lightpage.calibration.sampling_table import apart_inputs, cameras_apart, registration_coefficients
+from lightpage.calibration.sampling_table import needed_apart, registration_coefficients
 from lightpage.device.profile import Profile
 from lightpage.device.state import Device
 from lightpage.errors import CalibrationError
@@ -161,8 +161,7 @@ class Bench:
     ) -> float:
         registration = registration_coefficients(self.twin, parameters, self.profile)
         homodyne = np.array([np.cos(quadrature_phase), np.sin(quadrature_phase)], dtype=np.float32)
-        apart = cameras_apart(parameters, self.profile)
-        needed = {name: apart[name] for name in apart_inputs(parameters)}
-        field, _ = self.solve(page.pair, references, registration, homodyne, needed)
+        apart = needed_apart(parameters, self.profile)
+        field, _ = self.solve(page.pair, references, registration, homodyne, apart)
         sampler = FieldSampler(field, field_grid(self.profile))
         return page_coherence(sampler, self.twin, parameters, self.profile, page.symbols)

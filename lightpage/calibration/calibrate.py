@@ -28,7 +28,7 @@ from lightpage.calibration.patches import (
     search_window,
 )
 from lightpage.calibration.samplers import FieldSampler, FrameSampler
-from lightpage.calibration.sampling_table import apart_inputs, cameras_apart, registration_coefficients
+from lightpage.calibration.sampling_table import needed_apart, registration_coefficients
 from lightpage.calibration.waves.cameras_apart import related_apart
 from lightpage.calibration.waves.wave_fit import LevelPrior, WaveFit
 from lightpage.calibration.waves.wave_model import LaunchConditions
@@ -247,7 +247,7 @@ def _best_of_starts(work: _Registration) -> Registered:
 
 
 def _state(work: _Registration) -> dict[str, Any]:
-    """What the stages of a registration change, by name."""
+    """Return what the stages of a registration change, by name."""
     return {name: vars(work)[name] for name in _STATE}
 
 
@@ -604,9 +604,8 @@ class _Registration:
         registration = registration_coefficients(self.twin, parameters, self.profile)
         quadrature_phase = self.quadrature_phase if quadrature_phase is None else quadrature_phase
         homodyne = np.array([np.cos(quadrature_phase), np.sin(quadrature_phase)], dtype=np.float32)
-        apart = cameras_apart(parameters, self.profile)
-        needed = {name: apart[name] for name in apart_inputs(parameters)}
-        return self.solve_field(page.pair, self.references, registration, homodyne, needed)
+        apart = needed_apart(parameters, self.profile)
+        return self.solve_field(page.pair, self.references, registration, homodyne, apart)
 
     def _frame_samplers(self, page: KnownPage) -> list[FrameSampler]:
         frames = (page.pair.in_phase, page.pair.quadrature)

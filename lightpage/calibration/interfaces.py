@@ -95,6 +95,6 @@ class FieldSolver(Protocol):
             pair, references: frames [H, W].
             registration: [2, 2, 10], see `lightpage.calibration.sampling_table`.
             homodyne: [2], cosine and sine of the turn between the arms.
-            apart: what `apart_inputs` names of `lightpage.calibration.sampling_table.cameras_apart`.
+            apart: see `lightpage.calibration.sampling_table.needed_apart`.
         """
         ...

@@ -94,6 +94,12 @@ def cameras_apart(parameters: Real, profile: Profile) -> dict[str, NDArray[np.fl
     return dict(zip(APART, (kernels[0], np.stack(kernels[1:]), slopes.astype(np.float32)), strict=True))
 
 
+def needed_apart(parameters: Real, profile: Profile) -> dict[str, NDArray[np.float32]]:
+    """Return those of `cameras_apart` that `apart_inputs` names."""
+    apart = cameras_apart(parameters, profile)
+    return {name: apart[name] for name in apart_inputs(parameters)}
+
+
 def orientations(linear: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return how cameras flip and swap the axes from (x, y) to (column, row), without small turns and scales.
 

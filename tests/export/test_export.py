@@ -139,11 +139,7 @@ def test_a_fields_graph_takes_the_defocus_of_cameras_that_stand_apart(
     graph = Mock(ports=(*TABLE_INPUTS, *apart), value=table.__getitem__)
     own, torchs = BundleFieldSolver(replace(exported, files=files), graph, 1), TorchFieldSolver(FieldRecovery(profile))
     fields = []
-    for names, most in (
-        (apart, 1e-5),
-        (APART[:1], 1e-5),
-        ((), 0.1),
-    ):  # torch descends for cameras in one plane
+    for names, most in ((apart, 1e-5), (APART[:1], 1e-5), ((), 0.1)):  # torch descends for cameras in one plane
         asked = pair, references, table["registration"], table["homodyne"], {name: table[name] for name in names}
         (field, _), (expected, _) = own(*asked), torchs(*asked)
         assert np.linalg.norm(field - expected) < most * np.linalg.norm(expected)

@@ -8,7 +8,7 @@ import torch
 
 from analysis.comparison.methods.oracle import without_signal_power
 from lightpage.calibration.samplers import FieldSampler
-from lightpage.calibration.sampling_table import apart_inputs, cameras_apart, monomial_powers
+from lightpage.calibration.sampling_table import monomial_powers, needed_apart
 from lightpage.device.state import Aberration, CameraPose, Device, Drift, Homodyne, Reference, Sensor
 from lightpage.errors import InvalidInputError
 from lightpage.recording.frame_pair import FramePair
@@ -67,8 +67,7 @@ def record(
     real, imaginary = (resample(part, *optics.camera_axes_m, x, y) for part in (field.real, field.imag))
     turn = sign * np.pi / 2 + np.deg2rad(ERROR_DEG)
     parameters = true_parameters(PROFILE, device)
-    kernels = cameras_apart(parameters, PROFILE)
-    apart = {name: kernels[name] for name in apart_inputs(parameters)}
+    apart = needed_apart(parameters, PROFILE)
     truth = real + 1j * imaginary
     return Recorded(page.pair, simulator.references(), truth, turn, page.exit_field, optics, apart)
 
