@@ -53,8 +53,8 @@ def _cases(settings: Settings) -> list[Case]:
     usual = {"localizer": "ray", "true_deg": _times_smaller(settings) * true, "by_name": True}
     cases += [
         {**usual, "name": f"{course}-{reference}-{seed}", "course": course, "matched": matched, "seed": seed}
+        for reference, matched in (("flat", False), ("matched", True))  # those on one data set follow each other
         for course in _COURSES
-        for reference, matched in (("flat", False), ("matched", True))
         for seed in range(1 if settings.quick else _SEEDS)
     ]
     return cases
