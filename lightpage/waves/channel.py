@@ -6,13 +6,14 @@ y' = +-w/2 with y' = x sin t + y cos t, and the field vanishes on them. The comm
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.device.lens_path import IDEAL
 from lightpage.waves.arrays import NUMPY, Arrays
 from lightpage.waves.geometry import (
     Complex,
@@ -26,6 +27,17 @@ from lightpage.waves.geometry import (
 from lightpage.waves.lens import FourierLens, entrance_window
 from lightpage.waves.pipe import PipePropagator, real_products
 from lightpage.waves.sinc_interpolation import interpolation, sparse_axis
+
+_PARTS: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
+    "launch_lens": (("camera_x_m", "camera_y_m", "steps"), {"pipe_length_m": 1.0, "camera_path": IDEAL}),
+    "entrance_window": (("camera_x_m", "camera_y_m", "steps"), {"pipe_length_m": 1.0, "camera_path": IDEAL}),
+    "pipe": (
+        ("page_x_m", "page_y_m", "camera_x_m", "camera_y_m"),
+        {"focal_length_m": 1.0, "pipe_roll": 0.0, "lens_path": IDEAL, "camera_path": IDEAL},
+    ),
+    "delaunch_lens": (("page_x_m", "page_y_m", "steps"), {"pipe_length_m": 1.0, "lens_path": IDEAL}),
+}
+"""Parts of a channel that take long to make: what they do not depend on, and values that stand for it in a geometry."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +68,18 @@ class WaveChannel:
     envelope_m: float = 0.0
     blur_m: float = 0.0
     arrays: Arrays = NUMPY
+
+    def sharing(self, other: WaveChannel) -> WaveChannel:
+        """This channel with those parts of another one that are the same in both; they are made where they lack."""
+        for part, (without, usual) in _PARTS.items():
+            mine, theirs = (
+                {field.name: getattr(each, field.name) for field in fields(each) if field.name not in without}
+                | {"geometry": replace(each.geometry, **usual)}
+                for each in (self, other)
+            )
+            if all(np.array_equal(value, theirs[name]) for name, value in mine.items()):
+                vars(self)[part] = getattr(other, part)
+        return self
 
     @cached_property
     def launch_lens(self) -> FourierLens:

@@ -24,8 +24,6 @@ from lightpage.calibration.waves.wave_model import fitted_geometry
 from lightpage.device.lens_path import SeidelTerms
 from lightpage.device.profile import Profile
 
-_WIDEST_SPREAD = 1.05
-"""Headroom on the nominal exit centroid when counting how many walls a beam can meet."""
 _LANDINGS = 3
 """Rounds in which a place and the second lens's tilt there are made to agree: each leaves a hundredth of the error."""
 _NODES = leggauss(8)
@@ -57,9 +55,6 @@ class RayTwin(nn.Module):
         self.symbol_pitch = profile.symbol_pitch_m
         self.camera_pitch = profile.image_pixel_m
         self.camera_centre = ((profile.camera.columns_px - 1) / 2, (profile.camera.rows_px - 1) / 2)
-        pipe, focal_length_m = profile.pipe, profile.lens.focal_length_m
-        spread = pipe.length_m / focal_length_m / pipe.refractive_index / pipe.width_m * _WIDEST_SPREAD
-        self.walls_met = math.ceil(max(self.half_width, self.half_height) * spread) + 1
 
     def forward(
         self, parameters: Tensor, points: Tensor, anchors: Tensor, places: Tensor
@@ -164,17 +159,19 @@ class RayTwin(nn.Module):
         leaves = torch.where(torch.remainder(met, 2) == 0, 1, -1) * (mean - width * shifted)
         return mean, leaves, (light * places**2).sum(-1) / total - mean**2
 
+    @staticmethod
     def _reflect(
-        self, k: Tensor, phase: Tensor, normal: Tensor, cells: Tensor, width: Tensor, offset: Tensor
+        k: Tensor, phase: Tensor, normal: Tensor, cells: Tensor, width: Tensor, offset: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Reflect |cells| times on the pair of walls with `normal`, starting with the wall on the cells' side."""
-        for met in range(self.walls_met):
-            hit = (torch.abs(cells) > met).to(k.dtype)
-            wall = torch.sign(cells) * (width / 2) * (-1) ** met + offset
-            along = (k @ normal) * hit
-            phase = phase + 2 * along * wall + math.pi * hit
-            k = k - 2 * along[:, None] * normal
-        return k, phase
+        """Reflect |cells| times on the pair of walls with `normal`, starting with the wall on the cells' side.
+
+        Each reflection turns the sign of k.n, and the next wall is the other one. So what the walls' distance adds is
+        the same each time, and what their offset adds is undone by every second one.
+        """
+        met, along = torch.abs(cells), k @ normal
+        left_over = torch.remainder(met, 2)
+        phase = phase + along * (width * cells + 2 * offset * left_over) + math.pi * met
+        return k - 2 * (along * left_over)[:, None] * normal, phase
 
     def _pixels(self, value: dict[str, Tensor], places: Tensor) -> Tensor:
         radius2 = (places * places).sum(-1, keepdim=True) / self.corner**2

@@ -146,7 +146,8 @@ class SeenLight:
 
     def equations_of_fit(self) -> Iterator[Real]:
         """Yield the change of the equations by a small change of each parameter that the twin knows; each flat."""
-        here = self.coarse.to_cameras(self.page)
+        leaving = self.coarse.to_exit(self.page)
+        here = self.coarse.from_exit(leaving)
         places = np.stack(np.meshgrid(self._grid.x_m, self._grid.y_m), axis=-1)[_EVERY]
         for index in range(min(self._twin.known, len(PARAMETERS))):
             moved = self._device.parameters.copy()
@@ -157,7 +158,8 @@ class SeenLight:
                     _looked_at(self._images, at) / (2 * self.references[:, *_EVERY]) - self.counts[:, *_EVERY]
                 )
             else:
-                yield self.equations_of(self.changed(moved).to_cameras(self.page) - here)
+                there = self.coarse.moved(index, self.changed(moved), self.page, leaving, here)
+                yield self.equations_of(there - here)
 
     @property
     def coarse_places(self) -> tuple[Real, Real]:
@@ -178,13 +180,17 @@ class SeenLight:
     @cached_property
     def coarse(self) -> FittedWaves:
         """The fitted waves on the coarse grid."""
-        return self.changed(self._device.parameters)
+        return self._coarse(self._device.parameters)
 
     def changed(self, parameters: Real | None = None, **geometry: float) -> FittedWaves:
         """The waves on the coarse grid with other parameters, or with another geometry."""
-        parameters = self._device.parameters if parameters is None else parameters
-        coarse: dict[str, Any] = {"filled": True, "stride": _STRIDE, "accuracy": _ACCURACY}
-        return FittedWaves(self._device.profile, parameters, self._samples, changed=geometry, blur=self._blur, **coarse)
+        return self._coarse(
+            self._device.parameters if parameters is None else parameters, changed=geometry, like=self.coarse
+        )
+
+    def _coarse(self, parameters: Real, **more: Any) -> FittedWaves:
+        coarse: dict[str, Any] = {"filled": True, "stride": _STRIDE, "accuracy": _ACCURACY, "blur": self._blur}
+        return FittedWaves(self._device.profile, parameters, self._samples, **coarse, **more)
 
     @property
     def _lacking(self) -> Real:

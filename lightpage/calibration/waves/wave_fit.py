@@ -29,14 +29,28 @@ from lightpage.waves.grid import field_grid, symbol_samples
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
+
+class _Sampling(NamedTuple):
+    """Sampling with which the derivative of the light is taken.
+
+    Attributes:
+        samples: samples a symbol and axis, at most.
+        accuracy: share of the splitting steps.
+    """
+
+    samples: int
+    accuracy: float
+
+
+_FAR = _Sampling(1, 1 / 8)
+"""Sampling of the first derivative, which costs some half of another at full size: an error of a tenth is undone later.
+A fit that ended with it would tell a launched defocus three deviations from the best."""
+_NEAR = _Sampling(2, 3 / 8)
+"""Sampling of the others: an error of a percent costs no round, and half of the usual samples leave one of 0.3%."""
 READ_NOISE = 0.3
 """Variance of an equation that does not grow with the light, over the shot noise of the reference alone."""
 ROUNDS = 9
-_CHORD_ACCURACY = 3 / 8
-"""Share of the splitting steps for that derivative: an error of a percent in it costs no round."""
-_CHORD_SAMPLES = 2
-"""Samples a symbol and axis for it: half as many as usual leave an error of 0.3% in the light."""
-_STALE = 0.03
+_STALE = 0.04
 """Relative fall of the residual, since the derivative of the light was taken, beyond which it is taken anew. That costs
 as much as several rounds, but one from further off leaves axial places twenty deviations from the best."""
 _CONVERGED = 1e-3
@@ -58,12 +72,6 @@ _INSIDE = 0.98
 _USUAL_BLUR, _BLUR_PRIOR, _BLUR_STEP = 0.1, 0.5, 0.01
 """Variance of the modulator's blur to start from, its standard deviation about 0, and its finite difference."""
 _CAMERAS = ("in_phase", "quadrature")
-_AT_CAMERA = frozenset(indices("camera_phase"))
-"""Parameters whose change of the light needs no propagation."""
-_BEHIND_PIPE = frozenset(
-    index for index in indices("axial", "tilt", "tilt_apart") if not NAMES[index].startswith("modulator")
-)
-"""Parameters that change the light only behind the pipe."""
 _OF_REAL_LENSES = (NAMES.index("lens_path_relative"),)
 """Parameters that do nothing where the profile's lenses are ideal."""
 
@@ -218,16 +226,18 @@ class WaveFit:
         state = self._start(start, quadrature_phase, modulation)
         nothing, first = np.zeros(len(PARAMETERS)), LaunchConditions(state.light, state.blur)
         best = WaveFitted(start, nothing, quadrature_phase, np.inf, first, modulation)
-        slopes, taken_at = None, np.inf
+        slopes, taken_at, sampling = None, np.inf, _FAR
         for number in range(ROUNDS):
             progress(number / ROUNDS)
             fields, left = self._left(state)
             residual = float(np.sqrt(np.mean(left**2)))
             if not residual < (1 - _CONVERGED) * best.residual:
                 break
-            if slopes is None or (residual < (1 - _STALE) * taken_at and not rough):
+            fresh = sampling is not _FAR and residual >= (1 - _STALE) * taken_at
+            if slopes is None or not (fresh or rough):
                 told, taken_at = partial(_within_round, progress, number), residual
-                slopes = self._slopes(state, of_light, of_cameras, told, levels=levels is not None)
+                sampling = _FAR if slopes is None else _NEAR
+                slopes = self._slopes(state, of_light, of_cameras, sampling, told, levels=levels is not None)
             directions = _directions(state.light, bends=bends)
             columns = self._columns(state, fields, slopes, directions)
             # What is unexplained differs from symbol to symbol, so equations tell no more than symbols do.
@@ -291,14 +301,15 @@ class WaveFit:
         state: _State,
         of_light: list[int],
         of_cameras: list[int],
+        sampling: _Sampling,
         progress: Callable[[float], None],
         *,
         levels: bool,
     ) -> _Slopes:
-        samples = min(_CHORD_SAMPLES, self._samples)
+        samples = min(sampling.samples, self._samples)
 
         def waves(parameters: Real, like: FittedWaves | None = None, blur: float = state.blur) -> FittedWaves:
-            how: dict[str, Any] = {"stride": self._stride, "accuracy": _CHORD_ACCURACY, "like": like, "blur": blur}
+            how: dict[str, Any] = {"stride": self._stride, "accuracy": sampling.accuracy, "like": like, "blur": blur}
             return FittedWaves(self._profile, parameters, samples, filled=True, **how)
 
         def stepped(index: int) -> tuple[Real, float]:
@@ -311,22 +322,15 @@ class WaveFit:
         by_term = np.stack([here.to_cameras(even * term) for term in terms])
         page, field = even * np.tensordot(state.light, terms, 1), np.tensordot(state.light, by_term, 1)
         leaving = here.to_exit(page)
-        by_blur = (waves(state.parameters, blur=state.blur + _BLUR_STEP).to_cameras(page) - field) / _BLUR_STEP
+        blurred = waves(state.parameters, here, state.blur + _BLUR_STEP)
+        by_blur = (blurred.to_cameras(page) - field) / _BLUR_STEP
         functions = [on_modulator(one, samples) for one in modulations.page_basis(self._phases)] if levels else []
         by_level = [here.to_cameras(page * one) for one in functions]
         light, places = list[Complex](), list[Real]()
         for number, index in enumerate(of_light):
             progress(number / len(of_light))
             there, step = stepped(index)
-            moved = waves(there, here)
-            seen: Complex
-            if index in _AT_CAMERA:
-                seen = field * (moved.against_reference / here.against_reference)
-            elif index in _BEHIND_PIPE:
-                seen = moved.from_exit(leaving)
-            else:
-                seen = moved.to_cameras(page)
-            light.append((seen - field) / step)
+            light.append((here.moved(index, waves(there, here), page, leaving, field) - field) / step)
         for there, step in map(stepped, of_cameras):
             moved_px = (self._pixels(there) - self._pixels(state.parameters)) / step
             places.append(moved_px @ self._samples_per_pixel(state.parameters)[:, None])

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.calibration.parameters import as_dict
+from lightpage.calibration.parameters import NAMES, as_dict, indices
 from lightpage.calibration.phases import camera_phase, launch_phase
 from lightpage.device.lens_path import IDEAL, SeidelTerms
 from lightpage.device.profile import Profile
@@ -22,6 +22,12 @@ Complex = NDArray[np.complexfloating]
 
 _ILLUMINATION = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 """Powers of (x, y) in an illumination."""
+_AT_CAMERA = frozenset(indices("camera_phase"))
+"""Parameters whose change of the light needs no propagation."""
+_BEHIND_PIPE = frozenset(
+    index for index in indices("axial", "tilt", "tilt_apart") if not NAMES[index].startswith("modulator")
+)
+"""Parameters that change the light only behind the pipe."""
 
 
 def fitted_geometry(profile: Profile, value: Mapping[str, Any]) -> WaveGeometry:
@@ -116,7 +122,7 @@ class FittedWaves:
         stride: samples of the common grid from one to the next that is computed.
         accuracy: share of the splitting steps that a simulation takes.
         grid: the common grid, where it is not the usual one.
-        like: waves whose work is shared where geometry and sampling are the same.
+        like: waves whose work is shared as far as geometry and sampling are the same.
         changed: fields of the geometry that are not as fitted, by name.
         blur: variance of the modulator's blur, over the square of its pixels' pitch.
 
@@ -165,7 +171,7 @@ class FittedWaves:
         if shared is not None:
             self.channel = shared.channel
         else:
-            self.channel = WaveChannel(
+            own = WaveChannel(
                 geometry,
                 *page,
                 grid_x,
@@ -175,6 +181,7 @@ class FittedWaves:
                 envelope_m=pitch if filled else 0.0,
                 blur_m=float(np.sqrt(blur)) * profile.slm.pitch_m,
             )
+            self.channel = own if like is None else own.sharing(like.channel)
         at_launch = fitted_launch_phase(profile, value, geometry, x[None, :], y[:, None])
         at_camera = fitted_camera_phase(profile, value, geometry, grid_x[None, :], grid_y[:, None])
         self.launch: Complex = np.exp(1j * at_launch)
@@ -206,6 +213,18 @@ class FittedWaves:
             return np.stack([self.channel.camera_field(leaving) * self._camera] * 2)
         both = zip(self._channels, self._beyond, strict=True)
         return np.stack([channel.camera_field(leaving, beyond) * self._camera for channel, beyond in both])
+
+    def moved(self, index: int, there: FittedWaves, page: Complex, leaving: Complex, seen: Complex) -> Complex:
+        """Return the field that each camera sees once one parameter is another, with as little propagation as it takes.
+
+        Args:
+            index: number of the parameter, none of those that move a camera across.
+            there: the waves with that parameter.
+            page, leaving, seen: the field on the modulator, and as these waves have it at the exit facet and cameras.
+        """
+        if index in _AT_CAMERA:
+            return seen * (there.against_reference / self.against_reference)
+        return there.from_exit(leaving) if index in _BEHIND_PIPE else there.to_cameras(page)
 
     def back_to_exit(self, seen: Complex) -> Complex:
         """Fields that either camera sees, [2, Gy, Gx], back to the exit facet's grid, by the adjoint of `from_exit`."""

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from lightpage.calibration.parameters import as_dict, as_vector, nominal
+from lightpage.calibration.parameters import NAMES, SEEN_BY_CAMERAS, STEPS, as_dict, as_vector, nominal
 from lightpage.calibration.waves import wave_model as fitted_waves
 from lightpage.calibration.waves.wave_model import FittedWaves
 from lightpage.waves.geometry import cells_for
@@ -58,14 +58,33 @@ def test_a_coarser_grid_has_the_same_light_and_keeps_the_adjoint() -> None:
         assert np.vdot(other, seen) == pytest.approx(np.vdot(waves.to_page(other), page), rel=1e-4)
 
 
-def test_waves_share_the_work_of_others_with_their_geometry_and_of_no_others() -> None:
+def test_waves_share_the_work_of_others_where_it_is_the_same_and_nowhere_else() -> None:
     page = np.exp(2j * np.pi * np.random.default_rng(2).random([SAMPLES * count for count in PROFILE.page_shape]))
     first = FittedWaves(PROFILE, nominal(), SAMPLES)
-    for name in ("launch_coma_x_rad", "camera_tilt_x_rad", "pipe_angle_rad", "page_centre_x_m", "cameras_apart_y_rad"):
-        changed = as_vector(as_dict(nominal()) | {name: 1e-3})
+    first_leaving, parts = first.to_exit(page), ("launch_lens", "pipe", "delaunch_lens")
+    first_seen = first.from_exit(first_leaving)
+    for index in set(range(len(NAMES))) - set(SEEN_BY_CAMERAS):
+        changed = as_vector(as_dict(nominal()) | {NAMES[index]: STEPS[index]})
         shared, alone = (FittedWaves(PROFILE, changed, SAMPLES, like=like) for like in (first, None))
         seen = alone.to_cameras(page)
-        assert np.array_equal(shared.to_cameras(page), seen)
+        assert np.array_equal(shared.to_cameras(page), seen), NAMES[index]
+        moved = first.moved(index, shared, page, first_leaving, first_seen)
+        np.testing.assert_allclose(moved, seen, rtol=0, atol=1e-5 * np.abs(seen).max(), err_msg=NAMES[index])
         assert np.array_equal(FittedWaves(PROFILE, changed, SAMPLES, like=alone).to_cameras(page), seen)
         leaving = alone.to_exit(page)
         assert np.vdot(alone.back_to_exit(seen), leaving) == pytest.approx(np.vdot(seen, seen), rel=1e-4)
+        own = [getattr(shared.channel, part) is not getattr(first.channel, part) for part in parts]
+        assert own == _OWN.get(NAMES[index], [False] * 3), NAMES[index]
+
+
+_LAUNCH, _BEHIND, _LENSES, _ALL = [True, False, False], [False, False, True], [True, False, True], [True] * 3
+_OWN = {
+    **dict.fromkeys(("pipe_angle_rad", "pipe_width_relative"), _ALL),
+    **dict.fromkeys(("focal_length_relative", "pipe_roll_rad"), _LENSES),
+    "pipe_length_relative": [False, True, False],
+    **dict.fromkeys(("page_centre_x_m", "page_centre_y_m"), _LAUNCH),
+    **dict.fromkeys((f"modulator_axial_{axis}rad" for axis in ("", "x_", "y_")), _LAUNCH),
+    **dict.fromkeys((f"{plane}_axial_rad" for plane in ("in_phase", "quadrature")), _BEHIND),
+    **dict.fromkeys((f"cameras_axial_{axis}_rad" for axis in "xy"), _BEHIND),
+}
+"""Whether a channel has a launch lens, a pipe and a second lens of its own once a parameter is another."""

@@ -8,7 +8,7 @@ import torch
 
 from lightpage.calibration.interfaces import BRANCHES
 from lightpage.calibration.parameters import NAMES, PRIORS, nominal
-from lightpage.device.profile import Profile, Relay, load_profile
+from lightpage.device.profile import Profile, Relay
 from lightpage.train.models.twin import RayTwin, TorchTwin
 from tests.lightpage.small import THICK, small_profile
 
@@ -145,21 +145,6 @@ class TestClosedForms:
             np.testing.assert_allclose(rays.phases[b], phase, rtol=0, atol=1e-6)
             mirrored = points * (-1) ** cell
             np.testing.assert_allclose(rays.places[b], mirrored, rtol=0, atol=1e-15)
-
-    @pytest.mark.parametrize("name", ["bench", "paper"])
-    def test_shipped_profiles_count_walls_enough_for_the_whole_capture_range(self, name: str) -> None:
-        profile = load_profile(name)
-        twin = RayTwin(profile)
-        half = np.array([profile.page_width_m, profile.page_height_m]) / 2
-        extreme = only(
-            pipe_length_relative=0.005,
-            focal_length_relative=-0.003,
-            pipe_width_relative=-0.0005,
-            page_centre_x_m=6 * profile.slm.pitch_m,
-            page_centre_y_m=6 * profile.slm.pitch_m,
-        )
-        cells = np.abs(TorchTwin(twin).trace(extreme, half[None]).positions).max()
-        assert twin.walls_met >= max(2 * np.round(cells / 2), 2 * np.floor(cells / 2) + 1)
 
 
 class TestPaths:
