@@ -16,12 +16,15 @@ _ROUNDING = 1 / 12
 """Variance that counts have as whole numbers."""
 _NORMAL = 0.6745
 """Median of the magnitude of normal noise, in standard deviations."""
+_OUTLIER = 4.0
+"""Standard deviations, as a median has them, beyond which a pixel shows a defect. Noise of few electrons is not normal:
+the median alone would call it up to 30% weaker."""
 
 
 def noise_variance(frame: NDArray[np.integer]) -> tuple[float, float]:
     """Variance of a pixel's noise, counts squared: the part that does not grow with its count, and that by count.
 
-    Medians stand for variances, so that hot pixels and specks do not count.
+    Hot pixels and specks do not count.
 
     Args:
         frame: counts [H, W].
@@ -30,13 +33,17 @@ def noise_variance(frame: NDArray[np.integer]) -> tuple[float, float]:
     taps = np.array(_HIGH_PASS) / np.linalg.norm(_HIGH_PASS)
     edge = len(taps) // 2
     inside = (slice(edge, -edge), slice(edge, -edge))
-    noise = scipy.ndimage.convolve1d(scipy.ndimage.convolve1d(counts, taps, axis=0), taps, axis=1)[inside]
-    expected = scipy.ndimage.uniform_filter(counts, 2 * _SMOOTHED_PX + 1)[inside]
+    # the squares of the taps weigh the pixels' variances, and so the counts that these go with
+    noise, expected = (
+        scipy.ndimage.convolve1d(scipy.ndimage.convolve1d(counts, weights, axis=0), weights, axis=1)[inside]
+        for weights in (taps, taps**2)
+    )
     order = np.argsort(expected, axis=None)
     level, variance = (np.empty(_CLASSES) for _ in range(2))
     for number, chosen in enumerate(np.array_split(order, _CLASSES)):
         level[number] = expected.ravel()[chosen].mean()
-        variance[number] = (np.median(np.abs(noise.ravel()[chosen])) / _NORMAL) ** 2
+        power = noise.ravel()[chosen] ** 2
+        variance[number] = power[power <= _OUTLIER**2 * np.median(power) / _NORMAL**2].mean()
     # Clipped or flat classes say nothing; errors of a variance grow with it.
     told = variance > 0
     weight = 1 / np.maximum(variance[told], _ROUNDING)
@@ -45,16 +52,14 @@ def noise_variance(frame: NDArray[np.integer]) -> tuple[float, float]:
     return float(fixed), float(by_count)
 
 
-def with_more_noise(frame: NDArray[np.integer], times: float, rng: np.random.Generator) -> NDArray[np.integer]:
-    """A frame of the same type with so many times its noise added.
+def noise_like(frame: NDArray[np.integer], rng: np.random.Generator) -> NDArray[np.float32]:
+    """Noise like a frame's own, counts [H, W]; it is neither rounded nor cut off where counts end.
 
     Args:
         frame: counts [H, W].
-        times: standard deviation of what is added over that of the frame's own noise.
         rng: draws it.
     """
     fixed, by_count = noise_variance(frame)
     expected = scipy.ndimage.uniform_filter(frame.astype(np.float32), _SMOOTHED_PX)
-    deviation = times * np.sqrt(np.clip(fixed + by_count * expected, 0, None))
-    seen = np.rint(frame + deviation * rng.standard_normal(frame.shape, dtype=np.float32))
-    return np.asarray(np.clip(seen, 0, np.iinfo(frame.dtype).max), dtype=frame.dtype)
+    deviation = np.sqrt(np.clip(fixed + by_count * expected, 0, None))
+    return np.asarray(deviation * rng.standard_normal(frame.shape, dtype=np.float32), np.float32)

@@ -11,7 +11,7 @@ import scipy
 from numpy.typing import NDArray
 
 from lightpage.calibration.calibrated_device import CalibratedDevice
-from lightpage.calibration.goodness.frame_noise import with_more_noise
+from lightpage.calibration.goodness.frame_noise import noise_like
 from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.parameters import PARAMETERS, SEEN_BY_CAMERAS, STEPS
 from lightpage.calibration.samplers import smooth_reference
@@ -24,8 +24,6 @@ from lightpage.waves.grid import field_grid, symbol_samples
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
-_MORE_NOISE = 3.0
-"""Times the frames' own noise: rounding to whole counts, which adds some, then hardly counts."""
 _STRIDE, _ACCURACY = 4, 3 / 8
 """Samples of the common grid from one to the next, and share of the splitting steps, for corrections of the model: few
 unknowns need few equations."""
@@ -76,7 +74,9 @@ class SeenLight:
         amplitude = np.sqrt(self.references[0])
         self._amplitude = amplitude / amplitude[self._seen].mean()
         self._arms = np.exp(1j * np.array([0.0, device.quadrature_phase_rad]))[:, None, None]
-        self._images = self._filtered(pair, device.references)
+        seen, empty = ((each.in_phase, each.quadrature) for each in (pair, device.references))
+        beyond = [one.astype(np.float32) - other for one, other in zip(seen, empty, strict=True)]
+        self._images = self._filtered(beyond)
         self.counts = _looked_at(self._images, self._at) / (2 * self.references)
         self.fields = self.waves.to_cameras(self.page)
 
@@ -92,12 +92,10 @@ class SeenLight:
     def noise_of_frames(self) -> Complex:
         """Noise like that of the frames, as light of both cameras."""
         rng = np.random.default_rng(0)
-        frames, references = (
-            FramePair(*(with_more_noise(frame, _MORE_NOISE, rng) for frame in (pair.in_phase, pair.quadrature)))
-            for pair in (self._pair, self._device.references)
-        )
-        seen = _looked_at(self._filtered(frames, references), self._at) / (2 * self.references)
-        return self._mending((seen - self.counts) / _MORE_NOISE)
+        pair, references = self._pair, self._device.references
+        both = (pair.in_phase, references.in_phase), (pair.quadrature, references.quadrature)
+        noise = [noise_like(frame, rng) - noise_like(reference, rng) for frame, reference in both]
+        return self._mending(_looked_at(self._filtered(noise), self._at) / (2 * self.references))
 
     def noise_of_modulator(self) -> Complex:
         """Return the light that the modulator's phase noise of 1 rad a sample adds for both cameras, to first order."""
@@ -208,15 +206,14 @@ class SeenLight:
         along = self._along
         return np.asarray(self._seen * self._amplitude * along * left / (self.brightness + READ_NOISE))
 
-    def _filtered(self, pair: FramePair, references: FramePair) -> list[NDArray[np.float32]]:
-        """Return each frame less its reference, filtered as a decoder filters it, float32 [H, W]."""
-        images = []
-        for frame, reference in ((pair.in_phase, references.in_phase), (pair.quadrature, references.quadrature)):
-            beyond = frame.astype(np.float32) - reference
+    def _filtered(self, images: Sequence[NDArray[np.float32]]) -> list[NDArray[np.float32]]:
+        """Images filtered as a decoder filters what frames have beyond their references, float32 [H, W]."""
+        filtered = []
+        for image in images:
             for axis in (0, 1):
-                beyond = scipy.ndimage.convolve1d(beyond, self._grid.prefilter, axis=axis)
-            images.append(beyond)
-        return images
+                image = scipy.ndimage.convolve1d(image, self._grid.prefilter, axis=axis)
+            filtered.append(image)
+        return filtered
 
 
 def places_on_facet(waves: FittedWaves) -> tuple[Real, Real]:

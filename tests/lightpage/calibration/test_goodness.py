@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lightpage.calibration.goodness.frame_noise import noise_variance, with_more_noise
+from lightpage.calibration.goodness.frame_noise import noise_like, noise_variance
 from lightpage.calibration.goodness.measure import measure_goodness
 from lightpage.calibration.goodness.verdict import Goodness
 from lightpage.calibration.parameters import NAMES
@@ -48,7 +48,16 @@ def goodness_of(*settings: str, wrong_symbols: float = 0.0, stated: float = 1.0)
     return measure_goodness(TWIN, fitted, found.conditions, pair, told)
 
 
-@pytest.mark.parametrize("settings", [(), ("slm.phase_noise_rad=0.3",), ("sensor.full_well_e=1000", "slm.blur_px=0.5")])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        (),
+        ("slm.phase_noise_rad=0.3",),
+        ("sensor.full_well_e=1000", "slm.blur_px=0.5"),
+        ("sensor.full_well_e=32",),
+        ("sensor.full_well_e=100", "sensor.read_noise_e=0"),
+    ],
+)
 def test_a_right_fit_is_good_whatever_the_noise(settings: tuple[str, ...]) -> None:
     found = goodness_of(*settings)
     assert (found.verdict, found.cause) == ("good", "")
@@ -91,9 +100,9 @@ def test_a_frames_noise_is_known_by_the_frame_itself() -> None:
     frame[rng.random(frame.shape) < 1e-3] = 255
     fixed, by_count = noise_variance(frame)
     assert fixed + 120 * by_count == pytest.approx(8, rel=0.1)
-    more = with_more_noise(frame, 2.0, rng)
-    assert more.dtype == np.uint8
-    assert np.var(more.astype(float) - frame) == pytest.approx(4 * 8, rel=0.15)
+    assert np.var(noise_like(frame, rng)) == pytest.approx(8, rel=0.15)
+    few = np.clip(np.rint(8 * rng.poisson(light / 8)), 0, 255).astype(np.uint8)  # electrons, eight counts each
+    assert np.var(noise_like(few, rng)) == pytest.approx(8 * light.mean(), rel=0.05)
     frame[:100] = 255
     fixed, by_count = noise_variance(frame)
     assert fixed + 120 * by_count == pytest.approx(8, rel=0.1)
