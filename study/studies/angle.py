@@ -104,6 +104,8 @@ def first_step(curve: NDArray[np.float64], least: float = _LOCKED) -> float:
 
 
 def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) -> Figure:
+    if any("course" in case for case in cases):
+        return _plot_courses([both for both in zip(cases, results, strict=True) if "course" in both[0]])
     figure = Figure(figsize=(16, 8), layout="constrained")
     grid = figure.add_gridspec(2, 2 * len(cases))
     angles, rates = figure.add_subplot(grid[0, : len(cases)]), figure.add_subplot(grid[0, len(cases) :])
@@ -127,6 +129,32 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
         axis.set_xlabel("step")
         axis.legend()
     figure.colorbar(maps[0].images[0], ax=maps, label="own-MI, bit/symbol", shrink=0.8)
+    return figure
+
+
+def _plot_courses(measured: Sequence[tuple[Case, Result]]) -> Figure:
+    """Draw the angle and the AIR along each course, one line a seed."""
+    courses = [name for name in _COURSES if any(case["course"] == name for case, _ in measured)]
+    figure = Figure(figsize=(2.6 * len(courses) + 1, 5.5), layout="constrained")
+    axes = figure.subplots(2, len(courses), sharex=True, sharey="row", squeeze=False)
+    for (angle, rate), name in zip(axes.T, courses, strict=True):
+        for case, result in measured:
+            if case["course"] != name:
+                continue
+            style = {"color": "C1" if case["matched"] else "C0", "linewidth": 1, "alpha": 0.8}
+            angle.plot(result["angles"][:, 0], result["angles"][:, 1] / case["true_deg"], **style)
+            rate.plot(*result["validation_curve"].T, **style)
+        angle.axhline(1, color="k", linestyle="--", linewidth=1)
+        angle.axhline(0, color="k", linestyle=":", linewidth=1)
+        angle.set_title(name, fontsize="medium")
+        rate.set_xlabel("step")
+    axes[0, 0].set_ylabel("fitted angle, over the true one")
+    axes[1, 0].set_ylabel("AIR of validation, bit/symbol")
+    axes[1, 0].set_ylim(bottom=-0.5)
+    for color, reference in (("C0", "nearly flat reference"), ("C1", "matched reference")):
+        if any(case["matched"] == (color == "C1") for case, _ in measured):
+            axes[1, -1].plot([], [], color=color, label=reference)
+    axes[1, -1].legend(fontsize="small")
     return figure
 
 

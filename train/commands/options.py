@@ -172,6 +172,13 @@ CHOICES = (
         localizers=PUBLISHED,
     ),
     Choice(
+        "--held-share",
+        click.FloatRange(0, 1, max_open=True),
+        "Share of the steps over which registration and angle stay as they begin. The authors let them go at once.",
+        published="0",
+        localizers=PUBLISHED,
+    ),
+    Choice(
         "--learning-rate",
         float,
         "Peak learning rate of the one-cycle schedule, or the published network's rate.",

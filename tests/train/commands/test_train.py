@@ -74,6 +74,7 @@ def test_a_preset_is_what_it_says_and_single_options_change_it() -> None:
     assert options("--depth", "2")[1].depth == 2
     assert options("--field-rounds", "0") == ("coherent", Hyperparameters(refinements=1, field_rounds=0))
     assert options("--localizer", "ray", "--channels", "8")[1] == PublishedChoices(channels=(8, 16))
+    assert options("--localizer", "ray", "--held-share", "0.3")[1] == PublishedChoices(held_share=0.3)
 
 
 @pytest.mark.parametrize(
@@ -83,6 +84,7 @@ def test_a_preset_is_what_it_says_and_single_options_change_it() -> None:
         ("--preset", "fast", "--localizer", "wave"),
         *((option, "2", "--localizer", "ray") for option in ("--blocks", "--start")),
         ("--learning-rate", "0"),
+        ("--held-share", "0.3"),
     ],
 )
 def test_options_that_do_nothing_or_cannot_be_are_refused(words: tuple[str, ...]) -> None:
