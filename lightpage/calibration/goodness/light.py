@@ -20,6 +20,7 @@ from lightpage.calibration.waves.wave_model import FittedWaves, LaunchConditions
 from lightpage.recording.frame_pair import FramePair
 from lightpage.waves.geometry import couplings, facet_axis, on_facet
 from lightpage.waves.grid import field_grid, symbol_samples
+from lightpage.waves.parallel import in_parallel
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
@@ -120,7 +121,7 @@ class SeenLight:
         A blur of the modulator loses light there. A network learns both by itself.
         """
         terms, waves = len(self._terms), self.waves
-        lit = [self.coarse.to_cameras(self.page * term) for term in self._terms]
+        lit = list(in_parallel(lambda term: self.coarse.to_cameras(self.page * term), list(self._terms)))
         losses = [self.coarse.to_exit(self.page, radius2(self.coarse) ** power) for power in _LOSSES]
         changes = [*lit, *(1j * each for each in lit), *map(self.coarse.from_exit, losses)]
         columns = np.stack([*map(self.equations_of, changes)], axis=1)
@@ -178,17 +179,14 @@ class SeenLight:
     @cached_property
     def coarse(self) -> FittedWaves:
         """The fitted waves on the coarse grid."""
-        return self._coarse(self._device.parameters)
+        return self.changed()
 
     def changed(self, parameters: Real | None = None, **geometry: float) -> FittedWaves:
         """The waves on the coarse grid with other parameters, or with another geometry."""
-        return self._coarse(
-            self._device.parameters if parameters is None else parameters, changed=geometry, like=self.coarse
-        )
-
-    def _coarse(self, parameters: Real, **more: Any) -> FittedWaves:
-        coarse: dict[str, Any] = {"filled": True, "stride": _STRIDE, "accuracy": _ACCURACY, "blur": self._blur}
-        return FittedWaves(self._device.profile, parameters, self._samples, **coarse, **more)
+        parameters = self._device.parameters if parameters is None else parameters
+        coarse: dict[str, Any] = {"filled": True, "stride": _STRIDE, "accuracy": _ACCURACY}
+        coarse |= {"changed": geometry, "blur": self._blur, "like": vars(self).get("coarse")}
+        return FittedWaves(self._device.profile, parameters, self._samples, **coarse)
 
     @property
     def _lacking(self) -> Real:

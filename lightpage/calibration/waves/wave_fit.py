@@ -25,6 +25,7 @@ from lightpage.page import modulation as modulations
 from lightpage.page.modulation import NOMINAL, Modulation
 from lightpage.recording.frame_pair import FramePair
 from lightpage.waves.grid import field_grid, symbol_samples
+from lightpage.waves.parallel import in_parallel
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
@@ -319,18 +320,22 @@ class WaveFit:
 
         here = waves(state.parameters)
         even, terms = self._page(state.levels, samples), np.stack(illumination_terms(here.x, here.y))
-        by_term = np.stack([here.to_cameras(even * term) for term in terms])
+        by_term = np.stack(list(in_parallel(lambda term: here.to_cameras(even * term), list(terms))))
         page, field = even * np.tensordot(state.light, terms, 1), np.tensordot(state.light, by_term, 1)
         leaving = here.to_exit(page)
         blurred = waves(state.parameters, here, state.blur + _BLUR_STEP)
         by_blur = (blurred.to_cameras(page) - field) / _BLUR_STEP
         functions = [on_modulator(one, samples) for one in modulations.page_basis(self._phases)] if levels else []
-        by_level = [here.to_cameras(page * one) for one in functions]
-        light, places = list[Complex](), list[Real]()
-        for number, index in enumerate(of_light):
-            progress(number / len(of_light))
+        by_level = list(in_parallel(lambda one: here.to_cameras(page * one), functions))
+
+        def by_parameter(index: int) -> Complex:
             there, step = stepped(index)
-            light.append((here.moved(index, waves(there, here), page, leaving, field) - field) / step)
+            return np.asarray((here.moved(index, waves(there, here), page, leaving, field) - field) / step)
+
+        light, places = list[Complex](), list[Real]()
+        for number, column in enumerate(in_parallel(by_parameter, of_light)):
+            progress(number / len(of_light))
+            light.append(column)
         for there, step in map(stepped, of_cameras):
             moved_px = (self._pixels(there) - self._pixels(state.parameters)) / step
             places.append(moved_px @ self._samples_per_pixel(state.parameters)[:, None])
