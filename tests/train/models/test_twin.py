@@ -20,10 +20,7 @@ def some_device(seed: int, scale: float = 0.5) -> np.ndarray:
 
 def only(**values: float) -> np.ndarray:
     """Nominal but for the named parameters."""
-    vector = nominal()
-    for name, value in values.items():
-        vector[NAMES.index(name)] = value
-    return vector
+    return np.array([values.get(name, usual) for name, usual in zip(NAMES, nominal(), strict=True)])
 
 
 def page_points(profile: Profile, count: int, seed: int = 0) -> np.ndarray:
@@ -105,8 +102,7 @@ class TestAgainstSingleRays:
         for index, point in enumerate(points):
             for entry in rng.uniform(-0.5, 0.5, (4, 2)):
                 ray = follow(profile, values, point, entry)
-                branch = branch_of(ray.met)
-                if branch is None:
+                if (branch := branch_of(ray.met)) is None:
                     continue
                 seen[branch] += 1
                 b = BRANCHES.index(branch)
@@ -119,10 +115,9 @@ class TestAgainstSingleRays:
 
 class TestClosedForms:
     def test_a_long_square_pipe_unfolds(self) -> None:
-        small = small_profile()
-        profile = small.model_copy(
-            update={"pipe": small.pipe.model_copy(update={"length_m": 7.3 * small.pipe.length_m})}
-        )
+        profile = small_profile()
+        longer = profile.pipe.model_copy(update={"length_m": 7.3 * profile.pipe.length_m})
+        profile = profile.model_copy(update={"pipe": longer})
         points = page_points(profile, 400)
         twin = TorchTwin(RayTwin(profile))
         rays = twin.trace(nominal(), points)
@@ -136,15 +131,13 @@ class TestClosedForms:
         sheared = np.stack([unfolded[:, 0], unfolded @ [np.sin(0.01), np.cos(0.01)]], axis=-1)
         found = twin.trace(only(pipe_angle_rad=0.01), points).positions
         np.testing.assert_allclose(found, sheared, rtol=1e-12, atol=1e-12)
-        even = 2 * np.round(unfolded / 2)
-        odd = 2 * np.floor(unfolded / 2) + 1
+        even, odd = 2 * np.round(unfolded / 2), 2 * np.floor(unfolded / 2) + 1
         for b, branch in enumerate(BRANCHES):
             cell = np.stack([(odd if "x" in branch else even)[:, 0], (odd if "y" in branch else even)[:, 1]], axis=-1)
             # the cell's mirror image of the exit facet lies cell widths away, and each wall between turns by pi
             phase = (kz - nk) * profile.pipe.length_m + (k * cell).sum(1) * w + np.pi * np.abs(cell).sum(1)
             np.testing.assert_allclose(rays.phases[b], phase, rtol=0, atol=1e-6)
-            mirrored = points * (-1) ** cell
-            np.testing.assert_allclose(rays.places[b], mirrored, rtol=0, atol=1e-15)
+            np.testing.assert_allclose(rays.places[b], points * (-1) ** cell, rtol=0, atol=1e-15)
 
 
 class TestPaths:
