@@ -28,14 +28,16 @@ from lightpage.waves.lens import FourierLens, entrance_window
 from lightpage.waves.pipe import PipePropagator, real_products
 from lightpage.waves.sinc_interpolation import interpolation, sparse_axis
 
+_SHAPE = ("envelope_m", "blur_m")
+_CAMERAS = ("camera_x_m", "camera_y_m", "steps")
 _PARTS: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
-    "launch_lens": (("camera_x_m", "camera_y_m", "steps"), {"pipe_length_m": 1.0, "camera_path": IDEAL}),
-    "entrance_window": (("camera_x_m", "camera_y_m", "steps"), {"pipe_length_m": 1.0, "camera_path": IDEAL}),
+    "launch_lens": ((*_CAMERAS, *_SHAPE), {"pipe_length_m": 1.0, "camera_path": IDEAL}),
+    "entrance_window": (_CAMERAS, {"pipe_length_m": 1.0, "camera_path": IDEAL}),
     "pipe": (
-        ("page_x_m", "page_y_m", "camera_x_m", "camera_y_m"),
+        ("page_x_m", "page_y_m", "camera_x_m", "camera_y_m", *_SHAPE),
         {"focal_length_m": 1.0, "pipe_roll": 0.0, "lens_path": IDEAL, "camera_path": IDEAL},
     ),
-    "delaunch_lens": (("page_x_m", "page_y_m", "steps"), {"pipe_length_m": 1.0, "lens_path": IDEAL}),
+    "delaunch_lens": (("page_x_m", "page_y_m", "steps", *_SHAPE), {"pipe_length_m": 1.0, "lens_path": IDEAL}),
 }
 """Parts of a channel that take long to make: what they do not depend on, and values that stand for it in a geometry."""
 
@@ -70,15 +72,17 @@ class WaveChannel:
     arrays: Arrays = NUMPY
 
     def sharing(self, other: WaveChannel) -> WaveChannel:
-        """This channel with those parts of another one that are the same in both; they are made where they lack."""
+        """Return this channel with those parts that another one has made and that are the same in both."""
         for part, (without, usual) in _PARTS.items():
+            if part not in vars(other):
+                continue
             mine, theirs = (
                 {field.name: getattr(each, field.name) for field in fields(each) if field.name not in without}
                 | {"geometry": replace(each.geometry, **usual)}
                 for each in (self, other)
             )
             if all(np.array_equal(value, theirs[name]) for name, value in mine.items()):
-                vars(self)[part] = getattr(other, part)
+                vars(self)[part] = vars(other)[part]
         return self
 
     @cached_property

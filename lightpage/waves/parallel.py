@@ -17,10 +17,10 @@ RESULT = TypeVar("RESULT")
 def threads_beside() -> int:
     """Return the number of threads that may compute beside each other.
 
-    It is that of OMP_NUM_THREADS, or one a core, where OPENBLAS_NUM_THREADS keeps products of matrices to one thread;
-    1 where they take several by themselves.
+    It is the first number of OMP_NUM_THREADS, or one a core, where OPENBLAS_NUM_THREADS keeps products of matrices to
+    one thread; 1 where they may take several by themselves.
     """
-    chosen = os.environ.get("OMP_NUM_THREADS", "")
+    chosen = os.environ.get("OMP_NUM_THREADS", "").split(",")[0].strip()
     if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
         return 1
     return max(1, int(chosen)) if chosen.isdigit() else cores()

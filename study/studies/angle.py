@@ -133,7 +133,7 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
 
 
 def _plot_courses(measured: Sequence[tuple[Case, Result]]) -> Figure:
-    """Draw the angle and the AIR along each course, one line a seed."""
+    """Draw the angle and the AIR along each course, one line a seed; cases without a course are in the table alone."""
     courses = [name for name in _COURSES if any(case["course"] == name for case, _ in measured)]
     figure = Figure(figsize=(2.6 * len(courses) + 1, 5.5), layout="constrained")
     axes = figure.subplots(2, len(courses), sharex=True, sharey="row", squeeze=False)

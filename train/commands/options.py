@@ -233,9 +233,11 @@ def given_choices(localizer: str, options: Mapping[str, Any]) -> dict[str, Any]:
     for choice in CHOICES:
         if choice.name in given and localizer not in choice.localizers:
             raise InvalidInputError(choice.flag, given[choice.name], f"no such option with --localizer {localizer}")
-    rate = given.get("learning_rate", 1.0)
+    rate, held = given.get("learning_rate", 1.0), given.get("held_share", 0.0)
     if not (math.isfinite(rate) and rate > 0):
         raise InvalidInputError("--learning-rate", rate, "a positive number")
+    if not math.isfinite(held):
+        raise InvalidInputError("--held-share", held, "a number")
     return given
 
 

@@ -121,7 +121,9 @@ class SeenLight:
         A blur of the modulator loses light there. A network learns both by itself.
         """
         terms, waves = len(self._terms), self.waves
-        lit = list(in_parallel(lambda term: self.coarse.to_cameras(self.page * term), list(self._terms)))
+        first = self.coarse.to_cameras(self.page * self._terms[0])  # lenses are made before threads ask for them
+        rest = in_parallel(lambda term: self.coarse.to_cameras(self.page * term), list(self._terms[1:]))
+        lit = [first, *rest]
         losses = [self.coarse.to_exit(self.page, radius2(self.coarse) ** power) for power in _LOSSES]
         changes = [*lit, *(1j * each for each in lit), *map(self.coarse.from_exit, losses)]
         columns = np.stack([*map(self.equations_of, changes)], axis=1)

@@ -44,8 +44,8 @@ class _Sampling(NamedTuple):
 
 
 _FAR = _Sampling(1, 1 / 8)
-"""Sampling of the first derivative, which costs some half of another at full size: an error of a tenth is undone later.
-A fit that ended with it would tell a launched defocus three deviations from the best."""
+"""Sampling of the first derivative, which costs some half of another at full size. Its error of a tenth is undone by
+the next one."""
 _NEAR = _Sampling(2, 3 / 8)
 """Sampling of the others: an error of a percent costs no round, and half of the usual samples leave one of 0.3%."""
 READ_NOISE = 0.3
@@ -215,7 +215,8 @@ class WaveFit:
                 0 to 1. It may raise to stop the work.
             modulation: light that the modulator makes of its levels, to start from.
             levels: prior of the modulation where it is fitted too, None where it is held.
-            rough: whether the derivative of the light is taken but once.
+            rough: whether the derivative of the light is taken but once, coarsely: parameters come out half of their
+                deviations away, and a launched defocus some three.
         """
         without_effect = _OF_REAL_LENSES if self._profile.ideal_lenses else ()
         of_light = [index for index in indices(*groups) if index not in (*SEEN_BY_CAMERAS, *without_effect)]
@@ -232,7 +233,9 @@ class WaveFit:
             progress(number / ROUNDS)
             fields, left = self._left(state)
             residual = float(np.sqrt(np.mean(left**2)))
-            if not residual < (1 - _CONVERGED) * best.residual:
+            if (rough or sampling is _NEAR) and not residual < (1 - _CONVERGED) * best.residual:
+                if residual < best.residual:
+                    best = replace(best, residual=residual, **_found(state))
                 break
             fresh = sampling is not _FAR and residual >= (1 - _STALE) * taken_at
             if slopes is None or not (fresh or rough):
@@ -260,14 +263,11 @@ class WaveFit:
             deviations = np.zeros(len(PARAMETERS))
             deviations[free] = known[others:]
             best = WaveFitted(
-                state.parameters,
-                deviations,
-                state.quadrature_phase,
-                residual,
-                LaunchConditions(state.light, state.blur),
-                Modulation(tuple(state.levels.tolist())),
-                tuple(known[fitted_levels].tolist()) if levels else best.modulation_deviations,
-                float(known[len(directions)]),
+                deviations=deviations,
+                residual=residual,
+                modulation_deviations=tuple(known[fitted_levels].tolist()) if levels else best.modulation_deviations,
+                quadrature_deviation=float(known[len(directions)]),
+                **_found(state),
             )
             state = self._moved(state, covariance @ pull, directions, fitted_levels, free, bends=bends)
         return best if levels is None else _told_apart(best, levels.centre)
@@ -320,7 +320,8 @@ class WaveFit:
 
         here = waves(state.parameters)
         even, terms = self._page(state.levels, samples), np.stack(illumination_terms(here.x, here.y))
-        by_term = np.stack(list(in_parallel(lambda term: here.to_cameras(even * term), list(terms))))
+        first = here.to_cameras(even * terms[0])  # lenses and pipe are made before threads ask for them
+        by_term = np.stack([first, *in_parallel(lambda term: here.to_cameras(even * term), list(terms[1:]))])
         page, field = even * np.tensordot(state.light, terms, 1), np.tensordot(state.light, by_term, 1)
         leaving = here.to_exit(page)
         blurred = waves(state.parameters, here, state.blur + _BLUR_STEP)
@@ -422,6 +423,16 @@ class WaveFit:
             state.levels + share * by_level,
             max(0.0, state.blur + share * float(step[len(directions) + 1])),
         )
+
+
+def _found(state: _State) -> dict[str, Any]:
+    """Return what a fit finds, as attributes of `WaveFitted`."""
+    return {
+        "parameters": state.parameters,
+        "quadrature_phase": state.quadrature_phase,
+        "conditions": LaunchConditions(state.light, state.blur),
+        "modulation": Modulation(tuple(state.levels.tolist())),
+    }
 
 
 def _within_round(progress: Callable[[float], None], number: int, share: float) -> None:

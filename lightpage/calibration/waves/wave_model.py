@@ -193,6 +193,8 @@ class FittedWaves:
             self._channels = shared._channels
         else:
             self._channels = self._tilted(profile, 1), self._tilted(profile, -1)
+            for mine, theirs in zip(self._channels, like._channels if like else (), strict=False):
+                mine.sharing(theirs)
         self._camera = self.against_reference / stride  # samples that stand for more area are larger
 
     def to_exit(self, field: Complex, passed: NDArray[Any] | float = 1.0) -> Complex:

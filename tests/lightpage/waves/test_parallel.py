@@ -9,7 +9,7 @@ from lightpage.waves.parallel import in_parallel, threads_beside
 
 
 def test_results_come_in_order_and_a_fault_ends_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
-    for products, chosen, expected in (("2", "3", 1), ("1", "0", 1), ("1", "", cores()), ("1", "3", 3)):
+    for products, chosen, expected in (("2", "3", 1), ("1", "0", 1), ("1", "", cores()), ("1", " 3,1", 3)):
         monkeypatch.setenv("OPENBLAS_NUM_THREADS", products)
         monkeypatch.setenv("OMP_NUM_THREADS", chosen)
         assert threads_beside() == expected
