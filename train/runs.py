@@ -40,9 +40,8 @@ FORMAT = 8
 would not go together with those of this one, or when the simulator's light changes (as the simulator's `LIGHT` is
 then), or which pages the comparison trains on."""
 
-_RENAMED = {"levels": "depth", "held_share": "--held-share"}
-"""Choices that earlier runs keep under other names: the depth of the network was called its levels, and there was no
-option for the share of the steps that hold the geometry."""
+_RENAMED = {"levels": "depth"}
+"""Choices that runs in analysis/weights keep under other names: the depth of the network was called its levels."""
 
 
 @dataclass(frozen=True)

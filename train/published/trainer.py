@@ -29,8 +29,8 @@ EPOCHS = {4: 50, 8: 30, 16: 15}
 """Passes over the training pages, by samples per symbol and axis (table 1)."""
 
 _OPTIONS = {name: f"--{name}" for name in ("channels", "steps", "batch", "lenses", "seed", "precision")}
-_OPTIONS |= {"decoder_rate": "--learning-rate", "held_share": "--held-share"}
-"""Choices that the command line has an option for."""
+_OPTIONS["decoder_rate"] = "--learning-rate"
+"""Choices that a run keeps under the name of their option."""
 
 
 def published_choices(localizer: str, profile: Profile, pages: int, batch: int | None = None) -> PublishedChoices:

@@ -259,11 +259,11 @@ def test_a_run_goes_on_with_its_own_options_alone(tmp_path: Path) -> None:
         begin(tmp_path, begun)
 
 
-def test_choices_are_known_by_their_earlier_names(tmp_path: Path) -> None:
-    (tmp_path / "begun.json").write_text(json.dumps({"format": FORMAT, "held_share": 0.3, "levels": 1}))
-    assert check_begun(tmp_path, {"--held-share": 0.3, "depth": 1})
+def test_the_depth_of_the_network_is_known_by_its_earlier_name(tmp_path: Path) -> None:
+    (tmp_path / "begun.json").write_text(json.dumps({"format": FORMAT, "channels": 8, "levels": 1}))
+    assert check_begun(tmp_path, {"channels": 8, "depth": 1})
     with pytest.raises(InvalidInputError, match="depth: got 0"):
-        check_begun(tmp_path, {"--held-share": 0.3, "depth": 0})
+        check_begun(tmp_path, {"channels": 8, "depth": 0})
 
 
 def test_a_second_training_in_the_same_folder_is_refused(device: list[str], tmp_path: Path) -> None:
