@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 from lightpage.systems import cores
@@ -27,7 +26,7 @@ def threads_beside() -> int:
 
 
 def in_parallel(function: Callable[[ITEM], RESULT], items: Sequence[ITEM]) -> Iterator[RESULT]:
-    """Yield a function's results, in the order of the items; no more are computed ahead than there are threads.
+    """Yield a function's results, in the order of the items; the first error ends the rest.
 
     Args:
         function: function of an item, which lets other threads compute, as numpy's products do.
@@ -37,15 +36,5 @@ def in_parallel(function: Callable[[ITEM], RESULT], items: Sequence[ITEM]) -> It
     if count < 2:
         yield from map(function, items)
         return
-    ahead = deque[Future[RESULT]]()
     with ThreadPoolExecutor(count) as pool:
-        try:
-            for item in items:
-                ahead.append(pool.submit(function, item))
-                if len(ahead) > count:
-                    yield ahead.popleft().result()
-            while ahead:
-                yield ahead.popleft().result()
-        finally:
-            for future in ahead:
-                future.cancel()
+        yield from pool.map(function, items)

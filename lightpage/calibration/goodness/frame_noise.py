@@ -18,7 +18,7 @@ _NORMAL = 0.6745
 """Median of the magnitude of normal noise, in standard deviations."""
 _OUTLIER = 4.0
 """Standard deviations, as a median has them, beyond which a pixel shows a defect. Noise of few electrons is not normal:
-the median alone would call it up to 30% weaker."""
+the median alone would call it weaker."""
 
 
 def noise_variance(frame: NDArray[np.integer]) -> tuple[float, float]:

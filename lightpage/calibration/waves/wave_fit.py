@@ -44,8 +44,7 @@ class _Sampling(NamedTuple):
 
 
 _FAR = _Sampling(1, 1 / 8)
-"""Sampling of the first derivative, which costs some half of another at full size. Its error of a tenth is undone by
-the next one."""
+"""Sampling of the first derivative, which costs less. The next one undoes its error."""
 _NEAR = _Sampling(2, 3 / 8)
 """Sampling of the others: an error of a percent costs no round, and half of the usual samples leave one of 0.3%."""
 READ_NOISE = 0.3
@@ -215,8 +214,8 @@ class WaveFit:
                 0 to 1. It may raise to stop the work.
             modulation: light that the modulator makes of its levels, to start from.
             levels: prior of the modulation where it is fitted too, None where it is held.
-            rough: whether the derivative of the light is taken but once, coarsely: parameters come out half of their
-                deviations away, and a launched defocus some three.
+            rough: whether the derivative of the light is taken but once, coarsely: what the light tells least, such as
+                a launched defocus, may come out some deviations away.
         """
         without_effect = _OF_REAL_LENSES if self._profile.ideal_lenses else ()
         of_light = [index for index in indices(*groups) if index not in (*SEEN_BY_CAMERAS, *without_effect)]

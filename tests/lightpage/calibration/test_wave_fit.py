@@ -92,9 +92,8 @@ def test_a_realistic_device_is_told_from_near_it_with_calibrated_deviations() ->
     start[angle] = truth[angle] + 4e-4
     fit = seen_by(device, seed)
     found = fit.fit(start, device.homodyne.turn_rad, EVERY, modulation=levels)
-    again = fit.fit(found.parameters, found.quadrature_phase, EVERY, modulation=levels)
-    moved = (again.parameters - found.parameters) / np.maximum(found.deviations, 1e-30)
-    assert np.sqrt(np.mean(moved**2)) < 0.25
+    again = fit.fit(found.parameters, found.quadrature_phase, EVERY, modulation=levels).parameters
+    assert np.mean(((again - found.parameters) / np.maximum(found.deviations, 1e-30)) ** 2) < 0.25**2
     assert abs(found.parameters[angle] - truth[angle]) < found.deviations[angle] < 1e-4
     off_rad = abs(found.quadrature_phase - device.homodyne.turn_rad)
     assert off_rad < min(np.deg2rad(0.3), 3 * (found.quadrature_deviation or 0)) < 0.02
