@@ -44,8 +44,8 @@ demo-hardware: $(STAMP)  ## the main job over fake cameras, real packets, a seri
 	    $(BIN)/lightpage demo --source camera:$(HARDWARE)/device/device.toml --out $(HARDWARE)
 
 PYTEST := $(ONE_THREAD) $(BIN)/pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
-test: $(STAMP)  ## lint, then every test but the long ones; prints the slowest, and how far all stayed below the budget
-	@$(BIN)/python -m tests.budget "make test" $(MAKE) --no-print-directory lint pytest
+test: $(STAMP)  ## lint, and beside it every test but the long ones; prints the slowest, and how far all stayed below the budget
+	@$(BIN)/python -m tests.budget "make test" $(MAKE) --no-print-directory -j2 lint pytest
 
 pytest: $(STAMP)
 	$(PYTEST) -m "not long" --durations 20 --durations-min 5 $(PYTEST_ARGS)

@@ -30,7 +30,7 @@ from lightpage.calibration.patches import (
 from lightpage.calibration.samplers import FieldSampler, FrameSampler
 from lightpage.calibration.sampling_table import needed_apart, registration_coefficients
 from lightpage.calibration.waves.cameras_apart import related_apart
-from lightpage.calibration.waves.wave_fit import LevelPrior, WaveFit
+from lightpage.calibration.waves.wave_fit import Effort, LevelPrior, WaveFit
 from lightpage.calibration.waves.wave_model import LaunchConditions
 from lightpage.device.profile import Profile
 from lightpage.errors import CalibrationError
@@ -146,6 +146,7 @@ class _Stage:
     use_phase: bool = False
     half_rate: bool = False
     expected: str = _WANTED
+    most_patches: int | None = None
 
 
 _SINGLE_CAMERA = (
@@ -162,7 +163,7 @@ _PHASES = (_Stage("phases", 2, 1, _ALL_GROUPS, COHERENT_BRANCHES, use_phase=True
 """Each round halves what is left of the error, since patches are measured about the current geometry; two bring it
 within reach of the waves. On a small page they may take a phase for another a turn away: where the light is not
 explained, the waves begin anew without them."""
-_DRIFTED = (_Stage("follow the drift", 6, 2, _ALL_GROUPS, COHERENT_BRANCHES, half_rate=True),)
+_DRIFTED = (_Stage("follow the drift", 6, 2, _ALL_GROUPS, COHERENT_BRANCHES, half_rate=True, most_patches=250),)
 """Stages from an earlier calibration: the complex field is right from the start, so no camera is searched alone."""
 _DRIFT_SHARES = {"angle": 1.0, "lengths": 0.2, "in_phase": 0.3, "quadrature": 0.3, "axial": 0.2}
 _DRIFT_SCALE: Real = np.array([_DRIFT_SHARES.get(parameter.group, 0.05) for parameter in PARAMETERS])
@@ -302,7 +303,8 @@ def refine(
         start: [P] earlier parameters.
         quadrature_phase: earlier angle between the homodyne arms.
         modulation: earlier one, which is fitted again, see `DRIFTS`.
-        near: device at which the fit begins, if not at the earlier calibration. The priors stay about that one.
+        near: device at which the fit begins, if not at the earlier calibration. The priors stay about that one. Such a
+            fit takes the derivative of the light once.
         rough: whether the fit may end before its optimum, in half of the time. Its `goodness` is not measured then.
         twin, solve_field, profile, references, pages, progress: see `calibrate`.
 
@@ -311,7 +313,8 @@ def refine(
     """
     work = _Registration(twin, solve_field, profile, references, list(pages), progress)
     work.parameters, work.centre, work.quadrature_phase = start.copy(), start, quadrature_phase
-    work.modulation, work.levels, work.rough = modulation, LevelPrior(modulation, DRIFTS), rough
+    work.modulation, work.levels = modulation, LevelPrior(modulation, DRIFTS)
+    work.effort = "rough" if rough else "full" if near is None else "once"
     if near is not None:
         work.parameters, work.quadrature_phase = near.parameters.copy(), near.quadrature_phase_rad
         work.modulation = near.modulation
@@ -340,7 +343,7 @@ def goodness_of(
     start, group = device.parameters, ("launch",)  # with it the illumination does not bend the page's phases
     fit = WaveFit(twin, device.profile, page.pair, device.references, page.symbols)
     turn, levels = device.quadrature_phase_rad, device.modulation
-    found = fit.fit(start, turn, group, start, _HELD, progress, levels, rough=True)
+    found = fit.fit(start, turn, group, start, _HELD, progress, levels, effort="rough")
     if not np.isfinite(found.residual):
         raise CalibrationError("calibration, verdict", "no light of a page", "some")
     return measure_goodness(twin, device, found.conditions, page.pair, page.symbols, progress)
@@ -411,7 +414,8 @@ class _Registration:
             )
         self.grid = field_grid(profile)
         self.parameters, self.centre = nominal(), nominal()
-        self.any_orientation, self.orientations, self.rough = False, tuple[str, ...](), False
+        self.any_orientation, self.orientations = False, tuple[str, ...]()
+        self.effort: Effort = "full"
         self.deviations = np.zeros_like(self.parameters)
         self.quadrature_phase = np.pi / 2
         self.quadrature_deviation: float | None = None
@@ -532,7 +536,7 @@ class _Registration:
             self.tell,
             self.modulation,
             self.levels,
-            rough=self.rough,
+            self.effort,
         )
         self.parameters, self.deviations = found.parameters, found.deviations
         self.quadrature_phase, self.quadrature_deviation = found.quadrature_phase, found.quadrature_deviation
@@ -573,7 +577,7 @@ class _Registration:
 
     def _goodness(self) -> Goodness | None:
         """Verdict on the fit, by the light of the first page."""
-        if self.conditions is None or self.rough:
+        if self.conditions is None or self.effort == "rough":
             return None
         self.begin("unexplained light")
         device = CalibratedDevice(
@@ -617,7 +621,7 @@ class _Registration:
 
     def _where(self, stage: _Stage) -> list[Patch]:
         if not stage.middle_only:
-            return self.patches
+            return self.patches[:: math.ceil(len(self.patches) / (stage.most_patches or len(self.patches)))]
         return middle_patches(self.profile, self.patches, _FEWEST)
 
     def _on_each_camera(self, stage: _Stage) -> list[list[Measurement]]:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import reduce
+from operator import add
 from types import ModuleType
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from lightpage.waves.parallel import in_parallel
 
 
 class Arrays(Protocol):
@@ -27,6 +32,9 @@ class Arrays(Protocol):
     def complex64(self, values: Any) -> Any:
         """An array of the library in single precision."""
 
+    def sum(self, function: Callable[[slice], Any], count: int) -> Any:
+        """Add up what a function makes of so many items, by slices of them that it is called with."""
+
 
 class NumpyArrays:
     """See `Arrays`: numpy, whose arrays stay as they are."""
@@ -44,6 +52,12 @@ class NumpyArrays:
     def complex64(self, values: Any) -> Any:
         """Return the array in single precision."""
         return values.astype(np.complex64, copy=False)
+
+    def sum(self, function: Callable[[slice], Any], count: int) -> Any:
+        """Compute both halves beside each other, the same ones whatever the number of threads."""
+        middle = (count + 1) // 2
+        halves = [half for half in (slice(0, middle), slice(middle, count)) if half.start < half.stop]
+        return reduce(add, in_parallel(function, halves))
 
 
 NUMPY = NumpyArrays()

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import reduce
+from itertools import starmap
+from operator import add
 from typing import Any
 
 import numpy as np
@@ -158,24 +162,35 @@ class FourierLens:
     def to_facet(self, field: Complex) -> Complex:
         """Field on the plane [ny, nx] to the facet's grid [cells_y - 1, cells_x - 1]."""
         field = self._arrays.complex64(field) * self.on_plane
-        total: Any = None
-        for at_plane, at_facet in self.terms.terms():
-            term = self.y_to_y @ (((field * at_plane) @ self.x_to_x) * self.y_and_x)
-            term *= at_facet
-            total = term if total is None else total + term
-        light: Complex = total * self.on_facet
+
+        def term(at_plane: Complex, at_facet: Complex) -> Complex:
+            product: Complex = self.y_to_y @ (((field * at_plane) @ self.x_to_x) * self.y_and_x)
+            product *= at_facet
+            return product
+
+        light: Complex = self._sum(term) * self.on_facet
         return light
 
     def to_plane(self, field: Complex) -> Complex:
         """The adjoint of `to_facet`: a field on the facet's grid to the plane [ny, nx], kernel exp(+i ...)."""
         field = self._arrays.complex64(field) * self.on_facet.conj()
-        total: Any = None
-        for at_plane, at_facet in self.terms.terms():
+
+        def term(at_plane: Complex, at_facet: Complex) -> Complex:
             inner = (self.y_to_y.conj().T @ (field * at_facet.conj())) * self.y_and_x.conj()
-            term = (inner @ self.x_to_x.conj().T) * at_plane.conj()
-            total = term if total is None else total + term
-        light: Complex = total * self.on_plane.conj()
+            product: Complex = (inner @ self.x_to_x.conj().T) * at_plane.conj()
+            return product
+
+        light: Complex = self._sum(term) * self.on_plane.conj()
         return light
+
+    def _sum(self, term: Callable[[Complex, Complex], Complex]) -> Complex:
+        """Sum of what is made of each term's factors on plane and facet."""
+
+        def some(which: slice) -> Complex:
+            return reduce(add, starmap(term, self.terms.terms(which)))
+
+        total: Complex = self._arrays.sum(some, len(self.terms.first))
+        return total
 
 
 def _phasor(phase: Real) -> Complex:

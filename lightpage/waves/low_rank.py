@@ -82,9 +82,9 @@ class Expansion:
             self, first=first, second=second, first_axes=(first_y, first_x), second_axes=(second_y, second_x)
         )
 
-    def terms(self) -> Iterator[tuple[Complex, Complex]]:
+    def terms(self, which: slice = slice(None)) -> Iterator[tuple[Complex, Complex]]:
         """Pairs of factors on the planes' samples, [y, x] each; an axis on which nothing depends has one sample."""
-        for first, second in zip(self.first, self.second, strict=True):
+        for first, second in zip(self.first[which], self.second[which], strict=True):
             yield _values(first, self.first_axes), _values(second, self.second_axes)
 
 

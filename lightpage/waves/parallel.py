@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import TypeVar
 
 from lightpage.systems import cores
 
 ITEM = TypeVar("ITEM")
 RESULT = TypeVar("RESULT")
+
+
+_THREAD = threading.local()
+"""Whether a thread is one of several that compute beside each other."""
 
 
 def threads_beside() -> int:
@@ -28,13 +34,15 @@ def threads_beside() -> int:
 def in_parallel(function: Callable[[ITEM], RESULT], items: Sequence[ITEM]) -> Iterator[RESULT]:
     """Yield a function's results, in the order of the items; the first error ends the rest.
 
+    A calculation that is one of several already keeps to its thread.
+
     Args:
         function: function of an item, which lets other threads compute, as numpy's products do.
         items: its arguments.
     """
-    count = min(threads_beside(), len(items))
+    count = 1 if vars(_THREAD) else min(threads_beside(), len(items))
     if count < 2:
         yield from map(function, items)
         return
-    with ThreadPoolExecutor(count) as pool:
+    with ThreadPoolExecutor(count, initializer=partial(setattr, _THREAD, "beside", True)) as pool:
         yield from pool.map(function, items)

@@ -47,17 +47,18 @@ class PipePropagator:
             _parity_basis(n, float(dz * (np.pi / side) ** 2 / (2 * nk))) for n, side in zip(cells, sides, strict=True)
         ]
         y, x = (basis.mode_numbers for basis in bases)
-        detuning = mode_detuning(geometry, y[:, None, :, None], x[None, :, None, :])
+        detuning = mode_detuning(geometry, y[:, :, None], x[_OTHER][:, :, None, :])
         coupling = np.outer(bases[0].couplings, bases[1].couplings) / w**2
         coupling /= 1 + geometry.pipe_height_relative
         angle = dz / nk * np.sin(geometry.pipe_angle) * coupling
-        self._xp = arrays.xp
-        self._sine_y, self._sine_x = (arrays.array(basis.sine_by_parity) for basis in bases)
-        self._pairs_y, self._pairs_x = (arrays.array(basis.singular) for basis in bases)
+        self._arrays = arrays
+        self._sine_y, self._pairs_y = (arrays.array(part) for part in (bases[0].sine_by_parity, bases[0].singular))
+        self._sine_x, self._pairs_x = (
+            arrays.array(part[_OTHER]) for part in (bases[1].sine_by_parity, bases[1].singular)
+        )
         self._half = arrays.array(np.exp(0.5j * dz * detuning).astype(np.complex64))
-        # modes of parities (p, q) turn with those of (1 - p, 1 - q), one way where p = q and the other where not
-        sine = _ONE_WAY[:, :, None, None] * np.sin(angle)
-        self._cos, self._turn = (arrays.array(part.astype(np.complex64)) for part in (np.cos(angle), 1j * sine))
+        self._cos = arrays.array(np.cos(angle).astype(np.complex64))
+        self._turn = arrays.array((1j * _ONE_WAY[:, None, None, None] * np.sin(angle)).astype(np.complex64))
 
     def forward(self, field: Complex) -> Complex:
         """Entrance facet [cells_y - 1, cells_x - 1] to exit facet."""
@@ -69,26 +70,36 @@ class PipePropagator:
 
     def _run(self, field: Complex, *, adjoint: bool) -> Complex:
         half, turn = (self._half.conj(), -self._turn) if adjoint else (self._half, self._turn)
-        full = half * half
-        modes = real_products(self._sine_y[:, None], field[None, None], self._sine_x.swapaxes(1, 2)[None]) * half
-        for step in range(self.steps):
-            if self.sheared:
-                modes = self._rotate(modes, turn)
-            modes = modes * (full if step < self.steps - 1 else half)
-        fields: Any = real_products(self._sine_y.swapaxes(1, 2)[:, None], modes, self._sine_x[None])
-        field = fields.sum((0, 1))
-        return field
 
-    def _rotate(self, modes: Complex, turn: Complex) -> Complex:
-        """Apply exp(i angle d_x d_y') to modes [2, 2, Ky, Kx]."""
-        y, x = self._pairs_y, self._pairs_x
-        inner = real_products(y.swapaxes(1, 2)[:, None], modes, x[None])
-        turned = self._cos * inner + turn * self._xp.flip(inner, (0, 1))
-        return real_products(y[:, None], turned, x.swapaxes(1, 2)[None])
+        def through(kinds: slice) -> Complex:
+            sine_x, pairs_x = self._sine_x[kinds], self._pairs_x[kinds]
+            mine, turning = half[kinds], turn[kinds]
+            full = mine * mine
+            modes = real_products(self._sine_y, field, sine_x.swapaxes(2, 3)) * mine
+            for step in range(self.steps):
+                if self.sheared:
+                    modes = self._rotate(modes, pairs_x, turning)
+                modes = modes * (full if step < self.steps - 1 else mine)
+            fields: Any = real_products(self._sine_y.swapaxes(1, 2), modes, sine_x)
+            there: Complex = fields.sum((0, 1))
+            return there
+
+        leaving: Complex = self._arrays.sum(through, len(_OTHER))
+        return leaving
+
+    def _rotate(self, modes: Complex, pairs_x: Real, turn: Complex) -> Complex:
+        """Apply exp(i angle d_x d_y') to modes [kinds, 2, Ky, Kx]."""
+        y, flip = self._pairs_y, self._arrays.xp.flip
+        inner = real_products(y.swapaxes(1, 2), modes, pairs_x)
+        turned = self._cos * inner + turn * flip(inner, (1,))
+        return real_products(y, turned, pairs_x.swapaxes(2, 3))
 
 
-_ONE_WAY = np.array([[1, -1], [-1, 1]])
-"""Sense of the turn by the parities of the modes along y' and x."""
+_OTHER = np.array([[0, 1], [1, 0]])
+"""Parity along x of modes whose parity along y' is the column. The rows are two kinds that never meet: a shear takes
+modes of parities (p, q) to (1 - p, 1 - q)."""
+_ONE_WAY = np.array([1, -1])
+"""Sense of the turn of either kind."""
 
 
 class ParityBasis:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from types import ModuleType
 from typing import Any
@@ -94,6 +94,10 @@ class TorchEngine:
     def complex64(self, values: Tensor) -> Tensor:
         """See `Arrays`."""
         return values.to(torch.complex64)
+
+    def sum(self, function: Callable[[slice], Tensor], count: int) -> Tensor:
+        """Add up all at once: the device computes beside itself."""
+        return function(slice(0, count))
 
     def generator(self, seed: Sequence[int]) -> TorchNoise:
         """See `Engine`."""

@@ -12,6 +12,8 @@ _SMOOTHED_PX = 3
 """Side of the squares of pixels whose mean stands for a pixel's expected count."""
 _CLASSES = 20
 """Number of classes of pixels of like counts, each with a variance of its own."""
+_MOST_PIXELS = 2_000_000
+"""Pixels that are looked at, about: an even share of a larger frame's."""
 _ROUNDING = 1 / 12
 """Variance that counts have as whole numbers."""
 _NORMAL = 0.6745
@@ -38,11 +40,13 @@ def noise_variance(frame: NDArray[np.integer]) -> tuple[float, float]:
         scipy.ndimage.convolve1d(scipy.ndimage.convolve1d(counts, weights, axis=0), weights, axis=1)[inside]
         for weights in (taps, taps**2)
     )
-    order = np.argsort(expected, axis=None)
+    every = -(-noise.size // _MOST_PIXELS)
+    noise, expected = (values.ravel()[::every] for values in (noise, expected))
+    order = np.argsort(expected)
     level, variance = (np.empty(_CLASSES) for _ in range(2))
     for number, chosen in enumerate(np.array_split(order, _CLASSES)):
-        level[number] = expected.ravel()[chosen].mean()
-        power = noise.ravel()[chosen] ** 2
+        level[number] = expected[chosen].mean()
+        power = noise[chosen] ** 2
         variance[number] = power[power <= _OUTLIER**2 * np.median(power) / _NORMAL**2].mean()
     # Clipped or flat classes say nothing; errors of a variance grow with it.
     told = variance > 0

@@ -25,10 +25,12 @@ from lightpage.waves.parallel import in_parallel
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
-_STRIDE, _ACCURACY = 4, 3 / 8
-"""Samples of the common grid from one to the next, and share of the splitting steps, for corrections of the model: few
-unknowns need few equations."""
-_EVERY = (slice(None, None, _STRIDE), slice(None, None, _STRIDE))
+_EQUATIONS, _LEAST_STRIDE = 30_000, 4
+"""Approximate limit of equations for each camera by which the model is corrected, and least number of the common grid's
+samples from one to the next: few unknowns need few."""
+_EVERYWHERE = (slice(None), slice(None))
+_ACCURACY = 3 / 8
+"""Share of the splitting steps for corrections."""
 _LOSSES = (1, 2)
 """Powers of R^2 in the light that is lost towards the edges of the entrance facet."""
 
@@ -58,6 +60,8 @@ class SeenLight:
     ) -> None:
         self._twin, self._device, self._pair, profile = twin, device, pair, device.profile
         self._samples, self._grid = symbol_samples(profile), field_grid(profile)
+        self._stride = max(_LEAST_STRIDE, int(np.sqrt(np.prod(self._grid.shape) / _EQUATIONS)))
+        self._every = (slice(None, None, self._stride), slice(None, None, self._stride))
         self._blur = conditions.blur
         self.waves = FittedWaves(profile, device.parameters, self._samples, filled=True, blur=self._blur)
         self._terms = np.stack(illumination_terms(self.waves.x, self.waves.y))
@@ -88,7 +92,7 @@ class SeenLight:
 
     def seen_of(self, change: Complex) -> Complex:
         """A small change of the light of both cameras as it comes back from their equations."""
-        return self._mending((change / self._amplitude * self._along.conj()).real)
+        return self._mending((change / self._amplitude * self._along().conj()).real)
 
     def noise_of_frames(self) -> Complex:
         """Noise like that of the frames, as light of both cameras."""
@@ -121,11 +125,14 @@ class SeenLight:
         A blur of the modulator loses light there. A network learns both by itself.
         """
         terms, waves = len(self._terms), self.waves
-        first = self.coarse.to_cameras(self.page * self._terms[0])  # lenses are made before threads ask for them
-        rest = in_parallel(lambda term: self.coarse.to_cameras(self.page * term), list(self._terms[1:]))
-        lit = [first, *rest]
-        losses = [self.coarse.to_exit(self.page, radius2(self.coarse) ** power) for power in _LOSSES]
-        changes = [*lit, *(1j * each for each in lit), *map(self.coarse.from_exit, losses)]
+        page, share = self.page, 2 if self._samples % 4 == 0 else 1
+        coarse, (rows, columns) = self.changed(samples=self._samples // share), page.shape
+        page = page.reshape(rows // share, share, columns // share, share).mean(axis=(1, 3)) * share  # as bright
+        lighting = illumination_terms(coarse.x, coarse.y)
+        first = coarse.to_cameras(page * lighting[0])  # lenses are made before threads ask for them
+        lit = [first, *in_parallel(lambda term: coarse.to_cameras(page * term), lighting[1:])]
+        losses = [coarse.to_exit(page, radius2(coarse) ** power) for power in _LOSSES]
+        changes = [*lit, *(1j * each for each in lit), *map(coarse.from_exit, losses)]
         columns = np.stack([*map(self.equations_of, changes)], axis=1)
         found = np.linalg.lstsq(columns, self.left_of_equations, rcond=None)[0]
         self.page = self.page * (1 + np.tensordot(found[:terms] + 1j * found[terms : 2 * terms], self._terms, 1))
@@ -137,26 +144,26 @@ class SeenLight:
     def equations(self, left: Real) -> Real:
         """Equations [2, Gy, Gx], or on the coarse grid, over their noise, on that grid; flat."""
         if left.shape[1:] == self._seen.shape:
-            left = left[:, *_EVERY]
-        weighted = left / np.sqrt(self.brightness[:, *_EVERY] + READ_NOISE)
-        return np.asarray(weighted[:, self._seen[_EVERY]].ravel())
+            left = left[:, *self._every]
+        weighted = left / np.sqrt(np.abs(self._along(self._every)) ** 2 + READ_NOISE)
+        return np.asarray(weighted[:, self._seen[self._every]].ravel())
 
     def equations_of(self, change: Complex) -> Real:
         """Return the change of the equations, flat, by a small change of both cameras' light on the coarse grid."""
-        return self.equations((change / self._amplitude[_EVERY] * self._along[:, *_EVERY].conj()).real)
+        return self.equations((change / self._amplitude[self._every] * self._along(self._every).conj()).real)
 
     def equations_of_fit(self) -> Iterator[Real]:
         """Yield the change of the equations by a small change of each parameter that the twin knows; each flat."""
         leaving = self.coarse.to_exit(self.page)
         here = self.coarse.from_exit(leaving)
-        places = np.stack(np.meshgrid(self._grid.x_m, self._grid.y_m), axis=-1)[_EVERY]
+        places = np.stack(np.meshgrid(self._grid.x_m, self._grid.y_m), axis=-1)[self._every]
         for index in range(min(self._twin.known, len(PARAMETERS))):
             moved = self._device.parameters.copy()
             moved[index] += STEPS[index]
             if index in SEEN_BY_CAMERAS:
                 at = _rows_and_columns(self._twin.pixels(moved, places.reshape(-1, 2)).reshape(2, *places.shape))
                 yield self.equations(
-                    _looked_at(self._images, at) / (2 * self.references[:, *_EVERY]) - self.counts[:, *_EVERY]
+                    _looked_at(self._images, at) / (2 * self.references[:, *self._every]) - self.counts[:, *self._every]
                 )
             else:
                 there = self.coarse.moved(index, self.changed(moved), self.page, leaving, here)
@@ -165,13 +172,13 @@ class SeenLight:
     @property
     def coarse_places(self) -> tuple[Real, Real]:
         """Places (x, y) of the coarse grid over its half width and half height, to be spread over it."""
-        x, y = self._grid.x_m[::_STRIDE], self._grid.y_m[::_STRIDE]
+        x, y = self._grid.x_m[:: self._stride], self._grid.y_m[:: self._stride]
         return (x / self._grid.x_m[-1])[None, :], (y / self._grid.y_m[-1])[:, None]
 
     @property
     def brightness(self) -> Real:
         """Counts that the model expects, over the reference's counts, [2, Gy, Gx]."""
-        return np.abs(self._along) ** 2
+        return np.abs(self._along()) ** 2
 
     @property
     def left_of_equations(self) -> Real:
@@ -183,12 +190,12 @@ class SeenLight:
         """The fitted waves on the coarse grid."""
         return self.changed()
 
-    def changed(self, parameters: Real | None = None, **geometry: float) -> FittedWaves:
-        """The waves on the coarse grid with other parameters, or with another geometry."""
+    def changed(self, parameters: Real | None = None, samples: int | None = None, **geometry: float) -> FittedWaves:
+        """The waves on the coarse grid with other parameters, fewer samples a symbol, or another geometry."""
         parameters = self._device.parameters if parameters is None else parameters
-        coarse: dict[str, Any] = {"filled": True, "stride": _STRIDE, "accuracy": _ACCURACY}
+        coarse: dict[str, Any] = {"filled": True, "stride": self._stride, "accuracy": _ACCURACY}
         coarse |= {"changed": geometry, "blur": self._blur, "like": vars(self).get("coarse")}
-        return FittedWaves(self._device.profile, parameters, self._samples, **coarse)
+        return FittedWaves(self._device.profile, parameters, samples or self._samples, **coarse)
 
     @property
     def _lacking(self) -> Real:
@@ -196,15 +203,14 @@ class SeenLight:
         field = self.fields / self._amplitude
         return np.asarray(self.counts - (field * self._arms.conj()).real - np.abs(field) ** 2 / 2)
 
-    @property
-    def _along(self) -> Complex:
-        """Directions of the field along which the cameras' counts grow."""
-        return np.asarray(self._arms + self.fields / self._amplitude)
+    def _along(self, where: tuple[slice, slice] = _EVERYWHERE) -> Complex:
+        """Directions of the field along which the cameras' counts grow, at some places of the grid."""
+        return np.asarray(self._arms + self.fields[:, *where] / self._amplitude[where])
 
     def _mending(self, left: Real) -> Complex:
         """Light of both cameras that mends what is left of their equations, each weighted by its noise."""
-        along = self._along
-        return np.asarray(self._seen * self._amplitude * along * left / (self.brightness + READ_NOISE))
+        along = self._along()
+        return np.asarray(self._seen * self._amplitude * along * left / (np.abs(along) ** 2 + READ_NOISE))
 
     def _filtered(self, images: Sequence[NDArray[np.float32]]) -> list[NDArray[np.float32]]:
         """Images filtered as a decoder filters what frames have beyond their references, float32 [H, W]."""

@@ -19,7 +19,13 @@ from numpy.typing import NDArray
 from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.parameters import NAMES, PARAMETERS, PRIORS, SEEN_BY_CAMERAS, STEPS, indices
 from lightpage.calibration.samplers import smooth_reference
-from lightpage.calibration.waves.wave_model import FittedWaves, LaunchConditions, illumination_terms, on_modulator
+from lightpage.calibration.waves.wave_model import (
+    ILLUMINATIONS,
+    FittedWaves,
+    LaunchConditions,
+    illumination_terms,
+    on_modulator,
+)
 from lightpage.device.profile import Profile
 from lightpage.page import modulation as modulations
 from lightpage.page.modulation import NOMINAL, Modulation
@@ -29,6 +35,7 @@ from lightpage.waves.parallel import in_parallel
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
+Effort = Literal["full", "once", "rough"]
 
 
 class _Sampling(NamedTuple):
@@ -46,7 +53,9 @@ class _Sampling(NamedTuple):
 _FAR = _Sampling(1, 1 / 8)
 """Sampling of the first derivative, which costs less. The next one undoes its error."""
 _NEAR = _Sampling(2, 3 / 8)
-"""Sampling of the others: an error of a percent costs no round, and half of the usual samples leave one of 0.3%."""
+"""Sampling of the others, and of a rough fit's light: an error of a percent costs no round, and half of the usual
+samples leave one of 0.3%."""
+_EXACT = _Sampling(4, 1.0)
 READ_NOISE = 0.3
 """Variance of an equation that does not grow with the light, over the shot noise of the reference alone."""
 ROUNDS = 9
@@ -173,8 +182,6 @@ class WaveFit:
         self._twin, self._profile, self._symbols = twin, profile, symbols.size
         self._samples = symbol_samples(profile)
         self._phases = np.mod(np.angle(symbols), 2 * np.pi)
-        waves = FittedWaves(profile, np.zeros(len(PARAMETERS)), self._samples)
-        self._terms = np.stack(illumination_terms(waves.x, waves.y))
         grid = field_grid(profile)
         self._beside = grid.pitch_m * np.array([[0, 0], [1, 0], [0, 1]])
         self._stride = max(_LEAST_STRIDE, int(np.sqrt(np.prod(grid.shape) / _EQUATIONS)))
@@ -198,8 +205,7 @@ class WaveFit:
         progress: Callable[[float], None] = lambda share: None,
         modulation: Modulation = NOMINAL,
         levels: LevelPrior | None = None,
-        *,
-        rough: bool = False,
+        effort: Effort = "full",
     ) -> WaveFitted:
         """Fit the parameters of `groups` and the angle between the arms.
 
@@ -214,8 +220,8 @@ class WaveFit:
                 0 to 1. It may raise to stop the work.
             modulation: light that the modulator makes of its levels, to start from.
             levels: prior of the modulation where it is fitted too, None where it is held.
-            rough: whether the derivative of the light is taken but once, coarsely: what the light tells least, such as
-                a launched defocus, may come out some deviations away.
+            effort: ``once`` takes the derivative of the light but once, coarsely: what the light tells least, such as a
+                launched defocus, may come out some deviations away. ``rough`` takes the light itself coarsely, too.
         """
         without_effect = _OF_REAL_LENSES if self._profile.ideal_lenses else ()
         of_light = [index for index in indices(*groups) if index not in (*SEEN_BY_CAMERAS, *without_effect)]
@@ -227,17 +233,17 @@ class WaveFit:
         state = self._start(start, quadrature_phase, modulation)
         nothing, first = np.zeros(len(PARAMETERS)), LaunchConditions(state.light, state.blur)
         best = WaveFitted(start, nothing, quadrature_phase, np.inf, first, modulation)
-        slopes, taken_at, sampling = None, np.inf, _FAR
+        slopes, taken_at, sampling, once = None, np.inf, _FAR, effort != "full"
         for number in range(ROUNDS):
             progress(number / ROUNDS)
-            fields, left = self._left(state)
+            fields, left = self._left(state, _NEAR if effort == "rough" else _EXACT)
             residual = float(np.sqrt(np.mean(left**2)))
-            if (rough or sampling is _NEAR) and not residual < (1 - _CONVERGED) * best.residual:
+            if (once or sampling is _NEAR) and not residual < (1 - _CONVERGED) * best.residual:
                 if residual < best.residual:
                     best = replace(best, residual=residual, **_found(state))
                 break
             fresh = sampling is not _FAR and residual >= (1 - _STALE) * taken_at
-            if slopes is None or not (fresh or rough):
+            if slopes is None or not (fresh or once):
                 told, taken_at = partial(_within_round, progress, number), residual
                 sampling = _FAR if slopes is None else _NEAR
                 slopes = self._slopes(state, of_light, of_cameras, sampling, told, levels=levels is not None)
@@ -279,22 +285,32 @@ class WaveFit:
         light = Modulation(tuple(levels.tolist())).page_light(self._phases)
         return on_modulator(light * (self._samples / samples), samples)
 
-    def _light(self, state: _State) -> Complex:
+    def _light(self, state: _State, sampling: _Sampling) -> Complex:
         """The page's light on the common grid, as either camera sees it, [2, Gy, Gx]."""
-        lit = self._page(state.levels, self._samples) * np.tensordot(state.light, self._terms, 1)
-        waves = FittedWaves(self._profile, state.parameters, self._samples, filled=True, blur=state.blur)
-        return waves.to_cameras(lit)
+        waves = self._waves(state.parameters, state.blur, sampling)
+        terms = np.stack(illumination_terms(waves.x, waves.y))
+        return waves.to_cameras(self._page(state.levels, waves.samples) * np.tensordot(state.light, terms, 1))
 
     def _start(self, parameters: Real, quadrature_phase: float, modulation: Modulation) -> _State:
         """Return the state to start from: the given values, and the even illumination that fits best."""
         chosen, counts, amplitude = self._look(parameters)
-        even = np.eye(1, len(self._terms), dtype=np.complex128)[0]
+        even = np.eye(1, ILLUMINATIONS, dtype=np.complex128)[0]
         state = _State(parameters, quadrature_phase, even, np.array(modulation.coefficients), _USUAL_BLUR)
-        here = [field[self._every][chosen] / amplitude for field in self._light(state)]
+        waves = self._waves(parameters, state.blur, _FAR, self._stride)
+        lit = waves.to_cameras(self._page(state.levels, waves.samples))
+        here = [field[chosen] / amplitude for field in lit]
         arms = (0.0, quadrature_phase)
         columns = np.concatenate([field * np.exp(-1j * arm) for field, arm in zip(here, arms, strict=True)])
         found = np.linalg.lstsq(np.stack([columns.real, -columns.imag], axis=1), counts.ravel(), rcond=None)[0]
         return state._replace(light=even * complex(*found))
+
+    def _waves(
+        self, parameters: Real, blur: float, sampling: _Sampling, stride: int = 1, like: FittedWaves | None = None
+    ) -> FittedWaves:
+        """Return the waves on every so many samples of the common grid; `like` as for `FittedWaves`."""
+        how: dict[str, Any] = {"stride": stride, "accuracy": sampling.accuracy, "like": like, "blur": blur}
+        samples = min(sampling.samples, self._samples)
+        return FittedWaves(self._profile, parameters, samples, filled=True, **how)
 
     def _slopes(
         self,
@@ -306,31 +322,27 @@ class WaveFit:
         *,
         levels: bool,
     ) -> _Slopes:
-        samples = min(sampling.samples, self._samples)
-
-        def waves(parameters: Real, like: FittedWaves | None = None, blur: float = state.blur) -> FittedWaves:
-            how: dict[str, Any] = {"stride": self._stride, "accuracy": sampling.accuracy, "like": like, "blur": blur}
-            return FittedWaves(self._profile, parameters, samples, filled=True, **how)
-
         def stepped(index: int) -> tuple[Real, float]:
             there = state.parameters.copy()
             there[index] += STEPS[index]
             return there, STEPS[index]
 
-        here = waves(state.parameters)
+        here = self._waves(state.parameters, state.blur, sampling, self._stride)
+        samples = here.samples
         even, terms = self._page(state.levels, samples), np.stack(illumination_terms(here.x, here.y))
         first = here.to_cameras(even * terms[0])  # lenses and pipe are made before threads ask for them
         by_term = np.stack([first, *in_parallel(lambda term: here.to_cameras(even * term), list(terms[1:]))])
         page, field = even * np.tensordot(state.light, terms, 1), np.tensordot(state.light, by_term, 1)
         leaving = here.to_exit(page)
-        blurred = waves(state.parameters, here, state.blur + _BLUR_STEP)
+        blurred = self._waves(state.parameters, state.blur + _BLUR_STEP, sampling, self._stride, here)
         by_blur = (blurred.to_cameras(page) - field) / _BLUR_STEP
         functions = [on_modulator(one, samples) for one in modulations.page_basis(self._phases)] if levels else []
         by_level = list(in_parallel(lambda one: here.to_cameras(page * one), functions))
 
         def by_parameter(index: int) -> Complex:
             there, step = stepped(index)
-            return np.asarray((here.moved(index, waves(there, here), page, leaving, field) - field) / step)
+            waves = self._waves(there, state.blur, sampling, self._stride, here)
+            return np.asarray((here.moved(index, waves, page, leaving, field) - field) / step)
 
         light, places = list[Complex](), list[Real]()
         for number, column in enumerate(in_parallel(by_parameter, of_light)):
@@ -362,12 +374,12 @@ class WaveFit:
         amplitude = np.sqrt(_at(self._levels[0], pixels[0][chosen], order=1))
         return chosen, np.stack(counts), amplitude / amplitude.mean()
 
-    def _left(self, state: _State) -> tuple[Complex, Real]:
+    def _left(self, state: _State, sampling: _Sampling) -> tuple[Complex, Real]:
         """The light of both cameras [2, Gy, Gx], and what is left of the equations, [2 N], over each one's noise.
 
         A count says Re(e exp(-i arm)) + |e|^2 / 2 of the field e over the reference.
         """
-        fields, (chosen, counts, amplitude) = self._light(state), self._look(state.parameters)
+        fields, (chosen, counts, amplitude) = self._light(state, sampling), self._look(state.parameters)
         left = []
         for camera, arm in enumerate((0.0, state.quadrature_phase)):
             phasor, here = np.exp(-1j * arm), fields[camera][self._every][chosen] / amplitude

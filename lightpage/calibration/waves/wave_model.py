@@ -22,6 +22,8 @@ Complex = NDArray[np.complexfloating]
 
 _ILLUMINATION = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 """Powers of (x, y) in an illumination."""
+ILLUMINATIONS = len(_ILLUMINATION)
+"""Number of its terms."""
 _AT_CAMERA = frozenset(indices("camera_phase"))
 """Parameters whose change of the light needs no propagation."""
 _BEHIND_PIPE = frozenset(
@@ -127,6 +129,7 @@ class FittedWaves:
         blur: variance of the modulator's blur, over the square of its pixels' pitch.
 
     Attributes:
+        samples: as given.
         x, y: places of the modulator's samples over the page's half width and half height, [nx samples], [ny samples].
         channel: lenses and pipe.
         launch: [ny samples, nx samples] phasor of the smooth phases at the launch side.
@@ -147,6 +150,7 @@ class FittedWaves:
         changed: Mapping[str, Any] | None = None,
         blur: float = 0.0,
     ) -> None:
+        self.samples = samples
         value = as_dict(parameters)
         geometry = replace(fitted_geometry(profile, value), **(changed or {}))
         grid = grid or field_grid(profile)

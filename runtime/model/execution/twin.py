@@ -9,6 +9,7 @@ from lightpage.errors import BundleError
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import TWIN
 from lightpage.runtime.model.execution.session import open_session, running
+from lightpage.waves.parallel import in_parallel, threads_beside
 
 Real = NDArray[np.float64]
 
@@ -16,6 +17,8 @@ INPUTS = {"parameters": 1, "points": 2, "anchors": 2, "camera_places": 2}
 """Inputs of the graph, all float64, with their number of axes."""
 _THREADS = 1
 """For few points at a time, where a second thread would only spin."""
+_MANY = 20_000
+"""Points that are divided among threads."""
 OUTPUTS = ("places", "phases", "positions", "pixels")
 
 
@@ -51,14 +54,19 @@ class OnnxTwin:
         if parameters.ndim == 2:
             rays = [self.trace(one, points, anchors) for one in parameters]
             return Rays(*(np.stack(part) for part in zip(*rays, strict=True)))
-        feeds = {
-            "parameters": _doubles(parameters[: self.known]),
-            "points": _doubles(points),
-            "anchors": _doubles(points if anchors is None else anchors),
-            "camera_places": _doubles(points[:1]),
-        }
+        known, anchors = _doubles(parameters[: self.known]), points if anchors is None else anchors
+
+        def traced(part: slice) -> list[Real]:
+            own = {"points": _doubles(points[part]), "anchors": _doubles(anchors[part])}
+            feeds = {"parameters": known, "camera_places": _doubles(points[:1]), **own}
+            rays: list[Real] = self._session.run(OUTPUTS[:3], feeds)
+            return rays
+
+        size = max(1, len(points)) if len(points) < _MANY else -(-len(points) // threads_beside())
+        parts = [slice(first, first + size) for first in range(0, max(1, len(points)), size)]
         with running(self._subject):
-            return Rays(*self._session.run(OUTPUTS[:3], feeds))
+            places, phases, positions = zip(*in_parallel(traced, parts), strict=True)
+        return Rays(np.concatenate(places, axis=1), np.concatenate(phases, axis=1), np.concatenate(positions))
 
     def pixels(self, parameters: Real, places: Real) -> Real:
         """See `lightpage.calibration.interfaces.Twin`."""

@@ -80,10 +80,7 @@ def test_cameras_far_apart_behind_an_astigmatic_launch_are_found_at_a_second_sta
 @pytest.mark.long
 @pytest.mark.parametrize(
     "changed",
-    [
-        {"slm.falloff_relative": 0.4},
-        {"in_phase_camera.tilt_x_rad": 0.2, "quadrature_camera.tilt_x_rad": -0.2},
-    ],
+    [{"slm.falloff_relative": 0.4}, {"in_phase_camera.tilt_x_rad": 0.2, "quadrature_camera.tilt_x_rad": -0.2}],
 )
 def test_phases_of_a_small_page_that_were_a_turn_off_are_left_out(changed: dict[str, float]) -> None:
     profile = load_profile("analysis/comparison/eighth.toml")

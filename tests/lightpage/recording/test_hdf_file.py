@@ -76,8 +76,7 @@ def test_writes_that_fail_for_a_moment_cost_nothing(tmp_path: Path, disk: type[D
 
 
 @pytest.mark.parametrize(
-    ("number", "kind"),
-    [(errno.EIO, StorageError), (errno.ENOSPC, NoRoomError), (errno.EDQUOT, NoRoomError)],
+    ("number", "kind"), [(errno.EIO, StorageError), (errno.ENOSPC, NoRoomError), (errno.EDQUOT, NoRoomError)]
 )
 def test_wherever_writing_fails_the_pages_before_stay(
     tmp_path: Path, disk: type[Disk], number: int, kind: type[LightpageError]

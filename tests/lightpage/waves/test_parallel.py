@@ -26,3 +26,5 @@ def test_results_come_in_order_and_a_fault_ends_the_rest(monkeypatch: pytest.Mon
     with pytest.raises(ZeroDivisionError):
         list(in_parallel(inverse, range(40, 1000)))
     assert max(begun) < 500
+    nested = in_parallel(lambda _: {threading.get_ident(), *in_parallel(lambda _: threading.get_ident(), "abc")}, "ab")
+    assert [len(threads) for threads in nested] == [1, 1]  # one of several keeps to its thread

@@ -45,22 +45,24 @@ def bundle_with(path: Path, graph: bytes) -> Bundle:
     return Bundle.open(write_bundle(path, toy.manifest(), toy.files() | {TWIN: graph}))
 
 
-def test_rays_and_pixels_come_back_to_the_last_digit_of_float64(tmp_path: Path) -> None:
+@pytest.mark.parametrize("count", [2, 50_001])  # threads share the many
+def test_rays_and_pixels_come_back_to_the_last_digit_of_float64(
+    count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
     twin = OnnxTwin(bundle_with(tmp_path / "b.zip", twin_graph()))
-    parameters = np.zeros(len(NAMES))
-    parameters[0] = 1e-9
-    points = np.array([[1e-3, 2e-3], [5e-4, -1e-3]])
+    parameters, points = 1e-9 * np.eye(1, len(NAMES))[0], np.random.default_rng(0).normal(size=(count, 2))
     rays = twin.trace(parameters, points, points + 1.0)
     np.testing.assert_array_equal(rays.places[0], points + parameters[:2])
     np.testing.assert_array_equal(rays.phases[0], points[:, 0] + 1.0)
+    np.testing.assert_array_equal(rays.positions, points)
     np.testing.assert_array_equal(twin.trace(parameters, points).phases[0], points[:, 0])
     np.testing.assert_array_equal(twin.pixels(parameters, points[:1])[1], points[:1] + parameters[:2])
 
 
 def test_many_devices_at_once_are_each_device_by_itself(tmp_path: Path) -> None:
     twin = OnnxTwin(bundle_with(tmp_path / "b.zip", twin_graph()))
-    devices = np.random.default_rng(0).normal(size=(3, len(NAMES)))
-    points = np.random.default_rng(1).normal(size=(5, 2))
+    devices, points = (np.random.default_rng(0).normal(size=size) for size in ((3, len(NAMES)), (5, 2)))
     together = twin.trace(devices, points)
     assert together.places.shape == (3, 1, 5, 2)
     for index, device in enumerate(devices):
