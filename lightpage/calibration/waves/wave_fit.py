@@ -63,7 +63,7 @@ _STALE = 0.04
 """Relative fall of the residual, since the derivative of the light was taken, beyond which it is taken anew. That costs
 as much as several rounds, but one from further off leaves axial places twenty deviations from the best."""
 _CONVERGED = 1e-3
-"""Relative fall of the residual below which another round does not pay."""
+"""Relative fall of the residual, found or expected, below which another round does not pay."""
 _LEAST_OFF = 2.0
 """Mean square of the distances of a modulation's coefficients from the usual ones, over their deviations, from which on
 it is another one: a nominal device has 1 or less, and more than 2 in one of seventy fits."""
@@ -274,7 +274,12 @@ class WaveFit:
                 quadrature_deviation=float(known[len(directions)]),
                 **_found(state),
             )
-            state = self._moved(state, covariance @ pull, directions, fitted_levels, free, bends=bends)
+            step = covariance @ pull
+            state = self._moved(state, step, directions, fitted_levels, free, bends=bends)
+            settled = once or sampling is _NEAR
+            if settled and variance * float(pull @ step) < 2 * _CONVERGED * residual**2 * len(left):
+                best = replace(best, **_found(state))
+                break
         return best if levels is None else _told_apart(best, levels.centre)
 
     def _page(self, levels: Real, samples: int) -> Complex:
