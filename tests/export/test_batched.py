@@ -177,7 +177,7 @@ def test_a_stream_is_read_in_batches_as_page_by_page(
     ]
     tracker, batching = tracker_for(decoder), Batching(PAGES)
     gathering = Decoder(decoder.bundle, None, decoder.graph, batches=Batches(batches, decoder.graph, batching))
-    trackers, rates = (tracker, tracker.refitted(gathering)), []
+    trackers, rates, phases = (tracker, tracker.refitted(gathering)), [], []
     with ThreadPoolExecutor(1) as alone, ThreadPoolExecutor(14) as pool:  # two sessions of the second one
         asked = [
             [
@@ -191,8 +191,10 @@ def test_a_stream_is_read_in_batches_as_page_by_page(
         right = [(one.result(), symbols) for one, (_, symbols) in zip(read, pages, strict=True) if not one.exception()]
         read_well = [(page.phase[~mask], page.concentration[~mask], symbols[~mask]) for page, symbols in right]
         rates.append(np.mean([measure(*page, 256).air_bits_per_symbol for page in read_well]))
+        phases.append(np.stack([phase for phase, _, _ in read_well]))
     assert max(batching.pages.runs) > 1
-    assert rates[1:] == pytest.approx([rates[0]] * 2, abs=0.005)
+    assert all(np.median(np.abs(np.angle(np.exp(1j * (each - phases[0]))))) < 0.005 for each in phases[1:])
+    assert rates[1:] == pytest.approx([rates[0]] * 2, abs=0.05)  # few symbols, some of which half precision tips over
     with Recording.open(small_device[3]) as recording:
         decoders = zip((decoder, gathering), trackers, strict=True)
         both = [evaluate(one, recording, each.anew()).to_json() for one, each in decoders]

@@ -46,9 +46,7 @@ def bundle_with(path: Path, graph: bytes) -> Bundle:
 
 
 @pytest.mark.parametrize("count", [2, 50_001])  # threads share the many
-def test_rays_and_pixels_come_back_to_the_last_digit_of_float64(
-    count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_all_comes_back_to_the_last_digit(count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
     twin = OnnxTwin(bundle_with(tmp_path / "b.zip", twin_graph()))
     parameters, points = 1e-9 * np.eye(1, len(NAMES))[0], np.random.default_rng(0).normal(size=(count, 2))
