@@ -343,7 +343,7 @@ def goodness_of(
     start, group = device.parameters, ("launch",)  # with it the illumination does not bend the page's phases
     fit = WaveFit(twin, device.profile, page.pair, device.references, page.symbols)
     turn, levels = device.quadrature_phase_rad, device.modulation
-    found = fit.fit(start, turn, group, start, _HELD, progress, levels, effort="rough")
+    found = fit.fit(start, turn, group, start, _HELD, progress, levels, effort="once")
     if not np.isfinite(found.residual):
         raise CalibrationError("calibration, verdict", "no light of a page", "some")
     return measure_goodness(twin, device, found.conditions, page.pair, page.symbols, progress)

@@ -33,7 +33,7 @@ class Arrays(Protocol):
         """An array of the library in single precision."""
 
     def sum(self, function: Callable[[slice], Any], count: int) -> Any:
-        """Add up what a function makes of so many items, by slices of them that it is called with."""
+        """Return the sum over so many items of what a function makes of them; it is called with slices of them."""
 
 
 class NumpyArrays:

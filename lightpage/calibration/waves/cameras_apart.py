@@ -54,7 +54,7 @@ def related_apart(
             progress((number + share) / len(_APART_RAD))
 
         start = _apart(parameters, difference, axis)
-        found.append(fit.fit(start, quadrature_phase, _CAMERAS, start, held, told, modulation, effort="rough"))
+        found.append(fit.fit(start, quadrature_phase, _CAMERAS, start, held, told, modulation, effort="once"))
     return min(found, key=lambda one: one.residual)
 
 

@@ -36,10 +36,11 @@ from lightpage.waves.parallel import in_parallel
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 Effort = Literal["full", "once", "rough"]
+"""Care that a fit takes, see `WaveFit.fit`."""
 
 
 class _Sampling(NamedTuple):
-    """Sampling with which the derivative of the light is taken.
+    """Sampling with which the light, or its derivative, is computed.
 
     Attributes:
         samples: samples a symbol and axis, at most.
@@ -56,6 +57,7 @@ _NEAR = _Sampling(2, 3 / 8)
 """Sampling of the others, and of a rough fit's light: an error of a percent costs no round, and half of the usual
 samples leave one of 0.3%."""
 _EXACT = _Sampling(4, 1.0)
+"""Sampling of the light of all other fits: that of a simulation."""
 READ_NOISE = 0.3
 """Variance of an equation that does not grow with the light, over the shot noise of the reference alone."""
 ROUNDS = 9

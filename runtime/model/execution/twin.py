@@ -54,16 +54,16 @@ class OnnxTwin:
         if parameters.ndim == 2:
             rays = [self.trace(one, points, anchors) for one in parameters]
             return Rays(*(np.stack(part) for part in zip(*rays, strict=True)))
-        known, anchors = _doubles(parameters[: self.known]), points if anchors is None else anchors
+        known, one = _doubles(parameters[: self.known]), _doubles(points[:1])
 
-        def traced(part: slice) -> list[Real]:
-            own = {"points": _doubles(points[part]), "anchors": _doubles(anchors[part])}
-            feeds = {"parameters": known, "camera_places": _doubles(points[:1]), **own}
-            rays: list[Real] = self._session.run(OUTPUTS[:3], feeds)
+        def traced(both: tuple[Real, Real]) -> list[Real]:
+            own = dict(zip(("points", "anchors"), map(_doubles, both), strict=True))
+            rays: list[Real] = self._session.run(OUTPUTS[:3], {"parameters": known, "camera_places": one, **own})
             return rays
 
-        size = max(1, len(points)) if len(points) < _MANY else -(-len(points) // threads_beside())
-        parts = [slice(first, first + size) for first in range(0, max(1, len(points)), size)]
+        count = threads_beside() if len(points) >= _MANY else 1
+        both = (np.array_split(each, count) for each in (points, points if anchors is None else anchors))
+        parts = list(zip(*both, strict=True))
         with running(self._subject):
             places, phases, positions = zip(*in_parallel(traced, parts), strict=True)
         return Rays(np.concatenate(places, axis=1), np.concatenate(phases, axis=1), np.concatenate(positions))
