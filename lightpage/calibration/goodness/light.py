@@ -96,11 +96,12 @@ class SeenLight:
 
     def noise_of_frames(self) -> Complex:
         """Noise like that of the frames, as light of both cameras."""
-        rng = np.random.default_rng(0)
         pair, references = self._pair, self._device.references
-        both = (pair.in_phase, references.in_phase), (pair.quadrature, references.quadrature)
-        noise = [noise_like(frame, rng) - noise_like(reference, rng) for frame, reference in both]
-        return self._mending(_looked_at(self._filtered(noise), self._at) / (2 * self.references))
+        frames = [pair.in_phase, references.in_phase, pair.quadrature, references.quadrature]
+        drawn = list(zip(frames, np.random.default_rng(0).spawn(len(frames)), strict=True))
+        noise = list(in_parallel(lambda one: noise_like(*one), drawn))
+        beyond = [noise[0] - noise[1], noise[2] - noise[3]]
+        return self._mending(_looked_at(self._filtered(beyond), self._at) / (2 * self.references))
 
     def noise_of_modulator(self) -> Complex:
         """Return the light that the modulator's phase noise of 1 rad a sample adds for both cameras, to first order."""
@@ -214,12 +215,12 @@ class SeenLight:
 
     def _filtered(self, images: Sequence[NDArray[np.float32]]) -> list[NDArray[np.float32]]:
         """Images filtered as a decoder filters what frames have beyond their references, float32 [H, W]."""
-        filtered = []
-        for image in images:
-            for axis in (0, 1):
-                image = scipy.ndimage.convolve1d(image, self._grid.prefilter, axis=axis)
-            filtered.append(image)
-        return filtered
+
+        def filtered(image: NDArray[np.float32]) -> NDArray[np.float32]:
+            down = scipy.ndimage.convolve1d(image, self._grid.prefilter, axis=0)
+            return np.asarray(scipy.ndimage.convolve1d(down, self._grid.prefilter, axis=1))
+
+        return list(in_parallel(filtered, images))
 
 
 def places_on_facet(waves: FittedWaves) -> tuple[Real, Real]:

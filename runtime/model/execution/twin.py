@@ -52,7 +52,7 @@ class OnnxTwin:
     def trace(self, parameters: Real, points: Real, anchors: Real | None = None) -> Rays:
         """See `lightpage.calibration.interfaces.Twin`."""
         if parameters.ndim == 2:
-            rays = [self.trace(one, points, anchors) for one in parameters]
+            rays = list(in_parallel(lambda one: self.trace(one, points, anchors), list(parameters)))
             return Rays(*(np.stack(part) for part in zip(*rays, strict=True)))
         known, one = _doubles(parameters[: self.known]), _doubles(points[:1])
 
