@@ -28,6 +28,11 @@ _LANDINGS = 3
 """Rounds in which a place and the second lens's tilt there are made to agree: each leaves a hundredth of the error."""
 _NODES = leggauss(8)
 """Places along an axis of the facet that stand for a symbol's light there, -1 to 1, and their weights."""
+_FIRST = [int(branch == "yx") for branch in BRANCHES]
+"""Pair of walls by which each branch's light is reflected first: 0 along x, 1 along y."""
+_SECOND = [1 - axis for axis in _FIRST]
+_STATES = 4
+"""States of the device that are traced at once: more only take more memory."""
 _DARK = 1e-12
 """Light below which a part of the facet has no middle, over what the symbol sends at most."""
 
@@ -88,66 +93,65 @@ class RayTwin(nn.Module):
         wall_offset = torch.stack([value["pipe_centre_x_m"], value["pipe_centre_y_m"]])
         nk = self.index * self.wave_number
         zero, one = torch.zeros_like(angle), torch.ones_like(angle)
-        normals = {"x": torch.stack([one, zero]), "y": torch.stack([torch.sin(angle), torch.cos(angle)])}
+        normals = torch.stack([torch.stack([one, zero]), torch.stack([torch.sin(angle), torch.cos(angle)])])
 
         def in_pipe(at: Tensor) -> Tensor:
             return _turn(at + centre, -roll)
 
         def exit_centroid(k: Tensor) -> Tensor:
             kz = torch.sqrt(nk**2 - (k * k).sum(-1))
-            reach = length / width / kz
-            return torch.stack([k @ normals["x"] * reach, k @ normals["y"] * reach], dim=-1)
+            reached: Tensor = k @ normals.T * (length / width / kz)[:, None]
+            return reached
 
         def bent_by(path: SeidelTerms, field: Tensor, facet: Tensor, spread: Tensor) -> tuple[Tensor, Tensor]:
-            """Return the change of k, [N, 2], and of the phase, [N], by a lens's path of light on a part of the facet.
+            """Return the change of k, [B, N, 2], and of the phase, [B, N], by a lens's path of light on the facet.
 
-            The part has its middle at `facet`, as (X, Y'), and the variance `spread` along either axis, [N, 2].
+            Light there has its middle at `facet`, as (X, Y'), and the variance `spread` along either axis, [B, N, 2].
             """
-            x, y = facet[:, 0], (facet[:, 1] - facet[:, 0] * torch.sin(angle)) / torch.cos(angle)
-            at = field[:, 0], field[:, 1], x, y
-            (slope_x, slope_y), (bend_x, bend_y) = path.slope(*at), path.bend(*at)
-            middle = path.of_field(field[:, 0], field[:, 1]) + path.of_both(*at)
-            mean = middle + (bend_x * spread[:, 0] + bend_y * spread[:, 1]) / 2
-            return torch.stack([slope_x, slope_y], dim=-1), mean - slope_x * x - slope_y * y
+            x, y = facet[..., 0], (facet[..., 1] - facet[..., 0] * torch.sin(angle)) / torch.cos(angle)
+            at = field[..., 0], field[..., 1], x, y
+            slopes, (bend_x, bend_y) = path.slope(*at), path.bend(*at)
+            middle = path.of_field(field[..., 0], field[..., 1]) + path.of_both(*at)
+            mean = middle + (bend_x * spread[..., 0] + bend_y * spread[..., 1]) / 2
+            return torch.stack(slopes, dim=-1), mean - slopes[0] * x - slopes[1] * y
 
         per_metre = self.wave_number / focal
         starts = in_pipe(points)
         straight = -per_metre * starts
         positions = exit_centroid(straight)
-        at_launch = launch_phase(value, points[:, 0] / self.corner, points[:, 1] / self.corner)
         cells = exit_centroid(-per_metre * in_pipe(anchors)).detach()
-        even = 2 * torch.round(cells / 2)
-        odd = 2 * torch.floor(cells / 2) + 1
+        odd = torch.tensor([[axis in branch for axis in "xy"] for branch in BRANCHES], device=points.device)
+        crossed = torch.where(odd[:, None], 2 * torch.floor(cells / 2) + 1, 2 * torch.round(cells / 2))
 
-        landings, phases = [], []
-        for branch in BRANCHES:
-            crossed = {"x": (odd if "x" in branch else even)[:, 0], "y": (odd if "y" in branch else even)[:, 1]}
-            k, phase = straight, at_launch
-            met = torch.stack([crossed["x"], crossed["y"]], dim=-1)
-            entrance, leaves, spread = self._filled(met, positions, width, focal)
-            tilt, more = bent_by(geometry.lens_path, starts, entrance, spread)
-            k, phase = k + tilt, phase + more
-            squared = (k * k).sum(-1)
-            phase = phase - squared / (torch.sqrt(nk**2 - squared) + nk) * length
-            for name in "yx" if branch == "yx" else "xy":
-                k, phase = self._reflect(k, phase, normals[name], crossed[name], width, wall_offset["xy".index(name)])
-            landing = -k / per_metre
-            for _ in range(1 if self.ideal_lenses else _LANDINGS):
-                tilt, more = bent_by(geometry.camera_path, landing, leaves, spread)
-                landing = (tilt - k) / per_metre
-            phase = phase - more
-            landing = _turn(landing, roll)
-            landings.append(landing)
-            x, y = landing[:, 0] / self.corner, landing[:, 1] / self.corner
-            edges = self.half_width / self.corner, self.half_height / self.corner
-            phases.append(phase + camera_phase(value, x, y, *edges))
-        return torch.stack(landings), torch.stack(phases), positions
+        entrance, leaves, spread = self._filled(crossed, positions, width, focal)
+        tilt, more = bent_by(geometry.lens_path, starts, entrance, spread)
+        k = straight + tilt
+        phase = launch_phase(value, points[:, 0] / self.corner, points[:, 1] / self.corner) + more
+        squared = (k * k).sum(-1)
+        phase = phase - squared / (torch.sqrt(nk**2 - squared) + nk) * length
+        for order in (_FIRST, _SECOND):
+            cells_of = torch.stack([crossed[branch, :, axis] for branch, axis in enumerate(order)])
+            k, phase = self._reflect(k, phase, normals[order][:, None], cells_of, width, wall_offset[order][:, None])
+        landing = -k / per_metre
+        for _ in range(1 if self.ideal_lenses else _LANDINGS):
+            tilt, more = bent_by(geometry.camera_path, landing, leaves, spread)
+            landing = (tilt - k) / per_metre
+        landing = _turn(landing, roll)
+        x, y = landing[..., 0] / self.corner, landing[..., 1] / self.corner
+        edges = self.half_width / self.corner, self.half_height / self.corner
+        return landing, phase - more + camera_phase(value, x, y, *edges), positions
 
     def _filled(self, met: Tensor, positions: Tensor, width: Tensor, focal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the places where light through the cells `met` enters and leaves the pipe, by exit centroids.
 
+        Args:
+            met: cells by branch, [B, N, 2].
+            positions: exit centroids, [N, 2].
+            width: of the pipe, metres.
+            focal: focal length of the first lens, metres.
+
         Returns:
-            Mean places at entrance and exit, and variance along either axis, [N, 2]; weighted by a symbol's light.
+            Mean places at entrance and exit, and variance along either axis, [B, N, 2]; weighted by a symbol's light.
         """
         shifted = torch.clamp(met - positions, -1, 1)
         low, high = torch.clamp(shifted - 0.5, min=-0.5), torch.clamp(shifted + 0.5, max=0.5)
@@ -161,17 +165,23 @@ class RayTwin(nn.Module):
 
     @staticmethod
     def _reflect(
-        k: Tensor, phase: Tensor, normal: Tensor, cells: Tensor, width: Tensor, offset: Tensor
+        k: Tensor, phase: Tensor, normals: Tensor, cells: Tensor, width: Tensor, offsets: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Reflect |cells| times on the pair of walls with `normal`, starting with the wall on the cells' side.
+        """Reflect |cells| times on the pair of walls with the normal, starting with the wall on the cells' side.
 
         Each reflection turns the sign of k.n, and the next wall is the other one. So what the walls' distance adds is
         the same each time, and what their offset adds is undone by every second one.
+
+        Args:
+            k, phase: [B, N, 2] and [B, N].
+            normals, offsets: each branch's pair of walls, [B, 1, 2] and [B, 1].
+            cells: [B, N].
+            width: the walls' distance, metres.
         """
-        met, along = torch.abs(cells), k @ normal
+        met, along = torch.abs(cells), (k * normals).sum(-1)
         left_over = torch.remainder(met, 2)
-        phase = phase + along * (width * cells + 2 * offset * left_over) + math.pi * met
-        return k - 2 * (along * left_over)[:, None] * normal, phase
+        phase = phase + along * (width * cells + 2 * offsets * left_over) + math.pi * met
+        return k - 2 * (along * left_over)[..., None] * normals, phase
 
     def _pixels(self, value: dict[str, Tensor], places: Tensor) -> Tensor:
         radius2 = (places * places).sum(-1, keepdim=True) / self.corner**2
@@ -194,9 +204,9 @@ def _named(parameters: Tensor) -> dict[str, Tensor]:
 
 
 def _turn(points: Tensor, angle: Tensor) -> Tensor:
-    """Rotate [N, 2] from x towards y."""
+    """Rotate [..., 2] from x towards y."""
     cos, sin = torch.cos(angle), torch.sin(angle)
-    x, y = points[:, 0], points[:, 1]
+    x, y = points[..., 0], points[..., 1]
     return torch.stack([x * cos - y * sin, x * sin + y * cos], dim=-1)
 
 
@@ -224,5 +234,6 @@ class TorchTwin:
             if vector.ndim == 1:
                 outputs = asked(vector, *tensors)
             else:
-                outputs = torch.func.vmap(asked, in_dims=(0, *(None for _ in tensors)))(vector, *tensors)
+                of_each = torch.func.vmap(asked, in_dims=(0, *(None for _ in tensors)), chunk_size=_STATES)
+                outputs = of_each(vector, *tensors)
         return tuple(output.numpy() for output in outputs)
