@@ -24,12 +24,14 @@ SETTINGS = (
     "in_phase_camera.axial_rad=0.4 geometry.ghost_relative=0.01 sensor.bit_depth=12"
 )
 ROUGH = load_device("rough").with_settings(SETTINGS.split())
+each_processor = pytest.mark.parametrize("compute", ["cpu", *["cuda"] * torch.cuda.is_available()])
 
 
-def test_the_light_is_that_of_numpy_within_the_rounding_of_single_precision() -> None:
+@each_processor
+def test_the_light_is_that_of_numpy_within_the_rounding_of_single_precision(compute: str) -> None:
     phase = np.kron(random_phases(PROFILE), np.ones((4, 4)))
     seen = []
-    for engine in ({}, {"engine": TorchEngine("cpu")}):
+    for engine in ({}, {"engine": TorchEngine(compute)}):
         optics = Simulator(PROFILE, ROUGH, seed=1, **engine).optics  # type: ignore[arg-type]
         leaving = optics.exit_field(optics.engine.array(phase), flicker_rad=0.01)
         field = optics.camera_field(leaving, ROUGH.in_phase_camera)
@@ -41,12 +43,11 @@ def test_the_light_is_that_of_numpy_within_the_rounding_of_single_precision() ->
         assert np.abs(other - plain).max() < 1e-5 * np.abs(plain).max()  # 32 steps, each of some roundings
 
 
-def test_pages_are_those_of_numpy_but_for_the_noise() -> None:
+@each_processor
+def test_pages_are_those_of_numpy_but_for_the_noise(compute: str) -> None:
     symbols = random_symbols(PROFILE, 256, 2, np.random.default_rng(0))
-    plain, other, again = (
-        Simulator(PROFILE, ROUGH, seed=4, **engine)  # type: ignore[arg-type]
-        for engine in ({}, {"engine": TorchEngine("cpu")}, {"engine": TorchEngine("cpu")})
-    )
+    plain = Simulator(PROFILE, ROUGH, seed=4)
+    other, again = (Simulator(PROFILE, ROUGH, seed=4, engine=TorchEngine(compute)) for _ in range(2))
     again.skip(1)
     expected, found = ([simulator.simulate(page) for page in symbols] for simulator in (plain, other))
     assert [page.shift_px for page in found] == [page.shift_px for page in expected]
@@ -66,7 +67,6 @@ def test_pages_are_those_of_numpy_but_for_the_noise() -> None:
 
 def test_a_page_is_made_on_one_device_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     meta = torch.device("meta")  # it computes nothing, and refuses tensors of others
-
     normal = lambda shape, dtype=None: torch.randn(shape, device=meta)  # noqa: E731
     monkeypatch.setattr("lightpage.train.data.torch_engine.torch_device", lambda _: meta)
     engine = TorchEngine("cuda")
