@@ -69,6 +69,15 @@ class SeidelTerms(NamedTuple):
         even = self.astigmatism * product * product + self.field_curvature * r2 * aperture2
         return odd * product + even + (self.spherical * aperture2 + self.defocus_at(x, y)) * aperture2
 
+    def of_step(self, x: Any, y: Any, dx: Any, dy: Any, across: Any, up: Any) -> Any:
+        """The change of `of_both` from the field point (x, y) to (x + dx, y + dy), without the rounding of either."""
+        product, step = x * across + y * up, dx * across + dy * up
+        r2, more = x * x + y * y, dx * (2 * x + dx) + dy * (2 * y + dy)
+        aperture2 = across * across + up * up
+        even = self.field_curvature * more + self.tilt_x * dx + self.tilt_y * dy + self.coma * step
+        odd = self.distortion * (more * (product + step) + r2 * step)
+        return odd + self.astigmatism * step * (2 * product + step) + aperture2 * even
+
     def slope(self, x: Any, y: Any, across: Any, up: Any) -> tuple[Any, Any]:
         """Derivatives of W by the aperture's two coordinates, rad/m."""
         r2, aperture2, product = x * x + y * y, across * across + up * up, x * across + y * up

@@ -80,8 +80,7 @@ class LensPath:
         """Return the path's phase at (x, y) less that at (a, b), radians."""
         if not self.path.couples:
             return 0.0 * (a + b + x + y + across + up)
-        there = on_facet(self.factors, across, up)
-        return self.path.of_both(a + x, b + y, *there) - self.path.of_both(a, b, *there)
+        return self.path.of_step(a, b, x, y, *on_facet(self.factors, across, up))
 
     def phase(self, x: Any, y: Any, across: Any, up: Any, a: Any = 0.0, b: Any = 0.0) -> Any:
         """Return `beyond` of the whole lens, with the ideal lens's phase, radians."""

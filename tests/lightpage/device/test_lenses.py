@@ -27,12 +27,12 @@ def test_slope_and_bend_are_the_derivatives() -> None:
         np.testing.assert_allclose(TERMS.slope(x, y, across, up)[axis], (plus - minus) / (2 * step), atol=1e-6)
         bend = (plus - 2 * path(across, up) + minus) / step**2
         np.testing.assert_allclose(TERMS.bend(x, y, across, up)[axis], bend, atol=1e-5)
-        by_field = [
-            TERMS.of_field(x + side * dx, y + side * dy) + TERMS.of_both(x + side * dx, y + side * dy, across, up)
-            for side in (1, -1)
-        ]
+        beside = (x + dx, y + dy), (x - dx, y - dy)
+        by_field = [TERMS.of_field(*at) + TERMS.of_both(*at, across, up) for at in beside]
         expected = (by_field[0] - by_field[1]) / (2 * step)
         np.testing.assert_allclose(TERMS.slope_on_field(x, y, across, up)[axis], expected, atol=1e-6)
+    moved = TERMS.of_both(x + 0.3, y - 0.2, across, up) - path(across, up)
+    np.testing.assert_allclose(TERMS.of_step(x, y, 0.3, -0.2, across, up), moved, atol=1e-12)
 
 
 def test_the_mirror_image_sends_the_same_path_from_the_point_opposite() -> None:
