@@ -3,11 +3,9 @@
 - A claim is never about wall-clock time: what waits is given a clock (`tests.clock`), and what other threads and
   processes do is awaited by `tests.waiting.eventually`, which alone compares times.
 - Nobody sleeps longer than 0.2 s to let something happen. Who must hang waits for a signal or for his input.
-- An error is known by its class, subject and status. Sentences are kept in one snapshot (`tests/messages`), so that
-  they can be improved.
+- An error is known by its class, subject and status. Sentences are kept in one snapshot (`tests/messages`).
 - Private attributes of what is tested are left alone.
-- There are no more lines than `limits.toml` allows, and what git tracks has no more bytes.
-- Words have limits there too: of pages, of long sentences, and of docstrings and help that lack their subject.
+- `limits.toml` limits lines, bytes that git tracks, words of pages, long sentences, and docstrings without a subject.
 """
 
 import ast

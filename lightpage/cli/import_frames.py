@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lightpage.cli.main import RESUME_KEY
 from lightpage.cli.options import JSON, named_profile
-from lightpage.cli.paths import OutputFile
+from lightpage.cli.paths import OutputFile, check_new
 from lightpage.device.profile import Profile
 from lightpage.errors import FrameError, InvalidInputError, PageError
 from lightpage.failures import os_errors
@@ -102,8 +102,7 @@ def import_frames(out: Path, force: bool, keep_unlit: bool, json_path: Path | No
     click.get_current_context().meta[RESUME_KEY] = "run the same command again; it goes on where it was"
     if out.is_dir():
         raise InvalidInputError(f"--out {out}", "a folder", "a new file")
-    if out.exists() and not force:
-        raise InvalidInputError(f"--out {out}", "a file that exists", "a new name, or --force")
+    check_new(out, force)
     with ExitStack() as opened:
         sources = _Sources(given, opened)
         material = sources.material()

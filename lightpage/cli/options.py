@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from copy import copy
+from functools import wraps
+from pathlib import Path
 from typing import Any
 
 import click
 from click.shell_completion import CompletionItem
 
-from lightpage.cli.paths import NewPath, OutputFile, OutputFolder
+from lightpage.cli.paths import NewPath, OutputFile, OutputFolder, check_new
 from lightpage.device.profile import SHIPPED, Profile, load_profile
-from lightpage.errors import InvalidInputError
+from lightpage.errors import InvalidInputError, LightpageError
 
 JSON = click.option(
     "--json", "json_path", type=OutputFile(), help="Write the figures to this file as JSON; - is stdout."
@@ -47,6 +50,32 @@ _COMPLETED: dict[str, Sequence[str]] = {
     **dict.fromkeys(("--references", "--reference-in-phase", "--reference-quadrature"), ()),
 }
 """Names that an option of this name takes, beside files but for the provider."""
+
+
+def new_file(
+    told: str, *, required: bool = True, read: Callable[[Path], object] | None = None
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Options of a command that writes a file `out`: `--out`, and `--force`, without which it overwrites none.
+
+    Args:
+        told: help of `--out`.
+        required: whether the command always writes it; else `out` may be None.
+        read: reads a file of this kind, or raises a `LightpageError`; one that it can read is made anew without asking.
+    """
+
+    def with_options(command: Callable[..., Any]) -> Callable[..., Any]:
+        @click.option("--out", required=required, type=OutputFile(), help=told)
+        @click.option("--force", is_flag=True, help="Overwrite a file that exists.")
+        @wraps(command)
+        def checked(*words: Any, out: Path | None, force: bool, **options: Any) -> Any:
+            with suppress(LightpageError):
+                force = force or (read is not None and out is not None and out.is_file() and bool(read(out)))
+            check_new(out, force)
+            return command(*words, out=out, **options)
+
+        return checked
+
+    return with_options
 
 
 class _FileOrName(click.types.StringParamType):

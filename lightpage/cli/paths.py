@@ -38,10 +38,12 @@ class NewPath(_Completed):
         """The path.
 
         Raises:
-            InvalidInputError: its folder cannot be written.
+            InvalidInputError: it is there, or its folder cannot be written.
         """
         path = _file(value, param)
         with _told(path, param):
+            if path.exists() or path.is_symlink():
+                raise InvalidInputError(_option(path, param), "something that exists", "a new path")
             folder = path.absolute().parent
             while not folder.exists():
                 folder = folder.parent
@@ -97,6 +99,16 @@ def writes_to_stdout(context: click.Context) -> bool:
     """Return whether an option of a command names `STDOUT` for writing."""
     outputs = (param.name or "" for param in context.command.params if isinstance(param.type, OutputFile))
     return any(context.params.get(name) == STDOUT for name in outputs)
+
+
+def check_new(out: Path | None, force: bool) -> None:
+    """Check that `--out` overwrites nothing unasked.
+
+    Raises:
+        InvalidInputError: there is a file, and no `--force`.
+    """
+    if out is not None and not force and out.exists() and not is_special(out):
+        raise InvalidInputError(f"--out {out}", "a file that exists", "a new name, or --force")
 
 
 def check_outputs(context: click.Context) -> None:

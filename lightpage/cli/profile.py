@@ -9,12 +9,11 @@ from pathlib import Path
 import click
 
 from lightpage.cli.groups import Group
-from lightpage.cli.options import JSON
-from lightpage.cli.paths import OutputFile
+from lightpage.cli.options import JSON, new_file
 from lightpage.device.profile import Profile, load_profile
 from lightpage.device.profile_keys import commented_toml, key_table
 from lightpage.device.profile_keys import keys as all_keys
-from lightpage.errors import InvalidInputError, ProfileError, raised_as
+from lightpage.errors import ProfileError, raised_as
 from lightpage.files import replace_text, write_json
 from lightpage.progress import warn
 from lightpage.recording.reader import Recording
@@ -30,13 +29,10 @@ def profile() -> None:
 
 
 @profile.command()
-@click.option("--out", required=True, type=OutputFile(), help="The file to fill in, TOML.")
+@new_file("The file to fill in, TOML.")
 @click.option("--like", default="bench", show_default=True, metavar="P", help="Profile whose numbers it starts with.")
-@click.option("--force", is_flag=True, help="Overwrite a file that is there.")
-def new(out: Path, like: str, force: bool) -> None:
+def new(out: Path, like: str) -> None:
     """Write a profile with every key and its meaning."""
-    if out.exists() and not force:
-        raise InvalidInputError(f"--out {out}", "a file that exists", "a new name, or --force")
     replace_text(out, commented_toml(load_profile(like)), "profile")
     click.echo(f"{out}: the numbers of {like}; enter your device's, then: lightpage profile check {out}")
 

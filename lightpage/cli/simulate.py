@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from lightpage.cli.options import JSON, named_profile
-from lightpage.cli.paths import OutputFile
+from lightpage.cli.paths import OutputFile, check_new
 from lightpage.device.profile import Profile
 from lightpage.device.state import Device, load_device
 from lightpage.errors import InvalidInputError
@@ -77,8 +77,7 @@ def simulate(
     profile = named_profile(profile_name)
     if out.is_dir():
         raise InvalidInputError(f"--out {out}", "a folder", "a file")
-    if out.exists() and not force:
-        raise InvalidInputError(f"--out {out}", "a file that exists", "a new name, or --force")
+    check_new(out, force)
     if (pages is None) == (symbols is None):
         got = "neither --pages nor --symbols" if pages is None else "both --pages and --symbols"
         raise InvalidInputError("options", got, "one of them")

@@ -9,7 +9,6 @@ import click
 
 from lightpage.cli.options import JSON
 from lightpage.cli.paths import NewPath
-from lightpage.errors import InvalidInputError
 from lightpage.files import write_json
 from lightpage.foreign.unpacking import Form
 from lightpage.foreign.unpacking import unpack as unpack_recording
@@ -34,8 +33,6 @@ def unpack(recording: Path, out: Path, form: str, json_path: Path | None) -> Non
     Pages lie along the first axis, in MATLAB along the last. Frames are free of their black level. Symbols are .npy
     beside TIFF and PNG.
     """
-    if out.exists():
-        raise InvalidInputError(f"--out {out}", "something that exists", "a new name")
     with Recording.open(recording) as file:
         options = unpack_recording(file, Form(form), out)
         write_json(json_path, {"pages": file.pages, "options": options})

@@ -5,8 +5,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from lightpage.cli.options import JSON
-from lightpage.cli.paths import OutputFile
+from lightpage.cli.options import JSON, new_file
 from lightpage.errors import InvalidInputError
 from lightpage.files import replace_text, write_json
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
@@ -24,7 +23,7 @@ from lightpage.runtime.device.modulator.lookup_table import (
 @click.command("lookup-table")
 @click.option("--calibration", type=click.Path(path_type=Path), help="Calibration of the device, C.toml.")
 @click.option("--bundle", help="Bundle of the device, in place of its calibration.")
-@click.option("--out", required=True, type=OutputFile(), help="The corrected table.")
+@new_file("The corrected table.")
 @click.option("--levels", type=click.IntRange(MIN_LEVELS, MAX_LEVELS), help="Write one grey value for each level.")
 @click.option(
     "--in-use",

@@ -1,7 +1,4 @@
-"""Messages of the command line in the failures that people meet most, in one snapshot to be read as a whole.
-
-`make messages` writes the snapshot anew; no other test fixes a sentence.
-"""
+"""Messages of the command line in the failures that people meet most, in one snapshot that `make messages` writes."""
 
 import shlex
 import socket

@@ -1,7 +1,6 @@
 """Draws faults of one line by a seed, spread over areas and kinds, and prints the list anew.
 
-`python -m tests.planted.draw --seed 53 > list && mv list tests/planted/faults.toml`: what is struck out there is left
-out, and a fault that was there keeps its tests.
+`python -m tests.planted.draw --seed 53 > list && mv list tests/planted/faults.toml`: faults that stay keep their tests.
 """
 
 import argparse

@@ -240,12 +240,7 @@ def fit_references(bundle: Bundle, pages: KnownPages, progress: Progress, decode
 
 
 class ToySource(FrameSource):
-    """A source of toy pages whose device may drift.
-
-    Attributes:
-        asked: pages that were asked for, None for the next one.
-        shown: pages that were shown.
-    """
+    """A source of toy pages whose device may drift; `asked` has the pages asked for, `shown` those that were shown."""
 
     name = "toy:device"
     bit_depth = 8

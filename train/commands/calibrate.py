@@ -13,13 +13,14 @@ import torch
 
 from lightpage.calibration.calibrate import calibrate as register
 from lightpage.calibration.coherence import seen_share
-from lightpage.calibration.document import Calibration
+from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.calibration.goodness.figure import goodness_figure
 from lightpage.calibration.known_pages import first_lit_pages, known_pages
-from lightpage.cli.options import JSON, named_profile, profile_option
+from lightpage.cli.options import JSON, named_profile, new_file, profile_option
 from lightpage.cli.paths import OutputFile
 from lightpage.cli.progress_bar import percent_bar
 from lightpage.device.profile import Profile
+from lightpage.errors import ProfileError
 from lightpage.files import replace_file, write_json
 from lightpage.pictures import write_figure_png
 from lightpage.progress import Progress, warn
@@ -39,7 +40,7 @@ MAX_PAGES = 4
 @click.command()
 @profile_option
 @click.option("--recording", required=True, type=click.Path(path_type=Path), help="Pages with known symbols, R.h5.")
-@click.option("--out", required=True, type=OutputFile(), help="TOML file to write the calibration to.")
+@new_file("TOML file to write the calibration to.", read=load_calibration)
 @click.option(
     "--pages", default=DEFAULT_PAGES, show_default=True, type=click.IntRange(1, MAX_PAGES), help="Pages used."
 )
@@ -74,7 +75,7 @@ def calibrate(
     """Find this device's geometry, from nominal, with the first pages of a recording that show light.
 
     The fit is called good where a decoder loses less than 0.1 bit a symbol by what it leaves unexplained, usable
-    below 0.3, else wrong. A wrong one is written too, and ends the command with an error.
+    below 0.3, else wrong. A wrong one is written too, but over no better one, and ends the command with an error.
     """
     start, device = time.perf_counter(), torch_device(compute)
     with Recording.open(recording) as file, percent_bar() as progress:
@@ -84,7 +85,9 @@ def calibrate(
             file, profile, chosen, progress, any_orientation=orientation == "any", compute=device
         )
     seconds = time.perf_counter() - start
-    calibration.save(out)
+    kept = calibration.is_wrong and _is_better(out)
+    if not kept:
+        calibration.save(out)
     lost = int(np.sum(seen_share(TorchTwin(RayTwin(profile)), calibration.vector, profile) < 0.5))
     if json_path is not None:
         write_json(json_path, figures(calibration, profile, seconds, lost))
@@ -98,11 +101,20 @@ def calibrate(
         replace_file(picture, lambda file: write_figure_png(file, goodness_figure(found), dpi=_DOTS), "picture")
     click.echo(
         f"\ncoherence {calibration.coherence_before:.3f} -> {calibration.coherence_after:.3f}, "
-        f"{calibration.pages_used} known pages, {seconds:.0f} s; written to {out}"
+        f"{calibration.pages_used} known pages, {seconds:.0f} s; {'not ' * kept}written to {out}"
     )
     if found is not None and found.verdict == "good":
         click.echo(f"a good fit: about {found.bits_lost:.2f} bit a symbol lost to light that it does not explain")
-    calibration.check_good(f"calibration {out}", "; the file is there to be looked at")
+    remedy = "the file keeps a better one: name another --out" if kept else "the file is there to be looked at"
+    calibration.check_good(f"calibration {out}", f"; {remedy}")
+
+
+def _is_better(earlier: Path) -> bool:
+    """Return whether a file holds a calibration that is not wrong."""
+    try:
+        return not load_calibration(earlier).is_wrong
+    except ProfileError:
+        return False
 
 
 def calibrate_recording(

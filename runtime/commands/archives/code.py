@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
-from lightpage.cli.options import JSON
-from lightpage.cli.paths import NewPath, OutputFile
+from lightpage.cli.options import JSON, new_file
+from lightpage.cli.paths import NewPath
 from lightpage.codec.choose import HEADER, HEADROOM, bytes_without_headroom
 from lightpage.codec.code import Code, load_code
 from lightpage.errors import BundleError, CalibrationError, InvalidInputError
@@ -33,7 +33,7 @@ _UNITS = ", ".join(f"{name} ({kind.unit})" for name, kind in KINDS.items())
 @click.option(
     "--code", "code_path", type=click.Path(path_type=Path), help="Code of user data; the recording's or the bundle's."
 )
-@click.option("--out", type=OutputFile(), help="Write the code to this TOML file.")
+@new_file("Write the code to this TOML file.", required=False, read=load_code)
 @click.option("--out-bundle", type=NewPath(), help="Write the bundle with this code in it: a folder, or a .zip.")
 @click.option("--version", help="Version of the new bundle.")
 @click.option(

@@ -11,8 +11,7 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.cli.options import JSON
-from lightpage.cli.paths import OutputFile
+from lightpage.cli.options import JSON, new_file
 from lightpage.codec.code import Code, load_code
 from lightpage.codec.page_codec import PageCodec
 from lightpage.codec.volume import DATA_PAGES, PARITY_PAGES, Volume, encode_volume
@@ -76,11 +75,10 @@ def _opened(file: Path) -> BinaryIO:
 @click.option("--bundle", help="Bundle of the device: its path, or the name of a shipped one.")
 @click.option("--profile", "profile_name", metavar="P", help="Profile in its place: a shipped name or a file.")
 @click.option("--code", "code_path", type=click.Path(path_type=Path), help="Code of pages; the bundle's by default.")
-@click.option("--out", required=True, type=OutputFile(), help="The pages to write, PAGES.h5.")
+@new_file("The pages to write, PAGES.h5.")
 @click.option("--volume", "volume_id", type=int, help="Number that tells files on a medium apart; random if left out.")
 @click.option("--data-pages", default=DATA_PAGES, show_default=True, help="Data pages of a group.")
 @click.option("--parity-pages", default=PARITY_PAGES, show_default=True, help="Pages of a group that may be lost.")
-@click.option("--force", is_flag=True, help="Overwrite pages that exist.")
 @JSON
 def encode(
     file: Path,
@@ -91,12 +89,9 @@ def encode(
     volume_id: int | None,
     data_pages: int,
     parity_pages: int,
-    force: bool,
     json_path: Path | None,
 ) -> None:
     """Put FILE on pages to write: user bytes in, levels with pilots out. `-` reads stdin."""
-    if out.exists() and not force:
-        raise InvalidInputError(f"--out {out}", "a file that exists", "a new name, or --force")
     profile, code, mask, pilots = target_of(bundle, profile_name, code_path)
     codec = PageCodec(code, mask)
     number = secrets.randbits(32) if volume_id is None else volume_id

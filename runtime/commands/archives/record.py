@@ -7,13 +7,16 @@ from contextlib import closing
 from pathlib import Path
 
 import click
+import numpy as np
 
 from lightpage.cli.main import RESUME_KEY
 from lightpage.cli.options import JSON
-from lightpage.cli.paths import OutputFile
+from lightpage.cli.paths import OutputFile, check_new
 from lightpage.device.profile import Profile, load_profile
 from lightpage.errors import FrameError, InvalidInputError, LostDataError, LostPageError, LostShotError, SourceError
 from lightpage.files import write_json
+from lightpage.page.levels import MAX_LEVELS
+from lightpage.page.symbols import random_symbols
 from lightpage.progress import note, track, warn
 from lightpage.recording.exposure import check_pair_light
 from lightpage.recording.frame_pair import FramePair
@@ -34,7 +37,11 @@ _SHOT_S = 30.0
 @click.command()
 @click.option("--source", "spec", required=True, help="camera:CONFIG.toml, simulator:PROFILE or recording:FILE.")
 @click.option("--pages", type=click.IntRange(1), help="Number of pages; by default all that --symbols holds.")
-@click.option("--symbols", type=click.Path(path_type=Path), help="Pages to show, PAGES.h5, as `encode` makes them.")
+@click.option(
+    "--symbols",
+    type=click.Path(path_type=Path),
+    help="Pages to show, PAGES.h5, as `encode` makes them; --pages of random known symbols if left out.",
+)
 @click.option("--profile", "profile_name", metavar="P", help="Nominal device, where the source does not know it.")
 @click.option("--out", required=True, type=OutputFile(), help="The recording, R.h5.")
 @click.option(
@@ -59,8 +66,7 @@ def record(
     Dark and reference frames come first. The device blocks their beams; where it cannot, you are asked to. Interrupted,
     the same command goes on where it stopped. Lost shots are noted in the recording. Exit status 3: shots stayed lost.
     """
-    if out.exists() and not force:
-        raise InvalidInputError(f"--out {out}", "a file that exists", "a new name, or --force")
+    check_new(out, force)
     with closing(open_source(spec)) as source:
         source.operator = ask_operator
         profile = load_profile(profile_name) if profile_name is not None else source.profile
@@ -69,6 +75,10 @@ def record(
         source.check_against(profile)
         if symbols is not None:
             source.show_pages(PageStore(profile, Pages.open(symbols)))
+        elif pages is not None and source.page_count() == 0:
+            store = PageStore(profile)  # the same pages each time, so that the command can go on
+            store.append(random_symbols(profile, MAX_LEVELS, pages, np.random.default_rng(0)), MAX_LEVELS)
+            source.show_pages(store)
         count = _count(source, pages, symbols)
         identity = _identity(source, profile)
         there = pages_there(out, identity, overwrite=force)
@@ -91,7 +101,7 @@ def _count(source: FrameSource, asked: int | None, symbols: Path | None) -> int:
     """
     there = source.page_count()
     if there == 0:
-        raise InvalidInputError("--symbols", f"none, and {source.name} has no pages to show", "PAGES.h5")
+        raise InvalidInputError("--symbols", f"none, and {source.name} has no pages to show", "PAGES.h5, or --pages")
     if asked is None and there is None:
         raise InvalidInputError("options", "neither --pages nor pages to show", "one of them")
     if asked is not None and there is not None and asked > there:

@@ -11,8 +11,7 @@ import click
 import numpy as np
 
 from lightpage.cli.main import RESUME_KEY
-from lightpage.cli.options import JSON
-from lightpage.cli.paths import OutputFile
+from lightpage.cli.options import JSON, new_file
 from lightpage.device.profile import parse_profile
 from lightpage.errors import InvalidInputError, LightpageError, LostPageError, RecordingError, SourceError, StorageError
 from lightpage.files import write_json
@@ -45,8 +44,7 @@ _FIGURES = (
 @click.option("--source", is_flag=True, help="Have the service read pages from its own source.")
 @click.option("--pages", type=click.IntRange(1), help="Page count; all of a recording, or one of the source.")
 @click.option("--levels", type=click.IntRange(2, 256), help="Level count; that of the recording or source by default.")
-@click.option("--out", type=OutputFile(), help="Write symbols and confidences to this HDF5 file.")
-@click.option("--force", is_flag=True, help="Overwrite a file that exists.")
+@new_file("Write symbols and confidences to this HDF5 file.", required=False)
 @JSON
 def decode(
     target: str,
@@ -56,7 +54,6 @@ def decode(
     pages: int | None,
     levels: int | None,
     out: Path | None,
-    force: bool,
     json_path: Path | None,
 ) -> None:
     """Decode a recording, or pages of the service's source.
@@ -67,8 +64,6 @@ def decode(
     if (recording is None) == (not source):
         came = "both --recording and --source" if source else "neither --recording nor --source"
         raise InvalidInputError("options", came, "one of them")
-    if out is not None and out.exists() and not force:
-        raise InvalidInputError(f"--out {out}", "a file that exists", "a new name, or --force")
     results: list[dict[str, Any]] = []
     refused: list[RefusedPage] = []
     with ExitStack() as stack:

@@ -194,8 +194,6 @@ def _offline(
     bundle: str, recording: str, out: Path, pages: int, version: str | None, *, other_device: bool
 ) -> Recalibrated:
     """Return what came of it."""
-    if out.exists():
-        raise InvalidInputError(f"--out {out}", "something that exists", "a new path: bundles are never overwritten")
     if version is not None:
         check_version(version, "--version")
     decoder = Decoder.load(bundle_path(bundle))

@@ -139,6 +139,8 @@ def read_page(
                 levels = levels_for(model.decoder, levels, source.levels, user_data)
                 if user_data and not np.array_equal(mask, model.decoder.bundle.pilot_mask):
                     raise SourceError(f"{source.name}: pilots", "other places", "those of the model in service")
+                if user_data and found.symbols is not None and levels != source.levels:
+                    raise SourceError(f"{subject}: levels", source.levels, f"{levels}, as the code in service has")
                 # Pilots are what was written, whatever level count the caller wants to see.
                 if found.symbols is not None:
                     pilots = Pilots.of_symbols(mask, found.symbols, model.decoder.bundle.levels(source.levels))

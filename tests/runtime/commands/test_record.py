@@ -151,6 +151,14 @@ def test_a_page_that_no_shot_gives_ends_the_recording_and_keeps_the_others(
         assert len(recording.cameras.losses()) == module.ATTEMPTS
 
 
+def test_a_modulator_that_has_no_pages_shows_known_ones_at_random(record: Record, out: Path) -> None:
+    source = Bench()
+    source.page_count, source.levels = lambda: 0 if source.pages is None else len(source.pages), 256  # type: ignore[method-assign]
+    assert record(source, "--pages", 2) == 0
+    with Recording.open(out) as recording:
+        assert np.mean(recording.symbols(0) != recording.symbols(1)) > 0.9
+
+
 def test_what_cannot_be_recorded_is_refused_before_anything_is_connected(
     record: Record, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -162,7 +170,7 @@ def test_what_cannot_be_recorded_is_refused_before_anything_is_connected(
         (source, (), "neither --pages"),
         (source, ("--pages", 2, "--profile", "bench"), "toy:bench"),
         (source, ("--symbols", pages, "--pages", 3), "--pages: got 3"),
-        (empty, ("--pages", 3), "--symbols: got none"),
+        (empty, (), "--symbols: got none"),
         (Bench(), ("--pages", 1), "2 pages already"),
     ):
         monkeypatch.setattr(shown, "arm", lambda: pytest.fail("armed"))

@@ -140,11 +140,7 @@ def until_told(messages: Sequence[Any], more: threading.Event) -> Iterator[Any]:
 
 @dataclass(frozen=True)
 class Refused:
-    """How a call failed.
-
-    Attributes:
-        told: google.rpc's details, by name.
-    """
+    """How a call failed; `told` has google.rpc's details by name."""
 
     code: grpc.StatusCode
     text: str

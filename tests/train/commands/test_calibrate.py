@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 from lightpage.calibration.calibrate import Registered
-from lightpage.calibration.document import load_calibration
+from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.calibration.parameters import NAMES, PRIORS
 from lightpage.device.profile import load_profile
 from lightpage.errors import CalibrationError, FrameError, LightpageError, RecordingError
@@ -74,6 +74,7 @@ REGISTERED = Registered(
     goodness=EXPLAINED,
     quadrature_deviation=np.deg2rad(0.123),
 )
+EARLIER = Calibration.from_registered(REGISTERED, load_profile("bench"), ["0" * 64]).to_toml()
 
 
 @pytest.fixture
@@ -136,10 +137,16 @@ def test_what_was_found_is_written_as_json(tmp_path: Path, monkeypatch: pytest.M
 def test_a_wrong_fit_is_an_error_and_is_there_to_be_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake_registration(monkeypatch, replace(REGISTERED, goodness=UNEXPLAINED))
     out, picture = tmp_path / "calibration.toml", tmp_path / "left.png"
+    asked = flat_recording(tmp_path / "R.h5", 100), out, "--picture", str(picture)
     with pytest.raises(CalibrationError, match="wrong fit"):
-        run(flat_recording(tmp_path / "R.h5", 100), out, "--picture", str(picture))
+        run(*asked)
     assert load_calibration(out).goodness == UNEXPLAINED
     assert picture.read_bytes().startswith(b"\x89PNG")
+    for earlier, said in ((EARLIER, "name another"), (load_profile("bench").to_toml(), "--force")):
+        out.write_text(earlier)
+        with pytest.raises(LightpageError, match=said):
+            run(*asked)
+        assert out.read_text() == earlier
 
 
 @pytest.mark.parametrize(
@@ -160,10 +167,10 @@ def test_a_calibration_that_is_stopped_leaves_the_earlier_one_alone(
 ) -> None:
     fake_registration(monkeypatch, stop)
     recording, out = flat_recording(tmp_path / "R.h5", 100), tmp_path / "calibration.toml"
-    out.write_text("the earlier one")
+    out.write_text(EARLIER)
     with pytest.raises((click.Abort, LightpageError)):
         run(recording, out, "--json", str(tmp_path / "figures.json"))
-    assert out.read_text() == "the earlier one"
+    assert out.read_text() == EARLIER
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["R.h5", "calibration.toml"]
 
 

@@ -21,7 +21,7 @@ from lightpage.runtime.service.stages import CallTimes
 from tests.runtime import coded, toy
 from tests.runtime.held_graph import LARGEST, HeldGraph
 
-CODE = Code(levels=256, coded_bits=2, rate_per_mille=500)
+CODE = Code(levels=16, coded_bits=2, rate_per_mille=500)
 VOLUME = Volume(id=7, file_bytes=60, page_bytes=10, data_pages=3, parity_pages=1)
 """Pages 0 to 3 and 4 to 7 are its groups; the fourth of each is of parity."""
 
