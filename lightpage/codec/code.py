@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from lightpage.codec.checksum import crc16
 from lightpage.codec.mapping import level_bits
+from lightpage.device.problems import mistakes
 from lightpage.errors import InvalidInputError, LightpageError
 from lightpage.files import read_text, replace_text
 
@@ -85,14 +86,7 @@ def parse_code(text: str, subject: str) -> Code:
     except tomllib.TOMLDecodeError as error:
         raise InvalidInputError(subject, f"text that is not TOML ({error})", "the parameters of a code") from None
     except ValidationError as error:
-        raise InvalidInputError(subject, problems_of(error), "the parameters of a code") from None
-
-
-def problems_of(error: ValidationError) -> str:
-    """Describe in one line which parameters of a code were refused, and why."""
-    return "; ".join(
-        f"{'.'.join(map(str, e['loc'])) or 'code'}: {e['msg'].removeprefix('Value error, ')}" for e in error.errors()
-    )
+        raise InvalidInputError(subject, mistakes(Code, error), "the parameters of a code") from None
 
 
 def load_code(path: str | Path) -> Code:

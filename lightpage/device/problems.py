@@ -16,6 +16,15 @@ _ONE_OF = "one of "
 _LONGEST = 60
 """Characters of a value that are told."""
 
+_MARKS = {
+    "a profile": {"lens", "pipe", "slm"},
+    "a calibration": {"calibrated_pages", "turn_rad"},
+    "a code": {"coded_bits", "rate_per_mille"},
+    "cameras of a device": {"cameras", "trigger"},
+    "state of a simulated device": {"geometry", "sensor", "homodyne"},
+}
+"""Keys of which a document of each kind has some, and no other kind."""
+
 _TYPES = {
     "float_type": "a number",
     "float_parsing": "a number",
@@ -47,7 +56,8 @@ class Problem:
         place: the key, or the table, with dots; empty for the whole document.
         got: value, or words about it, that the table has.
         expected: words about a right value.
-        kind: ``missing``, ``unknown``, ``value`` where `got` is what the key has, or else ``wrong``.
+        kind: ``missing``, ``unknown``, ``value`` where `got` is what the key has, ``document`` where the whole is of
+            another kind, or else ``wrong``.
     """
 
     place: str
@@ -57,6 +67,8 @@ class Problem:
 
     def __str__(self) -> str:
         """Return the short form of the mistake."""
+        if self.kind == "document":
+            return self.got
         if self.kind == "missing":
             return f"no {self.place}"
         if self.kind == "unknown":
@@ -75,8 +87,21 @@ class Problem:
 
 
 def problems_of(model: type[BaseModel], error: ValidationError) -> list[Problem]:
-    """Every mistake in a table that does not validate against `model`."""
+    """Every mistake in a table that does not validate against `model`; a document of another kind is one alone."""
+    if kind := other_kind(error):
+        return [Problem("", kind, "a file with other keys", "document")]
     return [problem_of(model, one) for one in error.errors()]
+
+
+def mistakes(model: type[BaseModel], error: ValidationError) -> str:
+    """Return `problems_of` in one line."""
+    return "; ".join(map(str, problems_of(model, error)))
+
+
+def other_kind(error: ValidationError) -> str:
+    """Return the kind of document that the keys are of, in words; empty where they are of the right one, or of none."""
+    unknown = {one["loc"][0] for one in error.errors() if one["type"] == "extra_forbidden" and len(one["loc"]) == 1}
+    return next((kind for kind, marks in _MARKS.items() if marks & unknown and len(unknown) > 1), "")
 
 
 def keys_of(model: type[BaseModel]) -> list[str]:

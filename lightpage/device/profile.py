@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from lightpage.device.lens_path import SeidelTerms
-from lightpage.device.problems import problems_of
+from lightpage.device.problems import mistakes
 from lightpage.errors import ProfileError
 from lightpage.files import read_text
 from lightpage.words import brief, sides
@@ -303,8 +303,7 @@ def validate(model: type[T], data: dict[str, Any], source: str) -> T:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        problems = "; ".join(map(str, problems_of(model, error)))
-        raise ProfileError(source, problems, f"a valid {model.__name__.lower()}") from None
+        raise ProfileError(source, mistakes(model, error), f"a valid {model.__name__.lower()}") from None
 
 
 def parse_profile(text: str, source: str = "profile") -> Profile:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, get_origin
 from pydantic import Field, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
-from lightpage.device.problems import problem_of
+from lightpage.device.problems import other_kind, problem_of
 from lightpage.device.profile import toml_value
 from lightpage.errors import InvalidInputError
 from lightpage.files import read_toml
@@ -299,6 +299,8 @@ def service_settings(
     try:
         return Effective(ServiceSettings.model_validate(data), origins)
     except ValidationError as error:
+        if kind := other_kind(error):
+            raise InvalidInputError(subject, kind, "settings of a service") from None
         problems = [_told(each, origins) for each in error.errors(include_url=False)]
     if len(problems) == 1:
         origin, got, wanted = problems[0]

@@ -10,10 +10,11 @@ import numpy as np
 from pydantic import ValidationError
 from scipy.stats import beta
 
-from lightpage.codec.code import Code, problems_of
+from lightpage.codec.code import Code
 from lightpage.codec.page_bytes import LOSSES, Loss, PageBytes
 from lightpage.codec.volume import Volume
 from lightpage.codec.volume_file import Restored, VolumeFiles, ranges
+from lightpage.device.problems import mistakes
 from lightpage.errors import InvalidInputError, LightpageError, LostDataError, MissingResultsError, RecordingError
 from lightpage.progress import track
 from lightpage.recording.reader import Recording
@@ -133,7 +134,7 @@ def code_of(recording: Recording, bundle: Bundle) -> Code:
         told = json.loads(text)
         return Code.model_validate({key: told[key] for key in Code.model_fields if key in told})
     except ValidationError as error:
-        raise RecordingError(subject, problems_of(error), expected) from None
+        raise RecordingError(subject, mistakes(Code, error), expected) from None
     except (ValueError, TypeError) as error:
         raise RecordingError(subject, error, expected) from None
 

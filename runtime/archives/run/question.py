@@ -8,7 +8,7 @@ from pathlib import Path
 from pydantic import Field, ValidationError
 
 from lightpage.clock import Clock
-from lightpage.device.problems import problems_of
+from lightpage.device.problems import mistakes
 from lightpage.errors import InvalidInputError
 from lightpage.files import check_utf8, matching, read_toml
 from lightpage.progress import note
@@ -146,8 +146,7 @@ def of_fleet(choices: Choices, path: Path, before: Job | None) -> Job:
     try:
         fleet = _Fleet.model_validate(read_toml(path, subject, expected))
     except ValidationError as error:
-        told = "; ".join(map(str, problems_of(_Fleet, error)))
-        raise InvalidInputError(subject, told, expected) from None
+        raise InvalidInputError(subject, mistakes(_Fleet, error), expected) from None
     names = [device.name for device in fleet.device]
     if not names or len(set(names)) < len(names):
         raise InvalidInputError(subject, f"devices {', '.join(names) or 'none'}", "devices of different names")
