@@ -44,6 +44,7 @@ DOCS, PAGES, SITE = ROOT / "docs", ROOT / "build" / "pages", ROOT / "build" / "s
 MADE = "<!-- Made of the code by release/build_site.py. -->\n\n"
 TOP = {"README.md": "index.md", "CONTRIBUTING.md": "CONTRIBUTING.md", "CHANGELOG.md": "CHANGELOG.md"}
 """Pages at the top of the repository, and what they are called in the site."""
+_RUNTIME = "lightpage.runtime."
 PARTS = {
     "Parts of the client": {
         "client.frames": "FramesClient",
@@ -64,9 +65,12 @@ PARTS = {
         "device.trigger.trigger": "Trigger",
         "device.modulator.modulator": "Modulator",
         "device.acquisition.source": "FrameSource Shot",
+        "device.acquisition.page_store": "PageStore",
+        "lightpage.recording.layout": "FrameInfo",
+        "lightpage.recording.black_level": "DarkFrame",
     },
 }
-"""Chapters behind the public names on the page of Python: names by their module in `lightpage.runtime`."""
+"""Chapters behind the public names on the page of Python: names by module, of `lightpage.runtime` if not said."""
 ARGUMENTS = {
     "out": "Folder of the run; the same command continues it.",
     "encode file": "File to put on pages; - is stdin.",
@@ -169,8 +173,8 @@ def metrics() -> str:
         "Gauges of the last page show the device: where the service has a source, frames of callers' own sessions "
         "do not set them, nor do lost pages that came with a caller's own pilots. Without a source there is no "
         "`lightpage_source_ok`, without TLS no `lightpage_certificate_ends_seconds`. Counters of reasons begin at "
-        "0. What a fit in a process of its own takes is in none. Metrics of `lightpage bulk` also have the labels "
-        "`run` and `part`."
+        "0. The process of a recalibration is not counted. Metrics of `lightpage bulk` also have the labels `run` and "
+        "`part`."
     )
     return f"# Metrics\n\n{told}\n\n{table}"
 
@@ -271,7 +275,9 @@ def python() -> str:
     chapters["## Errors"] = [f"{errors.__name__}.{each.__name__}" for each in kinds if each is not LightpageError]
     for told, modules in PARTS.items():
         chapters[f"## {told}"] = [
-            f"lightpage.runtime.{module}.{name}" for module, names in modules.items() for name in names.split()
+            f"{module if module.startswith('lightpage.') else _RUNTIME + module}.{name}"
+            for module, names in modules.items()
+            for name in names.split()
         ]
     return "\n".join("\n\n".join((told, *(f"::: {name}" for name in names))) + "\n" for told, names in chapters.items())
 

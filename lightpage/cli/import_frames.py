@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shlex
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field
@@ -133,7 +134,7 @@ def import_frames(out: Path, force: bool, keep_unlit: bool, json_path: Path | No
             raise
     drop_claim(out)
     if unlit:
-        warn(f"pages {describe(unlit)}")
+        warn(describe(unlit))
     figures = {
         "pages": material.pages,
         "frame_shape": list(material.profile.frame_shape),
@@ -147,7 +148,7 @@ def import_frames(out: Path, force: bool, keep_unlit: bool, json_path: Path | No
     click.echo(
         f"{out}: {material.pages} pages, {exposure.bit_depth} bits, symbols "
         f"{'of ' + str(material.levels) + ' levels' if material.symbols is not None else 'unknown'}; "
-        f"next: lightpage inspect {out}"
+        f"next: {shlex.join(['lightpage', 'inspect', str(out)])}"
     )
 
 

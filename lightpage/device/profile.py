@@ -69,7 +69,7 @@ class Relay(TomlTable):
 
     magnification: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] = Field(
         1.0,
-        description="Size of the image on the sensors over that behind the de-launch lens; flips mend a turned one",
+        description="Size of the image on the sensors over that behind the de-launch lens; flips set it upright",
     )
 
 

@@ -186,7 +186,8 @@ def whole_counts(data: NDArray[Any], subject: str) -> Counts:
             raise FrameError(subject, f"{np.count_nonzero(~np.isfinite(data))} values that are no numbers", "counts")
         if np.any(odd := data != np.rint(data)):
             value = data[odd].flat[0]
-            raise FrameError(subject, f"a value of {value:.6g}", "whole counts: multiply by full scale, and round")
+            remedy = "multiply by full scale, and round" if data.max() <= 1 else "round them"
+            raise FrameError(subject, f"a value of {value:.6g}", f"whole counts: {remedy}")
     low, high = data.min(), data.max()
     if low < 0 or high > _MOST_COUNT:
         raise FrameError(subject, f"values from {low} to {high}", f"counts from 0 to {_MOST_COUNT}")

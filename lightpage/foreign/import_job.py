@@ -27,6 +27,7 @@ from lightpage.recording.exposure import check_different, check_light, unused_lo
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import MAX_BIT_DEPTH
 from lightpage.recording.writer import RecordingWriter
+from lightpage.words import counted
 
 _SAMPLED = 16
 """Frames of either camera that are looked at before the work begins."""
@@ -282,7 +283,7 @@ def _lit(
 
 
 def describe(unlit: Sequence[Unlit]) -> str:
-    """Return the numbers of the pages that were taken although no decoder will read them, for people."""
+    """Return number and list of the pages that were taken although no decoder will read them, for people."""
     numbers = sorted({each.page for each in unlit})
     told = ", ".join(map(str, numbers[:10])) + (", ..." if len(numbers) > 10 else "")
-    return f"{len(numbers)} with a black or saturated frame: {told}"
+    return f"{counted(len(numbers), 'page')} with a black or saturated frame: {told}"

@@ -56,7 +56,7 @@ def look_at_toml(path: Path, profile: Profile | None) -> Finding:
         return found
     if "cameras" in told or "trigger" in told:
         found = Finding(path, "cameras of a device")
-        found.next.append(f"lightpage record --source camera:{found.quoted} --pages 1 --out R.h5")
+        found.next.append(f"lightpage record --source camera:{found.quoted} --pages 2 --out R.h5")
         return found
     if told.keys() & Device.model_fields.keys():
         found = Finding(path, "state of a simulated device")

@@ -95,7 +95,7 @@ class Header:
             if own.page != given.page:
                 expected = f"what profile {given.name} says: leave --profile out, or import the frames anew with it"
                 raise RecordingError(subject, "; ".join(others), expected)
-            tell(f"{subject}: {'; '.join(others)}: profile {given.name} is taken")
+            tell(f"{subject}: {'; '.join(others)}: the named profile is taken, not the recording's")
         return given
 
     def _parsed(self, text: str) -> Profile:

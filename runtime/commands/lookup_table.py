@@ -5,7 +5,8 @@ from pathlib import Path
 import click
 import numpy as np
 
-from lightpage.cli.options import JSON, new_file
+from lightpage.cli.options import JSON
+from lightpage.cli.paths import OutputFile
 from lightpage.errors import InvalidInputError
 from lightpage.files import replace_text, write_json
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
@@ -23,7 +24,7 @@ from lightpage.runtime.device.modulator.lookup_table import (
 @click.command("lookup-table")
 @click.option("--calibration", type=click.Path(path_type=Path), help="Calibration of the device, C.toml.")
 @click.option("--bundle", help="Bundle of the device, in place of its calibration.")
-@new_file("The corrected table.")
+@click.option("--out", required=True, type=OutputFile(), help="The corrected table.")
 @click.option("--levels", type=click.IntRange(MIN_LEVELS, MAX_LEVELS), help="Write one grey value for each level.")
 @click.option(
     "--in-use",
@@ -60,7 +61,7 @@ def lookup_table(
         opened = Bundle.open(bundle_path(str(bundle)))
         subject, modulation = opened.subject, opened.modulation
     if modulation.is_nominal:
-        raise InvalidInputError(subject, "no modulation", "one that tells what the modulator makes of its levels")
+        raise InvalidInputError(subject, "even levels, or none fitted", "uneven ones: even ones need no table")
     count = GREYS if in_use is None else int(levels or 0)
     greys = np.arange(GREYS) if in_use is None else read_table(in_use, count).astype(np.int64)
     curve = dict(zip(greys.tolist(), modulation.phase(symbol_phases(np.arange(count), count)).tolist(), strict=True))

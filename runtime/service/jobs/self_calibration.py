@@ -57,8 +57,7 @@ class SelfCalibrationSettings(SettingsTable):
     nothing, doubles the time up to it. What was refused once will hardly be better a minute later, and each try costs
     reads a few pages' time."""
     most_share: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.1
-    """Share of all time that recalibrations may take at most: a sender of noise buys no more of the device than
-    that."""
+    """Largest share of all time that recalibrations take, whatever a sender of noise sends."""
     busy_s: Seconds = 5.0
     """Time after which the service looks again whether a caller's recalibration has ended."""
 

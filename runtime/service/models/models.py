@@ -354,7 +354,7 @@ class Models:
             return self.base
         path = self.store.folder.bundle(version)
         if version not in now.state.history.versions and not path.is_file():
-            raise BundleError("model", f"no {version}", "the version of a model that the service has")
+            raise BundleError("model", f"version {version}", "that of a model that the service has")
         manifest = read_manifest(path)
         if manifest.version != version:
             raise BundleError(f"bundle {path}: version", manifest.version, version)

@@ -51,14 +51,14 @@ def test_each_bad_value_is_refused_by_name(key: str, value: str) -> None:
 
 
 def test_what_is_no_code_is_refused(tmp_path: Path) -> None:
-    with refused("my code", "TOML"):
-        parse_code("levels: 16", "my code")
-    with refused("my code", "rate: "):
-        parse_code(TEXT + "rate = 1\n", "my code")
+    texts = {"TOML": "levels: 16", "rate": TEXT + "rate = 1\n", "a profile": "[lens]\n[pipe]\n"}
+    for got, text in texts.items():
+        with refused("my code", got):
+            parse_code(text, "my code")
     with refused("code.toml"):
         load_code(tmp_path / "code.toml")
     (tmp_path / "code.toml").write_text("levels = 5")
-    with refused("code.toml", "coded_bits: "):
+    with refused("code.toml", "coded_bits"):
         load_code(tmp_path / "code.toml")
 
 

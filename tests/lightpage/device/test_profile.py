@@ -83,9 +83,11 @@ def test_earlier_profiles_keep_their_text_and_hash() -> None:
     assert hashes == ["5be7b504", "3cbeffd1"]
 
 
-@pytest.mark.parametrize("text", ["", "not = [toml"])
-def test_text_that_is_no_profile_is_refused(text: str) -> None:
-    with pytest.raises(ProfileError):
+@pytest.mark.parametrize(
+    ("text", "got"), [("", "no"), ("not = [toml", "TOML"), ("turn_rad = 1\nx = 1", "a calibration")]
+)
+def test_text_that_is_no_profile_is_refused(text: str, got: str) -> None:
+    with refused("profile", got, kind=ProfileError):
         parse_profile(text)
 
 

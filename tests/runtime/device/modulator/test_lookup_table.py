@@ -116,7 +116,7 @@ def test_a_corrected_table_makes_the_levels_even(levels: int | None, in_use: str
     # half a grey value is half of 2 pi / 256 times the slope, up to 1.5 here, and some more where the table bends
     assert np.abs(shown - shown[0] - 2 * np.pi * np.arange(16) / 16).max() < 1.2 * 1.5 * np.pi / 256
     calibration.save(tmp_path / "c.toml")
-    with pytest.raises(InvalidInputError, match="no modulation"):
+    with pytest.raises(InvalidInputError, match="even levels"):
         run(lookup_table, *told_by)
 
 

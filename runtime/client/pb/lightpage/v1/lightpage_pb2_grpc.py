@@ -194,8 +194,8 @@ class LightpageServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def ReadPages(self, request, context):
-        """Read pages from the service's own source, one after another. A reply comes for each, in their order; a lost page ends
-        nothing, nor does one that storage did not give. At most `Limits.range_pages`.
+        """Read pages from the service's own source, one after another. A reply comes for each, in their order. The call
+        goes on after a page that is lost, or that storage did not give. At most `Limits.range_pages`.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
