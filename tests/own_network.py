@@ -1,7 +1,6 @@
 """Tests with the marker `own_network` run in a private network: fake cameras need two addresses, and one port.
 
-All such tests of a file are run at once, by a second pytest inside that network; each reports what became of it there.
-Their fixtures are set up in both, so they must not hold cameras.
+A second pytest inside that network runs those of a file at once. Fixtures are set up in both: they hold no cameras.
 """
 
 import json
