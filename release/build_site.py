@@ -42,6 +42,7 @@ from lightpage.runtime.service.settings import TABLES
 ROOT = Path(__file__).resolve().parents[1]
 DOCS, PAGES, SITE = ROOT / "docs", ROOT / "build" / "pages", ROOT / "build" / "site"
 MADE = "<!-- Made of the code by release/build_site.py. -->\n\n"
+CITATION = "CITATION.cff"
 TOP = {"README.md": "index.md", "CONTRIBUTING.md": "CONTRIBUTING.md", "CHANGELOG.md": "CHANGELOG.md"}
 """Pages at the top of the repository, and what they are called in the site."""
 _RUNTIME = "lightpage.runtime."
@@ -385,7 +386,7 @@ def front(text: str) -> str:
         name, mark, anchor = target.partition("#")
         if name in TOP:
             return f"[{words}]({TOP[name]}{mark}{anchor})"
-        return match[0] if "://" in target or not name else words
+        return match[0] if "://" in target or name in ("", CITATION) else words
 
     return re.sub(r"\[([^\]]*)\]\(([^)]+)\)", link, text)
 
@@ -399,6 +400,7 @@ def write_pages() -> None:
         (PAGES / "reference" / f"{name}.md").write_text(MADE + made(), "utf-8")
     for name, page in TOP.items():
         (PAGES / page).write_text(front((ROOT / name).read_text("utf-8")), "utf-8")
+    shutil.copy(ROOT / CITATION, PAGES)
     for path in sorted(DOCS.glob("notebooks/*.ipynb")):
         out = PAGES / "notebooks" / f"{path.stem}.md"
         out.parent.mkdir(exist_ok=True)

@@ -112,13 +112,15 @@ class Choice:
         return (
             f"{self.code.levels:>6} {self.information:>9.4f} {self.deviation:>9.4f} "
             f"{self.code.needed_information:>9.4f} {self.code.rate_per_mille / 1000:>7.3f} "
-            f"{self.upper_errors:>9.3f} {self.code.corrections:>4} {self.user_bytes:>9}"
+            f"{self.upper_errors:>9.3f} {self.code.corrections:>6} {self.user_bytes:>9}"
         )
 
 
-HEADER = f"{'levels':>6} {'carried':>9} {'deviation':>9} {'needed':>9} {'rate':>7} {'wrong':>9} {'t':>4} {'bytes':>9}"
-"""Information of a coded bit that pages carry, its deviation from page to page, what the code needs; rate; wrong upper
-numbers of a page, corrections of a Reed-Solomon word, user bytes of a page."""
+HEADER = (
+    f"{'levels':>6} {'carried':>9} {'deviation':>9} {'needed':>9} {'rate':>7} {'errors':>9} {'mended':>6} {'bytes':>9}"
+)
+"""Information of a coded bit that pages carry, its deviation from page to page, what the code needs; rate; errors that
+are left on a page, and those that a Reed-Solomon word mends; user bytes of a page."""
 
 
 def choose(
