@@ -43,8 +43,8 @@ class FramesClient(SubClient):
 
         Args:
             pair: both frames, uint8 or uint16.
-            levels: M, 2..256; 0 for the default of the service, `Description.default_levels`, or that of the model's
-                code where user bytes are asked for.
+            levels: M of the page, 2..256; of another one the symbols mean nothing. 0 for the default of the service,
+                `Description.default_levels`, or that of the model's code where user bytes are asked for.
             frame_id: the caller's number of the pair; the page has it too.
             captured_s: the caller's time of the exposure; the page has it too.
             memory: where the pair goes in place of being sent; it may be there already, as `SharedMemory.frames`.
