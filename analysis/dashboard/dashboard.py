@@ -18,7 +18,7 @@ from pathlib import Path
 import click
 
 from analysis.dashboard.drawing import Drawing
-from analysis.dashboard.load import scenario
+from analysis.dashboard.load import SESSION, scenario
 from analysis.dashboard.prometheus import DEPLOY, RunningPrometheus
 from analysis.service.running import RunningService
 from lightpage.cli.main import run
@@ -40,7 +40,9 @@ def main(seconds: float, threads: int, out: Path) -> None:
     decoder = Decoder.load(bundle_path(DEFAULT), threads)
     with tempfile.TemporaryDirectory(prefix="lightpage-") as name:
         folder = Path(name)
-        service = RunningService("--store", f"{folder}/models", "--threads", str(threads))
+        settings = folder / "settings.toml"
+        settings.write_text(f'[self_calibration]\ndevice_sessions = ["{SESSION}"]\n')
+        service = RunningService("--store", f"{folder}/models", "--threads", str(threads), "--config", str(settings))
         with service, RunningPrometheus(service.metrics.removeprefix("http://").partition("/")[0]) as prometheus:
             begun = time.time()
             scenario(service, decoder, seconds, folder)

@@ -33,8 +33,10 @@ _PAGES = tuple(page for page in range(6) if page != SPOILT_PAGE)
 _DRIFT = 0.1
 """Share of the change of temperature of `drifted`: margin is lost, and no page yet."""
 _DEADLINE_S = 4.0
-_CALLERS = 12
-_USER_BYTES = pb.DecodeOptions(want_user_data=True, session="device")
+_CALLERS = 32
+SESSION = "device"
+"""Session of all callers; the service has to be told that its frames are of its device."""
+_USER_BYTES = pb.DecodeOptions(want_user_data=True, session=SESSION)
 
 
 @dataclass(frozen=True)
