@@ -125,7 +125,9 @@ class PageLayout(TomlTable):
     columns: Count = Field(description="Symbols side by side")
     rows: Count = Field(description="Symbols above one another")
     symbol_size_px: Count = Field(description="Edge of a symbol, modulator pixels")
-    pilot_fraction: Annotated[float, Field(gt=0, lt=0.5)] = Field(0.01, description="Share of known symbols")
+    pilot_fraction: Annotated[float, Field(gt=0, lt=0.5)] = Field(
+        0.01, description="Share of known symbols, the pilots; those of a page must tell 13 bits before it is believed"
+    )
     pilot_seed: Annotated[int, Field(ge=0)] = Field(0, description="Seed of the positions and values of pilots")
 
 
