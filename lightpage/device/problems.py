@@ -100,8 +100,13 @@ def mistakes(model: type[BaseModel], error: ValidationError) -> str:
 
 def other_kind(error: ValidationError) -> str:
     """Return the kind of document that the keys are of, in words; empty where they are of the right one, or of none."""
-    unknown = {one["loc"][0] for one in error.errors() if one["type"] == "extra_forbidden" and len(one["loc"]) == 1}
-    return next((kind for kind, marks in _MARKS.items() if marks & unknown and len(unknown) > 1), "")
+    keys = {(one["type"], one["loc"][0]) for one in error.errors() if len(one["loc"]) == 1}
+    unknown, lacks = (
+        {key for kind, key in keys if kind == "extra_forbidden"},
+        any(kind == "missing" for kind, _ in keys),
+    )
+    foreign = len(unknown) > (1 if lacks else 2)  # a slip or two among its own keys make no other kind
+    return next((kind for kind, marks in _MARKS.items() if foreign and marks & unknown), "")
 
 
 def keys_of(model: type[BaseModel]) -> list[str]:
