@@ -11,11 +11,7 @@ T = TypeVar("T")
 
 @dataclass
 class Told:
-    """See `lightpage.progress.Reporter`.
-
-    Attributes:
-        notes: notes that were told.
-    """
+    """See `lightpage.progress.Reporter`; `notes` has what was told."""
 
     notes: list[str] = field(default_factory=list)
 

@@ -55,21 +55,23 @@ _COMPLETED: dict[str, Sequence[str]] = {
 def new_file(
     told: str, *, required: bool = True, read: Callable[[Path], object] | None = None
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Options of a command that writes a file `out`: `--out`, and `--force`, without which it overwrites none.
+    """Options of a command that writes a file `out`: `--out`, and `--force`.
+
+    Without that it overwrites none, but for one of its own kind where it is told how to read those.
 
     Args:
         told: help of `--out`.
         required: whether the command always writes it; else `out` may be None.
-        read: reads a file of this kind, or raises a `LightpageError`; one that it can read is made anew without asking.
+        read: reads a file of this kind, or raises a `LightpageError`.
     """
 
     def with_options(command: Callable[..., Any]) -> Callable[..., Any]:
         @click.option("--out", required=required, type=OutputFile(), help=told)
-        @click.option("--force", is_flag=True, help="Overwrite a file that exists.")
+        @click.option("--force", is_flag=True, help=f"Overwrite a file {'of another kind' if read else 'that exists'}.")
         @wraps(command)
         def checked(*words: Any, out: Path | None, force: bool, **options: Any) -> Any:
             with suppress(LightpageError):
-                force = force or (read is not None and out is not None and out.is_file() and bool(read(out)))
+                force = force or (read is not None and out is not None and out.is_file() and read(out) is not None)
             check_new(out, force)
             return command(*words, out=out, **options)
 

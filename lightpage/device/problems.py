@@ -17,13 +17,13 @@ _LONGEST = 60
 """Characters of a value that are told."""
 
 _MARKS = {
-    "a profile": {"lens", "pipe", "slm"},
+    "a profile": {"light", "lens", "pipe"},
     "a calibration": {"calibrated_pages", "turn_rad"},
     "a code": {"coded_bits", "rate_per_mille"},
-    "cameras of a device": {"cameras", "trigger"},
-    "state of a simulated device": {"geometry", "sensor", "homodyne"},
+    "cameras of a device": {"in_phase", "quadrature", "trigger"},
+    "state of a simulated device": {"geometry", "sensor", "homodyne", "in_phase_camera", "quadrature_camera"},
 }
-"""Keys of which a document of each kind has some, and no other kind."""
+"""Keys that documents of one kind alone have. Two make a file one of that kind: a single one may be a slip."""
 
 _TYPES = {
     "float_type": "a number",
@@ -100,13 +100,8 @@ def mistakes(model: type[BaseModel], error: ValidationError) -> str:
 
 def other_kind(error: ValidationError) -> str:
     """Return the kind of document that the keys are of, in words; empty where they are of the right one, or of none."""
-    keys = {(one["type"], one["loc"][0]) for one in error.errors() if len(one["loc"]) == 1}
-    unknown, lacks = (
-        {key for kind, key in keys if kind == "extra_forbidden"},
-        any(kind == "missing" for kind, _ in keys),
-    )
-    foreign = len(unknown) > (1 if lacks else 2)  # a slip or two among its own keys make no other kind
-    return next((kind for kind, marks in _MARKS.items() if foreign and marks & unknown), "")
+    unknown = {one["loc"][0] for one in error.errors() if one["type"] == "extra_forbidden" and len(one["loc"]) == 1}
+    return next((kind for kind, marks in _MARKS.items() if len(marks & unknown) > 1), "")
 
 
 def keys_of(model: type[BaseModel]) -> list[str]:

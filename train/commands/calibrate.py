@@ -20,7 +20,7 @@ from lightpage.cli.options import JSON, named_profile, new_file, profile_option
 from lightpage.cli.paths import OutputFile
 from lightpage.cli.progress_bar import percent_bar
 from lightpage.device.profile import Profile
-from lightpage.errors import ProfileError
+from lightpage.errors import LightpageError
 from lightpage.files import replace_file, write_json
 from lightpage.pictures import write_figure_png
 from lightpage.progress import Progress, warn
@@ -112,8 +112,8 @@ def calibrate(
 def _is_better(earlier: Path) -> bool:
     """Return whether a file holds a calibration that is not wrong."""
     try:
-        return not load_calibration(earlier).is_wrong
-    except ProfileError:
+        return earlier.is_file() and not load_calibration(earlier).is_wrong
+    except LightpageError:
         return False
 
 

@@ -15,7 +15,6 @@ from lightpage.cli.paths import OutputFile, check_new
 from lightpage.device.profile import Profile, load_profile
 from lightpage.errors import FrameError, InvalidInputError, LostDataError, LostPageError, LostShotError, SourceError
 from lightpage.files import write_json
-from lightpage.page.levels import MAX_LEVELS
 from lightpage.page.symbols import random_symbols
 from lightpage.progress import note, track, warn
 from lightpage.recording.exposure import check_pair_light
@@ -42,6 +41,7 @@ _SHOT_S = 30.0
     type=click.Path(path_type=Path),
     help="Pages to show, PAGES.h5, as `encode` makes them; --pages of random known symbols if left out.",
 )
+@click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0), help="Seed of random symbols.")
 @click.option("--profile", "profile_name", metavar="P", help="Nominal device, where the source does not know it.")
 @click.option("--out", required=True, type=OutputFile(), help="The recording, R.h5.")
 @click.option(
@@ -54,6 +54,7 @@ def record(
     spec: str,
     pages: int | None,
     symbols: Path | None,
+    seed: int,
     profile_name: str | None,
     out: Path,
     shot_seconds: float | None,
@@ -76,8 +77,8 @@ def record(
         if symbols is not None:
             source.show_pages(PageStore(profile, Pages.open(symbols)))
         elif pages is not None and source.page_count() == 0:
-            store = PageStore(profile)  # the same pages each time, so that the command can go on
-            store.append(random_symbols(profile, MAX_LEVELS, pages, np.random.default_rng(0)), MAX_LEVELS)
+            store, levels = PageStore(profile), source.levels
+            store.append(random_symbols(profile, levels, pages, np.random.default_rng(seed)), levels)
             source.show_pages(store)
         count = _count(source, pages, symbols)
         identity = _identity(source, profile)

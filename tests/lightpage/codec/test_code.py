@@ -51,7 +51,7 @@ def test_each_bad_value_is_refused_by_name(key: str, value: str) -> None:
 
 
 def test_what_is_no_code_is_refused(tmp_path: Path) -> None:
-    for got, text in {"TOML": "levels: 16", "rate": TEXT + "rate = 1\n", "a profile": "[lens]\n[pipe]\n"}.items():
+    for got, text in {"TOML": "levels: 16", "unknown": TEXT + "x = 1\n", "a profile": "[lens]\n[pipe]\n"}.items():
         with refused("my code", got):
             parse_code(text, "my code")
     with refused("code.toml"):

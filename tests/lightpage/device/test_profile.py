@@ -84,7 +84,7 @@ def test_earlier_profiles_keep_their_text_and_hash() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "got"), [("", "no"), ("not = [toml", "TOML"), ("turn_rad = 1\nx = 1", "a calibration")]
+    ("text", "got"), [("", "no name"), ("a = [", "TOML"), ("trigger = 1\nin_phase = 1", "cameras")]
 )
 def test_text_that_is_no_profile_is_refused(text: str, got: str) -> None:
     with refused("profile", got, kind=ProfileError):

@@ -153,10 +153,10 @@ def test_a_page_that_no_shot_gives_ends_the_recording_and_keeps_the_others(
 
 def test_a_modulator_that_has_no_pages_shows_known_ones_at_random(record: Record, out: Path) -> None:
     source = Bench()
-    source.page_count, source.levels = lambda: 0 if source.pages is None else len(source.pages), 256  # type: ignore[method-assign]
+    source.page_count = lambda: 0 if source.pages is None else len(source.pages)  # type: ignore[method-assign]
     assert record(source, "--pages", 2) == 0
     with Recording.open(out) as recording:
-        assert np.mean(recording.symbols(0) != recording.symbols(1)) > 0.9
+        assert np.mean(recording.symbols(0) != recording.symbols(1)) > 0.8
 
 
 def test_what_cannot_be_recorded_is_refused_before_anything_is_connected(

@@ -16,10 +16,7 @@ TIMES = LineTimes(answer_s=0.15, quiet_s=0.03, late_s=0.4, synchronise_s=1.5)
 
 
 class MemoryPort(VirtualSerialPort):
-    """The port that pyserial's `serial_for_url` opens from now on; a driver that waits for it moves the clock.
-
-    Its device's `answer` may be exchanged, and takes `answer_s`.
-    """
+    """The port that pyserial opens from now on; who waits for it moves the clock. `answer` takes `answer_s`."""
 
     def __init__(self, answer: Callable[[str], str], monkeypatch: pytest.MonkeyPatch) -> None:
         super().__init__(lambda message: self.answer(message))

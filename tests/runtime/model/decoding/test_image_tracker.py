@@ -30,8 +30,7 @@ Real = np.ndarray
 class FakeDevice:
     """A device whose image has drifted, as every part of the tracker sees it.
 
-    What a page shows is the truth less what its table holds. Further than `seen_px` off it shows nothing, and the page
-    is noise.
+    What a page shows is the truth less what its table holds; further than `seen_px` off it is noise.
     """
 
     decoder: Decoder

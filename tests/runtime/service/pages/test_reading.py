@@ -9,6 +9,7 @@ import pytest
 from lightpage.codec.code import Code
 from lightpage.codec.page_bytes import FileFacts, Header, Loss, PageBytes
 from lightpage.codec.volume import Volume
+from lightpage.errors import SourceError
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.model.decoding.batches import Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
@@ -16,7 +17,7 @@ from lightpage.runtime.service.caller import Call, Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.models.models import Models
 from lightpage.runtime.service.pages.page_calls import PageCalls
-from lightpage.runtime.service.pages.reading import DataPage, Unread, read_again, read_data
+from lightpage.runtime.service.pages.reading import DataPage, Unread, read_again, read_data, read_page
 from lightpage.runtime.service.stages import CallTimes
 from tests.runtime import coded, toy
 from tests.runtime.held_graph import LARGEST, HeldGraph
@@ -120,3 +121,10 @@ def test_a_range_ends_after_its_first_look_where_healing_leaves_no_room_for_a_se
         replies = [*PageCalls(plane).ReadData(pb.ReadDataRequest(first_page=0, pages=2), call)]
     assert [reply.page for reply in replies] == [0, 1]
     assert asked == [("toy-1", 2)]
+
+
+def test_user_bytes_are_not_asked_of_pages_with_other_levels_than_those_of_the_code(decoder: Decoder) -> None:
+    code = CODE.model_copy(update={"levels": 64})
+    other = replace(decoder.bundle, manifest=decoder.bundle.manifest.model_copy(update={"code": code.to_toml()}))
+    with pytest.raises(SourceError, match="levels"):
+        read_page(plane_of(Decoder(other, threads=1)), 0, None, Caller(), user_data=True)
