@@ -27,26 +27,31 @@ from lightpage.train.published.held_pages import MadePages
 from lightpage.train.trainers.symbols import SymbolTrainer
 from lightpage.train.trainers.whole_run import Split, make_run, usable_pages
 
-_TRAINING_PAGES = 148
+TRAINING_PAGES = 148
 """Pages to train on: as many as the shipped decoders learnt from, a third of what the published ones have."""
 _CALIBRATED = 2
 
 
-def preset_trained(settings: Settings, data_set: DataSet, preset: str, work: Path, progress: Progress) -> Result:
-    """Calibrate, train, export and evaluate a preset on the first pages of a data set and its held-out ones.
+def preset_trained(
+    settings: Settings, data_set: DataSet, preset: str, pages: int, work: Path, progress: Progress
+) -> Result:
+    """Calibrate, train, export and evaluate a preset on a data set, with the pages that published decoders hold out.
 
     Args:
         settings: settings of the study.
         data_set: device to train on.
         preset: name out of `PRESETS`.
+        pages: pages to train on: the first ones, and where these are not enough some behind those held out.
         work: folder of the case.
         progress: told of the steps.
 
     Returns:
         See `lightpage.study.trained.trained`; the angle is the calibration's, and user bytes those of `lightpage code`.
     """
-    parts, lights = split(settings), settings.lights
-    training, validation = parts[0][:_TRAINING_PAGES], parts[1]
+    (first, validation, unseen), lights = split(settings), settings.lights
+    pages = min(pages, len(first)) if settings.quick else pages
+    end = max(unseen.stop, pages + len(validation) + len(unseen))
+    training = [*first, *range(unseen.stop, end)][:pages]
     path, run, bundle = work / "recording.h5", work / "run", work / "bundle.zip"
     choices = PRESETS[preset].choices
     choices = replace(choices, seed=settings.seed, steps=max(2, round(settings.share * choices.steps)))
@@ -56,15 +61,15 @@ def preset_trained(settings: Settings, data_set: DataSet, preset: str, work: Pat
     with reporting(None):  # the case's own progress is shown
         progress("record", 0.0)
         if not path.exists():
-            made = lights.of(data_set, parts[-1].stop, settings.seed, progress)
-            _record(path, data_set, made, [*training, *validation, *parts[2]])
+            made = lights.of(data_set, end, settings.seed, progress)
+            _record(path, data_set, made, [*training, *validation, *unseen])
         with Recording.open(path) as recording:
             progress("calibrate and train", 0.2)
             usable = usable_pages(recording)
-            first, second = len(training), len(training) + len(validation)
+            trained, validated = len(training), len(training) + len(validation)
             numbers = list(usable)
-            shares = len(validation) / recording.pages, len(parts[2]) / recording.pages
-            chosen = Split(numbers[:first], numbers[first:second], numbers[second:], *shares)
+            shares = len(validation) / recording.pages, len(unseen) / recording.pages
+            chosen = Split(numbers[:trained], numbers[trained:validated], numbers[validated:], *shares)
             trainer = SymbolTrainer(PRESETS[preset].localizer, choices, 0, None)
             processes = Processes(1, compute=lights.compute)
             calibration = _calibrated(work / "calibration.toml", recording, data_set, processes)
@@ -75,7 +80,7 @@ def preset_trained(settings: Settings, data_set: DataSet, preset: str, work: Pat
             progress("evaluate", 0.9)
             decoder = Decoder.load(bundle)
             found = evaluate(decoder, recording, tracker_for(decoder))
-            user_bytes = _user_bytes(decoder, recording, len(parts[2]) - len(found.refused))
+            user_bytes = _user_bytes(decoder, recording, len(unseen) - len(found.refused))
     air, own = found.figures.air_bits_per_symbol, found.figures.own_mi_bits_per_symbol
     air_kb, own_kb = (page_kilobytes(bits, found.symbols_per_page) for bits in (air, own))
     path.unlink()

@@ -16,26 +16,16 @@ import sys
 from pathlib import Path
 
 import click
-import numpy as np
-from numpy.typing import NDArray
 
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, load_device
 from lightpage.errors import InvalidInputError
-from lightpage.metrics.information import own_information
 from lightpage.metrics.provenance import write_figures
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
-from lightpage.page.symbols import random_symbols
 from lightpage.progress import track
-from lightpage.simulator.light_bound import LightBound
-
-
-def bits(concentrations: list[float], levels: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Information of posteriors of these concentrations on one of M levels, each at an error that it draws."""
-    kappa = np.array(concentrations)
-    return own_information(rng.vonmises(0.0, np.minimum(kappa, 1e12)), kappa, levels)
+from lightpage.simulator.light_bound import bits, sampled
 
 
 def earlier(path: Path, asked: dict[str, object]) -> list[list[float]]:
@@ -96,15 +86,13 @@ def main(
     }
     found = earlier(json_path, asked)
     for page in track(range(len(found), pages), "bound", unit="page"):
-        rng = np.random.default_rng([seed, page])
-        bound = LightBound(profile, device, random_symbols(profile, levels, 1, rng)[0], levels)
-        places = rng.integers(profile.page_shape, size=(symbols, 2))
-        found.append([bound.concentration(row, column) for row, column in places.tolist()])
+        found.append([*sampled(profile, device, levels, symbols, (seed, page))])
         write_figures(json_path, {"asked": asked, "concentrations": found}, asked=asked)
-    each = bits([one for page in found for one in page], levels, np.random.default_rng(seed))
-    figures = {"bits": float(each.mean()), "standard_error": float(each.std(ddof=1) / np.sqrt(each.size))}
-    write_figures(json_path, {"asked": asked, **figures, "concentrations": found}, asked=asked)
-    click.echo(f"bound {figures['bits']:.3f} +- {figures['standard_error']:.3f} bits a symbol, {each.size} symbols")
+    each = [one for page in found for one in page]
+    mean, error = bits(each, levels, seed)
+    figures = {"bits": mean, "standard_error": error, "concentrations": found}
+    write_figures(json_path, {"asked": asked, **figures}, asked=asked)
+    click.echo(f"bound {mean:.3f} +- {error:.3f} bits a symbol, {len(each)} symbols")
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ and what a camera bends are left out: each takes information away.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,7 +15,9 @@ from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile
 from lightpage.device.state import CameraPose, Device
-from lightpage.page.symbols import symbol_phases
+from lightpage.metrics.information import own_information
+from lightpage.page.symbols import random_symbols, symbol_phases
+from lightpage.simulator.engine import NUMPY, Engine
 from lightpage.simulator.true_optics import TrueOptics
 
 Real = NDArray[np.floating]
@@ -30,17 +33,20 @@ class _View:
         amplitude: signal and reference, complex [y, x].
         electrons_per_unit: electrons for a unit of intensity.
         weight: 1 over the variance of a pixel's electrons, [y, x]; 0 beside the frame and where the pixel is full.
+        engine: what has computed them.
     """
 
     pose: CameraPose
     amplitude: Complex
     electrons_per_unit: float
     weight: Real
+    engine: Engine
 
     def information(self, change: Complex) -> float:
         """Fisher information of a number that changes the field at this rate, [y, x]."""
-        rate = 2 * self.electrons_per_unit * np.real(np.conj(self.amplitude) * change)
-        return float(np.sum(rate**2 * self.weight))
+        xp = self.engine.xp
+        rate = 2 * self.electrons_per_unit * xp.real(xp.conj(self.amplitude) * change)
+        return float(xp.sum(rate**2 * self.weight))
 
 
 class LightBound:
@@ -50,10 +56,14 @@ class LightBound:
         profile, device: nominal and true.
         symbols: symbols of the page, [ny, nx].
         levels: M.
+        engine: what computes.
     """
 
-    def __init__(self, profile: Profile, device: Device, symbols: NDArray[np.integer], levels: int) -> None:
-        self._optics, self._size, self._shape = TrueOptics(profile, device), profile.page.symbol_size_px, symbols.shape
+    def __init__(
+        self, profile: Profile, device: Device, symbols: NDArray[np.integer], levels: int, engine: Engine = NUMPY
+    ) -> None:
+        self._optics = TrueOptics(profile, device, engine=engine)
+        self._size, self._shape = profile.page.symbol_size_px, symbols.shape
         self._phase = self._enlarged(symbol_phases(symbols, levels))
 
     def concentration(self, row: int, column: int) -> float:
@@ -66,8 +76,9 @@ class LightBound:
         return 1.0 / (1.0 / told + noise**2)
 
     def _enlarged(self, values: Real) -> Real:
-        """Values of symbols on the modulator's pixels."""
-        return np.kron(values, np.ones((self._size, self._size)))
+        """Values of symbols on the modulator's pixels, in double precision: their change is a small difference."""
+        on_pixels: Real = self._optics.engine.exact(np.kron(values, np.ones((self._size, self._size))))
+        return on_pixels
 
     @cached_property
     def _views(self) -> tuple[_View, _View]:
@@ -77,7 +88,7 @@ class LightBound:
 
         def view(pose: CameraPose, turned: Complex, gain: float) -> _View:
             amplitude, scale = self._optics.camera_field(leaving, pose) + turned, gain * self._optics.electrons_per_unit
-            return _View(pose, amplitude, scale, self._weight(scale * np.abs(amplitude) ** 2))
+            return _View(pose, amplitude, scale, self._weight(scale * abs(amplitude) ** 2), self._optics.engine)
 
         homodyne = device.homodyne
         turned = reference * np.exp(1j * homodyne.turn_rad)
@@ -93,8 +104,29 @@ class LightBound:
             self._optics.profile.image_pixel_m,
         )
         step = sensor.full_well_e / (2**sensor.bit_depth - 1)
-        weight = np.where(electrons < sensor.full_well_e, 1 / (electrons + sensor.read_noise_e**2 + step**2 / 12), 0)
         x, y = self._optics.camera_axes_m
-        weight[np.abs(y) > camera.rows_px * pixel / 2] = 0
-        weight[:, np.abs(x) > camera.columns_px * pixel / 2] = 0
+        seen = (abs(y) <= camera.rows_px * pixel / 2)[:, None] & (abs(x) <= camera.columns_px * pixel / 2)
+        counted = (electrons < sensor.full_well_e) & self._optics.engine.exact(seen)
+        weight: Real = counted / (electrons + sensor.read_noise_e**2 + step**2 / 12)
         return weight
+
+
+def sampled(
+    profile: Profile, device: Device, levels: int, symbols: int, seed: tuple[int, int], engine: Engine = NUMPY
+) -> Iterator[float]:
+    """Yield the concentrations of so many symbols of a page that a seed draws, and with it its number."""
+    rng = np.random.default_rng(seed)
+    bound = LightBound(profile, device, random_symbols(profile, levels, 1, rng)[0], levels, engine)
+    for row, column in rng.integers(profile.page_shape, size=(symbols, 2)).tolist():
+        yield bound.concentration(row, column)
+
+
+def bits(concentrations: Sequence[float], levels: int, seed: int) -> tuple[float, float]:
+    """Mean information of posteriors of these concentrations on one of M levels, each at an error that a seed draws.
+
+    Returns:
+        Bits, and the standard error of the mean.
+    """
+    rng, kappa = np.random.default_rng(seed), np.array(concentrations)
+    each = own_information(rng.vonmises(0.0, np.minimum(kappa, 1e12)), kappa, levels)
+    return float(each.mean()), float(each.std(ddof=1) / np.sqrt(each.size))

@@ -180,7 +180,7 @@ class TrueOptics:
         shown: Complex = modulated(slm, with_crosstalk(page_phase, slm.crosstalk_relative, xp), xp) * noise
         if self._dead_pixels is not None:
             dead, light = self._dead_pixels
-            shown[dead] = light
+            shown[dead] = xp.asarray(light, dtype=shown.dtype)
         return shown
 
     @cached_property

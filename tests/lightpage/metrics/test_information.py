@@ -44,8 +44,7 @@ def test_own_information_is_what_the_posterior_leaves_unknown(levels: Levels) ->
 @pytest.mark.parametrize("levels", SOME_LEVELS)
 def test_posterior_equals_the_plain_softmax(levels: Levels) -> None:
     rng = np.random.default_rng(levels.count)
-    kappa = 10 ** rng.uniform(-3, 6, 400)
-    mu = rng.uniform(-20, 20, 400)
+    kappa, mu = 10 ** rng.uniform(-3, 6, 400), rng.uniform(-20, 20, 400)
     symbols = np.where(rng.random(400) < 0.5, information.decide(mu, levels), rng.integers(levels.count, size=400))
     logits = logits_of(mu, kappa, levels)
     expected = logits[np.arange(400), symbols] - logsumexp(logits, axis=1)

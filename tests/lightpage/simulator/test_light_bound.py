@@ -25,9 +25,8 @@ def test_it_is_what_a_small_change_of_the_symbol_does_to_the_counts(electrons: f
     symbols = random_symbols(PROFILE, 16, 1, np.random.default_rng(0))[0]
     optics, row, column, size = TrueOptics(PROFILE, device), 3, 5, PROFILE.page.symbol_size_px
     x, y = optics.camera_axes_m
-    inside = [
-        np.abs(axis) <= n * PROFILE.camera.pitch_m / 2 for axis, n in zip((y, x), PROFILE.frame_shape, strict=True)
-    ]
+    half_y, half_x = np.array(PROFILE.frame_shape) * PROFILE.camera.pitch_m / 2
+    inside = np.abs(y) <= half_y, np.abs(x) <= half_x
 
     def counts(step: float) -> np.ndarray:
         phases = symbol_phases(symbols, 16)
@@ -53,10 +52,8 @@ def test_the_command_goes_on_where_it_was(tmp_path: Path) -> None:
     words = ["--profile", str(tmp_path / "small.toml"), "--symbols", "3", "--json", str(file)]
     assert CliRunner().invoke(bound.main, [*words, "--pages", "1"]).exit_code == 0
     found = json.loads(file.read_text())
-    assert 0 < found["bits"] < 8
     file.write_text(json.dumps(found | {"concentrations": [[1.0] * 3]}))
     assert CliRunner().invoke(bound.main, [*words, "--pages", "2"]).exit_code == 0
     first, second = json.loads(file.read_text())["concentrations"]
-    assert first == [1.0] * 3
-    assert len(second) == 3
+    assert (first, len(second)) == ([1.0] * 3, 3)
     assert CliRunner().invoke(bound.main, [*words, "--seed", "1"]).exit_code

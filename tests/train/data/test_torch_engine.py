@@ -11,6 +11,8 @@ from lightpage.errors import InvalidInputError
 from lightpage.page.symbols import random_symbols
 from lightpage.recording.frame_pair import FramePair
 from lightpage.simulator.cameras import resample
+from lightpage.simulator.engine import NUMPY
+from lightpage.simulator.light_bound import sampled
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import perfectly_calibrated
 from lightpage.train.data.features import FeatureExtractor
@@ -41,6 +43,8 @@ def test_the_light_is_that_of_numpy_within_the_rounding_of_single_precision(comp
     for plain, other in zip(*seen, strict=True):
         assert other.dtype.itemsize == plain.dtype.itemsize
         assert np.abs(other - plain).max() < 1e-5 * np.abs(plain).max()  # 32 steps, each of some roundings
+    bounds = [[*sampled(PROFILE, ROUGH, 16, 3, (0, 1), engine)] for engine in (NUMPY, TorchEngine(compute))]
+    assert bounds[1] == pytest.approx(bounds[0], rel=1e-4)
 
 
 @each_processor
