@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy import ndimage
-from torch import Tensor
+from torch import Tensor, nn
 
 from lightpage.calibration.calibrate import LEAST_KEPT, KnownPage, least_coherence
 from lightpage.calibration.calibrated_device import CalibratedDevice
@@ -22,7 +23,7 @@ from lightpage.errors import CalibrationError
 from lightpage.page.symbols import symbol_phases
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
-from lightpage.train.models.field import Measured, TorchFieldSolver
+from lightpage.train.models.field import FieldRecovery, Measured, TorchFieldSolver
 from lightpage.train.models.hyperparameters import Hyperparameters
 from lightpage.train.models.localizers.coherent import CoherentLocalizer
 from lightpage.train.models.localizers.wave import WaveLocalizer
@@ -31,6 +32,7 @@ from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.waves.grid import GRID_STEP_PX, FieldGrid
 
 Real = NDArray[np.float64]
+M = TypeVar("M", bound=nn.Module)
 
 CPU = torch.device("cpu")
 _PROBE_PX = 0.3
@@ -77,7 +79,11 @@ class FeatureExtractor:
         localizer: `coherent` or `wave`.
         choices: hyperparameters of the decoder that the features are for.
         with_signal_power: see `FieldRecovery`.
-        compute: where fields and light are computed; `measure` computes on the CPU.
+        compute: where fields and light are computed.
+
+    Attributes:
+        device, compute: see above.
+        recovery: field recovery, on the CPU.
     """
 
     def __init__(
@@ -91,12 +97,12 @@ class FeatureExtractor:
     ) -> None:
         choices = choices or Hyperparameters()
         profile, parameters = device.profile, device.parameters
-        self.device = device
+        self.device, self.compute = device, compute
         self._twin = TorchTwin(RayTwin(profile))
         self.table: SamplingTable = sampling_table(self._twin, parameters, device.quadrature_phase_rad, profile)
         self._apart = {name: self.table[name] for name in device.apart_inputs}
         self.recovery = choices.field_recovery(profile, with_signal_power=with_signal_power)
-        self._solve = TorchFieldSolver(self.recovery if compute == CPU else deepcopy(self.recovery).to(compute))
+        self._solve = TorchFieldSolver(on_device(self.recovery, compute))
         self._coherent = choices.coherent_localizer(profile).to(compute)
         self._wave = WaveLocalizer(profile, parameters, self.grid).to(compute) if localizer == "wave" else None
         shares = branch_shares(self.table["positions"].reshape(2, -1).T.astype(float))
@@ -113,14 +119,21 @@ class FeatureExtractor:
         at = self.table["registration"], self.table["homodyne"], self._apart
         return self._solve(pair, self.device.references, *at)[0]
 
-    def measure(self, pair: FramePair, shift_px: tuple[float, float]) -> tuple[Measured, Tensor]:
-        """Return the equations and the field of a page whose image has moved by (x, y), on the calibrated grid."""
+    def measure(
+        self, pair: FramePair, shift_px: tuple[float, float], recovery: FieldRecovery | None = None
+    ) -> tuple[Measured, Tensor]:
+        """Return the equations and the field of a page whose image has moved by (x, y), on the calibrated grid.
+
+        They are where the recovery is: its own on the CPU, or a copy.
+        """
+        recovery = recovery or self.recovery
+        device = next(recovery.buffers()).device
         registration = shifted(self.table["registration"], np.array(shift_px))
         seen = (pair.in_phase, pair.quadrature, self.device.references.in_phase, self.device.references.quadrature)
         tensors = [*(frame.astype(np.float32) for frame in seen), registration, self.table["homodyne"]]
         tensors += self._apart.values()
-        measured = self.recovery.measure(*map(torch.from_numpy, tensors))
-        return measured, self.recovery.solve(measured)[0]
+        measured = recovery.measure(*(torch.from_numpy(values).to(device) for values in tensors))
+        return measured, recovery.solve(measured)[0]
 
     def check(self, page: KnownPage, calibrated: float) -> None:
         """Check that a known page shows its symbols where this calibration says.
@@ -209,6 +222,11 @@ class FeatureExtractor:
             if bend < 0:
                 step[axis] = -_PROBE_PX * (plus - minus) / (2 * bend)
         return np.clip(step, -_LARGEST_STEP_PX, _LARGEST_STEP_PX)
+
+
+def on_device(module: M, device: torch.device) -> M:
+    """The module on the CPU, where it is; elsewhere a copy of it."""
+    return module if device == CPU else deepcopy(module).to(device)
 
 
 def demodulate(

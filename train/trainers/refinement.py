@@ -15,11 +15,12 @@ from itertools import chain, repeat
 from pathlib import Path
 
 import numpy as np
+import torch
 from torch import nn
 
 from lightpage.recording.reader import Recording
 from lightpage.train.data.feature_store import FeatureStore, fill
-from lightpage.train.data.features import FeatureExtractor, PageFeatures
+from lightpage.train.data.features import FeatureExtractor, PageFeatures, on_device
 from lightpage.train.data.known_light import Explained
 from lightpage.train.data.patches import training_pages
 from lightpage.train.fitting.fit import fit_network
@@ -151,7 +152,7 @@ def refined_pages(
     start: int,
     shift_px: tuple[float, float],
 ) -> Iterator[PageFeatures]:
-    """Features for a refinement.
+    """Features for a refinement, computed where the extractor computes.
 
     Args:
         extractor, prediction: extractor and prediction of the device.
@@ -161,16 +162,22 @@ def refined_pages(
         start: first page.
         shift_px: not asked for: the pass before has found each page's.
     """
+    there = extractor.compute
+    recovery, network = on_device(extractor.recovery, there), on_device(module.network, there)
+    prediction = on_device(prediction, there)
     for number in range(start, len(inputs.pages)):
         *shown, phases = earlier[number]
-        state = earlier.state(number)
-        measured, field = extractor.measure(inputs.recording.frames(inputs.pages[number]), state.shift_px)
-        estimate = module(*(part[None] for part in shown))[0]
-        light = prediction(extractor.recovery, measured, field, turned(estimate, state.piston_rad))
+        state, pair = earlier.state(number), inputs.recording.frames(inputs.pages[number])
+        exact = torch.backends.cudnn.flags(enabled=True, allow_tf32=False)  # 10 bits would be seen
+        with torch.no_grad(), exact:
+            light, *others = (part[None].to(there) for part in shown)
+            estimate = network(light.float(), *others)[0]
+            measured, field = extractor.measure(pair, state.shift_px, recovery)
+            left = prediction(recovery, measured, field, turned(estimate, state.piston_rad))
         yield PageFeatures(
-            turned(light, -state.piston_rad).numpy().astype(np.float16),
+            turned(left, -state.piston_rad).cpu().numpy().astype(np.float16),
             shown[1].numpy(),
             phases.numpy(),
             state,
-            estimate.numpy(),
+            estimate.cpu().numpy(),
         )

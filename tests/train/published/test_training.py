@@ -53,8 +53,7 @@ def test_rates_rise_over_two_percent_of_the_steps_and_only_the_decoder_s_falls()
         optimizer.step()
         schedule.step()
     assert rates[0] == pytest.approx([rate / 2 for rate in STEP_RATES])
-    assert rates[1] == pytest.approx(STEP_RATES)
-    assert rates[79] == pytest.approx(STEP_RATES)
+    assert rates[1] == rates[79] == pytest.approx(STEP_RATES)
     assert rates[80] == pytest.approx([5e-4, *STEP_RATES[1:]])
     assert rates[90] == pytest.approx([2.5e-4, *STEP_RATES[1:]])
     late = module("ray", PublishedChoices(channels=(4, 8), steps=100, held_share=0.5, start=PROFILE))
@@ -114,10 +113,9 @@ def test_the_network_gets_two_images_and_the_places_they_stand_for() -> None:
 def test_pilots_are_not_learnt_from(classes: int) -> None:
     made = module("none", PublishedChoices(channels=(4, 8), classes=classes))
     made.log = lambda *_, **__: None  # type: ignore[method-assign]
-    profile = small_profile()
+    profile, pilots = small_profile(), pilot_mask(small_profile())
     frames = 100 + 10 * torch.rand(1, 2, *profile.frame_shape)
     phases = 2 * np.pi * torch.rand(*profile.page_shape)
-    pilots = pilot_mask(profile)
     others = torch.where(torch.from_numpy(pilots), phases + 1, phases)
     pages: list[Page] = [(frames[0], torch.zeros(3), shown) for shown in (phases, others)]
     asked = DataPages(pages, pilots)  # type: ignore[arg-type]  # a list is all that it takes
@@ -156,8 +154,7 @@ def test_table_1_of_samples_and_no_others() -> None:
 
 @pytest.mark.parametrize("kappa", [0.3, 3.0, 30.0])
 def test_a_von_mises_posterior_over_classes_comes_back(kappa: float) -> None:
-    angles = torch.arange(LEVELS) * (2 * math.pi / LEVELS)
-    direction = 1.3
+    angles, direction = torch.arange(LEVELS) * (2 * math.pi / LEVELS), 1.3
     logits = (kappa * torch.cos(angles - direction))[None, :, None, None]
     px, py = p_of_classes(logits)[0, :, 0, 0].tolist()
     assert math.atan2(py, px) == pytest.approx(direction, abs=1e-3)
@@ -165,8 +162,7 @@ def test_a_von_mises_posterior_over_classes_comes_back(kappa: float) -> None:
 
 
 def test_no_knowledge_is_no_p_and_a_sure_one_is_finite() -> None:
-    none = p_of_classes(torch.zeros(1, LEVELS, 1, 1))
-    assert float(none.abs().max()) < 1e-5
+    assert float(p_of_classes(torch.zeros(1, LEVELS, 1, 1)).abs().max()) < 1e-5
     sure = torch.zeros(1, LEVELS, 1, 1)
     sure[0, 5] = 1000.0
     p = p_of_classes(sure)[0, :, 0, 0]
@@ -175,9 +171,8 @@ def test_no_knowledge_is_no_p_and_a_sure_one_is_finite() -> None:
 
 
 def test_the_nearest_class_goes_round() -> None:
-    phases = torch.tensor([0.0, 2 * math.pi - 0.01, math.pi, -math.pi / 2])
-    assert nearest_class(phases, 4).tolist() == [0, 0, 2, 3]
-    assert nearest_class(torch.tensor([math.nan]), 4).tolist() == [NOT_ASKED]
+    phases = torch.tensor([0.0, 2 * math.pi - 0.01, math.pi, -math.pi / 2, math.nan])
+    assert nearest_class(phases, 4).tolist() == [0, 0, 2, 3, NOT_ASKED]
 
 
 def test_classes_are_judged_by_what_they_say_of_the_data_with_the_piston_known() -> None:
