@@ -3,14 +3,16 @@
 Rays say where light lands, not its phase, which runs hundreds of radians over the page and is left to the network.
 Against a reference beam of the same curvature most of it does not show: what it costs to learn, the third case says.
 
-Courses ask what makes rays find the angle: how long the geometry is held, where it begins, how fast it moves; each from
-several seeds. On a device smaller than the authors' the same angle moves the picture by fewer pixels, and by less than
-a symbol a network need not care. So for courses angle, cameras' poses and rates are as many times larger.
+Courses ask what makes rays find the angle: how long the geometry is held, where it begins, how fast it moves, how large
+symbols are; each from several seeds. On a device smaller than the authors' the same angle moves the picture by fewer
+pixels, and by less than a symbol a network need not care. So for courses angle, cameras' poses and rates are as many
+times larger.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -30,16 +32,34 @@ _LOCKED = 0.3
 """Training AIR, bits a symbol, from which a decoder counts as locked; `none` comes to it too, if later, by heart."""
 
 
-_COURSES: dict[str, dict[str, Any]] = {
-    "authors": {},
-    "held": {"held_share": 0.3},
-    "from-profile": {"start": PROFILE},
-    "held-from-profile": {"held_share": 0.3, "start": PROFILE},
-    "slow-angle": {"angle_rate": PublishedChoices.angle_rate / 4},
-    "fast-angle": {"angle_rate": 4 * PublishedChoices.angle_rate},
-    "slow-affine": {"affine_rate": PublishedChoices.affine_rate / 4},
+@dataclass(frozen=True)
+class _Course:
+    """A course of the geometry in training.
+
+    Attributes:
+        changes: changes of the authors' choices.
+        begins: angle at the beginning, over the true one.
+        symbol_px: side of a symbol, modulator pixels; the profile's if left out.
+    """
+
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    begins: float = 0.0
+    symbol_px: int = 0
+
+
+_COURSES = {
+    "authors": _Course(),
+    "held": _Course({"held_share": 0.3}),
+    "from-profile": _Course({"start": PROFILE}),
+    "held-from-profile": _Course({"held_share": 0.3, "start": PROFILE}),
+    "slow-angle": _Course({"angle_rate": PublishedChoices.angle_rate / 4}),
+    "fast-angle": _Course({"angle_rate": 4 * PublishedChoices.angle_rate}),
+    "slow-affine": _Course({"affine_rate": PublishedChoices.affine_rate / 4}),
+    "near": _Course({"start": PROFILE}, begins=0.8),
+    "midway": _Course({"start": PROFILE}, begins=0.5),
+    "symbols-8": _Course({"start": PROFILE}, symbol_px=8),
+    "symbols-16": _Course({"start": PROFILE}, symbol_px=16),
 }
-"""Courses of the geometry in training, by name: changes of the authors' choices."""
 _SEEDS = 3
 
 
@@ -76,15 +96,19 @@ def _enlarged(settings: Settings, device: Device) -> Device:
 
 
 def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> Result:
-    device, changes = settings.device, dict[str, Any]()
+    profile, device, changes = settings.profile, settings.device, dict[str, Any]()
     if case["matched"]:
-        device = device.with_settings([f"reference.curvature_rad={settings.profile.light_curvature_rad}"])
+        device = device.with_settings([f"reference.curvature_rad={profile.light_curvature_rad}"])
     if "course" in case:
-        device, times = _enlarged(settings, device), _times_smaller(settings)
+        course, times = _COURSES[case["course"]], _times_smaller(settings)
+        device = _enlarged(settings, device)
         rates = {"affine_rate": PublishedChoices.affine_rate, "angle_rate": PublishedChoices.angle_rate}
-        changes = {"seed": case["seed"], **rates, **_COURSES[case["course"]]}
+        changes = {"seed": case["seed"], **rates, **course.changes}
         changes |= {name: times * changes[name] for name in rates}
-    return trained(settings, DataSet(settings.profile, device), case["localizer"], work, progress, **changes)
+        profile = profile.with_symbols_of(course.symbol_px or profile.page.symbol_size_px)
+        pipe = profile.pipe.model_copy(update={"angle_deg": course.begins * case["true_deg"]})
+        profile = profile.model_copy(update={"pipe": pipe})
+    return trained(settings, DataSet(profile, device), case["localizer"], work, progress, **changes)
 
 
 def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:
