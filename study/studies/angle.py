@@ -56,7 +56,7 @@ _COURSES = {
     "fast-angle": _Course({"angle_rate": 4 * PublishedChoices.angle_rate}),
     "slow-affine": _Course({"affine_rate": PublishedChoices.affine_rate / 4}),
     "near": _Course({"start": PROFILE}, begins=0.8),
-    "midway": _Course({"start": PROFILE}, begins=0.5),
+    "held-near": _Course({"held_share": 0.3, "start": PROFILE}, begins=0.8),
     "symbols-8": _Course({"start": PROFILE}, symbol_px=8),
     "symbols-16": _Course({"start": PROFILE}, symbol_px=16),
 }
