@@ -22,7 +22,13 @@ LENS_CHOICES = (PARAXIAL, *LENSES)
 
 
 def make_localizer(
-    name: str, profile: Profile, samples: int, lenses: str = PARAXIAL, quadrature_sign: int = 1
+    name: str,
+    profile: Profile,
+    samples: int,
+    lenses: str = PARAXIAL,
+    quadrature_sign: int = 1,
+    *,
+    page_moves: bool = False,
 ) -> Localizer:
     """A published localizer by name.
 
@@ -32,6 +38,7 @@ def make_localizer(
         samples: samples per symbol and axis.
         lenses: name out of `LENS_CHOICES`, for rays.
         quadrature_sign: sign of the quadrature, for modes, see `ModeLocalizer`.
+        page_moves: see `RayLocalizer`.
 
     Raises:
         InvalidInputError: no such localizer or lens.
@@ -43,7 +50,7 @@ def make_localizer(
     if name == "mode":
         return ModeLocalizer(profile, samples, quadrature_sign)
     if name == "ray":
-        return RayLocalizer(profile, samples, LENSES.get(lenses))
+        return RayLocalizer(profile, samples, LENSES.get(lenses), page_moves=page_moves)
     raise InvalidInputError("published localizer", repr(name), f"one of {', '.join(NAMES)}")
 
 

@@ -12,7 +12,7 @@ from torch.autograd import forward_ad
 from lightpage.device.lenses import LensPrescription
 from lightpage.device.profile import Profile
 from lightpage.train.models.parts import adjoint, matmul, multiply, parts, stacked
-from lightpage.train.published.rays import RayTracer
+from lightpage.train.published.rays import RayTracer, Traced
 from lightpage.waves.geometry import WaveGeometry, cells_for, mode_detuning
 from lightpage.waves.lens import modes_of_plane
 
@@ -122,18 +122,37 @@ class ModeLocalizer(Localizer):
         return torch.stack(matmul(matmul(adjoint(y), modes), adjoint(x)), dim=1)
 
 
+class PageAffine(nn.Module):
+    """A trainable affine of the page against the pipe, in page half extents; nothing moves at first.
+
+    Walls turn the page's image over, so no affine of a camera stands for a page beside the pipe's axis.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.matrix = nn.Parameter(torch.eye(2))
+        self.offset = nn.Parameter(torch.zeros(2))
+
+    def forward(self, places: Tensor) -> Tensor:
+        """Return where places [h, w, 2] of the page stand."""
+        return torch.einsum("ij,hwj->hwi", self.matrix, places) + self.offset
+
+
 class _Landed(NamedTuple):
     """Places of the samples' rays about one angle of the pipe.
 
     Attributes:
         angle: the angle, radians.
+        entered: places on the page, in its half extents, [h, w, 2] float32.
         places: places on the camera plane in page half extents, [h, w, 2] float32; a lost ray's is off every camera.
-        slopes: their change with the angle, 1/rad, [h, w, 2] float32.
+        slopes: their change with the angle, 1/rad, and with the place on the page along x and y where that is trained,
+            [h, w, 2] float32.
     """
 
     angle: float
+    entered: Tensor
     places: Tensor
-    slopes: Tensor
+    slopes: list[Tensor]
 
 
 class RayLocalizer(Localizer):
@@ -141,40 +160,63 @@ class RayLocalizer(Localizer):
 
     Affine of each camera and the pipe's angle are trained; the sampling grid is a constant once they are. A trace takes
     ten times as long as the rest of a step on a GPU, so rays are traced where the angle has moved by more than
-    `TRACED_ANEW_RAD`, and at every other angle where nothing is trained.
+    `TRACED_ANEW_RAD`, or the page by more than a sample, and at every other angle and place where nothing is trained.
 
     Args:
         profile: the nominal device.
         samples: samples per symbol and axis.
         lens: prescription of both lenses; ideal ones if left out.
+        page_moves: whether an affine of the page is trained too, not the authors'.
     """
 
-    def __init__(self, profile: Profile, samples: int, lens: LensPrescription | None = None) -> None:
+    def __init__(
+        self, profile: Profile, samples: int, lens: LensPrescription | None = None, *, page_moves: bool = False
+    ) -> None:
         super().__init__(profile, samples)
         self.tracer = RayTracer(profile, lens)
         self.angle = nn.Parameter(torch.tensor(np.deg2rad(profile.pipe.angle_deg), dtype=torch.float32))
+        self.page = PageAffine() if page_moves else None
         self._half = (profile.page_width_m / 2, profile.page_height_m / 2)
         self._landed: _Landed | None = None
 
     def grid(self) -> Tensor:
         """Return the places of the samples in both frames; a ray that the pipe loses lies outside them."""
+        entered = self.places.float() if self.page is None else self.page(self.places.float())
         angle, known = float(self.angle.detach()), self._landed
-        stale = TRACED_ANEW_RAD if self.training else 0.0
-        if known is None or known.places.device != self.places.device or not abs(angle - known.angle) <= stale:
-            known = self._landed = self._trace(angle)
-        landed = known.places + (self.angle - known.angle) * known.slopes
+        if known is None or known.places.device != self.places.device or self._stale(known, angle, entered.detach()):
+            known = self._landed = self._trace(angle, entered.detach())
+        landed = known.places + (self.angle - known.angle) * known.slopes[0]
+        for axis, slope in enumerate(known.slopes[1:]):
+            landed = landed + (entered - known.entered)[..., axis, None] * slope
         return torch.as_tensor(self.registration(landed))
+
+    def _stale(self, known: _Landed, angle: float, entered: Tensor) -> bool:
+        """Whether rays are to be traced anew; not a number is."""
+        angle_rad, place = (TRACED_ANEW_RAD, 2 / max(self.places.shape)) if self.training else (0.0, 0.0)
+        moved = 0.0 if self.page is None else float((entered - known.entered).abs().max())
+        return not (abs(angle - known.angle) <= angle_rad and moved <= place)
 
     @torch.inference_mode(mode=False)  # forward derivatives need it off
     @torch.no_grad()
-    def _trace(self, angle: float) -> _Landed:
+    def _trace(self, angle: float, entered: Tensor) -> _Landed:
         half = torch.tensor(self._half, dtype=torch.float64, device=self.places.device)
         at = torch.tensor(angle, dtype=torch.float64, device=self.places.device)
+        points = ((self.places if self.page is None else entered.double()) * half).reshape(-1, 2)
+        moving = [(torch.zeros_like(points), torch.ones_like(at))]
+        if self.page is not None:
+            moving += [(axis.expand_as(points), torch.zeros_like(at)) for axis in torch.diag(half)]
+        found = [self._change(points, at, *tangents) for tangents in moving]
+        (traced, _), shape = found[0], self.places.shape
+        valid = traced.valid[:, None]
+        landed = torch.where(valid, traced.places / half, _FAR).reshape(shape).float()
+        slopes = [torch.where(valid, slope / half, 0.0).reshape(shape).float() for _, slope in found]
+        return _Landed(angle, entered, landed, slopes)
+
+    def _change(self, points: Tensor, angle: Tensor, *tangents: Tensor) -> tuple[Traced, Tensor]:
+        """Rays, and the change of their places along tangents of points and angle."""
         with forward_ad.dual_level():
-            moving: Tensor = forward_ad.make_dual(at, torch.ones_like(at))  # type: ignore[no-untyped-call]
-            traced = self.tracer((self.places * half).reshape(-1, 2), moving)
-            places, slopes = forward_ad.unpack_dual(traced.places)  # type: ignore[no-untyped-call]
-        slopes = torch.zeros_like(places) if slopes is None else slopes  # of a pipe that no ray meets
-        valid, shape = traced.valid[:, None], self.places.shape
-        landed = torch.where(valid, places / half, _FAR).reshape(shape).float()
-        return _Landed(angle, landed, torch.where(valid, slopes / half, 0.0).reshape(shape).float())
+            pairs = zip((points, angle), tangents, strict=True)
+            traced = self.tracer(*(forward_ad.make_dual(*pair) for pair in pairs))  # type: ignore[no-untyped-call]
+            places, slope = forward_ad.unpack_dual(traced.places)  # type: ignore[no-untyped-call]
+        slope = torch.zeros_like(places) if slope is None else slope  # of a pipe that no ray meets
+        return traced._replace(places=places), slope

@@ -145,7 +145,7 @@ def published_decoder(
     """
     sign = 1 if np.sin(quadrature_phase) > 0 else -1
     samples = samples_for(profile.page.symbol_size_px)
-    chosen = make_localizer(localizer, profile, samples, choices.lenses, sign)
+    chosen = make_localizer(localizer, profile, samples, choices.lenses, sign, page_moves=choices.page_moves)
     if choices.start == PROFILE:
         rows, columns = profile.frame_shape
         pixel = profile.image_pixel_m

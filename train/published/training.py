@@ -46,6 +46,7 @@ class PublishedChoices:
         decoder_rate, affine_rate, angle_rate: learning rates of U-Net, registration and pipe angle (radians).
         held_share: share of the steps over which registration and angle stay as they begin, not the authors'.
         start: where registrations begin: `AUTHORS`, or as the profile says, `PROFILE`.
+        page_moves: whether rays train an affine of the page against the pipe too, not the authors'.
         decay: factor on the decoder's learning rate at each of `DECAYS`.
         lenses: name out of `lightpage.train.published.decoder.LENS_CHOICES`.
         seed: seed of initial weights and batches.
@@ -61,6 +62,7 @@ class PublishedChoices:
     angle_rate: float = 1e-4
     held_share: float = 0.0
     start: str = AUTHORS
+    page_moves: bool = False
     decay: float = 0.5
     lenses: str = PARAXIAL
     seed: int = 0
@@ -185,7 +187,8 @@ class PublishedTraining(DecoderTraining[PublishedDecoder]):
         """Adam; all rates warm up, those of the geometry after it was held; the decoder's falls towards the end."""
         choices, localizer = self.choices, self.network.localizer
         angle = [localizer.angle] if isinstance(localizer, RayLocalizer) else []
-        affine = list(localizer.registration.parameters())
+        page = localizer.page if isinstance(localizer, RayLocalizer) else None
+        affine = [*localizer.registration.parameters(), *(page.parameters() if page else ())]
         apart = {id(parameter) for parameter in (*angle, *affine)}
         decoder = [parameter for parameter in self.network.parameters() if id(parameter) not in apart]
         held = choices.held_share * choices.steps
