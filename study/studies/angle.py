@@ -55,6 +55,8 @@ _COURSES = {
     "slow-angle": _Course({"angle_rate": PublishedChoices.angle_rate / 4}),
     "fast-angle": _Course({"angle_rate": 4 * PublishedChoices.angle_rate}),
     "slow-affine": _Course({"affine_rate": PublishedChoices.affine_rate / 4}),
+    "zero": _Course({"start": PROFILE, "angle_rate": 0.0}),
+    "true": _Course({"start": PROFILE, "angle_rate": 0.0}, begins=1.0),
     "near": _Course({"start": PROFILE}, begins=0.8),
     "held-near": _Course({"held_share": 0.3, "start": PROFILE}, begins=0.8),
     "page": _Course({"start": PROFILE, "page_moves": True}),
