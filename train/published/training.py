@@ -25,6 +25,8 @@ from lightpage.train.published.decoder import PARAXIAL, PublishedDecoder
 from lightpage.train.published.localizers import RayLocalizer
 
 AUTHORS, PROFILE = "authors", "profile"
+NOT_AUTHORS = ("held_share", "start", "page_moves")
+"""Choices that the authors have not; by default nothing comes of them."""
 WARM_UP = 0.02
 """Share of the steps over which learning rates rise."""
 DECAYS = (0.8, 0.9)

@@ -11,6 +11,7 @@ from click.testing import CliRunner
 from analysis.comparison import decoders, imperfections, kept_figures
 from analysis.comparison.kept_figures import FOURTH_DIGIT
 from analysis.comparison.kept_weights import moved_bits
+from analysis.comparison.methods.published import begun_with
 from analysis.comparison.outcome import symbols_by_walls
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.document import Calibration
@@ -20,6 +21,8 @@ from lightpage.page.symbols import pilot_mask
 from lightpage.run_files import BEGUN
 from lightpage.simulator.true_optics import true_parameters
 from lightpage.train.fitting.fitted import FITTED_WEIGHTS
+from lightpage.train.published.training import PublishedChoices
+from lightpage.train.runs import FORMAT
 from tests.lightpage.small import small_profile
 
 PROFILE = small_profile()
@@ -75,6 +78,11 @@ def test_the_command_compares_methods_and_says_what_the_device_is(tmp_path: Path
     assert float(line[1]) == pytest.approx(float(line[2]), abs=FOURTH_DIGIT)
     trained, kept = sorted((tmp_path / "figures").rglob(FITTED_WEIGHTS))
     assert trained.read_bytes() != kept.read_bytes()
+
+
+def test_kept_published_weights_are_those_of_the_authors_choices() -> None:
+    kept = Path("analysis/weights/bench/-0.6deg-32e-4px/ray/32-64-11250", BEGUN).read_text()
+    assert json.loads(kept) == {"format": FORMAT, **begun_with(PublishedChoices(seed=5000))}
 
 
 def test_what_is_said_moves_by_the_relative_entropy() -> None:

@@ -124,8 +124,7 @@ def test_what_was_found_is_written_as_json(tmp_path: Path, monkeypatch: pytest.M
     fake_registration(monkeypatch, REGISTERED)
     out, figures = tmp_path / "calibration.toml", tmp_path / "figures.json"
     run(flat_recording(tmp_path / "R.h5", 100), out, "--json", str(figures))
-    data = json.loads(figures.read_text())
-    calibration = load_calibration(out)
+    data, calibration = json.loads(figures.read_text()), load_calibration(out)
     assert data["angle_deg"] == pytest.approx(-0.6)
     assert (data["turn_deg"], data["turn_deviation_deg"]) == pytest.approx((-88, 0.123))
     assert (data["pages_used"], data["coherence_before"], data["coherence_after"]) == (2, 0.02, 0.71)

@@ -34,8 +34,7 @@ def test_a_flat_network_sees_the_neighbours_and_no_further() -> None:
 
 def test_the_filter_depends_on_where_a_beam_leaves_the_pipe() -> None:
     torch.manual_seed(0)
-    modulation = PositionModulation(4)
-    x = torch.randn(1, 4, 1, 3)
+    modulation, x = PositionModulation(4), torch.randn(1, 4, 1, 3)
     positions = torch.tensor([0.2, 0.4, 1.2]).expand(1, 2, 1, 3)
     assert torch.equal(modulation(x, positions), x)  # at the start, everywhere the same
     torch.nn.init.normal_(modulation.outer.weight)
