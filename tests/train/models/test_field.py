@@ -74,8 +74,7 @@ def record(
 
 def registration(shifts_px: tuple[float, float] = SHIFTS_PX) -> np.ndarray:
     """Cameras at their nominal scale, shifted in x."""
-    corner = PROFILE.corner_m
-    powers = monomial_powers()
+    corner, powers = PROFILE.corner_m, monomial_powers()
     cubics = np.zeros((2, 2, len(powers)), np.float32)
     cubics[:, 0, powers.index((1, 0))] = cubics[:, 1, powers.index((0, 1))] = corner / PROFILE.camera.pitch_m
     cubics[:, 0, powers.index((0, 0))] = (PROFILE.camera.columns_px - 1) / 2 + np.array(shifts_px)

@@ -118,8 +118,7 @@ class TestClosedForms:
         profile = small_profile()
         longer = profile.pipe.model_copy(update={"length_m": 7.3 * profile.pipe.length_m})
         profile = profile.model_copy(update={"pipe": longer})
-        points = page_points(profile, 400)
-        twin = TorchTwin(RayTwin(profile))
+        points, twin = page_points(profile, 400), TorchTwin(RayTwin(profile))
         rays = twin.trace(nominal(), points)
         k0, w = 2 * np.pi / profile.light.wavelength_m, profile.pipe.width_m
         nk = profile.pipe.refractive_index * k0
