@@ -58,6 +58,7 @@ def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> 
         "places": traced.places.reshape(*shape, 2).numpy(),
         "valid": traced.valid.reshape(shape).numpy(),
         "reflections": traced.reflections.reshape(*shape, 2).numpy(),
+        "symbol_m": profile.symbol_pitch_m,
         "path_x": tracer.path(along[0], angle).numpy(),
         "path_y": tracer.path(along[1], angle).numpy(),
     }
@@ -82,14 +83,16 @@ def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:
     rows: list[Row] = []
     for case, result in zip(cases, results, strict=True):
         there = result["valid"].ravel()
+        moved = np.linalg.norm(result["places"] - results[0]["places"], axis=-1).ravel()[there] / result["symbol_m"]
         zones, places = (result[name].reshape(-1, 2)[there] for name in ("reflections", "places"))
         step = float(np.ptp(places[:, 0])) / result["places"].shape[1]
         shared = shared_with_others(places, zones, 2 * step)
         for x, y in np.unique(zones, axis=0):
             chosen = (zones == (x, y)).all(1)
             share = float(chosen.sum() / len(there))
-            rows.append((f"{case['angle_deg']:g}", int(x), int(y), share, float(shared[chosen].mean())))
-        rows.append((f"{case['angle_deg']:g}", "lost", "", float(1 - there.mean()), float("nan")))
+            further = float(shared[chosen].mean()), float(np.median(moved[chosen]))
+            rows.append((f"{case['angle_deg']:g}", int(x), int(y), share, *further))
+        rows.append((f"{case['angle_deg']:g}", "lost", "", float(1 - there.mean()), float("nan"), float("nan")))
     return rows
 
 
@@ -121,7 +124,7 @@ STUDY = Study(
     source="figure 4A and 4D",
     cases=_cases,
     measure=_measure,
-    header=("angle", "reflections x", "reflections y", "share of page", "on another zone"),
+    header=("angle", "reflections x", "reflections y", "share of page", "on another zone", "moved, symbols"),
     rows=_rows,
     plot=_plot,
 )
