@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from lightpage.device.profile import Profile
 from lightpage.device.state import Device
 from lightpage.progress import Progress
-from lightpage.simulator.light_bound import bits, sampled
+from lightpage.simulator.light_bound import mean_information, sampled_concentrations
 from lightpage.simulator.simulator import Simulator
 from lightpage.train.data.torch_engine import TorchEngine
 from lightpage.train.published.held_pages import MadePages
@@ -55,6 +55,10 @@ class Lights:
             self._latest = key, MadePages.of(simulator, count, progress)
         return self._latest[1]
 
+    def release(self) -> None:
+        """Give the memory of the pages back."""
+        self._latest = None
+
     def bound(self, data_set: DataSet, pages: int, symbols: int, seed: int, progress: Progress) -> tuple[float, float]:
         """Return the bound of a data set's light, over so many symbols of so many pages, and its standard error, bits.
 
@@ -63,6 +67,9 @@ class Lights:
         """
         found, engine = list[float](), TorchEngine(self.compute)
         for page in range(pages):
-            progress("bound", page / pages)
-            found += sampled(data_set.profile, data_set.device, data_set.levels, symbols, (seed, page), engine)
-        return bits(found, data_set.levels, seed)
+            for concentration in sampled_concentrations(
+                data_set.profile, data_set.device, data_set.levels, symbols, (seed, page), engine
+            ):
+                found.append(concentration)
+                progress("bound", len(found) / (pages * symbols))
+        return mean_information(found, data_set.levels, seed)

@@ -41,17 +41,15 @@ def preset_trained(
         settings: settings of the study.
         data_set: device to train on.
         preset: name out of `PRESETS`.
-        pages: pages to train on: the first ones, and where these are not enough some behind those held out.
+        pages: number of pages to train on.
         work: folder of the case.
         progress: told of the steps.
 
     Returns:
         See `lightpage.study.trained.trained`; the angle is the calibration's, and user bytes those of `lightpage code`.
     """
-    (first, validation, unseen), lights = split(settings), settings.lights
-    pages = min(pages, len(first)) if settings.quick else pages
-    end = max(unseen.stop, pages + len(validation) + len(unseen))
-    training = [*first, *range(unseen.stop, end)][:pages]
+    lights, (training, validation, unseen) = settings.lights, split_for(settings, pages)
+    end = max(*training, unseen[-1]) + 1
     path, run, bundle = work / "recording.h5", work / "run", work / "bundle.zip"
     choices = PRESETS[preset].choices
     choices = replace(choices, seed=settings.seed, steps=max(2, round(settings.share * choices.steps)))
@@ -63,6 +61,9 @@ def preset_trained(
         if not path.exists():
             made = lights.of(data_set, end, settings.seed, progress)
             _record(path, data_set, made, [*training, *validation, *unseen])
+            if end > unseen[-1] + 1:
+                del made
+                lights.release()  # published decoders have no use for so many
         with Recording.open(path) as recording:
             progress("calibrate and train", 0.2)
             usable = usable_pages(recording)
@@ -101,6 +102,16 @@ def preset_trained(
         "error_map": found.maps.error_rad,
         **curves_in(run),
     }
+
+
+def split_for(settings: Settings, pages: int) -> tuple[list[int], range, range]:
+    """Numbers of so many pages to train on, and of those to validate with and to judge by, as published ones have them.
+
+    Where those before the held-out ones are not enough, others behind follow.
+    """
+    first, validation, unseen = split(settings)
+    more = range(unseen.stop, unseen.stop + max(0, pages - len(first)))
+    return list(first if settings.quick else [*first, *more][:pages]), validation, unseen
 
 
 def _record(path: Path, data_set: DataSet, made: MadePages, pages: list[int]) -> None:

@@ -21,7 +21,7 @@ from lightpage.study.lights import Lights
 from lightpage.train.published.training import PublishedChoices
 from lightpage.train.runs import load_arrays, save_arrays
 
-RESULTS = 6
+RESULTS = 5
 """Raised when results that were kept by an earlier version do not go together with those of this one."""
 Case = Mapping[str, Any]
 """Values that are varied, by name; `name` tells it from the others and names its files."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +80,7 @@ def trained(
     training, validation, unseen = (HeldPages(made, part) for part in parts)
     choices = chosen(settings, localizer, profile, len(training), **changes)
     mask = pilot_mask(profile)
-    begin(work, asdict(choices) | {"channels": list(choices.channels), "localizer": localizer})
+    begin(work, choices.kept() | {"localizer": localizer})
     processes, tell = Processes(1, compute=lights.compute), _Tell(progress, choices)
     turn = data_set.device.homodyne.turn_rad
     with reporting(None):  # the case's own progress is shown

@@ -25,7 +25,7 @@ from lightpage.errors import InvalidInputError
 from lightpage.metrics.provenance import write_figures
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 from lightpage.progress import track
-from lightpage.simulator.light_bound import bits, sampled
+from lightpage.simulator.light_bound import mean_information, sampled_concentrations
 
 
 def earlier(path: Path, asked: dict[str, object]) -> list[list[float]]:
@@ -86,10 +86,10 @@ def main(
     }
     found = earlier(json_path, asked)
     for page in track(range(len(found), pages), "bound", unit="page"):
-        found.append([*sampled(profile, device, levels, symbols, (seed, page))])
+        found.append([*sampled_concentrations(profile, device, levels, symbols, (seed, page))])
         write_figures(json_path, {"asked": asked, "concentrations": found}, asked=asked)
     each = [one for page in found for one in page]
-    mean, error = bits(each, levels, seed)
+    mean, error = mean_information(each, levels, seed)
     figures = {"bits": mean, "standard_error": error, "concentrations": found}
     write_figures(json_path, {"asked": asked, **figures}, asked=asked)
     click.echo(f"bound {mean:.3f} +- {error:.3f} bits a symbol, {len(each)} symbols")

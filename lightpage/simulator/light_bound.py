@@ -111,17 +111,17 @@ class LightBound:
         return weight
 
 
-def sampled(
+def sampled_concentrations(
     profile: Profile, device: Device, levels: int, symbols: int, seed: tuple[int, int], engine: Engine = NUMPY
 ) -> Iterator[float]:
-    """Yield the concentrations of so many symbols of a page that a seed draws, and with it its number."""
+    """Yield `LightBound.concentration` of symbols of one random page; `seed` is a seed and the page's number."""
     rng = np.random.default_rng(seed)
     bound = LightBound(profile, device, random_symbols(profile, levels, 1, rng)[0], levels, engine)
     for row, column in rng.integers(profile.page_shape, size=(symbols, 2)).tolist():
         yield bound.concentration(row, column)
 
 
-def bits(concentrations: Sequence[float], levels: int, seed: int) -> tuple[float, float]:
+def mean_information(concentrations: Sequence[float], levels: int, seed: int) -> tuple[float, float]:
     """Mean information of posteriors of these concentrations on one of M levels, each at an error that a seed draws.
 
     Returns:

@@ -3,14 +3,15 @@
 Rays say where light lands, not its phase, which runs hundreds of radians over the page and is left to the network.
 Against a reference beam of the same curvature most of it does not show: what it costs to learn, the third case says.
 
-Courses ask what makes rays find the angle: how long the geometry is held, where it begins, how fast it moves, how large
-symbols are; each from several seeds. On a device smaller than the authors' the same angle moves the picture by fewer
-pixels, and by less than a symbol a network need not care. So for courses angle, cameras' poses and rates are as many
-times larger.
+Courses ask what makes rays find the angle: how long the geometry is held, where it begins, how fast it moves, whether
+the page's place is trained too, how large symbols are; each from several seeds. On a device smaller than the authors'
+the same angle moves the picture by fewer pixels, and by less than a symbol a network need not care. So for courses
+angle, cameras' poses and rates are as many times larger.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -65,6 +66,7 @@ _COURSES = {
     "symbols-8": _Course({"start": PROFILE}, symbol_px=8),
     "symbols-16": _Course({"start": PROFILE}, symbol_px=16),
 }
+"""Courses of the geometry in training, by name."""
 _SEEDS = 3
 
 
@@ -110,9 +112,8 @@ def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> 
         rates = {"affine_rate": PublishedChoices.affine_rate, "angle_rate": PublishedChoices.angle_rate}
         changes = {"seed": case["seed"], **rates, **course.changes}
         changes |= {name: times * changes[name] for name in rates}
+        changes["begins_rad"] = math.radians(course.begins * case["true_deg"])
         profile = profile.with_symbols_of(course.symbol_px or profile.page.symbol_size_px)
-        pipe = profile.pipe.model_copy(update={"angle_deg": course.begins * case["true_deg"]})
-        profile = profile.model_copy(update={"pipe": pipe})
     return trained(settings, DataSet(profile, device), case["localizer"], work, progress, **changes)
 
 

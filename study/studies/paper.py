@@ -27,9 +27,9 @@ from lightpage.study.study import Case, Result, Row, Settings, Study, load_resul
 from lightpage.train.models.presets import ACCURATE, STANDARD
 
 _PRESET, _BOUND = "preset", "bound"
-_BOUND_OF = (4, 100)
+_BOUND_OF = {"pages": 4, "symbols": 100}
 """Pages, and symbols of each: the bound is then known to some thousandths of a bit."""
-_QUICK_BOUND_OF = (1, 3)
+_QUICK_BOUND_OF = {"pages": 1, "symbols": 3}
 _MORE_PAGES = (450, 1000, 2000)
 """Pages that `accurate` is trained on in pieces by name: what more of them bring."""
 _LEARNING = {"symbol-size": symbol_size.STUDY, "angle": angle.STUDY, "pipe-length": pipe_length.STUDY}
@@ -65,7 +65,8 @@ def _cases(settings: Settings) -> list[Case]:
         return [_piece("beside figure 3", _PRESET, case) for case in chosen] + bound(size)
 
     def bound(size: int) -> list[Case]:
-        return [_piece("beside figure 3", _BOUND, {"name": f"bound-{size}x{size}", "size": size})]
+        count = _QUICK_BOUND_OF if settings.quick else _BOUND_OF
+        return [_piece("beside figure 3", _BOUND, {"name": f"bound-{size}x{size}", "size": size, **count})]
 
     pieces = [*published(4), *ours(4)]
     if not settings.quick:
@@ -78,7 +79,7 @@ def _cases(settings: Settings) -> list[Case]:
     pieces += [_piece("figure 5", "pipe-length", case) for case in cases["pipe-length"].values()]
     pieces += [_piece(study.source, name, {"name": name}) for name, study in _WHOLE.items() if name != "rays"]
     for pages in _MORE_PAGES:
-        case = {"name": f"accurate-{pages}-pages", "preset": ACCURATE, "size": 4, "pages": pages}
+        case = {"name": f"pages-{pages}", "preset": ACCURATE, "size": 4, "pages": pages}
         pieces.append({**_piece("beyond", _PRESET, case), "by_name": True})
     return pieces
 
@@ -93,8 +94,7 @@ def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> 
         data_set = DataSet(settings.profile.with_symbols_of(inner["size"]), settings.device)
         if name == _PRESET:
             return preset_trained(settings, data_set, inner["preset"], inner["pages"], work, progress)
-        count = _QUICK_BOUND_OF if settings.quick else _BOUND_OF
-        mean, error = settings.lights.bound(data_set, *count, settings.seed, progress)
+        mean, error = settings.lights.bound(data_set, inner["pages"], inner["symbols"], settings.seed, progress)
         return {"air": mean, "standard_error": error}
     if name in _LEARNING:
         result = _LEARNING[name].measure(settings, inner, work, progress)

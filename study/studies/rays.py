@@ -81,16 +81,19 @@ def shared_with_others(places: NDArray[np.float64], zones: NDArray[np.int64], ce
 
 def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:
     rows: list[Row] = []
+    (straight,) = (result for case, result in zip(cases, results, strict=True) if not case["angle_deg"])
     for case, result in zip(cases, results, strict=True):
         there = result["valid"].ravel()
-        moved = np.linalg.norm(result["places"] - results[0]["places"], axis=-1).ravel()[there] / result["symbol_m"]
+        apart = np.linalg.norm(result["places"] - straight["places"], axis=-1)
+        # results that were kept before know no symbols
+        moved = np.where(straight["valid"], apart, np.nan).ravel()[there] / result.get("symbol_m", np.nan)
         zones, places = (result[name].reshape(-1, 2)[there] for name in ("reflections", "places"))
         step = float(np.ptp(places[:, 0])) / result["places"].shape[1]
         shared = shared_with_others(places, zones, 2 * step)
         for x, y in np.unique(zones, axis=0):
             chosen = (zones == (x, y)).all(1)
             share = float(chosen.sum() / len(there))
-            further = float(shared[chosen].mean()), float(np.median(moved[chosen]))
+            further = float(shared[chosen].mean()), float(np.nanmedian(moved[chosen]))
             rows.append((f"{case['angle_deg']:g}", int(x), int(y), share, *further))
         rows.append((f"{case['angle_deg']:g}", "lost", "", float(1 - there.mean()), float("nan"), float("nan")))
     return rows

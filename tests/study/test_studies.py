@@ -16,8 +16,9 @@ from lightpage.errors import InvalidInputError, MissingResultsError, ProfileErro
 from lightpage.study import STUDIES, angle, cross_section, pipe_length, scaling, tolerances
 from lightpage.study.command import study
 from lightpage.study.knobs import KNOBS
+from lightpage.study.ours import split_for
 from lightpage.study.study import Settings, measured
-from lightpage.study.trained import chosen
+from lightpage.study.trained import chosen, split
 from lightpage.train.published.training import PublishedChoices
 from tests.lightpage.small import small_profile
 
@@ -123,6 +124,23 @@ def test_the_paper_is_done_in_the_order_of_worth() -> None:
     worth = "mode-4x4 ray-4x4 standard-4x4 accurate-4x4 bound-4x4 ray-2x2 rays ray-16x16 mode-75mm drift"
     assert " ".join(name for name in names if name in worth.split()) == worth
     assert len(set(names)) == len(names)
+
+
+def test_more_pages_leave_the_same_ones_held_out() -> None:
+    for pages in (148, 450, 1000):
+        training, *held = split_for(Settings(SMALL), pages)
+        assert len({*training} - {*held[0], *held[1]}) == len(training) == pages
+        assert tuple(held) == split(Settings(SMALL))[1:]
+
+
+def test_a_course_of_a_small_device_has_the_pixels_of_the_full_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(angle, "trained", lambda *given, **changes: (given[1], changes))
+    small, names = Settings(SMALL), ["near-flat-1", "symbols-16-matched-0"]
+    near, large = (angle.STUDY.measure(small, case, Path(), print) for case in angle.STUDY.chosen(small, names, Path()))
+    assert near[0].device.geometry.pipe_angle_deg == pytest.approx(-4.8, rel=1e-3)
+    assert near[1]["begins_rad"] == pytest.approx(0.8 * np.deg2rad(-4.8), rel=1e-3)
+    assert (near[1]["seed"], near[1]["angle_rate"]) == (1, pytest.approx(8e-4, rel=1e-3))
+    assert large[0].profile.page.symbol_size_px == 16
 
 
 def test_enlarged_and_shortened_devices_have_the_zones_of_the_full_one() -> None:

@@ -83,7 +83,7 @@ class FeatureExtractor:
 
     Attributes:
         device, compute: see above.
-        recovery: field recovery, on the CPU.
+        recovery, recovery_there: field recovery on the CPU, and where fields are computed.
     """
 
     def __init__(
@@ -102,7 +102,8 @@ class FeatureExtractor:
         self.table: SamplingTable = sampling_table(self._twin, parameters, device.quadrature_phase_rad, profile)
         self._apart = {name: self.table[name] for name in device.apart_inputs}
         self.recovery = choices.field_recovery(profile, with_signal_power=with_signal_power)
-        self._solve = TorchFieldSolver(on_device(self.recovery, compute))
+        self.recovery_there = on_device(self.recovery, compute)
+        self._solve = TorchFieldSolver(self.recovery_there)
         self._coherent = choices.coherent_localizer(profile).to(compute)
         self._wave = WaveLocalizer(profile, parameters, self.grid).to(compute) if localizer == "wave" else None
         shares = branch_shares(self.table["positions"].reshape(2, -1).T.astype(float))
@@ -124,7 +125,7 @@ class FeatureExtractor:
     ) -> tuple[Measured, Tensor]:
         """Return the equations and the field of a page whose image has moved by (x, y), on the calibrated grid.
 
-        They are where the recovery is: its own on the CPU, or a copy.
+        They are computed on the CPU, or where another of the extractor's recoveries is.
         """
         recovery = recovery or self.recovery
         device = next(recovery.buffers()).device
@@ -225,7 +226,7 @@ class FeatureExtractor:
 
 
 def on_device(module: M, device: torch.device) -> M:
-    """The module on the CPU, where it is; elsewhere a copy of it."""
+    """Return the module itself for the CPU, on which it must be, or a copy on another device."""
     return module if device == CPU else deepcopy(module).to(device)
 
 

@@ -22,6 +22,8 @@ NAMES = ("none", "mode", "ray")
 TRACED_ANEW_RAD = 1e-3
 """Change of the pipe's angle in training after which rays are traced anew. Until then their places are linear in it: at
 full size they err by 0.01 camera pixel at most, but for one ray in two thousand, which meets other walls."""
+TRACED_ANEW_SAMPLES = 1.0
+"""The same for places on the page, where they are trained: rays at the edge of a zone meet other walls."""
 _FAR = 10.0
 """Place in page half extents: off every camera, where samples are zero."""
 
@@ -143,7 +145,7 @@ class _Landed(NamedTuple):
 
     Attributes:
         angle: the angle, radians.
-        entered: places on the page, in its half extents, [h, w, 2] float32.
+        entered: places on the page, in its half extents, [h, w, 2].
         places: places on the camera plane in page half extents, [h, w, 2] float32; a lost ray's is off every camera.
         slopes: their change with the angle, 1/rad, and with the place on the page along x and y where that is trained,
             [h, w, 2] float32.
@@ -181,7 +183,7 @@ class RayLocalizer(Localizer):
 
     def grid(self) -> Tensor:
         """Return the places of the samples in both frames; a ray that the pipe loses lies outside them."""
-        entered = self.places.float() if self.page is None else self.page(self.places.float())
+        entered = self.places if self.page is None else self.page(self.places.float())
         angle, known = float(self.angle.detach()), self._landed
         if known is None or known.places.device != self.places.device or self._stale(known, angle, entered.detach()):
             known = self._landed = self._trace(angle, entered.detach())
@@ -191,32 +193,39 @@ class RayLocalizer(Localizer):
         return torch.as_tensor(self.registration(landed))
 
     def _stale(self, known: _Landed, angle: float, entered: Tensor) -> bool:
-        """Whether rays are to be traced anew; not a number is."""
-        angle_rad, place = (TRACED_ANEW_RAD, 2 / max(self.places.shape)) if self.training else (0.0, 0.0)
+        """Whether rays are to be traced anew; also where a value is NaN."""
+        sample = 2 / max(self.places.shape)  # in page half extents
+        angle_rad, samples = (TRACED_ANEW_RAD, TRACED_ANEW_SAMPLES) if self.training else (0.0, 0.0)
         moved = 0.0 if self.page is None else float((entered - known.entered).abs().max())
-        return not (abs(angle - known.angle) <= angle_rad and moved <= place)
+        return not (abs(angle - known.angle) <= angle_rad and moved <= samples * sample)
 
     @torch.inference_mode(mode=False)  # forward derivatives need it off
     @torch.no_grad()
     def _trace(self, angle: float, entered: Tensor) -> _Landed:
         half = torch.tensor(self._half, dtype=torch.float64, device=self.places.device)
         at = torch.tensor(angle, dtype=torch.float64, device=self.places.device)
-        points = ((self.places if self.page is None else entered.double()) * half).reshape(-1, 2)
-        moving = [(torch.zeros_like(points), torch.ones_like(at))]
+        points = (entered.double() * half).reshape(-1, 2)
+        tangents: list[tuple[Tensor | None, Tensor | None]] = [(None, torch.ones_like(at))]
         if self.page is not None:
-            moving += [(axis.expand_as(points), torch.zeros_like(at)) for axis in torch.diag(half)]
-        found = [self._change(points, at, *tangents) for tangents in moving]
+            tangents += [(axis.expand_as(points), None) for axis in torch.diag(half)]
+        found = [self._change(points, at, *along) for along in tangents]
         (traced, _), shape = found[0], self.places.shape
         valid = traced.valid[:, None]
         landed = torch.where(valid, traced.places / half, _FAR).reshape(shape).float()
         slopes = [torch.where(valid, slope / half, 0.0).reshape(shape).float() for _, slope in found]
         return _Landed(angle, entered, landed, slopes)
 
-    def _change(self, points: Tensor, angle: Tensor, *tangents: Tensor) -> tuple[Traced, Tensor]:
-        """Rays, and the change of their places along tangents of points and angle."""
+    def _change(
+        self, points: Tensor, angle: Tensor, along_points: Tensor | None, along_angle: Tensor | None
+    ) -> tuple[Traced, Tensor]:
+        """Rays, and the change of their places along tangents of points and angle; what has none stays."""
         with forward_ad.dual_level():
-            pairs = zip((points, angle), tangents, strict=True)
-            traced = self.tracer(*(forward_ad.make_dual(*pair) for pair in pairs))  # type: ignore[no-untyped-call]
+            traced = self.tracer(_dual(points, along_points), _dual(angle, along_angle))
             places, slope = forward_ad.unpack_dual(traced.places)  # type: ignore[no-untyped-call]
         slope = torch.zeros_like(places) if slope is None else slope  # of a pipe that no ray meets
         return traced._replace(places=places), slope
+
+
+def _dual(value: Tensor, tangent: Tensor | None) -> Tensor:
+    dual: Tensor = value if tangent is None else forward_ad.make_dual(value, tangent)  # type: ignore[no-untyped-call]
+    return dual

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,7 @@ from lightpage.train.fitting.fitted import Fitted
 from lightpage.train.processes import AS_IT_IS, Processes
 from lightpage.train.published.decoder import PARAXIAL, PublishedDecoder, make_localizer
 from lightpage.train.published.held_pages import HeldPages
+from lightpage.train.published.localizers import RayLocalizer
 from lightpage.train.published.states import page_states
 from lightpage.train.published.training import PROFILE, DataPages, FramePages, PublishedChoices, PublishedTraining
 from lightpage.train.published.unet import samples_for
@@ -60,7 +61,7 @@ class PublishedTrainer:
 
     def options(self) -> dict[str, object]:
         """Everything that a run must go on with, under the names of the command line where it has one."""
-        chosen = {_OPTIONS.get(name, name): value for name, value in asdict(self.choices).items()}
+        chosen = {_OPTIONS.get(name, name): value for name, value in self.choices.kept().items()}
         return {"--localizer": self.localizer, **chosen, "--channels": self.choices.channels[0]}
 
     def train(self, inputs: TrainingInputs) -> Trained:
@@ -146,6 +147,8 @@ def published_decoder(
     sign = 1 if np.sin(quadrature_phase) > 0 else -1
     samples = samples_for(profile.page.symbol_size_px)
     chosen = make_localizer(localizer, profile, samples, choices.lenses, sign, page_moves=choices.page_moves)
+    if isinstance(chosen, RayLocalizer):
+        chosen.angle.data += choices.begins_rad
     if choices.start == PROFILE:
         rows, columns = profile.frame_shape
         pixel = profile.image_pixel_m

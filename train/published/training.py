@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -25,8 +25,6 @@ from lightpage.train.published.decoder import PARAXIAL, PublishedDecoder
 from lightpage.train.published.localizers import RayLocalizer
 
 AUTHORS, PROFILE = "authors", "profile"
-NOT_AUTHORS = ("held_share", "start", "page_moves")
-"""Choices that the authors have not; by default nothing comes of them."""
 WARM_UP = 0.02
 """Share of the steps over which learning rates rise."""
 DECAYS = (0.8, 0.9)
@@ -48,6 +46,7 @@ class PublishedChoices:
         decoder_rate, affine_rate, angle_rate: learning rates of U-Net, registration and pipe angle (radians).
         held_share: share of the steps over which registration and angle stay as they begin, not the authors'.
         start: where registrations begin: `AUTHORS`, or as the profile says, `PROFILE`.
+        begins_rad: angle at the beginning, beyond the profile's, not the authors'.
         page_moves: whether rays train an affine of the page against the pipe too, not the authors'.
         decay: factor on the decoder's learning rate at each of `DECAYS`.
         lenses: name out of `lightpage.train.published.decoder.LENS_CHOICES`.
@@ -64,12 +63,22 @@ class PublishedChoices:
     angle_rate: float = 1e-4
     held_share: float = 0.0
     start: str = AUTHORS
+    begins_rad: float = 0.0
     page_moves: bool = False
     decay: float = 0.5
     lenses: str = PARAXIAL
     seed: int = 0
     precision: str = "auto"
     classes: int = 0
+
+    def kept(self) -> dict[str, Any]:
+        """Return the choices as a run keeps them: those that are not the authors' only where they say something.
+
+        Runs that were begun before these were there are then gone on with.
+        """
+        usual = {name: getattr(PublishedChoices, name) for name in ("held_share", "start", "begins_rad", "page_moves")}
+        chosen = asdict(self) | {"channels": list(self.channels)}
+        return {name: value for name, value in chosen.items() if name not in usual or value != usual[name]}
 
 
 class FramePages(Dataset[Page]):

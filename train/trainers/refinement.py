@@ -162,13 +162,12 @@ def refined_pages(
         start: first page.
         shift_px: not asked for: the pass before has found each page's.
     """
-    there = extractor.compute
-    recovery, network = on_device(extractor.recovery, there), on_device(module.network, there)
-    prediction = on_device(prediction, there)
+    there, recovery = extractor.compute, extractor.recovery_there
+    prediction, network = on_device(prediction, there), on_device(module.network, there)
     for number in range(start, len(inputs.pages)):
         *shown, phases = earlier[number]
         state, pair = earlier.state(number), inputs.recording.frames(inputs.pages[number])
-        exact = torch.backends.cudnn.flags(enabled=True, allow_tf32=False)  # 10 bits would be seen
+        exact = torch.backends.cudnn.flags(enabled=True, allow_tf32=False)  # its 10 bits would be seen
         with torch.no_grad(), exact:
             light, *others = (part[None].to(there) for part in shown)
             estimate = network(light.float(), *others)[0]

@@ -2,23 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
-from typing import Any
-
 from analysis.comparison.methods.bench import Bench
 from analysis.comparison.methods.judgement import judged
 from analysis.comparison.outcome import Outcome
 from lightpage.train.processes import ONE
 from lightpage.train.published.states import page_states
 from lightpage.train.published.trainer import train_published
-from lightpage.train.published.training import NOT_AUTHORS, FramePages, PublishedChoices
-
-
-def begun_with(choices: PublishedChoices) -> dict[str, Any]:
-    """Choices as a run keeps them, but for those that its authors have not: kept runs know none of these."""
-    usual = {name: getattr(PublishedChoices, name) for name in NOT_AUTHORS}
-    chosen = asdict(choices) | {"channels": list(choices.channels)}
-    return {name: value for name, value in chosen.items() if name not in usual or value != usual[name]}
+from lightpage.train.published.training import FramePages, PublishedChoices
 
 
 def published_method(bench: Bench, name: str, choices: PublishedChoices) -> Outcome:
@@ -32,7 +22,7 @@ def published_method(bench: Bench, name: str, choices: PublishedChoices) -> Outc
         for part in (bench.training, bench.validation, bench.unseen)
     )
     size = "/".join(map(str, choices.channels))
-    folder = bench.begun(bench.out / name / f"{size.replace('/', '-')}-{choices.steps}", begun_with(choices))
+    folder = bench.begun(bench.out / name / f"{size.replace('/', '-')}-{choices.steps}", choices.kept())
     phase = bench.fitted.turn_rad
     trained = train_published(
         folder, name, choices, bench.profile, phase, bench.mask, training, validation, processes=ONE

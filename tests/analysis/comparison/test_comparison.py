@@ -11,7 +11,6 @@ from click.testing import CliRunner
 from analysis.comparison import decoders, imperfections, kept_figures
 from analysis.comparison.kept_figures import FOURTH_DIGIT
 from analysis.comparison.kept_weights import moved_bits
-from analysis.comparison.methods.published import begun_with
 from analysis.comparison.outcome import symbols_by_walls
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.document import Calibration
@@ -82,7 +81,7 @@ def test_the_command_compares_methods_and_says_what_the_device_is(tmp_path: Path
 
 def test_kept_published_weights_are_those_of_the_authors_choices() -> None:
     kept = Path("analysis/weights/bench/-0.6deg-32e-4px/ray/32-64-11250", BEGUN).read_text()
-    assert json.loads(kept) == {"format": FORMAT, **begun_with(PublishedChoices(seed=5000))}
+    assert json.loads(kept) == {"format": FORMAT, **PublishedChoices(seed=5000).kept()}
 
 
 def test_what_is_said_moves_by_the_relative_entropy() -> None:

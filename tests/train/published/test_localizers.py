@@ -166,8 +166,9 @@ def test_rays_traced_now_and_then_land_as_those_of_each_step(training: bool, pag
     pixel, sample = 2 / max(small_profile().frame_shape), 2 / max(rays.places.shape)
     for share, off_px in ((0.9, 0.02 if training else 0.0), (1.1, 0.0)):
         for localizer in (rays, anew):
-            localizer.angle.data.fill_(share * TRACED_ANEW_RAD)
-            if localizer.page is not None:
+            if localizer.page is None:
+                localizer.angle.data.fill_(share * TRACED_ANEW_RAD)
+            else:
                 localizer.page.offset.data.fill_(share * sample)
         apart = (rays.grid() - anew.grid()).detach().abs().amax(-1) / pixel
         assert float(apart.median()) <= off_px + 1e-3
@@ -190,7 +191,7 @@ def test_walls_turn_a_page_beside_the_axis_over_and_rays_follow_it_where_its_pla
     points = rays.places.numpy().reshape(-1, 2) * half
     true = twin.trace(true_parameters(profile, device), points).places.reshape(-1, *profile.page_shape, 2) / half
     shift_px = device.geometry.page_shift_x_px, device.geometry.page_shift_y_px
-    offset = torch.tensor(shift_px) * profile.slm.pitch_m / half
+    offset = torch.from_numpy(np.array(shift_px) * profile.slm.pitch_m / half)
 
     def followed() -> float:
         """Share of the symbols whose ray lands within a quarter of a symbol of a branch of the twin's."""
