@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -153,7 +154,8 @@ def written(
 
 
 def _names(cases: Sequence[Case]) -> str:
-    return "one of " + ", ".join(dict.fromkeys(str(case["name"]).partition("=")[0] for case in cases))
+    """Beginnings of the cases' names, without values and seeds."""
+    return "one of " + ", ".join(dict.fromkeys(re.sub(r"=.*|-\d+$", "", str(case["name"])) for case in cases))
 
 
 def aligned(header: Row, rows: Sequence[Row]) -> str:

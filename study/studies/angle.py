@@ -59,11 +59,8 @@ _COURSES = {
     "zero": _Course({"start": PROFILE, "angle_rate": 0.0}),
     "true": _Course({"start": PROFILE, "angle_rate": 0.0}, begins=1.0),
     "near": _Course({"start": PROFILE}, begins=0.8),
-    "held-near": _Course({"held_share": 0.3, "start": PROFILE}, begins=0.8),
     "page": _Course({"start": PROFILE, "page_moves": True}),
     "page-near": _Course({"start": PROFILE, "page_moves": True}, begins=0.8),
-    "held-page-near": _Course({"held_share": 0.3, "start": PROFILE, "page_moves": True}, begins=0.8),
-    "symbols-8": _Course({"start": PROFILE}, symbol_px=8),
     "symbols-16": _Course({"start": PROFILE}, symbol_px=16),
 }
 """Courses of the geometry in training, by name."""

@@ -193,7 +193,7 @@ class RayLocalizer(Localizer):
         return torch.as_tensor(self.registration(landed))
 
     def _stale(self, known: _Landed, angle: float, entered: Tensor) -> bool:
-        """Whether rays are to be traced anew; also where a value is NaN."""
+        """Return whether rays are to be traced anew, as they are too where a value is NaN."""
         sample = 2 / max(self.places.shape)  # in page half extents
         angle_rad, samples = (TRACED_ANEW_RAD, TRACED_ANEW_SAMPLES) if self.training else (0.0, 0.0)
         moved = 0.0 if self.page is None else float((entered - known.entered).abs().max())
