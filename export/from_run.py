@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-import re
-import shutil
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
-from lightpage.errors import BundleError, InvalidInputError
+from lightpage.errors import InvalidInputError
 from lightpage.export.batched import files_for_batches
 from lightpage.export.graph import FRAME_INPUTS, DecoderGraph, FieldGraph
 from lightpage.export.half import LARGEST_DEVIATION, check_deviation, in_half, rounded
 from lightpage.export.onnx_files import decoder_onnx, field_onnx, twin_onnx
 from lightpage.export.parity import check_parity
+from lightpage.export.proof import check_new, proven, version_of
 from lightpage.export.run_graph import golden_of, graph_of
-from lightpage.progress import Progress, note, warn
+from lightpage.progress import Progress, note
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import narrow
-from lightpage.recording.reader import Recording
-from lightpage.runtime.archives.recordings.coded_pages import choose_code
-from lightpage.runtime.archives.recordings.evaluation import check_recording
 from lightpage.runtime.model.bundle.bundle import Bundle, npz, write_bundle
 from lightpage.runtime.model.bundle.manifest import (
     DECODER,
@@ -34,13 +30,9 @@ from lightpage.runtime.model.bundle.manifest import (
     Manifest,
     Precision,
     Provenance,
-    check_version,
-    sha256,
 )
-from lightpage.runtime.model.decoding.batch_graph import with_proven_batches
-from lightpage.runtime.model.decoding.decoder import PAGE_INPUTS, Decoder
+from lightpage.runtime.model.decoding.decoder import PAGE_INPUTS
 from lightpage.runtime.model.decoding.golden import GOLDEN_TOLERANCE
-from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.execution.session import open_session
 from lightpage.train.models.twin import RayTwin
 from lightpage.train.published.training import PublishedChoices
@@ -82,10 +74,7 @@ def export_run(
         RecordingError: the recording is of another device.
         BundleError: `version` is none, or the exported decoder does not say what torch says; nothing stays at `out`.
     """
-    if version is not None:
-        check_version(version, "--version")
-    if out.exists():
-        raise BundleError(f"--out {out}", "something that exists", "a new path: bundles are never overwritten")
+    check_new(out, version)
     run = load_run(folder)
     if precision != FLOAT32 and isinstance(run.hyperparameters, PublishedChoices):
         raise InvalidInputError("--precision", f"{precision} for a published decoder", FLOAT32)
@@ -114,7 +103,7 @@ def export_run(
     name, created = name or profile.name, datetime.now(UTC)
     manifest = Manifest(
         name=name,
-        version=version or _version(name, created, decoder),
+        version=version or version_of(name, created, decoder),
         created=created.isoformat(timespec="seconds"),
         profile=run.profile_toml,
         calibration=run.calibration_toml,
@@ -144,51 +133,6 @@ def export_run(
         progress("decoder for many pages to ONNX", 0.7)
         files |= files_for_batches(graph, frame_dtype, defaults)
     progress("load the bundle as the service does", 0.8)
-    manifest, files = _proven(out, manifest, files, recording, progress)
+    manifest, files = proven(out, manifest, files, recording, progress)
     write_bundle(out, manifest, files)
     return Bundle.open(out), error
-
-
-def _proven(
-    out: Path, manifest: Manifest, files: dict[str, bytes], recording: Path | None, progress: Progress
-) -> tuple[Manifest, dict[str, bytes]]:
-    """Load the bundle beside `out` as the service does.
-
-    Returns:
-        its manifest, with a code where a recording chose one, and its files, those for many pages only if they decode.
-
-    Raises:
-        RecordingError: the recording is of another device.
-        BundleError: the decoder does not say what it should.
-    """
-    partial = out.with_name(f".{out.stem}-unproven{out.suffix}")
-    _remove(partial)
-    try:
-        write_bundle(partial, manifest, files)
-        proven = Decoder.load(partial)
-        files = dict(with_proven_batches(proven.bundle, proven.graph).files)
-        if recording is not None:
-            progress("choose the code of user bytes", 0.9)
-            with Recording.open(recording) as pages:
-                check_recording(proven, pages)
-                try:
-                    best, _ = choose_code(proven, pages, tracker_for(proven))
-                    manifest = manifest.model_copy(update={"code": best.code.to_toml()})
-                except InvalidInputError as lacking:
-                    warn(f"no code for user bytes: {lacking}")
-    finally:
-        _remove(partial)
-    return manifest, files
-
-
-def _version(name: str, created: datetime, decoder: bytes) -> str:
-    """A version that no other bundle has: name, time (UTC) and the beginning of the decoder's hash."""
-    plain = re.sub(r"[^A-Za-z0-9_.+-]", "_", name).lstrip("_.+-")[:60] or "bundle"
-    return f"{plain}-{created:%Y%m%dT%H%M%SZ}-{sha256(decoder)[:8]}"
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)

@@ -117,6 +117,7 @@ class Registered:
         goodness: how well all that explains the first page's light; None where that was not measured.
         quadrature_deviation: standard deviation of the angle between the arms, radians; None where it was not fitted.
         coherences: of each page, at the fitted geometry.
+        conditions: illumination and blur of the first page; None where its waves were not fitted.
     """
 
     parameters: Real
@@ -131,6 +132,7 @@ class Registered:
     goodness: Goodness | None = None
     quadrature_deviation: float | None = None
     coherences: tuple[float, ...] = ()
+    conditions: LaunchConditions | None = None
 
 
 @dataclass(frozen=True)
@@ -573,6 +575,7 @@ class _Registration:
             goodness=self._goodness(),
             quadrature_deviation=self.quadrature_deviation,
             coherences=tuple(coherences),
+            conditions=self.conditions,
         )
 
     def _goodness(self) -> Goodness | None:

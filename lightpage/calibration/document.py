@@ -14,6 +14,7 @@ from pydantic import AfterValidator, Field, field_serializer
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.goodness.verdict import USABLE, Goodness
+from lightpage.calibration.likelihood.statistics import Statistics
 from lightpage.calibration.parameters import KNOWN, NAMES, as_dict, as_vector
 from lightpage.device.profile import Count, Finite, Profile, TomlTable, to_toml, validate
 from lightpage.errors import CalibrationError, ProfileError
@@ -39,7 +40,7 @@ _ADDED = {
 independent of those beside them."""
 
 
-_OPTIONAL = ("turn_deviation_rad", "coherence_at_first", "goodness")
+_OPTIONAL = ("turn_deviation_rad", "coherence_at_first", "goodness", "statistics")
 
 
 def _names_problem(values: dict[str, Any], names: tuple[str, ...] = NAMES) -> str:
@@ -81,6 +82,7 @@ class Calibration(TomlTable):
             in documents that do not tell it.
         modulation_deviations: standard deviations of that, same names.
         goodness: how well the fit explains the light; None where that was not measured, as in documents of before.
+        statistics: statistics of the light and of the cameras' counts; None in documents of before.
     """
 
     schema_version: Literal[1] = 1
@@ -99,6 +101,7 @@ class Calibration(TomlTable):
     modulation: Annotated[dict[str, Finite], _just(modulations.NAMES)] = NOMINAL.as_dict()
     modulation_deviations: Annotated[dict[str, NonNegative], _just(modulations.NAMES)] = NOMINAL.as_dict()
     goodness: Goodness | None = None
+    statistics: Statistics | None = None
 
     def __repr__(self) -> str:
         verdict = "" if self.goodness is None else f", a {self.goodness.verdict} fit"
@@ -112,13 +115,16 @@ class Calibration(TomlTable):
         return list(pages)
 
     @classmethod
-    def from_registered(cls, registered: Registered, profile: Profile, hashes: Sequence[str]) -> Self:
+    def from_registered(
+        cls, registered: Registered, profile: Profile, hashes: Sequence[str], statistics: Statistics | None = None
+    ) -> Self:
         """The document of a registration.
 
         Args:
             registered: outcome of the registration.
             profile: the nominal device.
             hashes: SHA-256 of the known pages, one each.
+            statistics: statistics of the light and of the counts, where they were measured.
         """
         return cls(
             profile_name=profile.name,
@@ -135,6 +141,7 @@ class Calibration(TomlTable):
             modulation=registered.modulation.as_dict(),
             modulation_deviations=Modulation(registered.modulation_deviations).as_dict(),
             goodness=registered.goodness,
+            statistics=statistics,
         )
 
     def followed_by(self, fitted: Self) -> Self:

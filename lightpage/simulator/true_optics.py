@@ -123,7 +123,7 @@ class TrueOptics:
             cells=cells_for(self.geometry, page_x, page_y, *sensor),
             steps=self._steps,
             envelope_m=pitch,
-            blur_m=self.device.slm.blur_px * pitch,
+            blur_m2=(self.device.slm.blur_px * pitch) ** 2,
             arrays=self.engine,
         )
 

@@ -28,7 +28,7 @@ from lightpage.waves.lens import FourierLens, entrance_window
 from lightpage.waves.pipe import PipePropagator, real_products
 from lightpage.waves.sinc_interpolation import interpolation, sparse_axis
 
-_SHAPE = ("envelope_m", "blur_m")
+_SHAPE = ("envelope_m", "blur_m2")
 _CAMERAS = ("camera_x_m", "camera_y_m", "steps")
 _PARTS: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
     "launch_lens": ((*_CAMERAS, *_SHAPE), {"pipe_length_m": 1.0, "camera_path": IDEAL}),
@@ -53,7 +53,8 @@ class WaveChannel:
         cells: sample intervals of the pipe along (y', x).
         steps: splitting steps of a sheared pipe (`lightpage.waves.grid.splitting_steps`).
         envelope_m: edge of the SLM pixel, whose sinc is applied on the entrance facet; 0 for point samples.
-        blur_m: standard deviation of the SLM's blur.
+        blur_m2: variance of the SLM's blur, square metres; below zero where it transmits fine detail better than its
+            pixels' shape says.
         arrays: array library of the fields.
 
     Every term of the de-launch lens is a product over the camera plane, so its light is computed on few samples
@@ -68,7 +69,7 @@ class WaveChannel:
     cells: tuple[int, int]
     steps: int
     envelope_m: float = 0.0
-    blur_m: float = 0.0
+    blur_m2: float = 0.0
     arrays: Arrays = NUMPY
 
     def sharing(self, other: WaveChannel) -> WaveChannel:
@@ -122,7 +123,7 @@ class WaveChannel:
     def entrance_window(self) -> Real:
         """Transmission of the SLM's pixel shape and blur at the entrance facet, [cells_y - 1, cells_x - 1]."""
         facet_y, facet_x = map(facet_axis, self.cells, self.geometry.facet_sides_m())
-        window = entrance_window(self.geometry, facet_x, facet_y, self.envelope_m, self.blur_m)
+        window = entrance_window(self.geometry, facet_x, facet_y, self.envelope_m, self.blur_m2)
         entrance: Real = self.arrays.array(np.asarray(window, dtype=np.float32))
         return entrance
 

@@ -38,21 +38,21 @@ def lens_kernel(geometry: WaveGeometry, rows: Real, columns: Real) -> Complex:
 
 
 def entrance_window(
-    geometry: WaveGeometry, facet_x_m: Any, facet_y_m: Any, envelope_m: float, blur_m: float = 0.0, xp: Any = np
+    geometry: WaveGeometry, facet_x_m: Any, facet_y_m: Any, envelope_m: float, blur_m2: Any = 0.0, xp: Any = np
 ) -> Any:
     """Transmission of the SLM's pixel shape and blur at the entrance facet, [fy, fx].
 
     Args:
         geometry: the device.
         facet_x_m, facet_y_m: sample positions along the facet's axes, [fx] and [fy].
-        envelope_m, blur_m: see `WaveChannel`.
+        envelope_m, blur_m2: see `WaveChannel`; the blur may be a tensor.
         xp: see `couplings`.
     """
     per_metre = 1 / (geometry.wavelength_m * geometry.focal_length_m)
     along = on_facet(couplings(geometry, xp), facet_x_m, facet_y_m[:, None])
     fx, fy = (place * per_metre for place in along)
     pixel = xp.sinc(fx * envelope_m) * xp.sinc(fy * envelope_m)
-    return pixel * xp.exp(-2 * (np.pi * blur_m) ** 2 * (fx**2 + fy**2))
+    return pixel * xp.exp(-2 * np.pi**2 * blur_m2 * (fx**2 + fy**2))
 
 
 @dataclass(frozen=True)

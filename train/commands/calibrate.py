@@ -16,6 +16,7 @@ from lightpage.calibration.coherence import seen_share
 from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.calibration.goodness.figure import goodness_figure
 from lightpage.calibration.known_pages import first_lit_pages, known_pages
+from lightpage.calibration.likelihood.measure import measured_statistics
 from lightpage.cli.options import JSON, named_profile, new_file, profile_option
 from lightpage.cli.paths import OutputFile
 from lightpage.cli.progress_bar import percent_bar
@@ -28,6 +29,8 @@ from lightpage.recording.reader import Recording
 from lightpage.train.data.features import CPU
 from lightpage.train.data.torch_engine import torch_device
 from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
+from lightpage.train.models.likelihood.estimator import PhaseEstimator
+from lightpage.train.models.likelihood.torch_likelihood import TorchLikelihood
 from lightpage.train.models.twin import RayTwin, TorchTwin
 
 DEFAULT_PAGES = 2
@@ -133,9 +136,9 @@ def calibrate_recording(
         CalibrationError: nothing within the capture range explains the frames.
     """
     recording.header.check_against(profile)
-    known = known_pages(recording, profile, pages)
+    known, twin = known_pages(recording, profile, pages), TorchTwin(RayTwin(profile))
     registered = register(
-        TorchTwin(RayTwin(profile)),
+        twin,
         TorchFieldSolver(FieldRecovery(profile).to(compute)),
         profile,
         recording.references(),
@@ -143,7 +146,20 @@ def calibrate_recording(
         progress,
         any_orientation=any_orientation,
     )
-    return Calibration.from_registered(registered, profile, [recording.page_hash(page) for page in pages])
+    hashes = [recording.page_hash(page) for page in pages]
+    calibration = Calibration.from_registered(registered, profile, hashes)
+    if registered.conditions is None:
+        return calibration
+    likelihood = TorchLikelihood(PhaseEstimator(profile, registered.parameters).eval())
+    statistics = measured_statistics(
+        likelihood,
+        twin,
+        calibration.device(profile, recording.references()),
+        known,
+        registered.conditions,
+        lambda share: progress("statistics of the counts", share),
+    )
+    return calibration.model_copy(update={"statistics": statistics})
 
 
 def figures(calibration: Calibration, profile: Profile, seconds: float, lost: int) -> dict[str, object]:

@@ -219,11 +219,13 @@ class FieldRecovery(nn.Module):
         seen = self.references(references, registration)
         beyond = self.filtered(self.in_blocks(in_phase, quadrature) - references)
         a, b = seen.lit * sampled(beyond, seen.where) / (2 * seen.reference)
-        cameras = self._apart(*apart) if apart else None
-        return Measured(a, b, homodyne[0], homodyne[1], seen.amplitude, seen.lit, cameras)
+        return Measured(a, b, homodyne[0], homodyne[1], seen.amplitude, seen.lit, self.cameras(*apart))
 
-    def _apart(self, taps: Tensor, *tilted: Tensor) -> Cameras:
-        """Cameras that stand apart, by what `measure` takes."""
+    def cameras(self, *apart: Tensor) -> Cameras | None:
+        """Cameras that stand apart, by what `measure` takes; None where both see the same plane."""
+        if not apart:
+            return None
+        taps, *tilted = apart
         taps = taps @ self.to_taps.T
         if not tilted:
             return CamerasApart.of(taps)

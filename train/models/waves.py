@@ -132,14 +132,19 @@ class Waves(nn.Module):
         self.default: Tensor
         self.register_buffer("default", torch.from_numpy(parameters).to(torch.float32), persistent=False)
 
-    def matrices(self, parameters: Tensor | None = None) -> WaveMatrices:
-        """Return the matrices of both ways for parameters [P]; for those that the model was made with if left out."""
+    def matrices(self, parameters: Tensor | None = None, blur: Tensor | float = 0.0) -> WaveMatrices:
+        """Return the matrices of both ways.
+
+        Args:
+            parameters: [P]; those that the model was made with if left out.
+            blur: variance of the modulator's blur, over the square of its pixels' pitch.
+        """
         value = dict(zip(NAMES, (self.default if parameters is None else parameters).unbind(), strict=True))
         geometry = fitted_geometry(self.profile, value)
         x = self.x_m + value["page_centre_x_m"], self.y_m + value["page_centre_y_m"]
         grid = self.grid_x_m, self.grid_y_m
         facet = self.facet_x * geometry.pipe_width_m, self.facet_y * geometry.pipe_width_m
-        window = entrance_window(geometry, *facet, self.envelope_m, xp=torch)
+        window = entrance_window(geometry, *facet, self.envelope_m, blur * self.profile.slm.pitch_m**2, torch)
         at_launch = fitted_launch_phase(self.profile, value, geometry, self.x_m[None, :], self.y_m[:, None])
         at_camera = fitted_camera_phase(self.profile, value, geometry, grid[0][None, :], grid[1][:, None])
         path, mirrored = geometry.lens_path, geometry.camera_path

@@ -183,7 +183,7 @@ class FittedWaves:
                 cells=cells_for(geometry, *page, float(grid.x_m[-1]), float(grid.y_m[-1])),
                 steps=splitting_steps(profile, accuracy),
                 envelope_m=pitch if filled else 0.0,
-                blur_m=float(np.sqrt(blur)) * profile.slm.pitch_m,
+                blur_m2=blur * profile.slm.pitch_m**2,
             )
             self.channel = own if like is None else own.sharing(like.channel)
         at_launch = fitted_launch_phase(profile, value, geometry, x[None, :], y[:, None])

@@ -20,8 +20,13 @@ PILOTS = "pilots.npz"
 CONSTANTS = "constants.onnx"
 BATCH = "batch.onnx"
 """The decoder for many pages: what follows from the table alone, and frames with that to p; both or neither."""
+OPERATORS = "operators.onnx"
+FIRST = "first.onnx"
+STEP = "step.onnx"
+"""Maximum likelihood in three graphs: wave operators of a table, first estimate, and a step; all of them or none."""
+ESTIMATOR_FILES = (OPERATORS, FIRST, STEP)
 REQUIRED_FILES = frozenset({DECODER, TWIN, GOLDEN})
-OPTIONAL_FILES = frozenset({FIELD, TABLE, PILOTS, CONSTANTS, BATCH})
+OPTIONAL_FILES = frozenset({FIELD, TABLE, PILOTS, CONSTANTS, BATCH, *ESTIMATOR_FILES})
 Precision = Literal["float32", "float16"]
 FLOAT32: Precision = "float32"
 FLOAT16: Precision = "float16"

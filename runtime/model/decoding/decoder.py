@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.calibration.likelihood.table import PILOT_MASK, PILOT_PHASORS, pilot_tensors
 from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.errors import BundleError, FrameError, InvalidInputError, NoCodeError, raised_as
 from lightpage.metrics.information import decide_with_confidence
@@ -20,15 +21,15 @@ from lightpage.page.pilots import Pilots
 from lightpage.recording.exposure import check_light
 from lightpage.recording.frame_pair import FramePair, check_pair
 from lightpage.runtime.model.bundle.bundle import Bundle
-from lightpage.runtime.model.bundle.manifest import DECODER
+from lightpage.runtime.model.bundle.manifest import DECODER, ESTIMATOR_FILES
 from lightpage.runtime.model.decoding.batch_graph import REGISTRATION
 from lightpage.runtime.model.decoding.batches import NO_BATCHES, Batches, Batching, OneByOne
 from lightpage.runtime.model.decoding.camera_view import CameraView
 from lightpage.runtime.model.decoding.field_solver import BundleFieldSolver
 from lightpage.runtime.model.decoding.golden import check_golden
 from lightpage.runtime.model.decoding.page import OUTPUTS, DecodedPage, Inference, Timings, check_residual
+from lightpage.runtime.model.execution.estimator_graph import EstimatorGraph
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
-from lightpage.runtime.model.execution.session import Port
 from lightpage.runtime.model.execution.table_graph import GraphFile, TableGraph
 from lightpage.words import brief
 
@@ -37,19 +38,40 @@ if TYPE_CHECKING:
 
 PAGE_INPUTS = frozenset([REGISTRATION])
 """Table inputs that may differ from page to page, as the image shifts. All others are built into the graph."""
+PILOT_INPUTS = frozenset([PILOT_PHASORS, PILOT_MASK])
+"""Table inputs that are fed with each page where the graph takes them: what is known of its symbols."""
+Graph = TableGraph | EstimatorGraph
+"""Graph of a decoder: one that is run once, or an estimator's."""
 
 
-def open_graph(bundle: Bundle, threads: int | None = None, provider: Provider = ON_CPU) -> TableGraph:
+def open_graph(
+    bundle: Bundle, threads: int | None = None, provider: Provider = ON_CPU, steps: int | None = None
+) -> Graph:
     """The graph of a bundle's decoder with the bundle's table.
+
+    Args:
+        bundle: opened bundle.
+        threads: threads of one run.
+        provider: provider that computes pages.
+        steps: steps of an estimator; None for as many as the bundle has.
 
     Raises:
         BundleError: no ONNX model, or its table is not the one of the manifest, or does not fit.
+        InvalidInputError: `steps` of a bundle that takes none, or more than it has.
         ProviderError: there is no such provider here.
     """
     subject = f"{bundle.subject}: {DECODER}"
     file = GraphFile(bundle.files[DECODER], subject)
     if set(file.table_inputs) != set(bundle.manifest.table_inputs):
         raise BundleError(f"{subject}: table inputs", sorted(file.table_inputs), sorted(bundle.manifest.table_inputs))
+    if bundle.files.keys() >= set(ESTIMATOR_FILES):
+        operators, first, step = (bundle.files[name] for name in ESTIMATOR_FILES)
+        fed = (*PAGE_INPUTS, *PILOT_INPUTS)
+        return EstimatorGraph(
+            (operators, first, step), file, bundle.subject, fed, threads, bundle.table, provider=provider, steps=steps
+        )
+    if steps is not None:
+        raise InvalidInputError(f"{bundle.subject}: steps", steps, "none: its decoder is a network")
     with raised_as(BundleError, InvalidInputError, about=f"{bundle.subject}: "):
         return TableGraph(file, subject, PAGE_INPUTS, threads, bundle.table, provider=provider)
 
@@ -73,6 +95,7 @@ class Decoder:
         code_threads: threads that share the code of a page, where it is compiled.
         batching: how its pages are gathered with those of other callers.
         batches: batches that gather them, where they are open already.
+        steps: steps of an estimator; None for as many as the bundle has.
 
     Raises:
         ProviderError: there is no such provider here.
@@ -84,17 +107,19 @@ class Decoder:
         self,
         bundle: Bundle,
         threads: int | None = None,
-        graph: TableGraph | None = None,
+        graph: Graph | None = None,
         provider: Provider = ON_CPU,
         code_threads: int = 1,
         batching: Batching = NO_BATCHES,
         batches: OneByOne | None = None,
+        steps: int | None = None,
     ) -> None:
         self.bundle, self.threads, self.code_threads = bundle, threads, code_threads
-        self.graph = graph or open_graph(bundle, threads, provider)
+        self.graph = graph or open_graph(bundle, threads, provider, steps)
         self.batches, self._batching = batches or OneByOne(), batching
         residual = bundle.manifest.residual_output
         self._outputs = [*OUTPUTS, *([residual] if residual else [])]
+        self._estimates = isinstance(self.graph, EstimatorGraph)
         self._pilots: dict[int, Pilots] = {}
         if graph is None:
             self._check_graph()
@@ -114,9 +139,13 @@ class Decoder:
         provider: Provider = ON_CPU,
         batching: Batching = NO_BATCHES,
         code_threads: int = 1,
+        steps: int | None = None,
     ) -> Decoder:
         """Open the bundle at `path` and its decoder; raises as `Bundle.open` and the constructor do."""
-        return cls(Bundle.open(path), threads, provider=provider, batching=batching, code_threads=code_threads)
+        bundle = Bundle.open(path)
+        return cls(
+            bundle, threads, provider=provider, batching=batching, code_threads=code_threads, steps=steps
+        )
 
     def of_another(self, bundle: Bundle) -> Decoder:
         """The decoder of another bundle, on the same threads and provider; raises as the constructor does."""
@@ -201,13 +230,21 @@ class Decoder:
             check_light(name, frame, self.bundle.manifest.camera_bit_depth)
 
     def infer(
-        self, pair: FramePair, table: SamplingTable | None = None, *, doubtful: bool = False, alone: bool = False
+        self,
+        pair: FramePair,
+        table: SamplingTable | None = None,
+        pilots: Pilots | None = None,
+        *,
+        doubtful: bool = False,
+        alone: bool = False,
     ) -> Inference:
         """Run the graph on a checked pair, together with other callers' where pages are computed in batches.
 
         Args:
             pair: both frames, as `check` accepts them.
             table: tensors for this page alone, of `PAGE_INPUTS`; all others take `with_table`.
+            pilots: known symbols of the page, those of 256 levels if left out; an estimator takes the piston off by
+                them.
             doubtful: whether frames that contradict the homodyne equations are taken too.
             alone: whether it is computed by itself, as exactly as the golden page says.
 
@@ -223,9 +260,12 @@ class Decoder:
         page = None if alone else self.batches.infer(self.graph, pair, table.get(REGISTRATION))
         if page is None:
             feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **table}
+            if self._estimates and pilots is not None:
+                feeds |= pilot_tensors(pilots)
+            names = [*self._outputs, *(_OF_ESTIMATE if self._estimates else ())]
             with self.batches.alone:
-                p, phase, concentration, *rest = self.graph.run(self._outputs, feeds)
-            page = Inference(p, phase, concentration, float(np.max(rest[0])) if rest else 0.0)
+                found = dict(zip(names, self.graph.run(names, feeds), strict=True))
+            page = _inference(found, self.bundle.manifest.residual_output)
         check_residual(page.residual, self.bundle.manifest.residual_limit, doubtful=doubtful)
         return self.view.seen(page, table.get(REGISTRATION))
 
@@ -291,7 +331,7 @@ class Decoder:
         with self.batches.under_way():
             self.check(pair)
             checked = time.perf_counter()
-            inference = self.infer(pair)
+            inference = self.infer(pair, pilots=pilots or self.pilots(levels))
             inferred = time.perf_counter()
             page = self.post_process(inference, levels, pilots)
         waited, behind = inference.waited_s, time.perf_counter() - inferred
@@ -328,7 +368,7 @@ class Decoder:
             if not port.admits(manifest.frame_dtype, profile.frame_shape):
                 expected = f"{manifest.frame_dtype} {profile.frame_shape}"
                 raise BundleError(f"{subject}: input {name}", f"{port.dtype} {port.shape}", expected)
-        outputs = {node.name: Port.of(node) for node in self.graph.session.get_outputs()}
+        outputs = self.graph.outputs
         shapes = {"p": (2, *profile.page_shape), "phase": profile.page_shape, "concentration": profile.page_shape}
         for name, shape in shapes.items():
             if name not in outputs or not outputs[name].admits("float32", shape):
@@ -345,7 +385,21 @@ class Decoder:
         check_golden(self.bundle, answer, self.bundle.manifest.precision)
 
 
-def _like(decoder: Decoder, bundle: Bundle, graph: TableGraph) -> Decoder:
+_OF_ESTIMATE = ("nuisance", "chi_square")
+"""Further outputs of an estimator."""
+
+
+def _inference(found: dict[str, NDArray[np.float32]], residual: str | None) -> Inference:
+    """The inference of a graph's outputs by name."""
+    page = Inference(*(found[name] for name in OUTPUTS), float(np.max(found[residual])) if residual else 0.0)
+    if "nuisance" not in found:
+        return page
+    tilt, shift = found["nuisance"][2:4], found["nuisance"][4:6]
+    drift = np.concatenate([shift, tilt]).astype(np.float64)
+    return replace(page, drift=drift, chi_square=float(found["chi_square"]))
+
+
+def _like(decoder: Decoder, bundle: Bundle, graph: Graph) -> Decoder:
     """The decoder of the same graphs with another table; whatever is open is shared."""
     codes, batching, batches = decoder.code_threads, decoder._batching, decoder.batches
     return Decoder(bundle, decoder.threads, graph, code_threads=codes, batching=batching, batches=batches)

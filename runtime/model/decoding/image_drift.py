@@ -30,6 +30,7 @@ from lightpage.page.pilots import Pilots, read_pilots
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.page import Inference
+from lightpage.runtime.model.execution.estimator_graph import EstimatorGraph
 
 Real = NDArray[np.float64]
 
@@ -65,6 +66,9 @@ _MOST_OVER_CLAIM = 3.0
 
 _ROUNDS = 3
 
+MEASURED_INFLATION = 4.0
+"""Factor on the covariance of a drift that an estimator measures, for what its diagonal information leaves out."""
+
 
 @dataclass(frozen=True)
 class Estimate:
@@ -98,10 +102,12 @@ class DriftModel:
     Args:
         slopes: change of each symbol's decoded phase with the image's drift, [4, ny, nx], radians a unit of drift;
             or the promise of it.
+        covariance: covariance of the drift that an estimator has measured, [4, 4]; None for a graph that measures none,
+            of which the decoded phases show all drift.
     """
 
-    def __init__(self, slopes: Real | Future[Real]) -> None:
-        self._measured = slopes
+    def __init__(self, slopes: Real | Future[Real], covariance: Real | None = None) -> None:
+        self._measured, self._covariance = slopes, covariance
 
     @property
     def slopes(self) -> Real:
@@ -119,11 +125,32 @@ class DriftModel:
         Raises:
             CalibrationError: the bundle holds no calibration.
         """
+        graph = decoder.graph
+        if isinstance(graph, EstimatorGraph):
+            # relative gain, tilt and shift, to shift and tilt
+            order = [3, 4, 1, 2]
+            covariance = MEASURED_INFLATION * graph.value("nuisance_covariance").astype(np.float64)
+            return cls(graph.value("responses")[order].astype(np.float64), covariance[np.ix_(order, order)])
         parameters = decoder.bundle.calibration.vector
         thread = ThreadPoolExecutor(1, thread_name_prefix="lightpage-drift")
         slopes = thread.submit(drift_slopes, decoder, twin, parameters)
         thread.shutdown(wait=False)
         return cls(slopes)
+
+    def unexplained(self, inference: Inference, untraced: Real) -> tuple[Inference, Real]:
+        """A page freed from the drift that its table does not hold, so far as that is known.
+
+        Args:
+            inference: what the graph says of the page.
+            untraced: known drift that is not in the table, [4].
+
+        Returns:
+            The page with phases that show only what is not known, and the drift that the graph has measured beyond
+            what is known, [4]; zero where it measures none.
+        """
+        if inference.drift is None:
+            return inference.turned(-self.phase_change(untraced)), np.zeros(4)
+        return inference, inference.drift - untraced
 
     def phase_change(self, drift: Real) -> Real:
         """Return what `drift` [4] adds to decoded phases [ny, nx], radians, first order."""
@@ -140,6 +167,7 @@ class DriftModel:
             pilots: its known symbols.
             prior: covariance [4, 4] of the drift about zero before the page was seen.
         """
+        prior = prior if self._covariance is None else self._covariance
         known = np.zeros(pilots.mask.shape)
         known[pilots.mask] = pilots.phases
         taken = np.flatnonzero(pilots.mask | _lattice(pilots.mask.shape))

@@ -260,7 +260,7 @@ class ImageTracker:
                 pilots = pilots or self._decoder.pilots(levels)
                 clock.add("check_s")
                 if self._in_batches:
-                    begun, inference = self._in_turn(turn, pair, clock)
+                    begun, inference = self._in_turn(turn, pair, pilots, clock)
                 best, found, step = self._followed(pair, begun, inference, shown, pilots, clock)
                 learn = partial(self._learn, begun, best, step, searched=found is not None)
                 if self._in_batches:  # the page behind waits for it
@@ -273,7 +273,9 @@ class ImageTracker:
         page = replace(page, check=best.check, image=_position(best.after, found), timings=clock.timings)
         return confirmed(page, found)
 
-    def _in_turn(self, turn: Turn, pair: FramePair, clock: _Clock) -> tuple[ImageState, Inference | None]:
+    def _in_turn(
+        self, turn: Turn, pair: FramePair, pilots: Pilots, clock: _Clock
+    ) -> tuple[ImageState, Inference | None]:
         """The state that the page before has left, and what the graph says of a page by it; nothing before any page.
 
         The graph runs beforehand, and again where a page before it shows that the image is to be looked at elsewhere.
@@ -281,7 +283,7 @@ class ImageTracker:
         while True:
             state, inference = self.state, None
             if state.settled:
-                inference = state.decoder.infer(pair, state.table)
+                inference = state.decoder.infer(pair, state.table, pilots)
                 clock.add("inference_s", inference.waited_s)
             else:
                 state.decoder.batches.put_off()
@@ -344,7 +346,7 @@ class ImageTracker:
         best: _Attempt | None = None
         for _ in range(1 + CORRECTIONS):
             if inference is None:
-                inference = state.decoder.infer(pair, state.table)
+                inference = state.decoder.infer(pair, state.table, pilots)
                 clock.add("inference_s", inference.waited_s)
             attempt = self._read(inference, state, levels, pilots)
             clock.add("decision_s")
@@ -363,12 +365,13 @@ class ImageTracker:
 
     def _read(self, inference: Inference, state: ImageState, levels: Levels, pilots: Pilots) -> _Attempt:
         """Take in what a decoded page shows of drift beyond what its state knows."""
-        known = inference.turned(-self._model.phase_change(state.untraced))
+        known, measured = self._model.unexplained(inference, state.untraced)
         many = len(pilots.phases) >= FEWEST_PILOTS
         step = self._model.estimate(known, levels, pilots, np.diag(WIDEST**2)) if many else None
         unread = _Attempt(state, state, known, read_pilots(known.p, pilots).check, state.covariance)
         if step is None:
             return unread
+        step = replace(step, drift=step.drift + measured)
         shift, error = step.drift[SHIFT], step.deviations[SHIFT]
         significant = bool(np.linalg.norm(shift / error) > SIGNIFICANT_DEVIATIONS)
         if not (significant or error.max() <= LARGEST_ERROR_PX):
@@ -377,10 +380,13 @@ class ImageTracker:
         prior = _after_jump(state.covariance, shift) if jumped else state.covariance
         # after a jump the pilots say whether the reference has come along
         jump = state.jump_px + (shift if jumped else 0)
-        tilts = [np.zeros(2), self._tables.tilt_of(jump)] if np.any(jump) else [np.zeros(2)]
+        tilts = [np.zeros(2)]
+        if np.any(jump) and inference.drift is None:
+            tilts.append(self._tables.tilt_of(jump))
         read = [self._freed(known, tilt, levels, pilots, prior) for tilt in tilts]
         freed, drift, covariance, check = max(read, key=lambda each: each[3].confirmed_bits)
-        after = self._state_at(state.drift + drift, covariance, replace(state, jump_px=np.zeros(2)))
+        drift = state.drift + measured + drift
+        after = self._state_at(drift, covariance, replace(state, jump_px=np.zeros(2)))
         elsewhere = not self._in_batches or after.table is not state.table
         again = after.decoder is not state.decoder or (jumped and elsewhere)
         return _Attempt(state, after, freed, check, prior, again, step)

@@ -28,7 +28,9 @@ class Inference:
     The length is zero where a camera does not show the symbol, whatever p is.
 
     `residual` is the power that is left of the homodyne equations over the field's, zero where the graph tells none;
-    `waited_s` are the seconds for which the page waited for others of its batch.
+    `waited_s` are the seconds for which the page waited for others of its batch. An estimator also says by what `drift`
+    the page's light lies off the table, [4] as in `lightpage.runtime.model.decoding.image_drift`, and the mean square
+    of the counts' residuals over their variance, `chi_square`.
     """
 
     p: NDArray[np.float32]
@@ -36,6 +38,8 @@ class Inference:
     concentration: NDArray[np.float32]
     residual: float = 0.0
     waited_s: float = 0.0
+    drift: NDArray[np.float64] | None = None
+    chi_square: float | None = None
 
     def turned(self, by: NDArray[np.floating]) -> Inference:
         """The same with `by` (radians [ny, nx]) added to the phases."""

@@ -182,6 +182,45 @@ def _replace(graph: pb.Graph, **parts: list[Any]) -> None:
         getattr(graph, field).extend(messages)
 
 
+class HeldTable:
+    """Defaults of a table in memory, for graphs that are not in a bundle yet.
+
+    Args:
+        table: every tensor, by name.
+
+    Attributes:
+        table_inputs: type and shape of every tensor, by name.
+    """
+
+    def __init__(self, table: SamplingTable) -> None:
+        self._table = {name: np.asarray(value) for name, value in table.items()}
+        self.table_inputs = {name: Port(str(value.dtype), value.shape) for name, value in self._table.items()}
+
+    def default(self, name: str) -> NDArray[np.generic]:
+        """Return a tensor of the table."""
+        return self._table[name]
+
+
+def check_table(ports: Mapping[str, Port], table: SamplingTable) -> None:
+    """Check tensors that are to stand in a table.
+
+    Args:
+        ports: type and shape of the table's tensors, by name.
+        table: some of them.
+
+    Raises:
+        InvalidInputError: an unknown name, a wrong type or shape, or values that are not finite.
+    """
+    for name, value in table.items():
+        port = ports.get(name)
+        if port is None:
+            raise InvalidInputError("table", repr(name), f"one of {sorted(ports)}")
+        if not port.admits(str(value.dtype), value.shape):
+            raise InvalidInputError(f"table {name}", f"{value.dtype} {value.shape}", f"{port.dtype} {port.shape}")
+        if not np.isfinite(value).all():
+            raise InvalidInputError(f"table {name}", "NaN or infinity", "finite numbers")
+
+
 class TableGraph:
     """A graph and its table. It never changes; its methods may be called from many threads at once.
 
@@ -251,6 +290,11 @@ class TableGraph:
         nodes = self.session.get_inputs()
         return {node.name: Port.of(node) for node in nodes if node.name not in self._held}
 
+    @property
+    def outputs(self) -> dict[str, Port]:
+        """Type and shape of what can be asked for, by name."""
+        return {node.name: Port.of(node) for node in self.session.get_outputs()}
+
     def value(self, name: str) -> NDArray[Any]:
         """A tensor of the table, as the graph is run with it.
 
@@ -267,14 +311,7 @@ class TableGraph:
         Raises:
             InvalidInputError: an unknown name, a wrong type or shape, or values that are not finite.
         """
-        for name, value in table.items():
-            port = self.ports.get(name)
-            if port is None:
-                raise InvalidInputError("table", repr(name), f"one of {sorted(self.ports)}")
-            if not port.admits(str(value.dtype), value.shape):
-                raise InvalidInputError(f"table {name}", f"{value.dtype} {value.shape}", f"{port.dtype} {port.shape}")
-            if not np.isfinite(value).all():
-                raise InvalidInputError(f"table {name}", "NaN or infinity", "finite numbers")
+        check_table(self.ports, table)
 
     def run(self, outputs: Sequence[str], feeds: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
         """Run the graph; `feeds` holds the frames, and table tensors for this run alone."""

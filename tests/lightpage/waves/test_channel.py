@@ -218,7 +218,7 @@ class TestChannel:
         page = np.zeros((80, 80), np.complex64)
         page[30:50, 30:50] = noise(20, 20)
         sharp = WaveChannel(DEVICE, axis(80, pitch), axis(80, pitch), axis(9, pitch), axis(9, pitch), CELLS, steps=4)
-        blurred = replace(sharp, blur_m=blur_px * pitch)
+        blurred = replace(sharp, blur_m2=(blur_px * pitch) ** 2)
         by_hand = ndimage.gaussian_filter(page.real, blur_px, truncate=6) + 1j * ndimage.gaussian_filter(
             page.imag, blur_px, truncate=6
         )

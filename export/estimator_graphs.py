@@ -1,0 +1,289 @@
+"""The phase estimator as graphs: constants of a device's table, a first estimate, one step, and all in one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import onnx
+import torch
+from numpy.typing import NDArray
+from onnx import numpy_helper
+from torch import Tensor, nn
+from torch.utils import _pytree as tree
+
+from lightpage.calibration.likelihood.table import PILOT_MASK, PILOT_PHASORS
+from lightpage.calibration.sampling_table import SamplingTable
+from lightpage.export.graph import FRAME_INPUTS, TABLE_INPUTS, answers
+from lightpage.export.onnx_files import exported
+from lightpage.runtime.model.execution.estimator_graph import BEFORE, ESTIMATE, NOISE, PAGE, RESIDUAL, STEP_OUTPUTS
+from lightpage.train.models.likelihood.estimator import Estimate, Operators, Page, PhaseEstimator
+
+DEVICE = ("parameters", "blur", "illumination")
+"""Inputs that the wave operators follow from."""
+PILOTS = (PILOT_PHASORS, PILOT_MASK)
+FIRST = (*TABLE_INPUTS, "information", *PILOTS)
+"""Inputs of the first estimate beside frames, its noise, cameras that stand apart, and operators."""
+COUNTS = ("amplitude_series", "count_scale", "count_weights")
+STEP = (
+    "homodyne",
+    *COUNTS,
+    "information",
+    "responses",
+    "nuisance_covariance",
+    "nuisance_precision",
+    *PILOTS,
+)
+"""Inputs of a step beside the page, the estimate, its noise, cameras that stand apart, and operators."""
+
+
+class OperatorsGraph(nn.Module):
+    """A device's table to its wave operators.
+
+    Args:
+        estimator: of the device.
+    """
+
+    def __init__(self, estimator: PhaseEstimator) -> None:
+        super().__init__()
+        self.estimator = estimator
+        self.structure: tree.TreeSpec | None = None
+        """Structure of the operators, known once they were computed."""
+
+    def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
+        """`DEVICE` to the tensors of the operators."""
+        made = self.estimator.operators(dict(zip(DEVICE, tensors, strict=True)))
+        flat, self.structure = tree.tree_flatten(made)
+        return tuple(flat)
+
+
+class FirstGraph(nn.Module):
+    """Frames to the first estimate and the page.
+
+    Args:
+        estimator: of the device.
+        apart: names of the tensors of cameras that stand apart.
+        structure: of the operators.
+        used: numbers of the operators' tensors that are inputs.
+    """
+
+    def __init__(
+        self, estimator: PhaseEstimator, apart: tuple[str, ...], structure: tree.TreeSpec, used: Sequence[int]
+    ) -> None:
+        super().__init__()
+        self.estimator, self._structure, self._used = estimator, structure, tuple(used)
+        self.names = (*FIRST, *apart)
+
+    def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
+        """Frames, noise, `names` and operators to p, phase, concentration, nuisance, residual and the page's tensors."""
+        frames, noise, given = tensors[:2], tensors[2], 3 + len(self.names)
+        table = dict(zip(self.names, tensors[3:given], strict=True))
+        operators = restored(self._structure, self._used, tensors[given:])
+        estimate, page, residual = self.estimator.first(operators, table, noise, *frames)
+        return *answers(estimate.p), estimate.nuisance, residual, *page
+
+
+class StepGraph(nn.Module):
+    """An estimate to the next one.
+
+    Args:
+        estimator, apart, structure, used: see `FirstGraph`.
+    """
+
+    def __init__(
+        self, estimator: PhaseEstimator, apart: tuple[str, ...], structure: tree.TreeSpec, used: Sequence[int]
+    ) -> None:
+        super().__init__()
+        self.estimator, self._apart, self._structure, self._used = estimator, apart, structure, tuple(used)
+        self.names = (*STEP, *apart)
+
+    def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
+        """Estimate (p, nuisance), noise, page, `names` and operators to p, phase, concentration, nuisance, chi-square.
+
+        Beside them come the derivatives of the log-likelihood at the estimate that was given, and its expected counts.
+        """
+        state = len(ESTIMATE) + 1
+        p, nuisance, noise = tensors[:state]
+        page = Page(*tensors[state : state + len(PAGE)])
+        given = state + len(PAGE)
+        table = dict(zip(self.names, tensors[given : given + len(self.names)], strict=True))
+        operators = restored(self._structure, self._used, tensors[given + len(self.names) :])
+        cameras = self.estimator.recovery.cameras(*(table[name] for name in self._apart))
+        found = self.estimator.likelihood(operators, table, page, Estimate(p, nuisance), cameras)
+        after, chi_square = self.estimator.advanced(table, page, Estimate(p, nuisance), found, noise)
+        return *answers(after.p), after.nuisance, chi_square, *found
+
+
+class WholeGraph(nn.Module):
+    """Frames and table to the estimate after a fixed number of steps.
+
+    Args:
+        estimator, apart: see `FirstGraph`.
+        steps: number of steps.
+    """
+
+    outputs = ("p", "phase", "concentration", "residual", "nuisance", "chi_square")
+
+    def __init__(self, estimator: PhaseEstimator, apart: tuple[str, ...], steps: int) -> None:
+        super().__init__()
+        self.estimator, self.steps, self._apart = estimator, steps, apart
+        self.table_inputs = tuple(dict.fromkeys((*FIRST, *DEVICE, *STEP, NOISE, *apart)))
+
+    def forward(self, in_phase: Tensor, quadrature: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
+        """Frames and `table_inputs` to `outputs`."""
+        table = dict(zip(self.table_inputs, tensors, strict=True))
+        operators = self.estimator.operators(table)
+        cameras = self.estimator.recovery.cameras(*(table[name] for name in self._apart))
+        estimate, page, residual = self.estimator.first(operators, table, table[NOISE][0], in_phase, quadrature)
+        chi_square = torch.zeros_like(residual)
+        for number in range(self.steps):
+            noise = table[NOISE][number + 1]
+            estimate, chi_square = self.estimator.step(operators, table, page, estimate, noise, cameras)
+        return *answers(estimate.p), residual, estimate.nuisance, chi_square
+
+
+def restored(structure: tree.TreeSpec, used: Sequence[int], tensors: Sequence[Tensor]) -> Operators:
+    """Operators of those of their tensors that are there; the others are not looked at."""
+    whole: list[Tensor | None] = [None] * structure.num_leaves
+    for number, tensor in zip(used, tensors, strict=True):
+        whole[number] = tensor
+    operators: Operators = tree.tree_unflatten(whole, structure)
+    return operators
+
+
+def estimator_files(
+    estimator: PhaseEstimator, frame_dtype: str, apart: tuple[str, ...], table: SamplingTable
+) -> tuple[bytes, bytes, bytes]:
+    """Export the graphs of operators, first estimate and step.
+
+    Args:
+        estimator: estimator of the device.
+        frame_dtype: type of a frame's counts.
+        apart: names of the tensors of cameras that stand apart.
+        table: every tensor of the device.
+    """
+    tensors = {name: torch.from_numpy(np.array(value, order="C")) for name, value in table.items()}
+    frame = torch.from_numpy(np.zeros(table["reference_in_phase"].shape, frame_dtype))
+    frames = frame, frame.clone()
+    with torch.no_grad():
+        device = OperatorsGraph(estimator)
+        flat = device(*(tensors[name] for name in DEVICE))
+        structure = device.structure
+        assert structure is not None
+        names = [f"operator_{number}" for number in range(len(flat))]
+        numbered = tree.tree_unflatten(list(range(len(flat))), structure)
+        backward = tree.tree_flatten((numbered.backward, numbered.illumination))[0]
+        everything = range(len(flat))
+        first = FirstGraph(estimator, apart, structure, backward)
+        asked = *frames, tensors[NOISE][0], *(tensors[name] for name in first.names), *(flat[number] for number in backward)
+        begun = first(*asked)
+        step = StepGraph(estimator, apart, structure, everything)
+    outputs = [*STEP_OUTPUTS[:4], "residual", *PAGE]
+    made = dict(zip(outputs, begun, strict=True))
+    given = (*(made[name] for name in ESTIMATE), tensors[NOISE][1], *(made[name] for name in PAGE))
+    files = [
+        exported(device, tuple(tensors[name] for name in DEVICE), DEVICE, tuple(names), None),
+        exported(
+            first,
+            asked,
+            (*FRAME_INPUTS, NOISE, *first.names, *(names[number] for number in backward)),
+            tuple(outputs),
+            None,
+        ),
+        exported(
+            step,
+            (*given, *(tensors[name] for name in step.names), *flat),
+            (*BEFORE.values(), NOISE, *PAGE, *step.names, *names),
+            STEP_OUTPUTS,
+            None,
+        ),
+    ]
+    for file in files:
+        onnx.checker.check_model(file)
+    operators, begins, goes_on = (bytes(file.SerializeToString()) for file in files)
+    return operators, begins, goes_on
+
+
+def whole_onnx(files: tuple[bytes, bytes, bytes], steps: int, table: SamplingTable) -> bytes:
+    """Join the graphs of operators, first estimate and step to one, with `table` as the defaults of its inputs.
+
+    Args:
+        files: of `estimator_files`.
+        steps: number of steps.
+        table: every tensor of the device.
+
+    Returns:
+        A serialised model from frames and table to `WholeGraph.outputs`.
+    """
+    device, first, step = (onnx.ModelProto.FromString(file) for file in files)
+    whole = onnx.ModelProto()
+    whole.CopyFrom(first)
+    for field in ("node", "initializer", "input", "output", "value_info"):
+        whole.graph.ClearField(field)
+    inputs = {entry.name: entry for model in (device, first, step) for entry in model.graph.input}
+    _append(whole, device, "", {entry.name: entry.name for entry in device.graph.output})
+    kept = {entry.name: entry.name for entry in first.graph.output}
+    kept |= {NOISE: f"{NOISE}_0", RESIDUAL: f"{RESIDUAL}_0"}
+    kept |= {name: f"{name}_0" for name in STEP_OUTPUTS[:4]}
+    _append(whole, first, "first.", kept)
+    for number in range(1, steps + 1):
+        kept = {name: f"{name}_{number}" for name in (NOISE, *STEP_OUTPUTS)}
+        kept |= {entry: f"{name}_{number - 1}" for name, entry in BEFORE.items()}
+        _append(whole, step, f"step{number}.", kept)
+    rows = [onnx.helper.make_node("Split", [NOISE], [f"{NOISE}_row_{row}" for row in range(steps + 1)], axis=0)]
+    rows[0].attribute.append(onnx.helper.make_attribute("num_outputs", steps + 1))
+    axis = onnx.numpy_helper.from_array(np.array([0], np.int64), "first_axis")
+    whole.graph.initializer.append(axis)
+    for row in range(steps + 1):
+        rows.append(onnx.helper.make_node("Squeeze", [f"{NOISE}_row_{row}", "first_axis"], [f"{NOISE}_{row}"]))
+    for name in WholeGraph.outputs:
+        last = f"{name}_{0 if name == RESIDUAL else steps}"
+        rows.append(onnx.helper.make_node("Identity", [last], [name]))
+        source = first if name == RESIDUAL else step
+        whole.graph.output.append(next(entry for entry in source.graph.output if entry.name == name))
+    nodes = [*rows[: steps + 2], *whole.graph.node, *rows[steps + 2 :]]
+    whole.graph.ClearField("node")
+    whole.graph.node.extend(nodes)
+    whole.graph.input.extend(inputs[name] for name in FRAME_INPUTS)
+    _with_defaults(whole, table)
+    onnx.checker.check_model(whole)
+    return bytes(whole.SerializeToString())
+
+
+def _append(whole: onnx.ModelProto, part: onnx.ModelProto, prefix: str, kept: dict[str, str]) -> None:
+    """Append the nodes of a graph to another one.
+
+    Args:
+        whole, part: both graphs.
+        prefix: prefix of the names of tensors that nodes of the part compute.
+        kept: names of tensors in `whole`, by those in the part; inputs that are not there keep their names.
+    """
+    title = prefix.rstrip("0123456789.") or "operators"
+    present = {held.name for held in whole.graph.initializer}
+    inputs = {entry.name for entry in part.graph.input}
+    renamed = {held.name: f"{title}.{held.name}" for held in part.graph.initializer}
+    for held in part.graph.initializer:
+        if renamed[held.name] not in present:
+            whole.graph.initializer.add().CopyFrom(held)
+            whole.graph.initializer[-1].name = renamed[held.name]
+
+    def name_of(name: str) -> str:
+        if not name or name in kept:
+            return kept.get(name, name)
+        return renamed.get(name, name if name in inputs else prefix + name)
+
+    for node in part.graph.node:
+        copy = whole.graph.node.add()
+        copy.CopyFrom(node)
+        copy.name = prefix + node.name
+        copy.input[:] = map(name_of, node.input)
+        copy.output[:] = map(name_of, node.output)
+
+
+def _with_defaults(model: onnx.ModelProto, table: SamplingTable) -> None:
+    """Give a graph an input with a default for each tensor of a table, be it used or not."""
+    for name, value in table.items():
+        array: NDArray[np.generic] = np.array(value, order="C")
+        kind = onnx.helper.np_dtype_to_tensor_dtype(array.dtype)
+        model.graph.initializer.append(numpy_helper.from_array(array, name))
+        model.graph.input.append(onnx.helper.make_tensor_value_info(name, kind, array.shape))

@@ -1,0 +1,76 @@
+"""The last steps of every export: a version, and proof with the runtime's own decoder."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from datetime import datetime
+from pathlib import Path
+
+from lightpage.errors import BundleError, InvalidInputError
+from lightpage.progress import Progress, warn
+from lightpage.recording.reader import Recording
+from lightpage.runtime.archives.recordings.coded_pages import choose_code
+from lightpage.runtime.archives.recordings.evaluation import check_recording
+from lightpage.runtime.model.bundle.bundle import write_bundle
+from lightpage.runtime.model.bundle.manifest import Manifest, check_version, sha256
+from lightpage.runtime.model.decoding.batch_graph import with_proven_batches
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.image_tracker import tracker_for
+
+
+def check_new(out: Path, version: str | None) -> None:
+    """Check the path and the version of a bundle that is to be made.
+
+    Raises:
+        BundleError: something is at `out`, or `version` is none.
+    """
+    if version is not None:
+        check_version(version, "--version")
+    if out.exists():
+        raise BundleError(f"--out {out}", "something that exists", "a new path: bundles are never overwritten")
+
+
+def proven(
+    out: Path, manifest: Manifest, files: dict[str, bytes], recording: Path | None, progress: Progress
+) -> tuple[Manifest, dict[str, bytes]]:
+    """Load the bundle beside `out` as the service does.
+
+    Returns:
+        its manifest, with a code where a recording chose one, and its files, those for many pages only if they decode.
+
+    Raises:
+        RecordingError: the recording is of another device.
+        BundleError: the decoder does not say what it should.
+    """
+    partial = out.with_name(f".{out.stem}-unproven{out.suffix}")
+    _remove(partial)
+    try:
+        write_bundle(partial, manifest, files)
+        decoder = Decoder.load(partial)
+        files = dict(with_proven_batches(decoder.bundle, decoder.graph).files)
+        if recording is not None:
+            progress("choose the code of user bytes", 0.9)
+            with Recording.open(recording) as pages:
+                check_recording(decoder, pages)
+                try:
+                    best, _ = choose_code(decoder, pages, tracker_for(decoder))
+                    manifest = manifest.model_copy(update={"code": best.code.to_toml()})
+                except InvalidInputError as lacking:
+                    warn(f"no code for user bytes: {lacking}")
+    finally:
+        _remove(partial)
+    return manifest, files
+
+
+def version_of(name: str, created: datetime, decoder: bytes) -> str:
+    """A version that no other bundle has: name, time (UTC) and the beginning of the decoder's hash."""
+    plain = re.sub(r"[^A-Za-z0-9_.+-]", "_", name).lstrip("_.+-")[:60] or "bundle"
+    return f"{plain}-{created:%Y%m%dT%H%M%SZ}-{sha256(decoder)[:8]}"
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

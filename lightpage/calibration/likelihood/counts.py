@@ -1,0 +1,101 @@
+"""Statistics of one camera's counts on the common grid: mean and variance as smooth functions of the expected count.
+
+Gain, clipping at zero, read noise, quantisation and non-linearity of a camera all show there, and so does what the fit
+leaves unexplained.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+from pydantic import Field
+
+from lightpage.device.profile import Finite, TomlTable
+
+Real = NDArray[np.float64]
+
+KNOTS = 2048
+"""Places of a look-up table: the step from one to the next changes a weight by less than a thousandth."""
+_CLASSES = 60
+"""Classes of samples of like expected counts, each with a mean and a variance of its own."""
+_MEAN_DEGREE, _VARIANCE_DEGREE = 7, 5
+"""Degrees of the Chebyshev series over the root of the expected count."""
+_STORED = 33
+"""Points by which the functions are kept."""
+_BEYOND = 1.3
+"""Largest expected count of a table, over the largest that was met."""
+_LEAST_VARIANCE = 1e-6
+"""Least variance over the largest one."""
+_LEAST_SLOPE = 1e-3
+"""Least slope of the mean: where counts do not grow with the light, they tell next to nothing."""
+
+Values = Annotated[tuple[Finite, ...], Field(min_length=4, strict=False)]
+
+
+class CountStatistics(TomlTable):
+    """Statistics of one camera's counts, low-passed and resampled to the common grid.
+
+    Attributes:
+        expected: counts that the light would give a perfect camera, increasing.
+        mean, variance: mean and variance of the counts that came, at each of these.
+    """
+
+    expected: Values
+    mean: Values
+    variance: Values
+
+    @classmethod
+    def measured(cls, expected: Real, counts: Real) -> CountStatistics:
+        """Fit smooth functions to samples.
+
+        Args:
+            expected: counts that the fitted device should give, [N].
+            counts: counts that came, [N].
+        """
+        edges = np.quantile(expected, np.linspace(0, 1, _CLASSES + 1))
+        number = np.clip(np.searchsorted(edges, expected) - 1, 0, _CLASSES - 1)
+        size = np.maximum(np.bincount(number, minlength=_CLASSES), 1)
+        middle = np.bincount(number, expected, _CLASSES) / size
+        mean = np.bincount(number, counts, _CLASSES) / size
+        slope = np.gradient(mean, middle)
+        residual = counts - mean[number] - slope[number] * (expected - middle[number])
+        variance = np.bincount(number, residual**2, _CLASSES) / size
+        variance = np.maximum(variance, _LEAST_VARIANCE * variance.max())
+        root = np.sqrt(middle)
+        series = np.polynomial.chebyshev.Chebyshev
+        smooth_mean = series.fit(root, mean, _MEAN_DEGREE, w=np.sqrt(size / variance))
+        smooth_variance = series.fit(root, np.log(variance), _VARIANCE_DEGREE, w=np.sqrt(size))
+        at = np.linspace(root[0], root[-1], _STORED)
+        return cls(
+            expected=tuple((at**2).tolist()),
+            mean=tuple(smooth_mean(at).tolist()),
+            variance=tuple(np.exp(smooth_variance(at)).tolist()),
+        )
+
+    @property
+    def scale(self) -> float:
+        """Places of the look-up tables for a root of one count."""
+        return float((KNOTS - 1) / np.sqrt(_BEYOND * self.expected[-1]))
+
+    def weights(self, correlation: float = 1.0) -> NDArray[np.float32]:
+        """Tables over the root of the expected count, [4, KNOTS]: m'/v, m m'/v, m'^2/v, and the variance of the first
+        one's residuals, m'^2/v^2 times that of a count.
+
+        With m the mean and v the variance of a count, for sums over correlated samples.
+
+        Args:
+            correlation: factor of the variance of a sum of neighbouring samples over that of independent ones.
+        """
+        counts = (np.arange(KNOTS) / self.scale) ** 2
+        known, mean = np.array(self.expected), np.array(self.mean)
+        curve = scipy.interpolate.PchipInterpolator(known, mean)
+        inside = np.clip(counts, known[0], known[-1])
+        slope = np.maximum(curve.derivative()(inside), _LEAST_SLOPE)
+        level = curve(inside) + slope * (counts - inside)
+        variance = np.exp(np.interp(inside, known, np.log(self.variance)))
+        information = slope / (variance * correlation)
+        chi_square = information**2 * variance
+        return np.stack([information, level * information, slope * information, chi_square]).astype(np.float32)

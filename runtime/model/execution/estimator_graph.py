@@ -1,0 +1,175 @@
+"""Maximum likelihood in ONNX Runtime: constants of a table, a first estimate, and a step that is repeated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.calibration.sampling_table import SamplingTable
+from lightpage.errors import BundleError, InvalidInputError
+from lightpage.runtime.model.execution.providers import ON_CPU, Provider
+from lightpage.runtime.model.execution.session import BoundSession, Port, Session, open_session, running
+from lightpage.runtime.model.execution.table_graph import GraphFile, HeldTable, check_table
+
+ESTIMATE = ("p", "nuisance")
+"""State of the estimation, that a step takes and gives."""
+BEFORE = {name: f"{name}_before" for name in ESTIMATE}
+"""Names of the estimate as a step's input, by that of its output."""
+PAGE = ("counts", "reference", "amplitude", "lit")
+"""Measurements of a page on the common grid, which all steps share."""
+NOISE = "noise"
+"""Noise of a number of steps, a row each, from that of the first estimate on."""
+DERIVATIVES = ("by_phase", "by_nuisance", "expected")
+STEP_OUTPUTS = ("p", "phase", "concentration", "nuisance", "chi_square", *DERIVATIVES)
+RESIDUAL = "residual"
+"""Output of the first estimate that no step changes."""
+_FRAMES = ("in_phase", "quadrature")
+
+
+class EstimatorGraph:
+    """The graphs of an estimator and their table. It never changes; many threads may call its methods at once.
+
+    Args:
+        files: serialised graphs of operators, first estimate and step.
+        defaults: graph of all in one, whose inputs have the table's defaults.
+        subject: name of the bundle, for errors.
+        fed: names of table inputs that may be fed with each page.
+        threads: threads of one run; by default the cores that this process may use.
+        table: values instead of the defaults.
+        like: the same graphs with another table, whose sessions are shared.
+        provider: provider that computes pages; operators are computed on the CPU.
+        steps: number of steps; None for as many as the bundle has.
+
+    Attributes:
+        ports: type and shape of every tensor of the table, by name.
+        steps: number of steps.
+
+    Raises:
+        InvalidInputError: a table that does not fit, or more steps than the bundle knows the noise of.
+        BundleError: a graph cannot be run.
+        ProviderError: there is no such provider here.
+    """
+
+    def __init__(
+        self,
+        files: tuple[bytes, bytes, bytes],
+        defaults: GraphFile | HeldTable,
+        subject: str,
+        fed: Sequence[str],
+        threads: int | None,
+        table: SamplingTable | None = None,
+        like: EstimatorGraph | None = None,
+        provider: Provider = ON_CPU,
+        steps: int | None = None,
+    ) -> None:
+        self._files, self._defaults, self._subject = files, defaults, subject
+        self._fed, self._threads, self.provider = tuple(fed), threads, provider
+        self.ports = defaults.table_inputs
+        self.table: SamplingTable = table or {}
+        check_table(self.ports, self.table)
+        most = int(self.value(NOISE).shape[0]) - 1
+        if steps is not None and not 1 <= steps <= most:
+            raise InvalidInputError("steps", steps, f"1 to {most}, as the bundle has")
+        self.steps = most if steps is None else steps
+        if like is None:
+            self._device = open_session(files[0], f"{subject}: operators", threads, once=True)
+            self._first = open_session(files[1], f"{subject}: first estimate", threads, provider=provider)
+            self._step = open_session(files[2], f"{subject}: step", threads, provider=provider)
+        else:
+            self._device, self._first, self._step = like._device, like._first, like._step
+        names = [node.name for node in self._device.get_outputs()]
+        feeds = {node.name: self.value(node.name) for node in self._device.get_inputs()}
+        with running(subject):
+            made = dict(zip(names, self._device.run(names, feeds), strict=True))
+        self._held = {name: self.value(name) for name in self.ports if name != NOISE} | made
+        self._bound = {session: self._with_constants(session) for session in (self._first, self._step)}
+
+    def with_table(self, table: SamplingTable) -> EstimatorGraph:
+        """The graphs with other tensors in their table, by name; those left out stay. It raises as the constructor."""
+        merged = {**self.table, **table}
+        files, fed, threads = self._files, self._fed, self._threads
+        return EstimatorGraph(
+            files, self._defaults, self._subject, fed, threads, merged, self, self.provider, self.steps
+        )
+
+    @property
+    def outputs(self) -> dict[str, Port]:
+        """Type and shape of what can be asked for, by name."""
+        nodes = (*self._first.get_outputs(), *self._step.get_outputs())
+        return {node.name: Port.of(node) for node in nodes}
+
+    @property
+    def inputs(self) -> dict[str, Port]:
+        """Type and shape of what must be fed with each page, by name."""
+        return {node.name: Port.of(node) for node in self._first.get_inputs() if node.name in _FRAMES}
+
+    def value(self, name: str) -> NDArray[Any]:
+        """A tensor of the table.
+
+        Raises:
+            InvalidInputError: no such tensor.
+        """
+        if name not in self.ports:
+            raise InvalidInputError("table", repr(name), f"one of {sorted(self.ports)}")
+        return self.table[name] if name in self.table else self._defaults.default(name)
+
+    def check(self, table: SamplingTable) -> None:
+        """Check tensors that are to stand in the table; see `check_table`."""
+        check_table(self.ports, table)
+
+    def run(
+        self, outputs: Sequence[str], feeds: Mapping[str, NDArray[Any]], steps: int | None = None
+    ) -> list[NDArray[Any]]:
+        """Estimate a page.
+
+        Args:
+            outputs: names of what is wanted.
+            feeds: frames, and table tensors for this page alone.
+            steps: number of steps; the graph's if left out.
+        """
+        found, steps = self._begun(feeds), self.steps if steps is None else steps
+        noise = self.value(NOISE)
+        for number in range(steps):
+            wanted = STEP_OUTPUTS[:5] if number == steps - 1 else ESTIMATE
+            found |= self._stepped(found, noise[number + 1], feeds, wanted)
+        return [found[name] for name in outputs]
+
+    def derivatives(
+        self, feeds: Mapping[str, NDArray[Any]], p: NDArray[np.float32], nuisance: NDArray[np.float32]
+    ) -> dict[str, NDArray[Any]]:
+        """Return the log-likelihood's derivatives at an estimate, and the page's measurements, by name."""
+        found = {**self._begun(feeds), "p": p, "nuisance": nuisance}
+        return {**found, **self._stepped(found, self.value(NOISE)[1], feeds, DERIVATIVES)}
+
+    def _begun(self, feeds: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        names = [node.name for node in self._first.get_outputs()]
+        return self._asked(self._first, names, {**feeds, NOISE: self.value(NOISE)[0]})
+
+    def _stepped(
+        self,
+        found: Mapping[str, NDArray[Any]],
+        noise: NDArray[Any],
+        feeds: Mapping[str, NDArray[Any]],
+        outputs: Sequence[str],
+    ) -> dict[str, NDArray[Any]]:
+        state = {BEFORE.get(name, name): found[name] for name in (*ESTIMATE, *PAGE)} | {NOISE: noise}
+        shared = {name: value for name, value in feeds.items() if name not in _FRAMES}
+        return self._asked(self._step, outputs, {**shared, **state})
+
+    def _asked(
+        self, session: Session, outputs: Sequence[str], feeds: Mapping[str, NDArray[Any]]
+    ) -> dict[str, NDArray[Any]]:
+        taken = {node.name for node in session.get_inputs()}
+        given = {name: value for name, value in feeds.items() if name in taken}
+        return dict(zip(outputs, self._bound[session].run(outputs, given), strict=True))
+
+    def _with_constants(self, session: Session) -> BoundSession:
+        """A session with all of the table and the operators that it takes."""
+        inputs = {node.name for node in session.get_inputs()}
+        held = {name: value for name, value in self._held.items() if name in inputs}
+        if missing := inputs - held.keys() - {*_FRAMES, *BEFORE.values(), *PAGE, NOISE}:
+            raise BundleError(self._subject, f"graphs that want {', '.join(sorted(missing))}", "inputs of the table")
+        return BoundSession(session, self.provider, held, self._subject)

@@ -1,0 +1,59 @@
+"""Noise of an estimator's phases after each step, measured on known pages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.calibration.likelihood.noise import expected_bits, fitted_noise
+from lightpage.calibration.likelihood.table import pilot_tensors
+from lightpage.page.correction import wrapped
+from lightpage.page.pilots import Pilots
+from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.model.execution.estimator_graph import NOISE, EstimatorGraph
+
+MOST_STEPS = 6
+"""Gauss-Newton steps, at most."""
+_GAIN_BITS = 0.004
+"""Information that another step must gain, bits a symbol."""
+
+
+def measured_noise(
+    graph: EstimatorGraph,
+    pages: Sequence[tuple[FramePair, NDArray[np.float64]]],
+    mask: NDArray[np.bool_],
+    steps: int | None = None,
+) -> NDArray[np.float32]:
+    """Fit the noise after each step, from that of the first estimate on, [steps + 1, 2].
+
+    Args:
+        graph: graph of the device, with at least as many steps.
+        pages: frames of known pages, and the phases of their light, radians [ny, nx].
+        mask: places of the pilots, bool [ny, nx].
+        steps: number of steps; as many as gain information if left out.
+    """
+    most = MOST_STEPS if steps is None else steps
+    noise = np.tile(np.array([1, 0], np.float32), (len(graph.value(NOISE)), 1))
+    information = graph.value("information")[~mask].astype(np.float64)
+    bits: list[float] = []
+    for number in range(most + 1):
+        graph = graph.with_table({NOISE: noise})
+        errors = [_errors(graph, pair, phases, mask, number) for pair, phases in pages]
+        noise[number] = fitted_noise(np.concatenate(errors), np.tile(information, len(pages)))
+        bits.append(expected_bits(noise[number], information))
+        if steps is None and number > 1 and bits[-1] < bits[-2] + _GAIN_BITS:
+            return noise[:number]
+    return noise[: most + 1]
+
+
+def _errors(
+    graph: EstimatorGraph, pair: FramePair, phases: NDArray[np.float64], mask: NDArray[np.bool_], steps: int
+) -> NDArray[np.float64]:
+    """Errors of the data symbols' phases after so many steps, radians, 1-D."""
+    pilots = Pilots(mask, phases[mask])
+    feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **pilot_tensors(pilots)}
+    (p,) = graph.run(["p"], feeds, steps)
+    error = wrapped(np.arctan2(p[1], p[0]).astype(np.float64) - phases)
+    return np.asarray(wrapped(error - np.median(error[mask]))[~mask])

@@ -1,0 +1,288 @@
+"""Maximum likelihood of a page's phases: a first estimate by the adjoint waves, and Gauss-Newton steps.
+
+`docs/reference/physics.md` derives them. Every symbol's phase is unknown, and with it the nuisance parameters of the
+page. A step predicts the counts of both cameras, weighs what differs by its variance, sends that back by the adjoint
+waves, and divides by the Fisher information of each symbol.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from lightpage.calibration.waves.wave_model import illumination_terms
+from lightpage.device.profile import Profile
+from lightpage.train.models.apart import Cameras
+from lightpage.train.models.field import FieldRecovery, Measured, relative_power
+from lightpage.train.models.likelihood.counts import looked_up, score_of_counts
+from lightpage.train.models.likelihood.modulator import amplitude_and_slope
+from lightpage.train.models.likelihood.nuisances import PageNuisances
+from lightpage.train.models.parts import Parts, conjugate, multiply, parts, scaled
+from lightpage.train.models.prediction import expected_phasors
+from lightpage.train.models.waves import Fidelity, Real, WaveMatrices, Waves
+from lightpage.waves.grid import FieldGrid
+
+REFLECTIONS = 4
+"""Rounds by which the field of the first estimate is recovered, see `FieldRecovery`."""
+FORWARD, BACKWARD = Fidelity(0.005, 0.007), Fidelity(0.06, 0.05)
+"""Fidelity of the predicted light, and of the way back: an error of that one moves the estimate by its share of the
+noise alone."""
+_EVERY = 4
+"""Grid samples from one to the next at which residuals are looked at."""
+LARGEST_STEP_RAD = 1.0
+"""Largest change of a phase by one step: the model is linear over less than a radian."""
+
+
+class Operators(NamedTuple):
+    """Wave operators of a device.
+
+    Attributes:
+        forward, backward: matrices to the cameras, and back.
+        illumination: light of a symbol of phase zero and unit amplitude, [ny, nx].
+    """
+
+    forward: WaveMatrices
+    backward: WaveMatrices
+    illumination: Parts
+
+
+class Page(NamedTuple):
+    """Measurements of a page on the common grid.
+
+    Attributes:
+        counts: of both cameras, low-passed, [2, Gy, Gx].
+        reference: counts of the references, [2, Gy, Gx].
+        amplitude: reference amplitude over its mean, [Gy, Gx].
+        lit: 1 where both cameras have a reference, else 0, [Gy, Gx].
+    """
+
+    counts: Tensor
+    reference: Tensor
+    amplitude: Tensor
+    lit: Tensor
+
+
+class Estimate(NamedTuple):
+    """State of the estimation.
+
+    Attributes:
+        p: phase and concentration of each symbol as a vector, [2, ny, nx]; the page's piston is taken off.
+        nuisance: see `lightpage.train.models.likelihood.nuisances`, [6].
+    """
+
+    p: Tensor
+    nuisance: Tensor
+
+
+class Likelihood(NamedTuple):
+    """The log-likelihood's derivatives at an estimate, and the counts that it expects.
+
+    Attributes:
+        by_phase: derivative by each symbol's phase, [ny, nx].
+        by_nuisance: derivatives by the nuisance parameters, [6].
+        expected: counts that the light would give perfect cameras, [2, Gy, Gx].
+    """
+
+    by_phase: Tensor
+    by_nuisance: Tensor
+    expected: Tensor
+
+
+class PhaseEstimator(nn.Module):
+    """Estimator of one device's pages.
+
+    Args:
+        profile: nominal device.
+        parameters: [P] fitted; they say how finely waves are sampled.
+        grid: common grid, where it is not the usual one.
+        reflections: rounds of the field's recovery.
+        forward, backward: fidelity of the waves either way.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        parameters: Real,
+        grid: FieldGrid | None = None,
+        reflections: int = REFLECTIONS,
+        forward: Fidelity = FORWARD,
+        backward: Fidelity = BACKWARD,
+    ) -> None:
+        super().__init__()
+        self.recovery = FieldRecovery(profile, reflections=reflections, grid=grid)
+        self.waves = Waves(profile, parameters, 1, forward, filled=True, grid=grid)
+        self.back = Waves(profile, parameters, 1, backward, filled=True, grid=grid)
+        self.nuisances = PageNuisances(profile, self.recovery.grid)
+        self._half_width, self._half_height = profile.page_width_m / 2, profile.page_height_m / 2
+
+    def operators(self, table: Mapping[str, Tensor]) -> Operators:
+        """Return the wave operators of `parameters`, `blur` and `illumination` in the table."""
+        parameters, blur = table["parameters"], table["blur"]
+        terms = torch.stack(illumination_terms(self.waves.x_m / self._half_width, self.waves.y_m / self._half_height))
+        real, imaginary = torch.tensordot(table["illumination"], terms, 1).unbind()
+        forward, backward = self.waves.matrices(parameters, blur), self.back.matrices(parameters, blur)
+        return Operators(forward, backward, (real, imaginary))
+
+    def measured(self, table: Mapping[str, Tensor], *frames: Tensor) -> tuple[Page, Measured]:
+        """Measure a frame pair on the common grid.
+
+        Args:
+            table: `reference_in_phase`, `reference_quadrature`, `registration`, `homodyne`, and those of cameras that
+                stand apart, see `FieldRecovery.measure`.
+            frames: in-phase and quadrature frame [H, W].
+        """
+        apart = [table[name] for name in ("apart", "apart_beside", "apart_tilt") if name in table]
+        references = table["reference_in_phase"], table["reference_quadrature"]
+        both = self.recovery.references(self.recovery.in_blocks(*references), table["registration"])
+        measured = self.recovery.measure(*frames, *references, table["registration"], table["homodyne"], *apart)
+        brightness = 1 + 2 * torch.stack([measured.a, measured.b])
+        return Page(both.reference * brightness, both.reference, both.amplitude, both.lit), measured
+
+    def first(
+        self, operators: Operators, table: Mapping[str, Tensor], noise: Tensor, *frames: Tensor
+    ) -> tuple[Estimate, Page, Tensor]:
+        """Estimate the phases by the adjoint waves of the recovered field.
+
+        Returns:
+            The estimate; the page's measurements; power that is left of the homodyne equations over the field's, [].
+        """
+        page, measured = self.measured(table, *frames)
+        field, unexplained = self.recovery.solve(measured)
+        light = self._to_page(operators, parts(field * page.lit))
+        phasors = scaled(light, torch.rsqrt(light[0] * light[0] + light[1] * light[1] + 1e-20))
+        concentration = _concentration(table["information"], noise)
+        direction, piston = without_piston(phasors, concentration, table)
+        nuisance = torch.cat([torch.stack(piston), table["information"].new_zeros(4)])
+        estimate = Estimate(torch.stack(direction) * concentration, nuisance)
+        return estimate, page, relative_power(unexplained, field)
+
+    def likelihood(
+        self, operators: Operators, table: Mapping[str, Tensor], page: Page, estimate: Estimate, cameras: Cameras | None
+    ) -> Likelihood:
+        """Evaluate the derivatives of the log-likelihood at an estimate."""
+        x, y = parts(expected_phasors(estimate.p))
+        length = torch.sqrt(estimate.p.square().sum(0) + 1e-20)
+        direction = estimate.p[0] / length, estimate.p[1] / length
+        amplitude, slope = amplitude_and_slope(direction, table["amplitude_series"])
+        light = multiply(scaled((x, y), amplitude), operators.illumination)
+        at_camera = parts(self.waves.to_camera(operators.forward, torch.stack(light)))
+        field, tilt = self.nuisances(at_camera, estimate.nuisance)
+        score, expected = _score(table, page, field, cameras)
+        back = self._to_page(operators, multiply(score, conjugate(tilt)))
+        real, imaginary = estimate.nuisance[0], estimate.nuisance[1]
+        symbol = multiply(scaled(direction, amplitude), (real, imaginary))
+        by_log = symbol[0] * back[0] + symbol[1] * back[1]
+        turned = symbol[0] * back[1] - symbol[1] * back[0]
+        return Likelihood(turned + slope * by_log, self.nuisances.gradient(field, score), expected)
+
+    def step(
+        self,
+        operators: Operators,
+        table: Mapping[str, Tensor],
+        page: Page,
+        estimate: Estimate,
+        noise: Tensor,
+        cameras: Cameras | None = None,
+    ) -> tuple[Estimate, Tensor]:
+        """Take one Gauss-Newton step; arguments and results as of `likelihood` and `advanced`."""
+        found = self.likelihood(operators, table, page, estimate, cameras)
+        return self.advanced(table, page, estimate, found, noise)
+
+    def advanced(
+        self, table: Mapping[str, Tensor], page: Page, estimate: Estimate, found: Likelihood, noise: Tensor
+    ) -> tuple[Estimate, Tensor]:
+        """Move an estimate by the Gauss-Newton step of all phases and nuisance parameters together.
+
+        The Fisher information of the phases is taken for diagonal, but for what they share with the nuisance
+        parameters: `responses` are the changes of all phases by which the light says the least of a nuisance parameter.
+
+        Args:
+            table: `count_scale`, `count_weights`, `information`, `responses`, `nuisance_precision`,
+                `nuisance_covariance`, `pilot_phasors`, `pilot_mask`.
+            page, estimate: see there.
+            found: derivatives at the estimate.
+            noise: see `_concentration`, [2].
+
+        Returns:
+            The next estimate, and the mean square of the counts' residuals over their variance, [].
+        """
+        gain2 = estimate.nuisance[0] ** 2 + estimate.nuisance[1] ** 2
+        information, responses = gain2 * table["information"], table["responses"]
+        length = torch.sqrt(estimate.p.square().sum(0) + 1e-20)
+        direction = estimate.p[0] / length, estimate.p[1] / length
+        five = torch.cat([found.by_nuisance[:1], found.by_nuisance[2:]])
+        prior = torch.cat([torch.zeros_like(five[:1]), table["nuisance_precision"] * estimate.nuisance[2:]])
+        right = five - prior - (responses * found.by_phase).sum((1, 2))
+        change = table["nuisance_covariance"] @ right / gain2
+        turn = found.by_phase / information - (responses * change[:, None, None]).sum(0)
+        turn = torch.clamp(turn, -LARGEST_STEP_RAD, LARGEST_STEP_RAD)
+        concentration = _concentration(information, noise)
+        turned = multiply(direction, (torch.cos(turn), torch.sin(turn)))
+        direction, piston = without_piston(turned, concentration, table)
+        gain = multiply(scaled(parts(estimate.nuisance[:2]), 1 + change[0]), piston)
+        nuisance = torch.cat([torch.stack(gain), estimate.nuisance[2:] + change[1:]])
+        return Estimate(torch.stack(direction) * concentration, nuisance), _chi_square(table, page, found.expected)
+
+    def _to_page(self, operators: Operators, field: Parts) -> Parts:
+        """Field on the common grid [Gy, Gx] back to the symbols, by the adjoint waves and illumination, [ny, nx]."""
+        page = parts(self.back.to_page(operators.backward, torch.stack(field)))
+        return multiply(page, conjugate(operators.illumination))
+
+
+def without_piston(phasors: Parts, weights: Tensor, table: Mapping[str, Tensor]) -> tuple[Parts, Parts]:
+    """Turn phasors [ny, nx] so that those of pilots agree with the known ones; return them, and the phasor taken off.
+
+    Args:
+        phasors: unit phasors of the symbols.
+        weights: their concentrations.
+        table: `pilot_phasors` and `pilot_mask`; a page without pilots is left as it is.
+    """
+    known, mask = table["pilot_phasors"], table["pilot_mask"]
+    real, imaginary = multiply(phasors, (known[0], -known[1]))
+    total = torch.stack([(real * weights * mask).sum() + 1e-20, (imaginary * weights * mask).sum()])
+    total = total / torch.sqrt(total.square().sum())
+    return multiply(phasors, (total[0], -total[1])), (total[0], total[1])
+
+
+def _concentration(information: Tensor, noise: Tensor) -> Tensor:
+    """Concentration of symbols [ny, nx] of so much Fisher information: 1 / (noise[0] / information + noise[1])."""
+    return information / (noise[0] + noise[1] * information)
+
+
+def _score(
+    table: Mapping[str, Tensor], page: Page, field: Parts, cameras: Cameras | None
+) -> tuple[Parts, Tensor]:
+    """Derivative of the log-likelihood by the field [Gy, Gx], and the expected counts, [2, Gy, Gx]."""
+    inverse = 1 / page.amplitude
+    together = torch.stack(field)
+    seen = [together, together] if cameras is None else list(cameras.seen(together).split(2))
+    arms = (1.0, 0.0), tuple(table["homodyne"].unbind())
+    expected, directions = [], []
+    for camera, (arm, light) in enumerate(zip(arms, seen, strict=True)):
+        along = light[0] * inverse + arm[0], light[1] * inverse + arm[1]
+        reference = page.reference[camera]
+        counts = reference * (along[0] * along[0] + along[1] * along[1])
+        score = score_of_counts(
+            counts, page.counts[camera], table["count_scale"][camera], table["count_weights"][camera]
+        )
+        expected.append(counts)
+        directions.append(scaled(along, 2 * reference * score * page.lit * inverse))
+    if cameras is None:
+        (real, imaginary), other = directions
+        return (real + other[0], imaginary + other[1]), torch.stack(expected)
+    gathered = cameras.gathered(torch.stack([*directions[0], *directions[1]]))
+    return parts(gathered), torch.stack(expected)
+
+
+def _chi_square(table: Mapping[str, Tensor], page: Page, expected: Tensor) -> Tensor:
+    """Mean square of the counts' residuals over their variance, [], on a share of the grid."""
+    every = (slice(None), slice(None, None, _EVERY), slice(None, None, _EVERY))
+    lit, total = page.lit[every[1:]], torch.zeros_like(page.lit[0, 0])
+    for camera, (light, counts) in enumerate(zip(expected[every], page.counts[every], strict=True)):
+        scale, weights = table["count_scale"][camera], table["count_weights"][camera]
+        score = score_of_counts(light, counts, scale, weights)
+        total = total + (lit * score * score / looked_up(weights[3], scale * torch.sqrt(light))).sum()
+    return total / (2 * lit.sum() + 1e-6)
