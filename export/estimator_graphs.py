@@ -16,7 +16,16 @@ from lightpage.calibration.likelihood.table import PILOT_MASK, PILOT_PHASORS
 from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.export.graph import FRAME_INPUTS, TABLE_INPUTS, answers
 from lightpage.export.onnx_files import exported
-from lightpage.runtime.model.execution.estimator_graph import BEFORE, ESTIMATE, NOISE, PAGE, RESIDUAL, STEP_OUTPUTS
+from lightpage.runtime.model.execution.estimator_graph import (
+    BEFORE,
+    EARLY_STEPS,
+    ESTIMATE,
+    NOISE,
+    PAGE,
+    RESIDUAL,
+    STEP_OUTPUTS,
+    EstimatorFiles,
+)
 from lightpage.train.models.likelihood.estimator import Estimate, Operators, Page, PhaseEstimator
 
 DEVICE = ("parameters", "blur", "illumination")
@@ -88,13 +97,21 @@ class StepGraph(nn.Module):
 
     Args:
         estimator, apart, structure, used: see `FirstGraph`.
+        coarse: see `PhaseEstimator.likelihood`.
     """
 
     def __init__(
-        self, estimator: PhaseEstimator, apart: tuple[str, ...], structure: tree.TreeSpec, used: Sequence[int]
+        self,
+        estimator: PhaseEstimator,
+        apart: tuple[str, ...],
+        structure: tree.TreeSpec,
+        used: Sequence[int],
+        *,
+        coarse: bool,
     ) -> None:
         super().__init__()
         self.estimator, self._apart, self._structure, self._used = estimator, apart, structure, tuple(used)
+        self._coarse = coarse
         self.names = (*STEP, *apart)
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
@@ -109,7 +126,9 @@ class StepGraph(nn.Module):
         table = dict(zip(self.names, tensors[given : given + len(self.names)], strict=True))
         operators = restored(self._structure, self._used, tensors[given + len(self.names) :])
         cameras = self.estimator.recovery.cameras(*(table[name] for name in self._apart))
-        found = self.estimator.likelihood(operators, table, page, Estimate(p, nuisance), cameras)
+        found = self.estimator.likelihood(
+            operators, table, page, Estimate(p, nuisance), cameras, coarse=self._coarse
+        )
         after, chi_square = self.estimator.advanced(table, page, Estimate(p, nuisance), found, noise)
         return *answers(after.p), after.nuisance, chi_square, *found
 
@@ -137,8 +156,9 @@ class WholeGraph(nn.Module):
         estimate, page, residual = self.estimator.first(operators, table, table[NOISE][0], in_phase, quadrature)
         chi_square = torch.zeros_like(residual)
         for number in range(self.steps):
-            noise = table[NOISE][number + 1]
-            estimate, chi_square = self.estimator.step(operators, table, page, estimate, noise, cameras)
+            coarse = number < EARLY_STEPS
+            found = self.estimator.likelihood(operators, table, page, estimate, cameras, coarse=coarse)
+            estimate, chi_square = self.estimator.advanced(table, page, estimate, found, table[NOISE][number + 1])
         return *answers(estimate.p), residual, estimate.nuisance, chi_square
 
 
@@ -153,8 +173,8 @@ def restored(structure: tree.TreeSpec, used: Sequence[int], tensors: Sequence[Te
 
 def estimator_files(
     estimator: PhaseEstimator, frame_dtype: str, apart: tuple[str, ...], table: SamplingTable
-) -> tuple[bytes, bytes, bytes]:
-    """Export the graphs of operators, first estimate and step.
+) -> EstimatorFiles:
+    """Export the graphs of operators, first estimate, early step and step.
 
     Args:
         estimator: estimator of the device.
@@ -173,11 +193,14 @@ def estimator_files(
         names = [f"operator_{number}" for number in range(len(flat))]
         numbered = tree.tree_unflatten(list(range(len(flat))), structure)
         backward = tree.tree_flatten((numbered.backward, numbered.illumination))[0]
-        everything = range(len(flat))
+        everything = tuple(range(len(flat)))
         first = FirstGraph(estimator, apart, structure, backward)
         asked = *frames, tensors[NOISE][0], *(tensors[name] for name in first.names), *(flat[number] for number in backward)
         begun = first(*asked)
-        step = StepGraph(estimator, apart, structure, everything)
+        steps = {
+            numbers: StepGraph(estimator, apart, structure, numbers, coarse=numbers != everything)
+            for numbers in (tuple(backward), everything)
+        }
     outputs = [*STEP_OUTPUTS[:4], "residual", *PAGE]
     made = dict(zip(outputs, begun, strict=True))
     given = (*(made[name] for name in ESTIMATE), tensors[NOISE][1], *(made[name] for name in PAGE))
@@ -190,21 +213,23 @@ def estimator_files(
             tuple(outputs),
             None,
         ),
-        exported(
-            step,
-            (*given, *(tensors[name] for name in step.names), *flat),
-            (*BEFORE.values(), NOISE, *PAGE, *step.names, *names),
-            STEP_OUTPUTS,
-            None,
+        *(
+            exported(
+                step,
+                (*given, *(tensors[name] for name in step.names), *(flat[number] for number in numbers)),
+                (*BEFORE.values(), NOISE, *PAGE, *step.names, *(names[number] for number in numbers)),
+                STEP_OUTPUTS,
+                None,
+            )
+            for numbers, step in steps.items()
         ),
     ]
     for file in files:
         onnx.checker.check_model(file)
-    operators, begins, goes_on = (bytes(file.SerializeToString()) for file in files)
-    return operators, begins, goes_on
+    return EstimatorFiles(*(bytes(file.SerializeToString()) for file in files))
 
 
-def whole_onnx(files: tuple[bytes, bytes, bytes], steps: int, table: SamplingTable) -> bytes:
+def whole_onnx(files: EstimatorFiles, steps: int, table: SamplingTable) -> bytes:
     """Join the graphs of operators, first estimate and step to one, with `table` as the defaults of its inputs.
 
     Args:
@@ -215,12 +240,12 @@ def whole_onnx(files: tuple[bytes, bytes, bytes], steps: int, table: SamplingTab
     Returns:
         A serialised model from frames and table to `WholeGraph.outputs`.
     """
-    device, first, step = (onnx.ModelProto.FromString(file) for file in files)
+    device, first, early, step = (onnx.ModelProto.FromString(file) for file in files)
     whole = onnx.ModelProto()
     whole.CopyFrom(first)
     for field in ("node", "initializer", "input", "output", "value_info"):
         whole.graph.ClearField(field)
-    inputs = {entry.name: entry for model in (device, first, step) for entry in model.graph.input}
+    inputs = {entry.name: entry for model in (device, first, early, step) for entry in model.graph.input}
     _append(whole, device, "", {entry.name: entry.name for entry in device.graph.output})
     kept = {entry.name: entry.name for entry in first.graph.output}
     kept |= {NOISE: f"{NOISE}_0", RESIDUAL: f"{RESIDUAL}_0"}
@@ -229,7 +254,8 @@ def whole_onnx(files: tuple[bytes, bytes, bytes], steps: int, table: SamplingTab
     for number in range(1, steps + 1):
         kept = {name: f"{name}_{number}" for name in (NOISE, *STEP_OUTPUTS)}
         kept |= {entry: f"{name}_{number - 1}" for name, entry in BEFORE.items()}
-        _append(whole, step, f"step{number}.", kept)
+        part, title = (early, "early") if number <= EARLY_STEPS else (step, "step")
+        _append(whole, part, f"{title}{number}.", kept)
     rows = [onnx.helper.make_node("Split", [NOISE], [f"{NOISE}_row_{row}" for row in range(steps + 1)], axis=0)]
     rows[0].attribute.append(onnx.helper.make_attribute("num_outputs", steps + 1))
     axis = onnx.numpy_helper.from_array(np.array([0], np.int64), "first_axis")

@@ -42,8 +42,9 @@ from lightpage.runtime.model.execution.estimator_graph import NOISE, EstimatorGr
 from lightpage.runtime.model.execution.session import open_session
 from lightpage.runtime.model.execution.table_graph import GraphFile, HeldTable
 from lightpage.runtime.recalibration.noise import MOST_STEPS, measured_noise
-from lightpage.train.models.likelihood.estimator import REFLECTIONS, PhaseEstimator
+from lightpage.train.models.likelihood.estimator import PhaseEstimator
 from lightpage.train.models.likelihood.torch_likelihood import TorchLikelihood
+from lightpage.train.models.presets import REFLECTIONS
 from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.train.trainers.whole_run import own_pilots
 

@@ -22,9 +22,9 @@ BATCH = "batch.onnx"
 """The decoder for many pages: what follows from the table alone, and frames with that to p; both or neither."""
 OPERATORS = "operators.onnx"
 FIRST = "first.onnx"
-STEP = "step.onnx"
-"""Maximum likelihood in three graphs: wave operators of a table, first estimate, and a step; all of them or none."""
-ESTIMATOR_FILES = (OPERATORS, FIRST, STEP)
+EARLY, STEP = "early.onnx", "step.onnx"
+"""Maximum likelihood in graphs: wave operators of a table, first estimate, early step, step; all of them or none."""
+ESTIMATOR_FILES = (OPERATORS, FIRST, EARLY, STEP)
 REQUIRED_FILES = frozenset({DECODER, TWIN, GOLDEN})
 OPTIONAL_FILES = frozenset({FIELD, TABLE, PILOTS, CONSTANTS, BATCH, *ESTIMATOR_FILES})
 Precision = Literal["float32", "float16"]

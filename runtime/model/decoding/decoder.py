@@ -28,7 +28,7 @@ from lightpage.runtime.model.decoding.camera_view import CameraView
 from lightpage.runtime.model.decoding.field_solver import BundleFieldSolver
 from lightpage.runtime.model.decoding.golden import check_golden
 from lightpage.runtime.model.decoding.page import OUTPUTS, DecodedPage, Inference, Timings, check_residual
-from lightpage.runtime.model.execution.estimator_graph import EstimatorGraph
+from lightpage.runtime.model.execution.estimator_graph import EstimatorFiles, EstimatorGraph
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
 from lightpage.runtime.model.execution.table_graph import GraphFile, TableGraph
 from lightpage.words import brief
@@ -65,10 +65,10 @@ def open_graph(
     if set(file.table_inputs) != set(bundle.manifest.table_inputs):
         raise BundleError(f"{subject}: table inputs", sorted(file.table_inputs), sorted(bundle.manifest.table_inputs))
     if bundle.files.keys() >= set(ESTIMATOR_FILES):
-        operators, first, step = (bundle.files[name] for name in ESTIMATOR_FILES)
+        files = EstimatorFiles(*(bundle.files[name] for name in ESTIMATOR_FILES))
         fed = (*PAGE_INPUTS, *PILOT_INPUTS)
         return EstimatorGraph(
-            (operators, first, step), file, bundle.subject, fed, threads, bundle.table, provider=provider, steps=steps
+            files, file, bundle.subject, fed, threads, bundle.table, provider=provider, steps=steps
         )
     if steps is not None:
         raise InvalidInputError(f"{bundle.subject}: steps", steps, "none: its decoder is a network")

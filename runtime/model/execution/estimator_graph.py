@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,8 @@ PAGE = ("counts", "reference", "amplitude", "lit")
 """Measurements of a page on the common grid, which all steps share."""
 NOISE = "noise"
 """Noise of a number of steps, a row each, from that of the first estimate on."""
+EARLY_STEPS = 1
+"""Steps whose light may be predicted coarsely: what they err, later ones mend."""
 DERIVATIVES = ("by_phase", "by_nuisance", "expected")
 STEP_OUTPUTS = ("p", "phase", "concentration", "nuisance", "chi_square", *DERIVATIVES)
 RESIDUAL = "residual"
@@ -29,11 +31,26 @@ RESIDUAL = "residual"
 _FRAMES = ("in_phase", "quadrature")
 
 
+class EstimatorFiles(NamedTuple):
+    """Serialised graphs of an estimator.
+
+    Attributes:
+        operators: a table to the constants that the others take.
+        first: frames to a first estimate.
+        early, step: an estimate to the next one, coarsely and exactly.
+    """
+
+    operators: bytes
+    first: bytes
+    early: bytes
+    step: bytes
+
+
 class EstimatorGraph:
     """The graphs of an estimator and their table. It never changes; many threads may call its methods at once.
 
     Args:
-        files: serialised graphs of operators, first estimate and step.
+        files: its graphs.
         defaults: graph of all in one, whose inputs have the table's defaults.
         subject: name of the bundle, for errors.
         fed: names of table inputs that may be fed with each page.
@@ -55,7 +72,7 @@ class EstimatorGraph:
 
     def __init__(
         self,
-        files: tuple[bytes, bytes, bytes],
+        files: EstimatorFiles,
         defaults: GraphFile | HeldTable,
         subject: str,
         fed: Sequence[str],
@@ -75,17 +92,19 @@ class EstimatorGraph:
             raise InvalidInputError("steps", steps, f"1 to {most}, as the bundle has")
         self.steps = most if steps is None else steps
         if like is None:
-            self._device = open_session(files[0], f"{subject}: operators", threads, once=True)
-            self._first = open_session(files[1], f"{subject}: first estimate", threads, provider=provider)
-            self._step = open_session(files[2], f"{subject}: step", threads, provider=provider)
+            self._device = open_session(files.operators, f"{subject}: operators", threads, once=True)
+            self._first, self._early, self._step = (
+                open_session(model, f"{subject}: {what}", threads, provider=provider)
+                for what, model in {"first estimate": files.first, "early step": files.early, "step": files.step}.items()
+            )
         else:
-            self._device, self._first, self._step = like._device, like._first, like._step
+            self._device, self._first, self._early, self._step = like._device, like._first, like._early, like._step
         names = [node.name for node in self._device.get_outputs()]
         feeds = {node.name: self.value(node.name) for node in self._device.get_inputs()}
         with running(subject):
             made = dict(zip(names, self._device.run(names, feeds), strict=True))
         self._held = {name: self.value(name) for name in self.ports if name != NOISE} | made
-        self._bound = {session: self._with_constants(session) for session in (self._first, self._step)}
+        self._bound = {session: self._with_constants(session) for session in (self._first, self._early, self._step)}
 
     def with_table(self, table: SamplingTable) -> EstimatorGraph:
         """The graphs with other tensors in their table, by name; those left out stay. It raises as the constructor."""
@@ -134,7 +153,8 @@ class EstimatorGraph:
         noise = self.value(NOISE)
         for number in range(steps):
             wanted = STEP_OUTPUTS[:5] if number == steps - 1 else ESTIMATE
-            found |= self._stepped(found, noise[number + 1], feeds, wanted)
+            session = self._early if number < EARLY_STEPS else self._step
+            found |= self._stepped(session, found, noise[number + 1], feeds, wanted)
         return [found[name] for name in outputs]
 
     def derivatives(
@@ -142,7 +162,7 @@ class EstimatorGraph:
     ) -> dict[str, NDArray[Any]]:
         """Return the log-likelihood's derivatives at an estimate, and the page's measurements, by name."""
         found = {**self._begun(feeds), "p": p, "nuisance": nuisance}
-        return {**found, **self._stepped(found, self.value(NOISE)[1], feeds, DERIVATIVES)}
+        return {**found, **self._stepped(self._step, found, self.value(NOISE)[1], feeds, DERIVATIVES)}
 
     def _begun(self, feeds: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         names = [node.name for node in self._first.get_outputs()]
@@ -150,6 +170,7 @@ class EstimatorGraph:
 
     def _stepped(
         self,
+        session: Session,
         found: Mapping[str, NDArray[Any]],
         noise: NDArray[Any],
         feeds: Mapping[str, NDArray[Any]],
@@ -157,7 +178,7 @@ class EstimatorGraph:
     ) -> dict[str, NDArray[Any]]:
         state = {BEFORE.get(name, name): found[name] for name in (*ESTIMATE, *PAGE)} | {NOISE: noise}
         shared = {name: value for name, value in feeds.items() if name not in _FRAMES}
-        return self._asked(self._step, outputs, {**shared, **state})
+        return self._asked(session, outputs, {**shared, **state})
 
     def _asked(
         self, session: Session, outputs: Sequence[str], feeds: Mapping[str, NDArray[Any]]

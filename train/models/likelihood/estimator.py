@@ -25,8 +25,6 @@ from lightpage.train.models.prediction import expected_phasors
 from lightpage.train.models.waves import Fidelity, Real, WaveMatrices, Waves
 from lightpage.waves.grid import FieldGrid
 
-REFLECTIONS = 4
-"""Rounds by which the field of the first estimate is recovered, see `FieldRecovery`."""
 FORWARD, BACKWARD = Fidelity(0.005, 0.007), Fidelity(0.06, 0.05)
 """Fidelity of the predicted light, and of the way back: an error of that one moves the estimate by its share of the
 noise alone."""
@@ -98,7 +96,6 @@ class PhaseEstimator(nn.Module):
         profile: nominal device.
         parameters: [P] fitted; they say how finely waves are sampled.
         grid: common grid, where it is not the usual one.
-        reflections: rounds of the field's recovery.
         forward, backward: fidelity of the waves either way.
     """
 
@@ -107,12 +104,12 @@ class PhaseEstimator(nn.Module):
         profile: Profile,
         parameters: Real,
         grid: FieldGrid | None = None,
-        reflections: int = REFLECTIONS,
         forward: Fidelity = FORWARD,
         backward: Fidelity = BACKWARD,
     ) -> None:
         super().__init__()
-        self.recovery = FieldRecovery(profile, reflections=reflections, grid=grid)
+        # the root nearest to the linear field is enough: the first step mends more than rounds of its own would
+        self.recovery = FieldRecovery(profile, rounds=0, grid=grid)
         self.waves = Waves(profile, parameters, 1, forward, filled=True, grid=grid)
         self.back = Waves(profile, parameters, 1, backward, filled=True, grid=grid)
         self.nuisances = PageNuisances(profile, self.recovery.grid)
@@ -160,15 +157,32 @@ class PhaseEstimator(nn.Module):
         return estimate, page, relative_power(unexplained, field)
 
     def likelihood(
-        self, operators: Operators, table: Mapping[str, Tensor], page: Page, estimate: Estimate, cameras: Cameras | None
+        self,
+        operators: Operators,
+        table: Mapping[str, Tensor],
+        page: Page,
+        estimate: Estimate,
+        cameras: Cameras | None = None,
+        *,
+        coarse: bool = False,
     ) -> Likelihood:
-        """Evaluate the derivatives of the log-likelihood at an estimate."""
+        """Evaluate the derivatives of the log-likelihood at an estimate.
+
+        Args:
+            operators, page, estimate: see there.
+            table: `homodyne`, `amplitude_series`, `count_scale`, `count_weights`.
+            cameras: defocus of cameras that stand apart.
+            coarse: whether light is predicted with the fidelity of the way back, as is enough for a first step.
+        """
+        waves, forward = (
+            (self.back, operators.backward) if coarse else (self.waves, operators.forward)
+        )
         x, y = parts(expected_phasors(estimate.p))
         length = torch.sqrt(estimate.p.square().sum(0) + 1e-20)
         direction = estimate.p[0] / length, estimate.p[1] / length
         amplitude, slope = amplitude_and_slope(direction, table["amplitude_series"])
         light = multiply(scaled((x, y), amplitude), operators.illumination)
-        at_camera = parts(self.waves.to_camera(operators.forward, torch.stack(light)))
+        at_camera = parts(waves.to_camera(forward, torch.stack(light)))
         field, tilt = self.nuisances(at_camera, estimate.nuisance)
         score, expected = _score(table, page, field, cameras)
         back = self._to_page(operators, multiply(score, conjugate(tilt)))
@@ -177,19 +191,6 @@ class PhaseEstimator(nn.Module):
         by_log = symbol[0] * back[0] + symbol[1] * back[1]
         turned = symbol[0] * back[1] - symbol[1] * back[0]
         return Likelihood(turned + slope * by_log, self.nuisances.gradient(field, score), expected)
-
-    def step(
-        self,
-        operators: Operators,
-        table: Mapping[str, Tensor],
-        page: Page,
-        estimate: Estimate,
-        noise: Tensor,
-        cameras: Cameras | None = None,
-    ) -> tuple[Estimate, Tensor]:
-        """Take one Gauss-Newton step; arguments and results as of `likelihood` and `advanced`."""
-        found = self.likelihood(operators, table, page, estimate, cameras)
-        return self.advanced(table, page, estimate, found, noise)
 
     def advanced(
         self, table: Mapping[str, Tensor], page: Page, estimate: Estimate, found: Likelihood, noise: Tensor
@@ -203,7 +204,7 @@ class PhaseEstimator(nn.Module):
             table: `count_scale`, `count_weights`, `information`, `responses`, `nuisance_precision`,
                 `nuisance_covariance`, `pilot_phasors`, `pilot_mask`.
             page, estimate: see there.
-            found: derivatives at the estimate.
+            found: derivatives at the estimate, see `likelihood`.
             noise: see `_concentration`, [2].
 
         Returns:
