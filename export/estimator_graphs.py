@@ -84,7 +84,7 @@ class FirstGraph(nn.Module):
         self.names = (*FIRST, *apart)
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
-        """Frames, noise, `names` and operators to p, phase, concentration, nuisance, residual and the page's tensors."""
+        """Frames, noise, `names` and operators to p, phase, concentration, nuisance, residual and page."""
         frames, noise, given = tensors[:2], tensors[2], 3 + len(self.names)
         table = dict(zip(self.names, tensors[3:given], strict=True))
         operators = restored(self._structure, self._used, tensors[given:])
@@ -126,9 +126,7 @@ class StepGraph(nn.Module):
         table = dict(zip(self.names, tensors[given : given + len(self.names)], strict=True))
         operators = restored(self._structure, self._used, tensors[given + len(self.names) :])
         cameras = self.estimator.recovery.cameras(*(table[name] for name in self._apart))
-        found = self.estimator.likelihood(
-            operators, table, page, Estimate(p, nuisance), cameras, coarse=self._coarse
-        )
+        found = self.estimator.likelihood(operators, table, page, Estimate(p, nuisance), cameras, coarse=self._coarse)
         after, chi_square = self.estimator.advanced(table, page, Estimate(p, nuisance), found, noise)
         return *answers(after.p), after.nuisance, chi_square, *found
 
@@ -195,7 +193,12 @@ def estimator_files(
         backward = tree.tree_flatten((numbered.backward, numbered.illumination))[0]
         everything = tuple(range(len(flat)))
         first = FirstGraph(estimator, apart, structure, backward)
-        asked = *frames, tensors[NOISE][0], *(tensors[name] for name in first.names), *(flat[number] for number in backward)
+        asked = (
+            *frames,
+            tensors[NOISE][0],
+            *(tensors[name] for name in first.names),
+            *(flat[number] for number in backward),
+        )
         begun = first(*asked)
         steps = {
             numbers: StepGraph(estimator, apart, structure, numbers, coarse=numbers != everything)
@@ -256,20 +259,17 @@ def whole_onnx(files: EstimatorFiles, steps: int, table: SamplingTable) -> bytes
         kept |= {entry: f"{name}_{number - 1}" for name, entry in BEFORE.items()}
         part, title = (early, "early") if number <= EARLY_STEPS else (step, "step")
         _append(whole, part, f"{title}{number}.", kept)
-    rows = [onnx.helper.make_node("Split", [NOISE], [f"{NOISE}_row_{row}" for row in range(steps + 1)], axis=0)]
-    rows[0].attribute.append(onnx.helper.make_attribute("num_outputs", steps + 1))
-    axis = onnx.numpy_helper.from_array(np.array([0], np.int64), "first_axis")
-    whole.graph.initializer.append(axis)
-    for row in range(steps + 1):
-        rows.append(onnx.helper.make_node("Squeeze", [f"{NOISE}_row_{row}", "first_axis"], [f"{NOISE}_{row}"]))
-    for name in WholeGraph.outputs:
-        last = f"{name}_{0 if name == RESIDUAL else steps}"
-        rows.append(onnx.helper.make_node("Identity", [last], [name]))
-        source = first if name == RESIDUAL else step
-        whole.graph.output.append(next(entry for entry in source.graph.output if entry.name == name))
-    nodes = [*rows[: steps + 2], *whole.graph.node, *rows[steps + 2 :]]
+    make = onnx.helper.make_node
+    rows = [f"{NOISE}_row_{number}" for number in range(steps + 1)]
+    split = [make("Split", [NOISE], rows, axis=0, num_outputs=steps + 1)]
+    split += [make("Squeeze", [row, "first_axis"], [f"{NOISE}_{number}"]) for number, row in enumerate(rows)]
+    whole.graph.initializer.append(numpy_helper.from_array(np.array([0], np.int64), "first_axis"))
+    last = {name: f"{name}_{0 if name == RESIDUAL else steps}" for name in WholeGraph.outputs}
+    nodes = [*split, *whole.graph.node, *(make("Identity", [source], [name]) for name, source in last.items())]
     whole.graph.ClearField("node")
     whole.graph.node.extend(nodes)
+    known = {entry.name: entry for model in (first, step) for entry in model.graph.output}
+    whole.graph.output.extend(known[name] for name in WholeGraph.outputs)
     whole.graph.input.extend(inputs[name] for name in FRAME_INPUTS)
     _with_defaults(whole, table)
     onnx.checker.check_model(whole)

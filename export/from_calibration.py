@@ -113,7 +113,9 @@ def export_calibration(
     graphs = estimator_files(estimator, frame_dtype, device.apart_inputs, table)
     progress("noise of the known pages", 0.6)
     graph = EstimatorGraph(graphs, HeldTable(table), str(out), (), None)
-    table[NOISE] = measured_noise(graph, [(page.pair, np.angle(page.light(device.modulation))) for page in pages], mask, steps)
+    table[NOISE] = measured_noise(
+        graph, [(page.pair, np.angle(page.light(device.modulation))) for page in pages], mask, steps
+    )
     del graph
     progress("ask torch", 0.7)
     whole = WholeGraph(estimator, device.apart_inputs, len(table[NOISE]) - 1).eval()
@@ -178,4 +180,3 @@ def _pilots(
     if own is not None:
         return Pilots(mask, modulation.phase(own.astype(np.float64)))
     return Pilots.of_profile(profile, modulation.page_levels(256), mask)
-

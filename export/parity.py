@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from lightpage.errors import BundleError
+from lightpage.export.estimator_graphs import WholeGraph
 from lightpage.export.graph import Graph
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.manifest import FLOAT32
@@ -14,7 +15,7 @@ from lightpage.runtime.model.decoding.golden import GOLDEN_TOLERANCE
 
 
 def torch_answer(
-    graph: Graph, pair: FramePair, defaults: dict[str, NDArray[np.generic]]
+    graph: Graph | WholeGraph, pair: FramePair, defaults: dict[str, NDArray[np.generic]]
 ) -> dict[str, NDArray[np.float32]]:
     """Every output of the decoder for a frame pair, by torch; `defaults` in the order of its inputs."""
     with torch.no_grad():

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.calibration.sampling_table import sampling_table
+from lightpage.export.estimator_graphs import WholeGraph
 from lightpage.export.graph import DecoderGraph, Graph, PublishedGraph, published_tensors, table_tensors
 from lightpage.export.parity import torch_answer
 from lightpage.recording.frame_pair import FramePair
@@ -40,7 +41,7 @@ def graph_of(folder: Path, run: Run, references: FramePair, twin: RayTwin) -> tu
 
 
 def golden_of(
-    graph: Graph, pair: FramePair, defaults: Tensors, bit_depth: int
+    graph: Graph | WholeGraph, pair: FramePair, defaults: Tensors, bit_depth: int
 ) -> tuple[float | None, FramePair, dict[str, NDArray[np.float32]]]:
     """The residual's limit by a page of a run, the frames of the golden page, and what torch says to them."""
     answer = torch_answer(graph, pair, defaults)
@@ -52,7 +53,7 @@ def golden_of(
 
 
 def _residual_limit(
-    graph: Graph, pair: FramePair, defaults: Tensors, answer: dict[str, NDArray[np.float32]]
+    graph: Graph | WholeGraph, pair: FramePair, defaults: Tensors, answer: dict[str, NDArray[np.float32]]
 ) -> float | None:
     """Half way, in ratio, between the residuals of right and of swapped frames; None where both are alike."""
     if "residual" not in graph.outputs:

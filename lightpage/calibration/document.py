@@ -148,12 +148,13 @@ class Calibration(TomlTable):
         """A re-fit that started here, with what it has to remember of this one.
 
         It remembers the coherence at first, so that many small losses are not taken for none, and the pages of every
-        earlier fit, so that no figure counts one of them as held out.
+        earlier fit, so that no figure counts one of them as held out. Statistics that the re-fit has not measured stay.
         """
         return fitted.model_copy(
             update={
                 "coherence_at_first": self.reference_coherence,
                 "calibrated_pages": (*self.calibrated_pages, *fitted.calibrated_pages),
+                "statistics": fitted.statistics or self.statistics,
             }
         )
 

@@ -1,11 +1,14 @@
 """Re-fits the device's geometry with the exported twin and re-traces the sampling table."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from lightpage.calibration.calibrate import LEAST_KEPT, KnownPage, refine
 from lightpage.calibration.document import Calibration
 from lightpage.calibration.image_search import REACH_PX
 from lightpage.calibration.interfaces import FieldSolver, Twin
+from lightpage.calibration.likelihood.table import launch_tensors
 from lightpage.calibration.sampling_table import apart_inputs, moved_cameras, sampling_table
 from lightpage.errors import BundleError, CalibrationError
 from lightpage.page.pilots import Pilots
@@ -17,7 +20,9 @@ from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_drift import BundleSearch
 from lightpage.runtime.model.decoding.image_position import ImagePosition
+from lightpage.runtime.model.execution.estimator_graph import EstimatorGraph
 from lightpage.runtime.model.execution.twin import OnnxTwin
+from lightpage.runtime.recalibration.estimator import measured_anew
 from lightpage.runtime.recalibration.known_pages import KnownPages
 from lightpage.runtime.recalibration.recalibration import RefitReport, RefitResult
 
@@ -97,7 +102,20 @@ def refit(
     hashes = dict.fromkeys([*map(hash_frames, pages.pairs), *pages.fitted])
     fitted = earlier.followed_by(Calibration.from_registered(registered, profile, [*hashes]))
     check_as_good(earlier, fitted)
-    return traced(decoder, twin, references, fitted, image)
+    graph = decoder.graph
+    if not isinstance(graph, EstimatorGraph) or registered.conditions is None:
+        return traced(decoder, twin, references, fitted, image)
+    statistics, measured = measured_anew(
+        graph,
+        twin,
+        fitted.device(profile, references),
+        known,
+        registered.conditions,
+        bundle.pilot_mask if pages.pilot_mask is None else pages.pilot_mask,
+        lambda share: progress("statistics and noise of the estimator", share),
+    )
+    result = traced(decoder, twin, references, fitted.model_copy(update={"statistics": statistics}), image)
+    return replace(result, table={**result.table, **measured})
 
 
 def check_as_good(earlier: Calibration, fitted: Calibration) -> None:
@@ -130,6 +148,8 @@ def traced(
         "reference_quadrature": references.quadrature,
         **sampling_table(twin, fitted.vector, fitted.turn_rad, profile),
     }
+    if (statistics := fitted.statistics) is not None:
+        table |= launch_tensors(profile, statistics.conditions, fitted.modulator)
     return RefitResult(
         table=decoder.taken(table),
         calibration_toml=fitted.to_toml(),

@@ -21,6 +21,7 @@ from lightpage.runtime.model.decoding.image_drift import BundleTables, DriftMode
 from lightpage.runtime.model.decoding.image_tracker import ImageTracker
 from lightpage.runtime.model.decoding.page import DecodedPage
 from lightpage.runtime.model.decoding.tracking import Tracker, unconfirmed_page
+from lightpage.runtime.model.execution.estimator_graph import EstimatorGraph
 
 
 class Look(NamedTuple):
@@ -88,7 +89,12 @@ class UnknownPages:
         if fitted is None:
             return None
         if self._drift is None:
-            self._drift = DriftModel(drift_slopes(decoder, self._twin, decoder.bundle.calibration.vector, fitted))
+            parameters = decoder.bundle.calibration.vector
+            self._drift = (
+                DriftModel.of_decoder(decoder, self._twin)
+                if isinstance(decoder.graph, EstimatorGraph)
+                else DriftModel(drift_slopes(decoder, self._twin, parameters, fitted))
+            )
         return ImageTracker(decoder, self._drift, BundleTables(decoder, self._twin), None)
 
     def _decoded(self, decoder: Decoder, tracker: Tracker | None, pair: FramePair, known: Pilots) -> DecodedPage:
@@ -100,7 +106,7 @@ class UnknownPages:
                     return tracker.decode(pair, levels, known)
                 except UnconfirmedPageError as error:
                     return unconfirmed_page(error)
-        return decoder.post_process(decoder.infer(pair, doubtful=True), levels, known)
+        return decoder.post_process(decoder.infer(pair, pilots=known, doubtful=True), levels, known)
 
     def decided(self, decoder: Decoder, fitted: FramePair | None = None) -> tuple[int, NDArray[np.uint8]]:
         """The page that a model decides best, and its symbols, uint8 [ny, nx].

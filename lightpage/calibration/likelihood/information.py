@@ -108,8 +108,8 @@ class InformationFit:
         """Measure the Fisher information of the symbols, and how they couple with the nuisance parameters.
 
         Returns:
-            `count_scale`, `count_weights`; information [ny, nx] of a page of unit gain; responses [5, ny, nx] of the phases to its
-            relative gain, tilt and shift; nuisance_covariance [5, 5] and nuisance_precision [4], those of the prior.
+            `count_scale`, `count_weights`; information [ny, nx] of a page of unit gain; responses [5, ny, nx] of the
+            phases to its relative gain, tilt and shift; nuisance_covariance [5, 5] and nuisance_precision [4], those of the prior.
         """
         for known in self._pages:
             self._first_counts(known)

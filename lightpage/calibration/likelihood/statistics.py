@@ -11,9 +11,7 @@ from lightpage.calibration.likelihood.counts import CountStatistics, Values
 from lightpage.calibration.waves.wave_model import ILLUMINATIONS, LaunchConditions
 from lightpage.device.profile import Finite, TomlTable
 
-Coefficients = Annotated[
-    tuple[Finite, ...], Field(min_length=ILLUMINATIONS, max_length=ILLUMINATIONS, strict=False)
-]
+Coefficients = Annotated[tuple[Finite, ...], Field(min_length=ILLUMINATIONS, max_length=ILLUMINATIONS, strict=False)]
 
 
 class Statistics(TomlTable):
@@ -57,7 +55,9 @@ class Statistics(TomlTable):
     @property
     def conditions(self) -> LaunchConditions:
         """Conditions under which the pages' light is launched."""
-        return LaunchConditions(np.array(self.illumination_real) + 1j * np.array(self.illumination_imaginary), self.blur)
+        return LaunchConditions(
+            np.array(self.illumination_real) + 1j * np.array(self.illumination_imaginary), self.blur
+        )
 
     @property
     def cameras(self) -> tuple[CountStatistics, CountStatistics]:

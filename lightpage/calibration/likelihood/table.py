@@ -29,8 +29,8 @@ def launch_tensors(profile: Profile, conditions: LaunchConditions, modulation: M
         modulation: light that the modulator makes of its levels.
 
     Returns:
-        blur []; illumination [2, 6], of one sample that stands for a symbol, without its phase; amplitude_series [13], see
-        `lightpage.train.models.likelihood.modulator`.
+        blur []; illumination [2, 6], of one sample that stands for a symbol, without its phase; amplitude_series [13],
+        see `lightpage.train.models.likelihood.modulator`.
     """
     one_sample = symbol_samples(profile) * np.exp(-1j * np.angle(conditions.illumination[0]))
     coefficients = conditions.illumination * one_sample

@@ -16,8 +16,8 @@ from lightpage.runtime.model.bundle.manifest import BATCH, CONSTANTS, FLOAT16
 from lightpage.runtime.model.decoding.golden import check_golden
 from lightpage.runtime.model.decoding.page import OUTPUTS, Inference
 from lightpage.runtime.model.execution.device_memory import ON_NO_DEVICE, Copies
+from lightpage.runtime.model.execution.page_graph import PageGraph
 from lightpage.runtime.model.execution.session import BoundSession, OnDevice, open_session, running
-from lightpage.runtime.model.execution.table_graph import TableGraph
 
 _log = logging.getLogger(__name__)
 
@@ -108,7 +108,7 @@ class BatchGraph:
         ProviderError: there is no such provider here.
     """
 
-    def __init__(self, bundle: Bundle, graph: TableGraph, pages: int, threads: int | None = None) -> None:
+    def __init__(self, bundle: Bundle, graph: PageGraph, pages: int, threads: int | None = None) -> None:
         self.subject = f"{bundle.subject}: {BATCH}"
         if missing := _FILES - bundle.files.keys():
             raise BundleError(f"{bundle.subject}: files", f"no {', '.join(sorted(missing))}", "a graph for batches")
@@ -145,7 +145,7 @@ class BatchGraph:
         manifest = self._bundle.manifest
         return FrameBuffer(self.pages, self._bundle.profile.frame_shape, manifest.frame_dtype, self._copies)
 
-    def constants(self, graph: TableGraph, registration: NDArray[np.float32] | None = None) -> Constants:
+    def constants(self, graph: PageGraph, registration: NDArray[np.float32] | None = None) -> Constants:
         """Constants of a table, computed on the CPU.
 
         Args:
@@ -191,7 +191,7 @@ def fewer(pages: int) -> int:
     return 1 << ((pages - 1).bit_length() - 1)
 
 
-def with_proven_batches(bundle: Bundle, graph: TableGraph) -> Bundle:
+def with_proven_batches(bundle: Bundle, graph: PageGraph) -> Bundle:
     """The bundle, without its graph for batches and a warning where that does not decode the golden page as it should.
 
     Args:

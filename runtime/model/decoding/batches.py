@@ -30,8 +30,8 @@ from lightpage.runtime.model.decoding.batch_graph import (
 )
 from lightpage.runtime.model.decoding.page import Inference
 from lightpage.runtime.model.decoding.under_way import Phase, UnderWay
+from lightpage.runtime.model.execution.page_graph import PageGraph
 from lightpage.runtime.model.execution.providers import ON_CPU
-from lightpage.runtime.model.execution.table_graph import TableGraph
 
 _log = logging.getLogger(__name__)
 
@@ -95,7 +95,7 @@ class _Ticket:
 class _Held:
     """Constants with the table that they follow from, and when they were last asked for."""
 
-    graph: ref[TableGraph]
+    graph: ref[PageGraph]
     own: NDArray[np.float32]
     constants: Constants
     asked: int = 0
@@ -116,15 +116,15 @@ class HeldConstants:
     """
 
     def __init__(
-        self, graph: BatchGraph, table: TableGraph, beside: Callable[[Callable[[], None]], None] = _beside
+        self, graph: BatchGraph, table: PageGraph, beside: Callable[[Callable[[], None]], None] = _beside
     ) -> None:
         self._graph, self._beside, self._lock, self._asked = graph, beside, threading.Lock(), 0
         first = graph.constants_of_bundle
         self._held = [_Held(ref(table), first.registration, first)]
-        self._making: set[TableGraph] = set()
+        self._making: set[PageGraph] = set()
 
     def of(
-        self, table: TableGraph, registration: NDArray[np.float32] | None
+        self, table: PageGraph, registration: NDArray[np.float32] | None
     ) -> tuple[Constants, NDArray[np.float32]] | None:
         """Constants of a table, and by how much an image lies elsewhere than they have it, [2, 2] pixels.
 
@@ -145,7 +145,7 @@ class HeldConstants:
             return self._found(table, registration)
 
     def _found(
-        self, table: TableGraph, registration: NDArray[np.float32] | None
+        self, table: PageGraph, registration: NDArray[np.float32] | None
     ) -> tuple[Constants, NDArray[np.float32]] | None:
         """See `of`: what is held."""
         for held in self._held:
@@ -155,7 +155,7 @@ class HeldConstants:
                 return held.constants, shift
         return None
 
-    def _make(self, table: TableGraph, registration: NDArray[np.float32] | None) -> None:
+    def _make(self, table: PageGraph, registration: NDArray[np.float32] | None) -> None:
         """Make constants, and hold them in place of those that were not asked for the longest."""
         made = list[_Held]()
         try:
@@ -195,7 +195,7 @@ class OneByOne:
         """Have no batch wait for the caller's page until it is inferred: that waits for something else."""
 
     def infer(
-        self, table: TableGraph, pair: FramePair, registration: NDArray[np.float32] | None = None
+        self, table: PageGraph, pair: FramePair, registration: NDArray[np.float32] | None = None
     ) -> Inference | None:
         """The graph's answer to a page that is computed with others; None where it must be computed alone.
 
@@ -223,7 +223,7 @@ class Batches(OneByOne):
         clock: clock by which runs wait.
     """
 
-    def __init__(self, graph: BatchGraph, table: TableGraph, batching: Batching, clock: Clock = SYSTEM) -> None:
+    def __init__(self, graph: BatchGraph, table: PageGraph, batching: Batching, clock: Clock = SYSTEM) -> None:
         super().__init__(_ALONE)
         self._clock = clock
         self._graph, self._batching, self._constants = graph, batching, HeldConstants(graph, table)
@@ -239,7 +239,7 @@ class Batches(OneByOne):
         self._is_running = False
 
     @classmethod
-    def opened(cls, bundle: Bundle, table: TableGraph, batching: Batching, threads: int | None) -> OneByOne:
+    def opened(cls, bundle: Bundle, table: PageGraph, batching: Batching, threads: int | None) -> OneByOne:
         """Open a bundle's graph for batches; pages go one by one where it has none, which is logged, or none is wanted.
 
         Raises:
@@ -268,7 +268,7 @@ class Batches(OneByOne):
                 self._changed.notify_all()
 
     def infer(
-        self, table: TableGraph, pair: FramePair, registration: NDArray[np.float32] | None = None
+        self, table: PageGraph, pair: FramePair, registration: NDArray[np.float32] | None = None
     ) -> Inference | None:
         """See `OneByOne`."""
         if (found := self._constants.of(table, registration)) is None:

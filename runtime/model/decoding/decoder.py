@@ -29,6 +29,7 @@ from lightpage.runtime.model.decoding.field_solver import BundleFieldSolver
 from lightpage.runtime.model.decoding.golden import check_golden
 from lightpage.runtime.model.decoding.page import OUTPUTS, DecodedPage, Inference, Timings, check_residual
 from lightpage.runtime.model.execution.estimator_graph import EstimatorFiles, EstimatorGraph
+from lightpage.runtime.model.execution.page_graph import PageGraph
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
 from lightpage.runtime.model.execution.table_graph import GraphFile, TableGraph
 from lightpage.words import brief
@@ -40,13 +41,11 @@ PAGE_INPUTS = frozenset([REGISTRATION])
 """Table inputs that may differ from page to page, as the image shifts. All others are built into the graph."""
 PILOT_INPUTS = frozenset([PILOT_PHASORS, PILOT_MASK])
 """Table inputs that are fed with each page where the graph takes them: what is known of its symbols."""
-Graph = TableGraph | EstimatorGraph
-"""Graph of a decoder: one that is run once, or an estimator's."""
 
 
 def open_graph(
     bundle: Bundle, threads: int | None = None, provider: Provider = ON_CPU, steps: int | None = None
-) -> Graph:
+) -> PageGraph:
     """The graph of a bundle's decoder with the bundle's table.
 
     Args:
@@ -67,9 +66,7 @@ def open_graph(
     if bundle.files.keys() >= set(ESTIMATOR_FILES):
         files = EstimatorFiles(*(bundle.files[name] for name in ESTIMATOR_FILES))
         fed = (*PAGE_INPUTS, *PILOT_INPUTS)
-        return EstimatorGraph(
-            files, file, bundle.subject, fed, threads, bundle.table, provider=provider, steps=steps
-        )
+        return EstimatorGraph(files, file, bundle.subject, fed, threads, bundle.table, provider=provider, steps=steps)
     if steps is not None:
         raise InvalidInputError(f"{bundle.subject}: steps", steps, "none: its decoder is a network")
     with raised_as(BundleError, InvalidInputError, about=f"{bundle.subject}: "):
@@ -107,7 +104,7 @@ class Decoder:
         self,
         bundle: Bundle,
         threads: int | None = None,
-        graph: Graph | None = None,
+        graph: PageGraph | None = None,
         provider: Provider = ON_CPU,
         code_threads: int = 1,
         batching: Batching = NO_BATCHES,
@@ -143,9 +140,7 @@ class Decoder:
     ) -> Decoder:
         """Open the bundle at `path` and its decoder; raises as `Bundle.open` and the constructor do."""
         bundle = Bundle.open(path)
-        return cls(
-            bundle, threads, provider=provider, batching=batching, code_threads=code_threads, steps=steps
-        )
+        return cls(bundle, threads, provider=provider, batching=batching, code_threads=code_threads, steps=steps)
 
     def of_another(self, bundle: Bundle) -> Decoder:
         """The decoder of another bundle, on the same threads and provider; raises as the constructor does."""
@@ -391,7 +386,8 @@ _OF_ESTIMATE = ("nuisance", "chi_square")
 
 def _inference(found: dict[str, NDArray[np.float32]], residual: str | None) -> Inference:
     """The inference of a graph's outputs by name."""
-    page = Inference(*(found[name] for name in OUTPUTS), float(np.max(found[residual])) if residual else 0.0)
+    p, phase, concentration = (found[name] for name in OUTPUTS)
+    page = Inference(p, phase, concentration, float(np.max(found[residual])) if residual else 0.0)
     if "nuisance" not in found:
         return page
     tilt, shift = found["nuisance"][2:4], found["nuisance"][4:6]
@@ -399,7 +395,7 @@ def _inference(found: dict[str, NDArray[np.float32]], residual: str | None) -> I
     return replace(page, drift=drift, chi_square=float(found["chi_square"]))
 
 
-def _like(decoder: Decoder, bundle: Bundle, graph: Graph) -> Decoder:
+def _like(decoder: Decoder, bundle: Bundle, graph: PageGraph) -> Decoder:
     """The decoder of the same graphs with another table; whatever is open is shared."""
     codes, batching, batches = decoder.code_threads, decoder._batching, decoder.batches
     return Decoder(bundle, decoder.threads, graph, code_threads=codes, batching=batching, batches=batches)

@@ -12,8 +12,8 @@ from lightpage.errors import BundleError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import DECODER, FIELD
+from lightpage.runtime.model.execution.page_graph import PageGraph
 from lightpage.runtime.model.execution.session import open_session, running
-from lightpage.runtime.model.execution.table_graph import TableGraph
 from lightpage.waves.grid import field_grid
 
 FIELD_OUTPUTS = ("field", "unexplained")
@@ -35,7 +35,7 @@ class BundleFieldSolver:
         BundleError: no graph shows the field.
     """
 
-    def __init__(self, bundle: Bundle, graph: TableGraph, threads: int | None = None) -> None:
+    def __init__(self, bundle: Bundle, graph: PageGraph, threads: int | None = None) -> None:
         self._graph, self._profile = graph, bundle.profile
         self._alone = FIELD in bundle.files
         name = FIELD if self._alone else DECODER

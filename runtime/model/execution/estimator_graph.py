@@ -95,7 +95,11 @@ class EstimatorGraph:
             self._device = open_session(files.operators, f"{subject}: operators", threads, once=True)
             self._first, self._early, self._step = (
                 open_session(model, f"{subject}: {what}", threads, provider=provider)
-                for what, model in {"first estimate": files.first, "early step": files.early, "step": files.step}.items()
+                for what, model in {
+                    "first estimate": files.first,
+                    "early step": files.early,
+                    "step": files.step,
+                }.items()
             )
         else:
             self._device, self._first, self._early, self._step = like._device, like._first, like._early, like._step
@@ -149,7 +153,7 @@ class EstimatorGraph:
             feeds: frames, and table tensors for this page alone.
             steps: number of steps; the graph's if left out.
         """
-        found, steps = self._begun(feeds), self.steps if steps is None else steps
+        found, steps = self.begun(feeds), self.steps if steps is None else steps
         noise = self.value(NOISE)
         for number in range(steps):
             wanted = STEP_OUTPUTS[:5] if number == steps - 1 else ESTIMATE
@@ -158,13 +162,24 @@ class EstimatorGraph:
         return [found[name] for name in outputs]
 
     def derivatives(
-        self, feeds: Mapping[str, NDArray[Any]], p: NDArray[np.float32], nuisance: NDArray[np.float32]
+        self,
+        page: Mapping[str, NDArray[Any]],
+        feeds: Mapping[str, NDArray[Any]],
+        p: NDArray[np.float32],
+        nuisance: NDArray[np.float32],
     ) -> dict[str, NDArray[Any]]:
-        """Return the log-likelihood's derivatives at an estimate, and the page's measurements, by name."""
-        found = {**self._begun(feeds), "p": p, "nuisance": nuisance}
-        return {**found, **self._stepped(self._step, found, self.value(NOISE)[1], feeds, DERIVATIVES)}
+        """Return `DERIVATIVES` at an estimate, by name.
 
-    def _begun(self, feeds: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        Args:
+            page: measurements of the page, as `begun` returns them.
+            feeds: table tensors for this evaluation alone.
+            p, nuisance: the estimate.
+        """
+        found = {**page, "p": p, "nuisance": nuisance}
+        return self._stepped(self._step, found, self.value(NOISE)[1], feeds, DERIVATIVES)
+
+    def begun(self, feeds: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        """Return the first estimate and the measurements of a page, by name; feeds as for `run`."""
         names = [node.name for node in self._first.get_outputs()]
         return self._asked(self._first, names, {**feeds, NOISE: self.value(NOISE)[0]})
 

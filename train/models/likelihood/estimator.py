@@ -174,9 +174,7 @@ class PhaseEstimator(nn.Module):
             cameras: defocus of cameras that stand apart.
             coarse: whether light is predicted with the fidelity of the way back, as is enough for a first step.
         """
-        waves, forward = (
-            (self.back, operators.backward) if coarse else (self.waves, operators.forward)
-        )
+        waves, forward = (self.back, operators.backward) if coarse else (self.waves, operators.forward)
         x, y = parts(expected_phasors(estimate.p))
         length = torch.sqrt(estimate.p.square().sum(0) + 1e-20)
         direction = estimate.p[0] / length, estimate.p[1] / length
@@ -253,14 +251,13 @@ def _concentration(information: Tensor, noise: Tensor) -> Tensor:
     return information / (noise[0] + noise[1] * information)
 
 
-def _score(
-    table: Mapping[str, Tensor], page: Page, field: Parts, cameras: Cameras | None
-) -> tuple[Parts, Tensor]:
+def _score(table: Mapping[str, Tensor], page: Page, field: Parts, cameras: Cameras | None) -> tuple[Parts, Tensor]:
     """Derivative of the log-likelihood by the field [Gy, Gx], and the expected counts, [2, Gy, Gx]."""
     inverse = 1 / page.amplitude
     together = torch.stack(field)
-    seen = [together, together] if cameras is None else list(cameras.seen(together).split(2))
-    arms = (1.0, 0.0), tuple(table["homodyne"].unbind())
+    seen = [together, together] if cameras is None else [*cameras.seen(together).reshape(2, 2, *together.shape[1:])]
+    cosine, sine = table["homodyne"].unbind()
+    arms = (torch.ones_like(cosine), torch.zeros_like(sine)), (cosine, sine)
     expected, directions = [], []
     for camera, (arm, light) in enumerate(zip(arms, seen, strict=True)):
         along = light[0] * inverse + arm[0], light[1] * inverse + arm[1]

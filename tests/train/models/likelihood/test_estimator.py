@@ -1,0 +1,218 @@
+"""Claims about maximum likelihood: its derivatives are those of the likelihood, and its steps read pages."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+
+from lightpage.calibration.calibrate import KnownPage
+from lightpage.calibration.likelihood.counts import CountStatistics
+from lightpage.calibration.likelihood.measure import estimator_table, light_table, measured_statistics
+from lightpage.calibration.likelihood.table import count_tensors, pilot_tensors
+from lightpage.calibration.sampling_table import APART, SamplingTable
+from lightpage.calibration.waves.wave_fit import WaveFit
+from lightpage.calibration.waves.wave_model import LaunchConditions
+from lightpage.device.state import CameraPose, Device, Drift, SlmDefects
+from lightpage.page.correction import wrapped
+from lightpage.page.pilots import Pilots
+from lightpage.page.symbols import random_symbols, symbol_phases
+from lightpage.recording.frame_pair import FramePair
+from lightpage.simulator.simulator import Simulator
+from lightpage.simulator.true_optics import perfectly_calibrated
+from lightpage.train.models.likelihood.estimator import Estimate, Likelihood, Operators, Page, PhaseEstimator
+from lightpage.train.models.likelihood.torch_likelihood import TorchLikelihood
+from lightpage.train.models.twin import RayTwin, TorchTwin
+from lightpage.train.models.waves import Fidelity
+from tests.lightpage.small import random_phases, small_profile
+
+PROFILE = small_profile()
+TWIN = TorchTwin(RayTwin(PROFILE))
+FINE = Fidelity(0.002, 0.003)
+STILL = Device(drift=Drift(shift_px=0))
+MASK = np.random.default_rng(0).random(PROFILE.page_shape) < 0.05
+NOISE = torch.tensor([1.0, 0.0])
+SURE = 1e6
+STEPS = 4
+KNOCK_PX = np.array([0.1, -0.05])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def without_gradients() -> Iterator[None]:
+    with torch.no_grad():
+        yield
+
+
+def written(seed: int) -> np.ndarray:
+    return random_symbols(PROFILE, 256, 1, np.random.default_rng(seed))[0]
+
+
+def tensors(table: SamplingTable) -> dict[str, torch.Tensor]:
+    return {name: torch.from_numpy(np.array(value)) for name, value in table.items()}
+
+
+@dataclass(frozen=True)
+class Posed:
+    """A page whose counts have one variance, so that their log-likelihood is a sum of squares."""
+
+    estimator: PhaseEstimator
+    operators: Operators
+    table: dict[str, torch.Tensor]
+    page: Page
+
+    VARIANCE = 4.0
+
+    def at(self, phases: np.ndarray, nuisance: np.ndarray) -> Likelihood:
+        p = torch.from_numpy(SURE * np.stack([np.cos(phases), np.sin(phases)])).float()
+        estimate = Estimate(p, torch.from_numpy(nuisance).float())
+        cameras = self.estimator.recovery.cameras(*(self.table[name] for name in APART if name in self.table))
+        return self.estimator.likelihood(self.operators, self.table, self.page, estimate, cameras)
+
+    def logarithm(self, phases: np.ndarray, nuisance: np.ndarray) -> float:
+        missed = (self.page.counts - self.at(phases, nuisance).expected).double() * self.page.lit
+        return -float(missed.square().sum()) / (2 * self.VARIANCE)
+
+    def slope(self, phases: np.ndarray, nuisance: np.ndarray, by: np.ndarray, ahead: np.ndarray) -> float:
+        """Derivative of the logarithm along changes of phases and nuisance parameters."""
+        there, back = (self.logarithm(phases + sign * by, nuisance + sign * ahead) for sign in (1, -1))
+        return (there - back) / 2
+
+
+@pytest.fixture(scope="module", params=[0.0, 0.3], ids=["one plane", "cameras apart"])
+def posed(request: pytest.FixtureRequest) -> Posed:
+    slm = SlmDefects(unmodulated_relative=0.1)
+    poses = {
+        "in_phase_camera": CameraPose(axial_rad=request.param),
+        "quadrature_camera": CameraPose(axial_rad=-request.param),
+    }
+    simulator = Simulator(PROFILE, STILL.model_copy(update={"slm": slm, **poses}), seed=1)
+    device = perfectly_calibrated(PROFILE, simulator.device, simulator.references())
+    assert bool(device.apart_inputs) == bool(request.param)
+    line = tuple(np.linspace(0, 300, 9).tolist())
+    even = CountStatistics(expected=line, mean=line, variance=(Posed.VARIANCE,) * len(line))
+    conditions = LaunchConditions(np.eye(6)[0] * 1.4 + 0.1j, 0.09)
+    table = tensors(light_table(TWIN, device, conditions) | count_tensors((even, even), 1.0))
+    estimator = PhaseEstimator(PROFILE, device.parameters, forward=FINE, backward=FINE).eval()
+    pair = simulator.page(written(1))
+    page, _ = estimator.measured(table, torch.from_numpy(pair.in_phase), torch.from_numpy(pair.quadrature))
+    return Posed(estimator, estimator.operators(table), table, page)
+
+
+PHASES = random_phases(PROFILE, 3)
+NUISANCE = np.array([0.9, -0.3, 0.05, -0.03, 0.0, 0.0])
+
+
+def test_the_derivative_by_phases_is_that_of_the_likelihood(posed: Posed) -> None:
+    by_phase, rng = posed.at(PHASES, NUISANCE).by_phase.numpy().astype(float), np.random.default_rng(0)
+    for _ in range(4):
+        direction = 0.01 * rng.standard_normal(PHASES.shape)
+        slope = posed.slope(PHASES, NUISANCE, direction, np.zeros(6))
+        print("PH", slope, np.sum(direction * by_phase), 0.01 * np.linalg.norm(by_phase))
+        assert slope == pytest.approx(np.sum(direction * by_phase), abs=0.01 * 0.01 * np.linalg.norm(by_phase))
+
+
+def test_the_derivative_by_nuisance_parameters_is_that_of_the_likelihood(posed: Posed) -> None:
+    found = posed.at(PHASES, NUISANCE).by_nuisance.numpy()
+    gain = complex(*NUISANCE[:2])
+    ways = np.zeros((6, 6))
+    ways[0, :2], ways[1, :2] = (gain.real, gain.imag), (-gain.imag, gain.real)  # relative change, and phase
+    ways[range(2, 6), range(2, 6)] = 1
+    step = 0.003
+    expected = [posed.slope(PHASES, NUISANCE, np.zeros_like(PHASES), step * way) / step for way in ways]
+    print("NU", found, expected)
+    np.testing.assert_allclose(found, expected, rtol=0.01)
+
+
+def test_the_way_back_is_the_adjoint_of_the_way_there(posed: Posed) -> None:
+    waves, matrices = posed.estimator.waves, posed.operators.forward
+    rng = np.random.default_rng(0)
+    page, field = (
+        torch.from_numpy(rng.standard_normal((2, *shape))).float() for shape in (PROFILE.page_shape, posed.page.lit.shape)
+    )
+    there, back = waves.to_camera(matrices, page).double(), waves.to_page(matrices, field).double()
+    left, right = float((there * field).sum()), float((page * back).sum())
+    print("AD", left, right, float(there.norm() * field.norm()))
+    assert left == pytest.approx(right, abs=1e-6 * float(there.norm() * field.norm()))
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """An estimator of a calibrated device, with all that its table holds but pilots."""
+
+    estimator: PhaseEstimator
+    table: SamplingTable
+
+    def read(
+        self, pair: FramePair, phases: np.ndarray, turn: float = 0.0, steps: int = STEPS
+    ) -> tuple[list[Estimate], list[float]]:
+        """Estimates of a page from the first one on, and chi-square at each but the last; pilots may be turned."""
+        table = tensors(self.table | pilot_tensors(Pilots(MASK, phases[MASK] + turn)))
+        operators = self.estimator.operators(table)
+        frames = torch.from_numpy(pair.in_phase), torch.from_numpy(pair.quadrature)
+        estimate, page, _ = self.estimator.first(operators, table, NOISE, *frames)
+        estimates, chi_squares = [estimate], []
+        for _ in range(steps):
+            found = self.estimator.likelihood(operators, table, page, estimates[-1])
+            estimate, chi_square = self.estimator.advanced(table, page, estimates[-1], found, NOISE)
+            estimates.append(estimate)
+            chi_squares.append(float(chi_square))
+        return estimates, chi_squares
+
+
+def decoded(estimate: Estimate) -> np.ndarray:
+    return np.arctan2(estimate.p[1].numpy(), estimate.p[0].numpy())
+
+
+@pytest.fixture(scope="module")
+def fitted() -> Fitted:
+    simulator, symbols = Simulator(PROFILE, STILL, seed=1), written(1)
+    pair, references = simulator.page(symbols), simulator.references()
+    device = perfectly_calibrated(PROFILE, STILL, references)
+    known = KnownPage(pair, np.exp(1j * symbol_phases(symbols, 256)))
+    waves = WaveFit(TWIN, PROFILE, pair, references, known.symbols)
+    conditions = waves.fit(device.parameters, device.quadrature_phase_rad, ("in_phase",)).conditions
+    estimator = PhaseEstimator(PROFILE, device.parameters).eval()
+    likelihood = TorchLikelihood(estimator)
+    statistics = measured_statistics(likelihood, TWIN, device, [known], conditions)
+    return Fitted(estimator, estimator_table(likelihood, TWIN, device, [known], statistics))
+
+
+@pytest.fixture(scope="module")
+def pages() -> tuple[np.ndarray, FramePair, FramePair]:
+    """Phases of a page, its frames, and those of the same page after a knock."""
+    simulator, symbols = Simulator(PROFILE, STILL, seed=2), written(2)
+    before = simulator.page(symbols)
+    simulator.knock((KNOCK_PX[0], KNOCK_PX[1]))
+    return symbol_phases(symbols, 256), before, simulator.page(symbols)
+
+
+def test_every_step_comes_nearer_to_the_page(fitted: Fitted, pages: tuple[np.ndarray, FramePair, FramePair]) -> None:
+    phases, pair, _ = pages
+    estimates, chi_squares = fitted.read(pair, phases)
+    errors = [wrapped(decoded(estimate) - phases)[~MASK] for estimate in estimates]
+    deviations = [float(np.sqrt(np.mean(error**2))) for error in errors]
+    information = fitted.table["information"][~MASK]
+    print("ER", deviations, chi_squares, np.mean(errors[-1]**2*information))
+    assert deviations == sorted(deviations, reverse=True)
+    assert deviations[-1] < 0.025 < 0.05 < deviations[0]
+
+
+def test_a_shift_of_the_image_is_found(fitted: Fitted, pages: tuple[np.ndarray, FramePair, FramePair]) -> None:
+    phases, *pairs = pages
+    before, after = (fitted.read(pair, phases)[0][-1].nuisance.numpy() for pair in pairs)
+    print("SH", before, after)
+    np.testing.assert_allclose(after[4:] - before[4:], KNOCK_PX, atol=0.015)
+    np.testing.assert_allclose(before[2:], 0, atol=0.02)
+
+
+def test_turned_pilots_turn_the_answer_and_the_gain(
+    fitted: Fitted, pages: tuple[np.ndarray, FramePair, FramePair]
+) -> None:
+    phases, pair, _ = pages
+    turn = 0.7
+    one, other = (fitted.read(pair, phases, by, steps=2)[0] for by in (0.0, turn))
+    for straight, turned in zip(one, other, strict=True):
+        assert np.abs(wrapped(decoded(turned) - decoded(straight) - turn)).max() < 1e-3
+        gain, found = (complex(*each.nuisance[:2].tolist()) for each in (straight, turned))
+        assert found == pytest.approx(gain * np.exp(-1j * turn), abs=1e-3)
