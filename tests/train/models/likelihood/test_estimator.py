@@ -19,6 +19,7 @@ from lightpage.page.correction import wrapped
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols, symbol_phases
 from lightpage.recording.frame_pair import FramePair
+from lightpage.runtime.model.execution.estimator_graph import EARLY_STEPS
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import perfectly_calibrated
 from lightpage.train.models.likelihood.estimator import Estimate, Likelihood, Operators, Page, PhaseEstimator
@@ -34,7 +35,7 @@ STILL = Device(drift=Drift(shift_px=0))
 MASK = np.random.default_rng(0).random(PROFILE.page_shape) < 0.05
 NOISE = torch.tensor([1.0, 0.0])
 SURE = 1e6
-STEPS = 4
+STEPS = 3
 KNOCK_PX = np.array([0.1, -0.05])
 
 
@@ -45,7 +46,7 @@ def without_gradients() -> Iterator[None]:
 
 
 def written(seed: int) -> np.ndarray:
-    return random_symbols(PROFILE, 256, 1, np.random.default_rng(seed))[0]
+    return np.asarray(random_symbols(PROFILE, 256, 1, np.random.default_rng(seed))[0])
 
 
 def tensors(table: SamplingTable) -> dict[str, torch.Tensor]:
@@ -105,11 +106,10 @@ NUISANCE = np.array([0.9, -0.3, 0.05, -0.03, 0.0, 0.0])
 
 def test_the_derivative_by_phases_is_that_of_the_likelihood(posed: Posed) -> None:
     by_phase, rng = posed.at(PHASES, NUISANCE).by_phase.numpy().astype(float), np.random.default_rng(0)
-    for _ in range(4):
+    for _ in range(3):
         direction = 0.01 * rng.standard_normal(PHASES.shape)
         slope = posed.slope(PHASES, NUISANCE, direction, np.zeros(6))
-        print("PH", slope, np.sum(direction * by_phase), 0.01 * np.linalg.norm(by_phase))
-        assert slope == pytest.approx(np.sum(direction * by_phase), abs=0.01 * 0.01 * np.linalg.norm(by_phase))
+        assert slope == pytest.approx(np.sum(direction * by_phase), abs=1e-4 * float(np.linalg.norm(by_phase)))
 
 
 def test_the_derivative_by_nuisance_parameters_is_that_of_the_likelihood(posed: Posed) -> None:
@@ -120,19 +120,19 @@ def test_the_derivative_by_nuisance_parameters_is_that_of_the_likelihood(posed: 
     ways[range(2, 6), range(2, 6)] = 1
     step = 0.003
     expected = [posed.slope(PHASES, NUISANCE, np.zeros_like(PHASES), step * way) / step for way in ways]
-    print("NU", found, expected)
-    np.testing.assert_allclose(found, expected, rtol=0.01)
+    np.testing.assert_allclose(found, expected, rtol=0.01, atol=0.001 * np.abs(found[2:]).max())
 
 
+@pytest.mark.parametrize("posed", [0.0], indirect=True, ids=["one plane"])
 def test_the_way_back_is_the_adjoint_of_the_way_there(posed: Posed) -> None:
     waves, matrices = posed.estimator.waves, posed.operators.forward
     rng = np.random.default_rng(0)
     page, field = (
-        torch.from_numpy(rng.standard_normal((2, *shape))).float() for shape in (PROFILE.page_shape, posed.page.lit.shape)
+        torch.from_numpy(rng.standard_normal((2, *shape))).float()
+        for shape in (PROFILE.page_shape, posed.page.lit.shape)
     )
     there, back = waves.to_camera(matrices, page).double(), waves.to_page(matrices, field).double()
     left, right = float((there * field).sum()), float((page * back).sum())
-    print("AD", left, right, float(there.norm() * field.norm()))
     assert left == pytest.approx(right, abs=1e-6 * float(there.norm() * field.norm()))
 
 
@@ -152,8 +152,9 @@ class Fitted:
         frames = torch.from_numpy(pair.in_phase), torch.from_numpy(pair.quadrature)
         estimate, page, _ = self.estimator.first(operators, table, NOISE, *frames)
         estimates, chi_squares = [estimate], []
-        for _ in range(steps):
-            found = self.estimator.likelihood(operators, table, page, estimates[-1])
+        for number in range(steps):
+            early = number < EARLY_STEPS
+            found = self.estimator.likelihood(operators, table, page, estimates[-1], coarse=early)
             estimate, chi_square = self.estimator.advanced(table, page, estimates[-1], found, NOISE)
             estimates.append(estimate)
             chi_squares.append(float(chi_square))
@@ -161,7 +162,7 @@ class Fitted:
 
 
 def decoded(estimate: Estimate) -> np.ndarray:
-    return np.arctan2(estimate.p[1].numpy(), estimate.p[0].numpy())
+    return np.asarray(np.arctan2(estimate.p[1].numpy(), estimate.p[0].numpy()))
 
 
 @pytest.fixture(scope="module")
@@ -193,15 +194,16 @@ def test_every_step_comes_nearer_to_the_page(fitted: Fitted, pages: tuple[np.nda
     errors = [wrapped(decoded(estimate) - phases)[~MASK] for estimate in estimates]
     deviations = [float(np.sqrt(np.mean(error**2))) for error in errors]
     information = fitted.table["information"][~MASK]
-    print("ER", deviations, chi_squares, np.mean(errors[-1]**2*information))
     assert deviations == sorted(deviations, reverse=True)
-    assert deviations[-1] < 0.025 < 0.05 < deviations[0]
+    assert deviations[-1] < 0.02 < 0.05 < deviations[0]
+    assert 0.7 < np.mean(errors[-1] ** 2 * information) < 1.5  # as the information promises
+    assert chi_squares[-1] == pytest.approx(1, abs=0.1)
+    assert chi_squares[0] > 2
 
 
 def test_a_shift_of_the_image_is_found(fitted: Fitted, pages: tuple[np.ndarray, FramePair, FramePair]) -> None:
     phases, *pairs = pages
     before, after = (fitted.read(pair, phases)[0][-1].nuisance.numpy() for pair in pairs)
-    print("SH", before, after)
     np.testing.assert_allclose(after[4:] - before[4:], KNOCK_PX, atol=0.015)
     np.testing.assert_allclose(before[2:], 0, atol=0.02)
 
