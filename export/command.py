@@ -18,6 +18,7 @@ from lightpage.files import write_json
 from lightpage.progress import note
 from lightpage.recording.reader import Recording
 from lightpage.runtime.model.bundle.manifest import FLOAT32, Precision
+from lightpage.runtime.recalibration.noise import MOST_STEPS
 from lightpage.train.commands.options import ACCEPT
 from lightpage.train.runs import load_run
 
@@ -31,7 +32,7 @@ from lightpage.train.runs import load_run
     help="Export a calibration in place of a run: pages are read by the fitted waves, without training.",
 )
 @profile_option
-@click.option("--steps", type=click.IntRange(1), help="Gauss-Newton steps of a page, with --calibration.")
+@click.option("--steps", type=click.IntRange(1, MOST_STEPS), help="Gauss-Newton steps of a page, with --calibration.")
 @click.option("--out", required=True, type=NewPath(), help="New bundle: a folder, or a .zip.")
 @click.option("--name", default=None, help="Name of the bundle; the profile's if left out.")
 @click.option(

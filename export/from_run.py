@@ -31,8 +31,8 @@ from lightpage.runtime.model.bundle.manifest import (
     Precision,
     Provenance,
 )
-from lightpage.runtime.model.decoding.decoder import PAGE_INPUTS
 from lightpage.runtime.model.decoding.golden import GOLDEN_TOLERANCE
+from lightpage.runtime.model.execution.page_graph import PAGE_INPUTS
 from lightpage.runtime.model.execution.session import open_session
 from lightpage.train.models.twin import RayTwin
 from lightpage.train.published.training import PublishedChoices

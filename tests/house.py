@@ -1,7 +1,6 @@
 """Sizes of the house: `python -m tests.house` prints its figures beside their limits, those of `limits.toml`."""
 
 import ast
-import io
 import sys
 import tokenize
 import tomllib
@@ -58,7 +57,6 @@ def figures() -> dict[str, float]:
         "files": max(Counter(path.parent for path in code).values()),
         "class_lines": max(lines for _, lines, _, _ in usual),
         "methods": max(methods for *_, methods, _ in usual),
-        "runtime_lines": sum(code_lines(path.read_text()) for path in product if (ROOT / "runtime") in path.parents),
     }
 
 
@@ -69,20 +67,6 @@ def _floor(room: str, arrows: dict[str, set[str]]) -> int:
 
 def _imports(path: Path) -> int:
     return sum(isinstance(node, ast.Import | ast.ImportFrom) for node in ast.walk(ast.parse(path.read_text())))
-
-
-def code_lines(source: str) -> int:
-    """Count the lines of code: no docstrings, comments or blank lines."""
-    texts = [node.value for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Expr)]
-    told = {
-        line
-        for text in texts
-        if isinstance(text, ast.Constant) and isinstance(text.value, str)
-        for line in range(text.lineno, (text.end_lineno or 0) + 1)
-    }
-    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
-    lines = {n for token in tokens if token.type not in _NO_CODE for n in range(token.start[0], token.end[0] + 1)}
-    return len(lines - told)
 
 
 def limits() -> dict[str, float]:

@@ -5,7 +5,7 @@
 - Nobody sleeps longer than 0.2 s to let something happen. Who must hang waits for a signal or for his input.
 - An error is known by its class, subject and status. Sentences are kept in one snapshot (`tests/messages`).
 - Private attributes of what is tested are left alone.
-- `limits.toml` limits lines, bytes that git tracks, words of pages, long sentences, and docstrings without a subject.
+- `limits.toml` limits bytes that git tracks, long sentences of pages, and docstrings without a subject.
 """
 
 import ast
@@ -129,12 +129,12 @@ def without_subject(sources: Iterable[str]) -> dict[str, float]:
 
 
 def prose(pages: Iterable[str]) -> dict[str, float]:
-    """Return the number of words of Markdown pages without their code, and the percentage of long sentences."""
+    """Return the percentage of long sentences of Markdown pages without their code."""
     texts = [re.sub(r"```.*?```", "", page, flags=re.DOTALL) for page in pages]
     plain = [re.sub(r"^\s*[|#>].*$", "", text, flags=re.MULTILINE) for text in texts]
     lengths = [len(each.split()) for text in plain for each in re.split(r"(?<=[.!?])\s+(?=[A-Z`*])", text)]
     long_percent = _percent(sum(n > LONGEST_SENTENCE for n in lengths), len(lengths))
-    return {"words": sum(len(text.split()) for text in texts), "long_sentences_percent": long_percent}
+    return {"long_sentences_percent": long_percent}
 
 
 def _percent(part: int, whole: int) -> float:
@@ -154,7 +154,6 @@ def main() -> int:
     root = HERE.parent
     pages = [root / "README.md", root / "CONTRIBUTING.md", *root.glob("docs/**/*.md")]
     sizes = {
-        "lines": sum(len(path.read_bytes().splitlines()) for path in paths),
         "bytes": tracked_bytes(root),
         **prose(path.read_text("utf-8") for path in pages),
         **without_subject(path.read_text("utf-8") for path in python_files(tests=True)),

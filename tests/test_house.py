@@ -1,4 +1,4 @@
-"""The house stays small: its rooms, floors, arrows, folders and lines have limits, and so have its words."""
+"""The house stays small: its rooms, floors, arrows and folders have limits, and so have its sentences."""
 
 from pathlib import Path
 
@@ -17,11 +17,6 @@ def test_a_figure_is_within_its_limit(name: str, figures: dict[str, float]) -> N
     assert figures[name] <= house.limits()[name]
 
 
-def test_lines_of_code_are_counted_without_docstrings_comments_and_blank_lines() -> None:
-    source = '"""One."""\n\n# two\nx = (\n  1\n)\n"""Three."""\n\ndef f():\n  """Four."""\n  return """\n\n"""\n'
-    assert house.code_lines(source) == 3 + 1 + 3
-
-
 def test_a_class_is_as_large_as_its_lines_and_methods_and_may_say_why(tmp_path: Path) -> None:
     source = "class A:\n    x = 1\n\n    def f(self): ...\n\n    async def g(self):\n        def h(): ...\n\n\n"
     (path := tmp_path / "a.py").write_text(source + "# Large: a table\n@dataclass\nclass B:\n    y: int\n")
@@ -35,6 +30,6 @@ def test_docstrings_that_begin_without_their_subject_are_counted(docstring: str,
     assert list(found.values()) == [percent, 2 * percent, 2 * percent]
 
 
-def test_words_and_long_sentences_of_pages_are_counted_without_code() -> None:
+def test_long_sentences_of_pages_are_counted_without_code() -> None:
     page = f"# Title\n\nA short one. A{' word' * 25}. Three more words.\n```\nno word\n```\n| a | row |\n"
-    assert rules.prose([page]) == {"words": 2 + 3 + 26 + 3 + 5, "long_sentences_percent": 33.4}
+    assert rules.prose([page]) == {"long_sentences_percent": 33.4}

@@ -9,7 +9,7 @@ import numpy as np
 
 from lightpage.device.profile import Profile
 from lightpage.export.graph import FRAME_INPUTS
-from lightpage.runtime.model.decoding.decoder import PAGE_INPUTS
+from lightpage.runtime.model.execution.page_graph import PAGE_INPUTS
 from lightpage.runtime.model.execution.table_graph import GraphFile, TableGraph
 
 SETTLE_S = 0.2

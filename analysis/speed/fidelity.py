@@ -33,9 +33,10 @@ from lightpage.metrics.provenance import write_figures
 from lightpage.page.pilots import Pilots
 from lightpage.progress import track
 from lightpage.recording.reader import Recording
-from lightpage.runtime.model.decoding.decoder import PAGE_INPUTS, Decoder
+from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.execution.cpus import available_cpus
+from lightpage.runtime.model.execution.page_graph import PAGE_INPUTS
 from lightpage.train.models.decoder import SymbolDecoder
 from lightpage.train.models.prediction import Prediction
 from lightpage.train.models.twin import RayTwin, TorchTwin

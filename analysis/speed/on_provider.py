@@ -21,8 +21,9 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import DECODER, FLOAT32, Precision
 from lightpage.runtime.model.decoding.batches import Batching
-from lightpage.runtime.model.decoding.decoder import PAGE_INPUTS, Decoder
+from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.page import DecodedPage
+from lightpage.runtime.model.execution.page_graph import PAGE_INPUTS
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
 from lightpage.runtime.model.execution.table_graph import GraphFile, TableGraph
 

@@ -32,7 +32,7 @@ from lightpage.export.onnx_files import decoder_onnx
 from lightpage.export.operators.check import page_part
 from lightpage.metrics.provenance import write_figures
 from lightpage.runtime.model.bundle.manifest import FLOAT16
-from lightpage.runtime.model.decoding.decoder import PAGE_INPUTS
+from lightpage.runtime.model.execution.page_graph import PAGE_INPUTS
 
 CONVOLUTIONS, PRODUCTS, SAMPLING, LAYOUT, POINTWISE = (
     "convolutions",

@@ -12,7 +12,7 @@ from onnx.defs import OpSchema
 
 from lightpage.errors import InvalidInputError
 from lightpage.export.operators.operator_list import FLOATING, Kernel, Operator, OperatorList, dtype_name
-from lightpage.runtime.model.decoding.decoder import PAGE_INPUTS
+from lightpage.runtime.model.execution.page_graph import PAGE_INPUTS
 from lightpage.runtime.model.execution.table_graph import GraphFile
 
 _SHAPES = frozenset(["Shape", "Size"])

@@ -29,12 +29,13 @@ from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.evaluation import evaluate
 from lightpage.runtime.model.bundle.bundle import npz
 from lightpage.runtime.model.bundle.manifest import BATCH, CONSTANTS, GOLDEN
-from lightpage.runtime.model.decoding.batch_graph import REGISTRATION, BatchGraph, Constants, with_proven_batches
+from lightpage.runtime.model.decoding.batch_graph import BatchGraph, Constants, with_proven_batches
 from lightpage.runtime.model.decoding.batches import Batches, Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_drift import SHIFT
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.decoding.page import Inference
+from lightpage.runtime.model.execution.page_graph import REGISTRATION
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
 from lightpage.train.models.decoder import SymbolDecoder

@@ -21,7 +21,8 @@ from analysis.service.other_servers.timing import Timed
 from lightpage.helper_process import Helper, HelperProcess
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.bundle import Bundle
-from lightpage.runtime.model.decoding.decoder import Decoder, open_graph
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.execution.page_graph import open_graph
 
 WHOLE, CUT = "whole", "cut"
 _START_S = 120.0

@@ -109,7 +109,7 @@ class InformationFit:
 
         Returns:
             `count_scale`, `count_weights`; information [ny, nx] of a page of unit gain; responses [5, ny, nx] of the
-            phases to its relative gain, tilt and shift; nuisance_covariance [5, 5] and nuisance_precision [4], those of the prior.
+            phases to its relative gain, tilt and shift; nuisance_covariance [5, 5]; and nuisance_precision [4].
         """
         for known in self._pages:
             self._first_counts(known)

@@ -16,13 +16,12 @@ from lightpage.runtime.model.bundle.manifest import BATCH, CONSTANTS, FLOAT16
 from lightpage.runtime.model.decoding.golden import check_golden
 from lightpage.runtime.model.decoding.page import OUTPUTS, Inference
 from lightpage.runtime.model.execution.device_memory import ON_NO_DEVICE, Copies
-from lightpage.runtime.model.execution.page_graph import PageGraph
+from lightpage.runtime.model.execution.page_graph import REGISTRATION, PageGraph
 from lightpage.runtime.model.execution.session import BoundSession, OnDevice, open_session, running
 
 _log = logging.getLogger(__name__)
 
 _FILES = {CONSTANTS, BATCH}
-REGISTRATION = "registration"
 SHIFT = "shift"
 """Input of the images' shifts against the registration of the constants, (x, y) of either camera, pixels [B, 2, 2]."""
 REACH = 0.003

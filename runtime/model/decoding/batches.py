@@ -21,7 +21,6 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import BATCH
 from lightpage.runtime.model.decoding.batch_graph import (
-    REGISTRATION,
     BatchGraph,
     Constants,
     FrameBuffer,
@@ -30,7 +29,7 @@ from lightpage.runtime.model.decoding.batch_graph import (
 )
 from lightpage.runtime.model.decoding.page import Inference
 from lightpage.runtime.model.decoding.under_way import Phase, UnderWay
-from lightpage.runtime.model.execution.page_graph import PageGraph
+from lightpage.runtime.model.execution.page_graph import REGISTRATION, PageGraph
 from lightpage.runtime.model.execution.providers import ON_CPU
 
 _log = logging.getLogger(__name__)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.calibration.likelihood.table import PILOT_MASK, PILOT_PHASORS, pilot_tensors
+from lightpage.calibration.likelihood.table import pilot_tensors
 from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.errors import BundleError, FrameError, InvalidInputError, NoCodeError, raised_as
 from lightpage.metrics.information import decide_with_confidence
@@ -21,56 +21,19 @@ from lightpage.page.pilots import Pilots
 from lightpage.recording.exposure import check_light
 from lightpage.recording.frame_pair import FramePair, check_pair
 from lightpage.runtime.model.bundle.bundle import Bundle
-from lightpage.runtime.model.bundle.manifest import DECODER, ESTIMATOR_FILES
-from lightpage.runtime.model.decoding.batch_graph import REGISTRATION
+from lightpage.runtime.model.bundle.manifest import DECODER
 from lightpage.runtime.model.decoding.batches import NO_BATCHES, Batches, Batching, OneByOne
 from lightpage.runtime.model.decoding.camera_view import CameraView
 from lightpage.runtime.model.decoding.field_solver import BundleFieldSolver
 from lightpage.runtime.model.decoding.golden import check_golden
 from lightpage.runtime.model.decoding.page import OUTPUTS, DecodedPage, Inference, Timings, check_residual
-from lightpage.runtime.model.execution.estimator_graph import EstimatorFiles, EstimatorGraph
-from lightpage.runtime.model.execution.page_graph import PageGraph
+from lightpage.runtime.model.execution.estimator_graph import EstimatorGraph
+from lightpage.runtime.model.execution.page_graph import PAGE_INPUTS, REGISTRATION, PageGraph, open_graph
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
-from lightpage.runtime.model.execution.table_graph import GraphFile, TableGraph
 from lightpage.words import brief
 
 if TYPE_CHECKING:
     from lightpage.codec.page_codec import PageCodec
-
-PAGE_INPUTS = frozenset([REGISTRATION])
-"""Table inputs that may differ from page to page, as the image shifts. All others are built into the graph."""
-PILOT_INPUTS = frozenset([PILOT_PHASORS, PILOT_MASK])
-"""Table inputs that are fed with each page where the graph takes them: what is known of its symbols."""
-
-
-def open_graph(
-    bundle: Bundle, threads: int | None = None, provider: Provider = ON_CPU, steps: int | None = None
-) -> PageGraph:
-    """The graph of a bundle's decoder with the bundle's table.
-
-    Args:
-        bundle: opened bundle.
-        threads: threads of one run.
-        provider: provider that computes pages.
-        steps: steps of an estimator; None for as many as the bundle has.
-
-    Raises:
-        BundleError: no ONNX model, or its table is not the one of the manifest, or does not fit.
-        InvalidInputError: `steps` of a bundle that takes none, or more than it has.
-        ProviderError: there is no such provider here.
-    """
-    subject = f"{bundle.subject}: {DECODER}"
-    file = GraphFile(bundle.files[DECODER], subject)
-    if set(file.table_inputs) != set(bundle.manifest.table_inputs):
-        raise BundleError(f"{subject}: table inputs", sorted(file.table_inputs), sorted(bundle.manifest.table_inputs))
-    if bundle.files.keys() >= set(ESTIMATOR_FILES):
-        files = EstimatorFiles(*(bundle.files[name] for name in ESTIMATOR_FILES))
-        fed = (*PAGE_INPUTS, *PILOT_INPUTS)
-        return EstimatorGraph(files, file, bundle.subject, fed, threads, bundle.table, provider=provider, steps=steps)
-    if steps is not None:
-        raise InvalidInputError(f"{bundle.subject}: steps", steps, "none: its decoder is a network")
-    with raised_as(BundleError, InvalidInputError, about=f"{bundle.subject}: "):
-        return TableGraph(file, subject, PAGE_INPUTS, threads, bundle.table, provider=provider)
 
 
 def _told(decoder: Decoder) -> str:

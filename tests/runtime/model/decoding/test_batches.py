@@ -12,10 +12,11 @@ import pytest
 
 from lightpage.errors import BundleError
 from lightpage.recording.frame_pair import FramePair
-from lightpage.runtime.model.decoding.batch_graph import REGISTRATION, BatchGraph, Constants, FrameBuffer, fewer
+from lightpage.runtime.model.decoding.batch_graph import BatchGraph, Constants, FrameBuffer, fewer
 from lightpage.runtime.model.decoding.batches import KEPT, Batches, Batching, HeldConstants
 from lightpage.runtime.model.decoding.page import Inference
 from lightpage.runtime.model.decoding.under_way import Device, Phase, UnderWay
+from lightpage.runtime.model.execution.page_graph import REGISTRATION
 from lightpage.runtime.model.execution.session import BoundSession
 from lightpage.runtime.model.execution.table_graph import TableGraph
 from tests.clock import HandClock

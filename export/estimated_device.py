@@ -1,0 +1,135 @@
+"""A calibrated device as an estimator reads its pages: graphs, table and noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.calibration.calibrate import KnownPage
+from lightpage.calibration.calibrated_device import CalibratedDevice
+from lightpage.calibration.document import Calibration
+from lightpage.calibration.known_pages import known_pages
+from lightpage.calibration.likelihood.measure import estimator_table
+from lightpage.calibration.likelihood.table import pilot_tensors
+from lightpage.calibration.sampling_table import SamplingTable
+from lightpage.device.profile import Profile
+from lightpage.errors import CalibrationError
+from lightpage.export.estimator_graphs import estimator_files
+from lightpage.page.pilots import Pilots
+from lightpage.page.symbols import pilot_mask
+from lightpage.progress import Progress, warn
+from lightpage.recording.layout import narrow
+from lightpage.recording.reader import Recording
+from lightpage.runtime.model.execution.estimator_graph import NOISE, EstimatorFiles, EstimatorGraph
+from lightpage.runtime.model.execution.table_graph import HeldTable
+from lightpage.runtime.recalibration.noise import MOST_STEPS, measured_noise
+from lightpage.train.models.likelihood.estimator import PhaseEstimator
+from lightpage.train.models.likelihood.torch_likelihood import TorchLikelihood
+from lightpage.train.models.twin import RayTwin, TorchTwin
+from lightpage.train.trainers.whole_run import own_pilots
+
+MOST_PAGES = 4
+"""Known pages by which information and noise are measured, at most."""
+
+
+@dataclass(frozen=True)
+class EstimatedDevice:
+    """A calibrated device with all that its pages are estimated by.
+
+    Attributes:
+        device: calibrated device.
+        twin: its ray tracer.
+        estimator: its estimator.
+        graphs: the estimator's graphs.
+        table: every tensor that they take.
+        pages: known pages, in counts as the device's frames are kept.
+        pilot_mask: places of the pilots, bool [ny, nx].
+        pilot_phases: phases of the device's own fixed pilots, radians; None where they are the profile's.
+    """
+
+    device: CalibratedDevice
+    twin: RayTwin
+    estimator: PhaseEstimator
+    graphs: EstimatorFiles
+    table: SamplingTable
+    pages: list[KnownPage]
+    pilot_mask: NDArray[np.bool_]
+    pilot_phases: NDArray[np.float32] | None
+
+    @property
+    def steps(self) -> int:
+        """Number of Gauss-Newton steps of a page."""
+        return len(self.table[NOISE]) - 1
+
+    @property
+    def frame_dtype(self) -> str:
+        """Type of a frame's counts."""
+        return self.pages[0].pair.in_phase.dtype.name
+
+
+def estimated_device(
+    calibration: Calibration, recording: Recording, profile: Profile, steps: int | None, progress: Progress
+) -> EstimatedDevice:
+    """Measure what an estimator needs of a calibrated device, and export its graphs.
+
+    Args:
+        calibration: calibration of the recording's device, with its statistics.
+        recording: recording with the pages that it was made of.
+        profile: nominal device.
+        steps: Gauss-Newton steps of a page; as many as gain information on the known pages if left out.
+        progress: function that takes every step.
+
+    Raises:
+        CalibrationError: a calibration without statistics, or of other pages.
+        ProfileError: a calibration of another profile.
+        RecordingError: the recording is of another device.
+    """
+    calibration.check_profile(profile)
+    recording.header.check_against(profile)
+    if (statistics := calibration.statistics) is None:
+        raise CalibrationError("calibration: statistics", "none", "those of the counts: calibrate anew")
+    used, bits = calibrated_pages(calibration, recording), recording.bit_depth
+    pages = [KnownPage(narrow(page.pair, bits), page.symbols) for page in known_pages(recording, profile, used)]
+    device = calibration.device(profile, narrow(recording.references(), bits))
+    twin, estimator = RayTwin(profile), PhaseEstimator(profile, device.parameters).eval()
+    what = "information of the symbols"
+    table = estimator_table(
+        TorchLikelihood(estimator), TorchTwin(twin), device, pages, statistics, lambda share: progress(what, share)
+    )
+    mask = recording.pilots()
+    mask = pilot_mask(profile) if mask is None else mask
+    own = own_pilots(recording, profile, mask, used)
+    table |= pilot_tensors(_pilots(device, mask, own))
+    table[NOISE] = np.tile(np.array([1, 0], np.float32), (MOST_STEPS + 1, 1))
+    progress("graphs to ONNX", 0.0)
+    graphs = estimator_files(estimator, pages[0].pair.in_phase.dtype.name, device.apart_inputs, table)
+    progress("noise of the known pages", 0.0)
+    graph = EstimatorGraph(graphs, HeldTable(table), "estimator", (), None)
+    known = [(page.pair, np.angle(page.light(device.modulation))) for page in pages]
+    table[NOISE] = measured_noise(graph, known, mask, steps)
+    return EstimatedDevice(device, twin, estimator, graphs, table, pages, mask, own)
+
+
+def calibrated_pages(calibration: Calibration, recording: Recording) -> list[int]:
+    """Numbers of the pages of a recording that a calibration was made of, the last ones.
+
+    Raises:
+        CalibrationError: none of them is there.
+    """
+    wanted = set(calibration.calibrated_pages)
+    known = [page for page in range(recording.pages) if recording.page_hash(page) in wanted]
+    if not known:
+        expected = "the recording that the calibration was made of, or a calibration by pages of this one"
+        raise CalibrationError(f"recording {recording.path}", "none of the calibration's pages", expected)
+    if len(known) == 1:
+        warn("statistics by one known page: two read more in bright light (lightpage calibrate --pages 2)")
+    return known[-MOST_PAGES:]
+
+
+def _pilots(device: CalibratedDevice, mask: NDArray[np.bool_], own: NDArray[np.float32] | None) -> Pilots:
+    """Pilots of the device's pages of 256 levels."""
+    if own is not None:
+        return Pilots(mask, device.modulation.phase(own.astype(np.float64)))
+    return Pilots.of_profile(device.profile, device.modulation.page_levels(256), mask)
