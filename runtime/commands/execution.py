@@ -39,6 +39,9 @@ def decoder_options(command: Callable[..., Any]) -> Callable[..., Any]:
     @PROVIDER
     @BATCHES
     @ENGINE_CACHE
+    @click.option(
+        "--steps", type=click.IntRange(1), help="Gauss-Newton steps of a page; all that the bundle has if left out."
+    )
     @functools.wraps(command)
     def with_decoder(
         *,
@@ -47,13 +50,14 @@ def decoder_options(command: Callable[..., Any]) -> Callable[..., Any]:
         provider: str | None,
         batches: int | None,
         engine_cache: Path | None,
+        steps: int | None,
         **others: Any,
     ) -> Any:
         chosen = Provider.parse(CPU if provider is None else provider, engine_cache)
         batching = Batching(batches or 1)
 
         def load(code_threads: int = 1) -> Decoder:
-            return Decoder.load(bundle_path(bundle), threads, chosen, batching, code_threads)
+            return Decoder.load(bundle_path(bundle), threads, chosen, batching, code_threads, steps)
 
         return command(load=load, **others)
 

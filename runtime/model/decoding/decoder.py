@@ -222,7 +222,8 @@ class Decoder:
                 feeds |= pilot_tensors(pilots)
             names = [*self._outputs, *(_OF_ESTIMATE if self._estimates else ())]
             with self.batches.alone:
-                found = dict(zip(names, self.graph.run(names, feeds), strict=True))
+                answers = self.graph.run_whole(names, feeds) if alone else self.graph.run(names, feeds)
+            found = dict(zip(names, answers, strict=True))
             page = _inference(found, self.bundle.manifest.residual_output)
         check_residual(page.residual, self.bundle.manifest.residual_limit, doubtful=doubtful)
         return self.view.seen(page, table.get(REGISTRATION))
@@ -338,7 +339,7 @@ class Decoder:
     def _check_golden(self) -> None:
         def answer(pair: FramePair) -> NDArray[np.float32]:
             self.check(pair)
-            return self.infer(pair).p
+            return self.infer(pair, alone=True).p
 
         check_golden(self.bundle, answer, self.bundle.manifest.precision)
 

@@ -25,15 +25,22 @@ class FollowingDecoder(Decoder):
         threads: number of threads of an inference; all cores if None.
         provider: provider that computes the graph.
         tracking: whether the image is followed; else each page is decoded where calibration saw it.
+        steps: see `Decoder`.
 
     Raises:
         ProviderError, BundleError: see `Decoder`.
     """
 
     def __init__(
-        self, bundle: Bundle, threads: int | None = None, provider: Provider = ON_CPU, *, tracking: bool = True
+        self,
+        bundle: Bundle,
+        threads: int | None = None,
+        provider: Provider = ON_CPU,
+        *,
+        tracking: bool = True,
+        steps: int | None = None,
     ) -> None:
-        super().__init__(bundle, threads, provider=provider)
+        super().__init__(bundle, threads, provider=provider, steps=steps)
         self._tracking = tracking
 
     @cached_property
@@ -64,6 +71,7 @@ def load(
     engine_cache: str | Path | None = None,
     *,
     tracking: bool = True,
+    steps: int | None = None,
 ) -> FollowingDecoder:
     """Return a bundle's decoder: it follows the image from page to page, and raises where pilots contradict a page.
 
@@ -73,12 +81,14 @@ def load(
         provider: what pages are computed with: ``cpu``, ``cuda``, ``tensorrt``, or ``cuda:1`` for the second GPU.
         engine_cache: folder where TensorRT keeps its engines; without, it builds them each time.
         tracking: whether the image is followed; else each page is decoded where calibration saw it.
+        steps: Gauss-Newton steps of a page, where the bundle is of a calibration alone; by default all that it has.
+            Fewer take less time and read less.
 
     Raises:
         BundleError: there is none, or it is damaged.
-        InvalidInputError: the text names no provider, or one that keeps no engines.
+        InvalidInputError: the text names no provider, or one that keeps no engines; or more steps than the bundle has.
         ProviderError: there is no such provider here.
     """
     cache = None if engine_cache is None else Path(engine_cache)
     bundle = Bundle.open(bundle_path(str(name_or_path)))
-    return FollowingDecoder(bundle, threads, Provider.parse(provider, cache), tracking=tracking)
+    return FollowingDecoder(bundle, threads, Provider.parse(provider, cache), tracking=tracking, steps=steps)

@@ -161,6 +161,10 @@ class EstimatorGraph:
             found |= self._stepped(session, found, noise[number + 1], feeds, wanted)
         return [found[name] for name in outputs]
 
+    def run_whole(self, outputs: Sequence[str], feeds: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
+        """Estimate a page with all steps that the bundle has; arguments as for `run`."""
+        return self.run(outputs, feeds, len(self.value(NOISE)) - 1)
+
     def derivatives(
         self,
         page: Mapping[str, NDArray[Any]],

@@ -316,3 +316,5 @@ class TableGraph:
     def run(self, outputs: Sequence[str], feeds: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
         """Run the graph; `feeds` holds the frames, and table tensors for this run alone."""
         return self._bound.run(outputs, feeds)
+
+    run_whole = run
