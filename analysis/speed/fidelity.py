@@ -35,8 +35,7 @@ from lightpage.progress import track
 from lightpage.recording.reader import Recording
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
-from lightpage.runtime.model.execution.cpus import available_cpus
-from lightpage.runtime.model.execution.page_graph import PAGE_INPUTS
+from lightpage.runtime.model.execution import cpus, page_graph
 from lightpage.train.models.decoder import SymbolDecoder
 from lightpage.train.models.prediction import Prediction
 from lightpage.train.models.twin import RayTwin, TorchTwin
@@ -95,7 +94,7 @@ def graphs(folder: Path) -> tuple[dict[str, bytes], bytes]:
     for form in track(FORMS, "export", unit="form"):
         graph = DecoderGraph(profile, _with(run, folder, form), run.kappa_scale).eval()
         made[name_of(form)] = decoder_onnx(graph, "uint8", profile.frame_shape, table_tensors(graph, table, references))
-    return made, rounded(made[name_of((EXACT, ROUGH))], PAGE_INPUTS)
+    return made, rounded(made[name_of((EXACT, ROUGH))], page_graph.PAGE_INPUTS)
 
 
 def _with(run: Run, folder: Path, form: tuple[Fidelity, Fidelity]) -> SymbolDecoder:
@@ -122,7 +121,7 @@ def measured(
         repeats: rounds of timing.
         usual: name of the form that p is compared with.
     """
-    graphs = {name: opened(model, available_cpus()) for name, model in {**models, HALF: half}.items()}
+    graphs = {name: opened(model, cpus.available_cpus()) for name, model in {**models, HALF: half}.items()}
     trackers = {name: tracker_for(Decoder(decoder.bundle, graph=graph)) for name, graph in graphs.items()}
     data, levels = ~decoder.bundle.pilot_mask, recording.levels
     rates: dict[str, list[float]] = {name: [] for name in graphs}

@@ -56,4 +56,5 @@ def _errors(
     feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **pilot_tensors(pilots)}
     (p,) = graph.run(["p"], feeds, steps)
     error = wrapped(np.arctan2(p[1], p[0]).astype(np.float64) - phases)
-    return np.asarray(wrapped(error - np.median(error[mask]))[~mask])
+    piston = np.angle(np.mean(np.exp(1j * error[mask])))
+    return np.asarray(wrapped(error - piston)[~mask])

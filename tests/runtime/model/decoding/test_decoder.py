@@ -119,7 +119,8 @@ def test_pilot_phases_that_do_not_fit_are_refused_when_loading(phases: np.ndarra
 def test_what_may_differ_from_page_to_page_is_fed_and_stays_as_it_was_without(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("lightpage.runtime.model.decoding.decoder.PAGE_INPUTS", frozenset(["homodyne"]))
+    for module in ("decoding.decoder", "execution.page_graph"):
+        monkeypatch.setattr(f"lightpage.runtime.model.{module}.PAGE_INPUTS", frozenset(["homodyne"]))
     default, bundled, fed = (np.array([gain, 1.0], np.float32) for gain in (400 / toy.AMPLITUDE, 2.0, 3.0))
     _, pair = pair_of()
     p = toy.expected_p(pair)

@@ -1,0 +1,163 @@
+"""What the fitted waves alone read of a device, over the bound of its light, from two known pages.
+
+    python -m analysis.calibration.waves --json F
+    python -m analysis.calibration.waves --set sensor.full_well_e=32 --pages 24 --json F
+
+A device is simulated and calibrated, its calibration exported, and further pages are decoded as a service decodes them:
+by the bundle's steps, and by fewer. Beside each stand its time over that of the shipped decoder, both timed in turns in
+this run, and, where the file of `python -m analysis.comparison.bound` is given, its share of that bound. Interrupted,
+the same command goes on: recording, calibration and bundle are kept in `--out`.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import click
+import numpy as np
+
+from analysis.comparison.data_set import CALIBRATED, simulate
+from lightpage.calibration.document import load_calibration
+from lightpage.cli.main import run
+from lightpage.cli.paths import OutputFile, OutputFolder
+from lightpage.cli.progress_bar import percent_bar
+from lightpage.device.profile import load_profile
+from lightpage.device.state import Device, draw_device, load_device
+from lightpage.export.from_calibration import export_calibration
+from lightpage.metrics.provenance import write_figures
+from lightpage.progress import track
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording
+from lightpage.runtime.archives.recordings.evaluation import evaluate
+from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.image_tracker import tracker_for
+from lightpage.runtime.model.execution.estimator_graph import NOISE
+from lightpage.train.commands.calibrate import calibrate_recording
+from lightpage.train.runs import begin
+
+_TIMED = 7
+"""Turns in which decoders are timed."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """Figures of a number of steps.
+
+    Attributes:
+        steps: Gauss-Newton steps.
+        air: AIR of unseen pages, bits a symbol.
+        over_bound: the same over the bound of the light; None where that is not given.
+        ece: calibration error of confidences.
+        over_claim: information that is claimed, less the AIR.
+        seconds: median time of a page's inference.
+        over_shipped: the same over the shipped decoder's, timed in turns.
+    """
+
+    steps: int
+    air: float
+    over_bound: float | None
+    ece: float
+    over_claim: float
+    seconds: float
+    over_shipped: float
+
+
+def timed(decoders: list[Decoder], pair: FramePair) -> list[float]:
+    """Median seconds of an inference of each decoder, taking turns."""
+    seconds: list[list[float]] = [[] for _ in decoders]
+    for number in range(_TIMED + 1):
+        for own, decoder in zip(seconds, decoders, strict=True):
+            start = time.perf_counter()
+            decoder.infer(pair, doubtful=True)
+            if number:
+                own.append(time.perf_counter() - start)
+    return [float(np.median(own)) for own in seconds]
+
+
+def _bits(path: Path) -> float:
+    """Bound of a light, bits a symbol, as `analysis.comparison.bound` or `analysis.results` keeps it."""
+    kept = json.loads(path.read_text("utf-8"))
+    return float(kept.get("figures", kept)["bits"])
+
+
+@click.command()
+@click.option("--profile", "profile_name", default="bench", show_default=True, help="Shipped profile or TOML file.")
+@click.option("--symbol-size", type=click.IntRange(1), help="Pixels; the profile's if left out.")
+@click.option("--device", "state", type=click.Path(path_type=Path), help="True state (TOML).")
+@click.option("--draw", type=click.IntRange(0), help="Seed of a device that is drawn from the capture range.")
+@click.option("--set", "settings", multiple=True, metavar="TABLE.KEY=VALUE", help="Number of the true state to change.")
+@click.option("--pages", default=24, show_default=True, type=click.IntRange(1), help="Pages that are read.")
+@click.option("--levels", default=256, show_default=True, type=click.IntRange(2, 256), help="Levels of the pages.")
+@click.option("--seed", default=7000, show_default=True, type=click.IntRange(0), help="Seed of pages and noise.")
+@click.option("--bound", type=click.Path(path_type=Path), help="Figures of `analysis.comparison.bound` of this light.")
+@click.option("--out", type=OutputFolder(), required=True, help="Folder that keeps recording, calibration and bundle.")
+@click.option("--json", "json_path", type=OutputFile(), required=True)
+def main(
+    profile_name: str,
+    symbol_size: int | None,
+    state: Path | None,
+    draw: int | None,
+    settings: tuple[str, ...],
+    pages: int,
+    levels: int,
+    seed: int,
+    bound: Path | None,
+    out: Path,
+    json_path: Path,
+) -> None:
+    """Print AIR, its share of the bound and time by the number of steps."""
+    profile = load_profile(profile_name)
+    profile = profile.with_symbols_of(symbol_size or profile.page.symbol_size_px)
+    if draw is not None:
+        device = draw_device(np.random.default_rng(draw))
+    else:
+        device = Device() if state is None else load_device(state)
+    device = device.of_profile(profile).with_settings([*settings])
+    asked = {"--profile": profile.to_toml(), "device": device.model_dump(mode="json"), "--pages": pages}
+    asked |= {"--levels": levels, "--seed": seed}
+    begin(out, asked)
+    recording, calibration, bundle = out / "recording.h5", out / "calibration.toml", out / "bundle.zip"
+    simulate(recording, profile, device, CALIBRATED + pages, seed, levels)
+    limit = None if bound is None else _bits(bound)
+    with Recording.open(recording) as file, percent_bar() as progress:
+        if not calibration.exists():
+            calibrate_recording(file, profile, range(CALIBRATED), progress).save(calibration)
+        if not bundle.exists():
+            export_calibration(load_calibration(calibration), file, profile, bundle, progress=progress)
+    most = len(Decoder.load(bundle).graph.value(NOISE)) - 1
+    decoders = [Decoder.load(bundle, steps=steps) for steps in range(1, most + 1)]
+    rows = []
+    with Recording.open(recording) as file:
+        shipped, *seconds = timed([Decoder.load(bundle_path(DEFAULT)), *decoders], file.frames(CALIBRATED))
+        asked_steps = zip(track(decoders, "decode", unit="number of steps"), seconds, strict=True)
+        for steps, (decoder, own) in enumerate(asked_steps, 1):
+            figures = evaluate(decoder, file, tracker_for(decoder)).figures
+            air = figures.air_bits_per_symbol
+            share = None if limit is None else air / limit
+            rows.append(
+                Row(
+                    steps,
+                    air,
+                    share,
+                    figures.ece,
+                    figures.over_claim_bits_per_symbol,
+                    own,
+                    own / shipped,
+                )
+            )
+    for row in rows:
+        of_bound = "" if row.over_bound is None else f", {row.over_bound:.4f} of the bound"
+        click.echo(
+            f"{row.steps} steps: AIR {row.air:.4f}{of_bound}; over-claim {row.over_claim:+.3f}, ECE {row.ece:.4f}; "
+            f"{1000 * row.seconds:.0f} ms, {row.over_shipped:.2f} of the shipped decoder's"
+        )
+    write_figures(json_path, {"asked": asked, "bound": limit, "rows": [asdict(row) for row in rows]}, asked=asked)
+
+
+if __name__ == "__main__":
+    sys.exit(run(main, name="python -m analysis.calibration.waves"))
