@@ -163,6 +163,11 @@ def test_a_graph_that_says_something_else_to_the_golden_page_is_left_out(decoder
     assert files.keys() - left.files.keys() == {BATCH, CONSTANTS}
 
 
+def typical(phases: np.ndarray) -> float:
+    """Median size of phases, radians."""
+    return float(np.median(np.abs(np.angle(np.exp(1j * phases)))))
+
+
 def test_a_stream_is_read_in_batches_as_page_by_page(
     decoder: Decoder, batches: BatchGraph, small_device: list[str]
 ) -> None:
@@ -178,7 +183,7 @@ def test_a_stream_is_read_in_batches_as_page_by_page(
     ]
     tracker, batching = tracker_for(decoder), Batching(PAGES)
     gathering = Decoder(decoder.bundle, None, decoder.graph, batches=Batches(batches, decoder.graph, batching))
-    trackers, rates, phases = (tracker, tracker.refitted(gathering)), [], []
+    trackers, rates, phases, errors = (tracker, tracker.refitted(gathering)), [], [], []
     with ThreadPoolExecutor(1) as alone, ThreadPoolExecutor(14) as pool:  # two sessions of the second one
         asked = [
             [
@@ -193,8 +198,10 @@ def test_a_stream_is_read_in_batches_as_page_by_page(
         read_well = [(page.phase[~mask], page.concentration[~mask], symbols[~mask]) for page, symbols in right]
         rates.append(np.mean([measure(*page, 256).air_bits_per_symbol for page in read_well]))
         phases.append(np.stack([phase for phase, _, _ in read_well]))
+        errors.append(np.stack([phase - 2 * np.pi * symbols / 256 for phase, _, symbols in read_well]))
     assert max(batching.pages.runs) > 1
-    assert all(np.median(np.abs(np.angle(np.exp(1j * (each - phases[0]))))) < 0.005 for each in phases[1:])
+    # the small network's errors depend on the processor that trained it, and so does what a page gains by its place
+    assert all(typical(each - phases[0]) < typical(errors[0]) / 10 for each in phases[1:])
     assert rates[1:] == pytest.approx([rates[0]] * 2, abs=0.05)  # few symbols, some of which half precision tips over
     with Recording.open(small_device[3]) as recording:
         decoders = zip((decoder, gathering), trackers, strict=True)

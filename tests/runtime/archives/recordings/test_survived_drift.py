@@ -50,7 +50,7 @@ def air(draw: Draw) -> float:
     ("kind", "amount", "setting"),
     [
         ("angle", 0.2, "geometry.pipe_angle_deg=-0.8"),
-        ("camera", 0.5, "quadrature_camera.shift_x_px=-4.5"),
+        ("camera", 0.75, "quadrature_camera.shift_x_px=-4.75"),
         ("stroke", 6.0, "slm.stroke_relative_error=-0.06"),
     ],
 )
