@@ -120,6 +120,7 @@ def main(
     device = device.of_profile(profile).with_settings([*settings])
     asked = {"--profile": profile.to_toml(), "device": device.model_dump(mode="json"), "--pages": pages}
     asked |= {"--levels": levels, "--seed": seed}
+    out.mkdir(parents=True, exist_ok=True)
     begin(out, asked)
     recording, calibration, bundle = out / "recording.h5", out / "calibration.toml", out / "bundle.zip"
     simulate(recording, profile, device, CALIBRATED + pages, seed, levels)

@@ -196,13 +196,14 @@ def test_a_stream_is_read_in_batches_as_page_by_page(
         assert [page for page, one in enumerate(read) if isinstance(one.exception(), UnconfirmedPageError)] == [lost]
         right = [(one.result(), symbols) for one, (_, symbols) in zip(read, pages, strict=True) if not one.exception()]
         read_well = [(page.phase[~mask], page.concentration[~mask], symbols[~mask]) for page, symbols in right]
-        rates.append(np.mean([measure(*page, 256).air_bits_per_symbol for page in read_well]))
+        rates.append(np.array([measure(*page, 256).air_bits_per_symbol for page in read_well]))
         phases.append(np.stack([phase for phase, _, _ in read_well]))
         errors.append(np.stack([phase - 2 * np.pi * symbols / 256 for phase, _, symbols in read_well]))
     assert max(batching.pages.runs) > 1
     # the small network's errors depend on the processor that trained it, and so does what a page gains by its place
     assert all(typical(each - phases[0]) < typical(errors[0]) / 10 for each in phases[1:])
-    assert rates[1:] == pytest.approx([rates[0]] * 2, abs=0.05)  # few symbols, some of which half precision tips over
+    # a dozen pilots may trust one page less, by chance either way
+    assert all(np.median(np.abs(each - rates[0])) < 0.05 for each in rates[1:])
     with Recording.open(small_device[3]) as recording:
         decoders = zip((decoder, gathering), trackers, strict=True)
         both = [evaluate(one, recording, each.anew()).to_json() for one, each in decoders]
