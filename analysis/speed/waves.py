@@ -1,7 +1,7 @@
 """What the fitted waves alone read of a device, over the bound of its light, from two known pages.
 
-    python -m analysis.calibration.waves --json F
-    python -m analysis.calibration.waves --set sensor.full_well_e=32 --pages 24 --json F
+    python -m analysis.speed.waves --json F
+    python -m analysis.speed.waves --set sensor.full_well_e=32 --pages 24 --json F
 
 A device is simulated and calibrated, its calibration exported, and further pages are decoded as a service decodes them:
 by the bundle's steps, and by fewer. Beside each stand its time over that of the shipped decoder, both timed in turns in
@@ -161,4 +161,4 @@ def main(
 
 
 if __name__ == "__main__":
-    sys.exit(run(main, name="python -m analysis.calibration.waves"))
+    sys.exit(run(main, name="python -m analysis.speed.waves"))
