@@ -106,7 +106,7 @@ def estimated_device(
     progress("graphs to ONNX", 0.0)
     graphs = estimator_files(estimator, pages[0].pair.in_phase.dtype.name, device.apart_inputs, table)
     progress("noise of the known pages", 0.0)
-    graph = EstimatorGraph(graphs, HeldTable(table), "estimator", (), None)
+    graph = EstimatorGraph(graphs, HeldTable(table), "estimator", None)
     known = [(page.pair, np.angle(page.light(device.modulation))) for page in pages]
     table[NOISE] = measured_noise(graph, known, mask, steps)
     return EstimatedDevice(device, twin, estimator, graphs, table, pages, mask, own)

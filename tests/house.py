@@ -2,7 +2,6 @@
 
 import ast
 import sys
-import tokenize
 import tomllib
 from collections import Counter
 from pathlib import Path
@@ -13,7 +12,6 @@ ROOT = Path(__file__).resolve().parents[1]
 _MADE = {"pb", "build", "dist", "runs", "out", "lightning_logs"}
 """Folders of what commands make, generated stubs among them."""
 _LARGE = "# Large: "
-_NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 
 
 def python_files(*, tests: bool = False) -> list[Path]:

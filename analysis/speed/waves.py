@@ -1,4 +1,4 @@
-"""What the fitted waves alone read of a device, over the bound of its light, from two known pages.
+"""AIR of a device that is read by its fitted waves alone, from two known pages, over the bound of its light.
 
     python -m analysis.speed.waves --json F
     python -m analysis.speed.waves --set sensor.full_well_e=32 --pages 24 --json F

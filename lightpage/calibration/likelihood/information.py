@@ -21,8 +21,8 @@ from lightpage.errors import CalibrationError
 
 Real = NDArray[np.float64]
 
-GAIN, TILT, SHIFT = slice(0, 2), slice(2, 4), slice(4, 6)
-"""Parts of a nuisance vector."""
+GAIN = slice(0, 2)
+"""Real and imaginary part of the gain within a nuisance vector."""
 PRIOR_DEVIATIONS = np.array([0.1, 0.1, 0.15, 0.15])
 """Standard deviations of a page's tilt, radians, and of its shift from where the tracker expects it, camera pixels."""
 _STEPS = np.array([0.01, 0.01, 0.005, 0.005, 0.01, 0.01])
@@ -117,7 +117,8 @@ class InformationFit:
         shape = self._pages[0].phases.shape
         curvature, couplings, normal = np.zeros(shape), np.zeros((6, *shape)), np.zeros((6, 6))
         rng = np.random.default_rng(0)
-        for known in self._pages:
+        for number, known in enumerate(self._pages):
+            self._progress(number / (len(self._pages) + 1))
             for _ in range(_ROUNDS):
                 known.nuisance = self._fitted(known)
             here, gain2 = self._at(known), float(np.sum(known.nuisance[GAIN] ** 2))
@@ -131,6 +132,7 @@ class InformationFit:
         information = scipy.ndimage.gaussian_filter(curvature / count, _SMOOTHED)
         information = np.maximum(information, _LEAST_INFORMATION * np.median(information))
         couplings = np.stack([scipy.ndimage.median_filter(one, _MEDIAN) for one in couplings[_FITTED] / count])
+        self._progress(count / (count + 1))
         responses = self._responses(information, couplings)
         precision = 1 / PRIOR_DEVIATIONS**2
         schur = (normal / count)[np.ix_(_FITTED, _FITTED)] - np.einsum("kyx,lyx->kl", couplings, responses)

@@ -53,7 +53,6 @@ class EstimatorGraph:
         files: its graphs.
         defaults: graph of all in one, whose inputs have the table's defaults.
         subject: name of the bundle, for errors.
-        fed: names of table inputs that may be fed with each page.
         threads: threads of one run; by default the cores that this process may use.
         table: values instead of the defaults.
         like: the same graphs with another table, whose sessions are shared.
@@ -75,7 +74,6 @@ class EstimatorGraph:
         files: EstimatorFiles,
         defaults: GraphFile | HeldTable,
         subject: str,
-        fed: Sequence[str],
         threads: int | None,
         table: SamplingTable | None = None,
         like: EstimatorGraph | None = None,
@@ -83,7 +81,7 @@ class EstimatorGraph:
         steps: int | None = None,
     ) -> None:
         self._files, self._defaults, self._subject = files, defaults, subject
-        self._fed, self._threads, self.provider = tuple(fed), threads, provider
+        self._threads, self.provider = threads, provider
         self.ports = defaults.table_inputs
         self.table: SamplingTable = table or {}
         check_table(self.ports, self.table)
@@ -113,10 +111,8 @@ class EstimatorGraph:
     def with_table(self, table: SamplingTable) -> EstimatorGraph:
         """The graphs with other tensors in their table, by name; those left out stay. It raises as the constructor."""
         merged = {**self.table, **table}
-        files, fed, threads = self._files, self._fed, self._threads
-        return EstimatorGraph(
-            files, self._defaults, self._subject, fed, threads, merged, self, self.provider, self.steps
-        )
+        files, defaults, threads = self._files, self._defaults, self._threads
+        return EstimatorGraph(files, defaults, self._subject, threads, merged, self, self.provider, self.steps)
 
     @property
     def outputs(self) -> dict[str, Port]:

@@ -1,19 +1,16 @@
 """Graphs that decode a page: one that is run once, or an estimator's, whose step is repeated."""
 
-from lightpage.calibration.likelihood.table import PILOT_MASK, PILOT_PHASORS
 from lightpage.errors import BundleError, InvalidInputError, raised_as
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import DECODER, ESTIMATOR_FILES
 from lightpage.runtime.model.execution.estimator_graph import EstimatorFiles, EstimatorGraph
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
-from lightpage.runtime.model.execution.table_graph import GraphFile, TableGraph
+from lightpage.runtime.model.execution.table_graph import GraphFile, TableGraph, check_table
 
 PageGraph = TableGraph | EstimatorGraph
 REGISTRATION = "registration"
 PAGE_INPUTS = frozenset([REGISTRATION])
 """Table inputs that may differ from page to page, as the image shifts. All others are built into the graph."""
-PILOT_INPUTS = frozenset([PILOT_PHASORS, PILOT_MASK])
-"""Table inputs that are fed with each page where the graph takes them: what is known of its symbols."""
 
 
 def open_graph(
@@ -37,9 +34,10 @@ def open_graph(
     if set(file.table_inputs) != set(bundle.manifest.table_inputs):
         raise BundleError(f"{subject}: table inputs", sorted(file.table_inputs), sorted(bundle.manifest.table_inputs))
     if bundle.files.keys() >= set(ESTIMATOR_FILES):
+        with raised_as(BundleError, InvalidInputError, about=f"{bundle.subject}: "):
+            check_table(file.table_inputs, bundle.table)
         files = EstimatorFiles(*(bundle.files[name] for name in ESTIMATOR_FILES))
-        fed = (*PAGE_INPUTS, *PILOT_INPUTS)
-        return EstimatorGraph(files, file, bundle.subject, fed, threads, bundle.table, provider=provider, steps=steps)
+        return EstimatorGraph(files, file, bundle.subject, threads, bundle.table, provider=provider, steps=steps)
     if steps is not None:
         raise InvalidInputError(f"{bundle.subject}: steps", steps, "none: its decoder is a network")
     with raised_as(BundleError, InvalidInputError, about=f"{bundle.subject}: "):

@@ -6,7 +6,6 @@ and lower edge of the page's image, and shift (x, y) of the image from where the
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -15,7 +14,6 @@ from lightpage.device.profile import Profile
 from lightpage.train.models.parts import Parts, multiply, phasor
 from lightpage.waves.grid import FieldGrid
 
-NUISANCES = 6
 _REACH = 2
 
 
@@ -78,8 +76,3 @@ class PageNuisances(nn.Module):
         along = (8 * (at(0, 1) - at(0, -1)) - (at(0, 2) - at(0, -2))) / 12
         down = (8 * (at(1, 0) - at(-1, 0)) - (at(2, 0) - at(-2, 0))) / 12
         return (along[0], along[1]), (down[0], down[1])
-
-
-def unchanged() -> np.ndarray:
-    """Return the nuisance parameters of a page as calibration saw its device, float32 [6]."""
-    return np.array([1, 0, 0, 0, 0, 0], np.float32)
