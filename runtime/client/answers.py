@@ -17,12 +17,21 @@ from lightpage.words import brief, sides
 
 @dataclass(frozen=True)
 class RemoteTimings:
-    """Seconds spent in the service."""
+    """Seconds spent in the service, and the page's Gauss-Newton steps.
+
+    Attributes:
+        receive_s: from the beginning of the call until the frames were there; or reading from the source.
+        decode_s: all attempts at the page.
+        inference_s: all inferences, a part of `decode_s`.
+        total_s: everything, waiting for a free slot included.
+        steps: number of Gauss-Newton steps of all inferences; 0 for a network's bundle, and from services before 0.2.
+    """
 
     receive_s: float
     decode_s: float
     inference_s: float
     total_s: float
+    steps: int = 0
 
 
 @dataclass(frozen=True)
@@ -61,7 +70,7 @@ class RemotePage:
         recalibration_due: whether they confirm less than on a device that is as it was calibrated.
         image: position of the image, or None where the service does not follow it.
         model_version: version of the model that decoded it.
-        timings: seconds in the service.
+        timings: seconds in the service, and Gauss-Newton steps.
         page: number of the page in the source, or None where the caller sent the frames.
         written: symbols that were written, uint8 [ny, nx], or None where the source does not know them.
         pilot_mask: places of the pilots, bool [ny, nx]; given with `written`.

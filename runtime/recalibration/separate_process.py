@@ -78,7 +78,7 @@ def recalibrate_apart(
                 until = clock() + limit_s
                 # The bundle goes as it lies in memory, without what was computed of it: its file may have changed.
                 task = replace(decoder.bundle), pages, out, version, tracker.memory()
-                process.send("recalibrate", *task, progress=progress)
+                process.send("recalibrate", *task, decoder.steps, progress=progress)
                 while not process.poll(_POLL_S):
                     check()
                     if clock() >= until:

@@ -96,10 +96,18 @@ class RecalibrationWorker(Helper):
         out: Path,
         version: str,
         memory: TrackerMemory | None,
+        steps: int | None,
         progress: Progress,
     ) -> RecalibrationOutcome:
-        """Recalibrate a model whose tracker has learnt so much; see `recalibrate` and `recalibrate_by_lost`."""
-        decoder = Decoder(bundle, THREADS)
+        """Recalibrate a model; see `recalibrate` and `recalibrate_by_lost`.
+
+        Args:
+            bundle: bundle of the model.
+            pages, out, version, progress: see `recalibrate`.
+            memory: what the model's tracker has learnt; None where the image is not followed.
+            steps: largest number of Gauss-Newton steps of a page, as in the service; None for no limit.
+        """
+        decoder = Decoder(bundle, THREADS, steps=steps)
         tracker = NoTracker(decoder) if memory is None else tracker_for(decoder, memory)
         if isinstance(pages, LostPages):
             return recalibrate_by_lost(decoder, pages, out, version, self.fit, progress, tracker)

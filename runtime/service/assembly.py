@@ -16,6 +16,7 @@ from lightpage.runtime.model.bundle.signature import BundleKey
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.decoding.tracking import NoTracker
+from lightpage.runtime.model.execution.page_graph import check_steps
 from lightpage.runtime.model.execution.providers import Provider
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.jobs.kept_pages import KeptPages
@@ -68,8 +69,16 @@ def assembled(settings: ServiceSettings, observer: Observer) -> Iterator[Assembl
     key = None if service.bundle_key is None else BundleKey(service.bundle_key)
     provider = Provider.parse(service.provider, service.engine_cache)
     bundle = Bundle.open(bundle_path(service.bundle), key=key)
+    if bundle.is_estimator:
+        check_steps(bundle, service.steps)
+    elif service.steps is not None:
+        _log.warning(
+            "%s is of a network, so a limit of %d steps holds for other models alone", bundle.subject, service.steps
+        )
     together, codes = settings.batches.batching(), service.code_threads
-    base = Decoder(bundle, service.threads, provider=provider, code_threads=codes, batching=together)
+    base = Decoder(
+        bundle, service.threads, provider=provider, code_threads=codes, batching=together, steps=service.steps
+    )
     metrics = ServiceMetrics()
     monitor = Monitor(metrics=metrics)
     own = settings.self_calibration

@@ -83,6 +83,12 @@ class ServiceTable(SettingsTable):
     code_threads: int = Field(
         1, ge=1, le=64, description="Threads that share the code of a page, where it is compiled."
     )
+    steps: int | None = Field(
+        None,
+        ge=1,
+        description="Gauss-Newton steps of a page at most, of every model that is served; by default all of "
+        "its bundle. Bundles of a network have none.",
+    )
     provider: Annotated[str, checked(Provider.parse)] = CPU
     """Processor that computes pages: cpu, cuda or tensorrt, with :N behind it for another GPU than the first."""
     engine_cache: Folder | None = None

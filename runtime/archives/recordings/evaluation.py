@@ -43,6 +43,7 @@ class Evaluation:
         symbols_per_page: data symbols, pilots not counted.
         seconds_per_page: median of the whole decode, without waiting for other pages.
         inference_seconds_per_page: median of the inference alone.
+        steps_per_page: median number of Gauss-Newton steps; 0 for a network's bundle.
         air_per_page: AIR of each page, bits per symbol.
         concentration_bins: what concentrations promise against what happened.
         maps: means over the pages at every place of the page.
@@ -68,6 +69,7 @@ class Evaluation:
     pages_recalibration_due: int = 0
     refused: tuple[RefusedPage, ...] = ()
     air_before_refit_bits_per_symbol: float = float("nan")
+    steps_per_page: float = 0.0
 
     def __repr__(self) -> str:
         air = f"AIR {self.figures.air_bits_per_symbol:.3f} bits a symbol"
@@ -258,6 +260,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
         pages_recalibration_due=due,
         refused=tuple(refused),
         air_before_refit_bits_per_symbol=float(np.mean(before)),
+        steps_per_page=float(np.median([t.steps for t in timings])),
     )
 
 

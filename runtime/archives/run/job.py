@@ -18,6 +18,7 @@ from lightpage.runtime.archives.run.task import Choices, NamedBundle, Plain, Pro
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import MANIFEST
 from lightpage.runtime.model.bundle.shipped import bundle_path
+from lightpage.runtime.model.execution.page_graph import check_steps
 
 FILE = "job.json"
 
@@ -151,6 +152,24 @@ class Job(Plain):
             place = first.setdefault(source.device, index) if source.device else index
             found[place] = (*found.get(place, ()), source)
         return found
+
+    def check_steps(self) -> None:
+        """Check that a bundle of the run has as many Gauss-Newton steps as are chosen; others do with fewer.
+
+        Raises:
+            InvalidInputError: none has; the error is that of the first bundle.
+        """
+        refusals = []
+        for named in (*self.bundles, *self.rounds):
+            try:
+                check_steps(Bundle.open(named.path), self.choices.steps)
+                return
+            except InvalidInputError as error:
+                refusals.append(error)
+            except BundleError:
+                continue  # whoever decodes with it tells why it cannot be read
+        if refusals:
+            raise refusals[0]
 
     def check(self, folder: Path, asked: Job) -> None:
         """Check that a run asks what was asked before; files that have gone or changed are the workers' to tell.

@@ -130,6 +130,7 @@ class Choices(Plain):
         provider: provider that computes pages.
         batches: largest number of pages that are computed together.
         code_threads: number of threads that share the code of a page, where it is compiled.
+        steps: largest number of Gauss-Newton steps of a page; None for as many as its bundle has.
         known_pages: number of pages that recalibrate a device; None for `KNOWN_PAGES`, or all with `fine_tuning`.
         fine_tuning: settings of training after the fit of the geometry; None to fit the geometry alone.
         parts: number of parts that processes do independently of each other.
@@ -144,6 +145,7 @@ class Choices(Plain):
     provider: str = CPU
     batches: int = 1
     code_threads: int = 1
+    steps: int | None = None
     known_pages: int | None = None
     fine_tuning: FineTuning | None = None
     parts: int = 1

@@ -21,6 +21,7 @@ from lightpage.runtime.archives.run.task import Choices, Done, Failed, NamedBund
 from lightpage.runtime.archives.workers.device import recalibrated
 from lightpage.runtime.archives.workers.fine_tuning import DeepRecalibration, deep_recalibration
 from lightpage.runtime.archives.workers.page_range import PageRange, lost_page
+from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.batches import Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
@@ -95,7 +96,14 @@ class Worker:
             self._warm = None
             if (found := bundle_sha256(bundle.path)) != bundle.sha256:
                 raise BundleError(f"bundle {bundle.path}", f"SHA-256 {found}", f"{bundle.sha256}, as at the start")
-            decoder = Decoder.load(bundle.path, self._threads, provider, batching, choices.code_threads)
+            decoder = Decoder(
+                Bundle.open(bundle.path),
+                self._threads,
+                provider=provider,
+                code_threads=choices.code_threads,
+                batching=batching,
+                steps=choices.steps,
+            )
             self._warm = bundle, choices, _Warm(decoder)
         return self._warm[2]
 

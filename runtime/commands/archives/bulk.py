@@ -86,6 +86,11 @@ _pages_options = _together(
     click.option("--retry-lost", is_flag=True, help="Read ranges with lost pages once more, whatever the cause."),
     click.option("--again-with", metavar="BUNDLE", help="Read pages again that were not read well."),
     click.option("--tracking/--no-tracking", default=None, help="Follow the image within a range; the default."),
+    click.option(
+        "--steps",
+        type=click.IntRange(1),
+        help="Gauss-Newton steps of a page at most; by default all of its bundle. Bundles of a network have none.",
+    ),
     click.option("--range-pages", type=click.IntRange(1), help=f"Pages of a range; {RANGE_PAGES} by default."),
 )
 """Options of operations on page ranges."""
@@ -186,6 +191,8 @@ def _bulk(
                 job = _with_checked_devices(job, ledger)
             if again_with is not None:
                 job = with_round(job, again_with)
+            if choices.steps is not None:
+                job.check_steps()
             job.write(ledger.folder)
         if retry_lost:
             ledger.doubt_losses(job)

@@ -53,6 +53,7 @@ def bench(load: Load, rounds: int, json_path: Path | None) -> None:
         "provider": str(decoder.graph.provider),
         "page_code": page_code_in_use(),
         "rounds": rounds,
+        "steps_per_page": decoder.infer(pair).steps,
         **{f"{name}_p50_seconds": value for name, value in median.items()},
         "decode_over_inference": median["decode"] / median["inference"],
         "grpc_over_inference": median["grpc"] / median["inference"],

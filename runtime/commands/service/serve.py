@@ -64,7 +64,7 @@ def _option(name: str, key: str, setting: dict[str, Any]) -> Callable[[_Command]
     if value["type"] == "boolean":
         name, default = f"{name}/--no-{name[2:]}", default and key
     elif value["type"] == "integer":
-        kind = click.IntRange(value["minimum"], value["maximum"])
+        kind = click.IntRange(value["minimum"], value.get("maximum"))
     elif "format" in value:
         kind = click.Path(file_okay=value["format"] == "path", path_type=Path)
     shown, unset = str(default) if default else None, () if multiple else None

@@ -30,6 +30,7 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle.archive import MAX_BYTES, MAX_FILES, check_name, read_files
 from lightpage.runtime.model.bundle.manifest import (
     DECODER,
+    ESTIMATOR_FILES,
     GOLDEN,
     MANIFEST,
     OPTIONAL_FILES,
@@ -138,6 +139,11 @@ class Bundle:
     def version(self) -> str:
         """The version string that replies carry."""
         return self.manifest.version
+
+    @property
+    def is_estimator(self) -> bool:
+        """Whether it is of a calibration alone: pages are estimated by the fitted waves, without a network."""
+        return self.files.keys() >= set(ESTIMATOR_FILES)
 
     @cached_property
     def profile(self) -> Profile:
@@ -435,5 +441,10 @@ def _check_listing(names: set[str], subject: str) -> None:
         check_name(name, subject)
     if missing := REQUIRED_FILES - names:
         raise BundleError(f"{subject}: files", f"no {', '.join(sorted(missing))}", f"{DECODER}, {TWIN} and {GOLDEN}")
+    lacking = [name for name in ESTIMATOR_FILES if name not in names]
+    if 0 < len(lacking) < len(ESTIMATOR_FILES):
+        raise BundleError(
+            f"{subject}: files", f"no {', '.join(lacking)}", f"{', '.join(ESTIMATOR_FILES)}, or none of them"
+        )
     if extra := names - REQUIRED_FILES - OPTIONAL_FILES:
         raise BundleError(f"{subject}: files", sorted(extra), f"{sorted(REQUIRED_FILES | OPTIONAL_FILES)} only")

@@ -21,14 +21,20 @@ from lightpage.page.pilots import Pilots
 from lightpage.recording.exposure import check_light
 from lightpage.recording.frame_pair import FramePair, check_pair
 from lightpage.runtime.model.bundle.bundle import Bundle
-from lightpage.runtime.model.bundle.manifest import DECODER
 from lightpage.runtime.model.decoding.batches import NO_BATCHES, Batches, Batching, OneByOne
 from lightpage.runtime.model.decoding.camera_view import CameraView
 from lightpage.runtime.model.decoding.field_solver import BundleFieldSolver
 from lightpage.runtime.model.decoding.golden import check_golden
 from lightpage.runtime.model.decoding.page import OUTPUTS, DecodedPage, Inference, Timings, check_residual
 from lightpage.runtime.model.execution.estimator_graph import EstimatorGraph
-from lightpage.runtime.model.execution.page_graph import PAGE_INPUTS, REGISTRATION, PageGraph, open_graph
+from lightpage.runtime.model.execution.page_graph import (
+    PAGE_INPUTS,
+    REGISTRATION,
+    PageGraph,
+    check_ports,
+    check_steps,
+    open_graph,
+)
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
 from lightpage.words import brief
 
@@ -55,7 +61,7 @@ class Decoder:
         code_threads: threads that share the code of a page, where it is compiled.
         batching: how its pages are gathered with those of other callers.
         batches: batches that gather them, where they are open already.
-        steps: steps of an estimator; None for as many as the bundle has.
+        steps: largest number of Gauss-Newton steps of a page; None for as many as the bundle has. A network has none.
 
     Raises:
         ProviderError: there is no such provider here.
@@ -75,6 +81,7 @@ class Decoder:
         steps: int | None = None,
     ) -> None:
         self.bundle, self.threads, self.code_threads = bundle, threads, code_threads
+        self.steps = steps
         self.graph = graph or open_graph(bundle, threads, provider, steps)
         self.batches, self._batching = batches or OneByOne(), batching
         residual = bundle.manifest.residual_output
@@ -82,7 +89,7 @@ class Decoder:
         self._estimates = isinstance(self.graph, EstimatorGraph)
         self._pilots: dict[int, Pilots] = {}
         if graph is None:
-            self._check_graph()
+            check_ports(self.bundle, self.graph)
             self.pilots(MAX_LEVELS)  # damaged pilots are noticed now, not with the first page
             if bundle.code is not None:
                 _ = self.page_codec
@@ -101,14 +108,20 @@ class Decoder:
         code_threads: int = 1,
         steps: int | None = None,
     ) -> Decoder:
-        """Open the bundle at `path` and its decoder; raises as `Bundle.open` and the constructor do."""
+        """Open the bundle at `path` and its decoder.
+
+        Raises:
+            InvalidInputError: the bundle has fewer than so many `steps`, or none.
+            BundleError, ProviderError: see `Bundle.open` and the constructor.
+        """
         bundle = Bundle.open(path)
+        check_steps(bundle, steps)
         return cls(bundle, threads, provider=provider, batching=batching, code_threads=code_threads, steps=steps)
 
     def of_another(self, bundle: Bundle) -> Decoder:
-        """The decoder of another bundle, on the same threads and provider; raises as the constructor does."""
-        provider, batching = self.graph.provider, self._batching
-        return Decoder(bundle, self.threads, provider=provider, code_threads=self.code_threads, batching=batching)
+        """The decoder of another bundle, with this one's threads, provider and limit of steps; see the constructor."""
+        provider, batching, codes = self.graph.provider, self._batching, self.code_threads
+        return Decoder(bundle, self.threads, provider=provider, code_threads=codes, batching=batching, steps=self.steps)
 
     def with_table(self, table: SamplingTable) -> Decoder:
         """This decoder with other tensors in its table, by name; those left out stay. The golden page is not looked at.
@@ -225,6 +238,8 @@ class Decoder:
                 answers = self.graph.run_whole(names, feeds) if alone else self.graph.run(names, feeds)
             found = dict(zip(names, answers, strict=True))
             page = _inference(found, self.bundle.manifest.residual_output)
+            if isinstance(self.graph, EstimatorGraph):
+                page = replace(page, steps=self.graph.steps)
         check_residual(page.residual, self.bundle.manifest.residual_limit, doubtful=doubtful)
         return self.view.seen(page, table.get(REGISTRATION))
 
@@ -294,7 +309,8 @@ class Decoder:
             inferred = time.perf_counter()
             page = self.post_process(inference, levels, pilots)
         waited, behind = inference.waited_s, time.perf_counter() - inferred
-        return replace(page, timings=Timings(checked - start, inferred - checked - waited, behind, waiting_s=waited))
+        timings = Timings(checked - start, inferred - checked - waited, behind, waiting_s=waited, steps=inference.steps)
+        return replace(page, timings=timings)
 
     def post_process(self, inference: Inference, levels: int, pilots: Pilots | None = None) -> DecodedPage:
         """Piston, crosstalk, smooth phase error, flicker, trust, decision: all behind the graph; timings are zero."""
@@ -316,25 +332,6 @@ class Decoder:
             level_phases=shown.uneven,
             stroke_relative=page.stroke_relative,
         )
-
-    def _check_graph(self) -> None:
-        """Check names, types and shapes of the frames and of what the graph says of them."""
-        manifest, profile, subject = self.bundle.manifest, self.bundle.profile, f"{self.bundle.subject}: {DECODER}"
-        inputs = self.graph.inputs
-        if set(inputs) != {"in_phase", "quadrature"}:
-            raise BundleError(f"{subject}: inputs", sorted(inputs), "in_phase and quadrature")
-        for name, port in inputs.items():
-            if not port.admits(manifest.frame_dtype, profile.frame_shape):
-                expected = f"{manifest.frame_dtype} {profile.frame_shape}"
-                raise BundleError(f"{subject}: input {name}", f"{port.dtype} {port.shape}", expected)
-        outputs = self.graph.outputs
-        shapes = {"p": (2, *profile.page_shape), "phase": profile.page_shape, "concentration": profile.page_shape}
-        for name, shape in shapes.items():
-            if name not in outputs or not outputs[name].admits("float32", shape):
-                got = f"{outputs[name].dtype} {outputs[name].shape}" if name in outputs else "nothing"
-                raise BundleError(f"{subject}: output {name}", got, f"float32 {shape}")
-        if manifest.residual_output is not None and manifest.residual_output not in outputs:
-            raise BundleError(f"{subject}: output {manifest.residual_output}", "nothing", "a scalar residual")
 
     def _check_golden(self) -> None:
         def answer(pair: FramePair) -> NDArray[np.float32]:
@@ -362,4 +359,6 @@ def _inference(found: dict[str, NDArray[np.float32]], residual: str | None) -> I
 def _like(decoder: Decoder, bundle: Bundle, graph: PageGraph) -> Decoder:
     """The decoder of the same graphs with another table; whatever is open is shared."""
     codes, batching, batches = decoder.code_threads, decoder._batching, decoder.batches
-    return Decoder(bundle, decoder.threads, graph, code_threads=codes, batching=batching, batches=batches)
+    return Decoder(
+        bundle, decoder.threads, graph, code_threads=codes, batching=batching, batches=batches, steps=decoder.steps
+    )

@@ -11,6 +11,7 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.decoding.page import DecodedPage
 from lightpage.runtime.model.decoding.tracking import NoTracker, Tracker
+from lightpage.runtime.model.execution.page_graph import check_steps
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
 
 
@@ -25,7 +26,7 @@ class FollowingDecoder(Decoder):
         threads: number of threads of an inference; all cores if None.
         provider: provider that computes the graph.
         tracking: whether the image is followed; else each page is decoded where calibration saw it.
-        steps: see `Decoder`.
+        steps: largest number of Gauss-Newton steps of a page; see `Decoder`.
 
     Raises:
         ProviderError, BundleError: see `Decoder`.
@@ -46,7 +47,7 @@ class FollowingDecoder(Decoder):
     @cached_property
     def tracker(self) -> Tracker:
         """Return what follows the image."""
-        decoder = Decoder(self.bundle, self.threads, self.graph)
+        decoder = Decoder(self.bundle, self.threads, self.graph, steps=self.steps)
         return tracker_for(decoder) if self._tracking else NoTracker(decoder)
 
     def decode(self, pair: FramePair, levels: int = 256, pilots: Pilots | None = None) -> DecodedPage:
@@ -91,4 +92,5 @@ def load(
     """
     cache = None if engine_cache is None else Path(engine_cache)
     bundle = Bundle.open(bundle_path(str(name_or_path)))
+    check_steps(bundle, steps)
     return FollowingDecoder(bundle, threads, Provider.parse(provider, cache), tracking=tracking, steps=steps)

@@ -284,7 +284,7 @@ class ImageTracker:
             state, inference = self.state, None
             if state.settled:
                 inference = state.decoder.infer(pair, state.table, pilots)
-                clock.add("inference_s", inference.waited_s)
+                clock.add_inference(inference)
             else:
                 state.decoder.batches.put_off()
             is_next = turn.wait(partial(self._has_left, state))
@@ -347,7 +347,7 @@ class ImageTracker:
         for _ in range(1 + CORRECTIONS):
             if inference is None:
                 inference = state.decoder.infer(pair, state.table, pilots)
-                clock.add("inference_s", inference.waited_s)
+                clock.add_inference(inference)
             attempt = self._read(inference, state, levels, pilots)
             clock.add("decision_s")
             if best is not None and _worse(attempt, best):
@@ -516,6 +516,11 @@ class _Clock:
     def __init__(self) -> None:
         self._last = time.perf_counter()
         self.timings = Timings(0.0, 0.0, 0.0)
+
+    def add_inference(self, inference: Inference) -> None:
+        """Count the time since the last call as an inference, without what the page waited in it, and its steps."""
+        self.add("inference_s", inference.waited_s)
+        self.timings = replace(self.timings, steps=self.timings.steps + inference.steps)
 
     def add(self, part: str, waited_s: float = 0.0) -> None:
         """Count the time since the last call as one of `Timings`' parts, but what was waited of it."""

@@ -29,8 +29,8 @@ class Inference:
 
     `residual` is the power that is left of the homodyne equations over the field's, zero where the graph tells none;
     `waited_s` are the seconds for which the page waited for others of its batch. An estimator also says by what `drift`
-    the page's light lies off the table, [4] as in `lightpage.runtime.model.decoding.image_drift`, and the mean square
-    of the counts' residuals over their variance, `chi_square`.
+    the page's light lies off the table, [4] as in `lightpage.runtime.model.decoding.image_drift`, the mean square of
+    the counts' residuals over their variance, `chi_square`, and its number of Gauss-Newton `steps`.
     """
 
     p: NDArray[np.float32]
@@ -40,6 +40,7 @@ class Inference:
     waited_s: float = 0.0
     drift: NDArray[np.float64] | None = None
     chi_square: float | None = None
+    steps: int = 0
 
     def turned(self, by: NDArray[np.floating]) -> Inference:
         """The same with `by` (radians [ny, nx]) added to the phases."""
@@ -50,7 +51,7 @@ class Inference:
 
 @dataclass(frozen=True)
 class Timings:
-    """Wall-clock seconds of one page, every attempt at it counted.
+    """Wall-clock seconds of one page, and its Gauss-Newton steps, every attempt at it counted.
 
     Attributes:
         check_s: checks of the frames.
@@ -59,6 +60,7 @@ class Timings:
         search_s: looking for the image.
         waiting_s: waiting for the other pages of a batch, and for the batch before it.
         turn_s: waiting for the pages before it, behind which it is followed.
+        steps: number of Gauss-Newton steps of all inferences of the page; 0 for a network's bundle.
     """
 
     check_s: float
@@ -67,6 +69,7 @@ class Timings:
     search_s: float = 0.0
     waiting_s: float = 0.0
     turn_s: float = 0.0
+    steps: int = 0
 
     @property
     def waited_s(self) -> float:

@@ -57,15 +57,15 @@ class EstimatorGraph:
         table: values instead of the defaults.
         like: the same graphs with another table, whose sessions are shared.
         provider: provider that computes pages; operators are computed on the CPU.
-        steps: number of steps; None for as many as the bundle has.
+        steps: largest number of steps; None for as many as the bundle has.
 
     Attributes:
         ports: type and shape of every tensor of the table, by name.
         steps: number of steps.
 
     Raises:
-        InvalidInputError: a table that does not fit, or more steps than the bundle knows the noise of.
-        BundleError: a graph cannot be run.
+        InvalidInputError: a table that does not fit.
+        BundleError: a graph cannot be run, or lacks what it needs of the table.
         ProviderError: there is no such provider here.
     """
 
@@ -85,10 +85,9 @@ class EstimatorGraph:
         self.ports = defaults.table_inputs
         self.table: SamplingTable = table or {}
         check_table(self.ports, self.table)
-        most = int(self.value(NOISE).shape[0]) - 1
-        if steps is not None and not 1 <= steps <= most:
-            raise InvalidInputError("steps", steps, f"1 to {most}, as the bundle has")
-        self.steps = most if steps is None else steps
+        self._limit = steps
+        most = most_steps(self.ports, subject)
+        self.steps = most if steps is None else min(steps, most)
         if like is None:
             self._device = open_session(files.operators, f"{subject}: operators", threads, once=True)
             self._first, self._early, self._step = (
@@ -112,7 +111,7 @@ class EstimatorGraph:
         """The graphs with other tensors in their table, by name; those left out stay. It raises as the constructor."""
         merged = {**self.table, **table}
         files, defaults, threads = self._files, self._defaults, self._threads
-        return EstimatorGraph(files, defaults, self._subject, threads, merged, self, self.provider, self.steps)
+        return EstimatorGraph(files, defaults, self._subject, threads, merged, self, self.provider, self._limit)
 
     @property
     def outputs(self) -> dict[str, Port]:
@@ -209,3 +208,22 @@ class EstimatorGraph:
         if missing := inputs - held.keys() - {*_FRAMES, *BEFORE.values(), *PAGE, NOISE}:
             raise BundleError(self._subject, f"graphs that want {', '.join(sorted(missing))}", "inputs of the table")
         return BoundSession(session, self.provider, held, self._subject)
+
+
+def most_steps(ports: Mapping[str, Port], subject: str) -> int:
+    """Number of steps whose noise the table of an estimator holds.
+
+    Args:
+        ports: type and shape of every tensor of the table, by name.
+        subject: name of the bundle or file, for errors.
+
+    Raises:
+        BundleError: the table holds no noise, or that of no step.
+    """
+    port, wanted = ports.get(NOISE), "float32 [steps + 1, 2], a row for the first estimate and for each step"
+    if port is None:
+        raise BundleError(f"{subject}: table input {NOISE}", "nothing", wanted)
+    rows = port.shape[0] if len(port.shape) == 2 else None
+    if port.dtype != "float32" or rows is None or rows < 2 or port.shape[1] != 2:
+        raise BundleError(f"{subject}: table input {NOISE}", f"{port.dtype} {list(port.shape)}", wanted)
+    return rows - 1

@@ -533,16 +533,18 @@ class ImagePosition(_message.Message):
     def __init__(self, shift_x_px: _Optional[float] = ..., shift_y_px: _Optional[float] = ..., tilt_x_rad: _Optional[float] = ..., tilt_y_rad: _Optional[float] = ..., searched: bool = ..., found: bool = ...) -> None: ...
 
 class Timings(_message.Message):
-    __slots__ = ("receive_s", "decode_s", "inference_s", "total_s")
+    __slots__ = ("receive_s", "decode_s", "inference_s", "total_s", "steps")
     RECEIVE_S_FIELD_NUMBER: _ClassVar[int]
     DECODE_S_FIELD_NUMBER: _ClassVar[int]
     INFERENCE_S_FIELD_NUMBER: _ClassVar[int]
     TOTAL_S_FIELD_NUMBER: _ClassVar[int]
+    STEPS_FIELD_NUMBER: _ClassVar[int]
     receive_s: float
     decode_s: float
     inference_s: float
     total_s: float
-    def __init__(self, receive_s: _Optional[float] = ..., decode_s: _Optional[float] = ..., inference_s: _Optional[float] = ..., total_s: _Optional[float] = ...) -> None: ...
+    steps: int
+    def __init__(self, receive_s: _Optional[float] = ..., decode_s: _Optional[float] = ..., inference_s: _Optional[float] = ..., total_s: _Optional[float] = ..., steps: _Optional[int] = ...) -> None: ...
 
 class ReadPageRequest(_message.Message):
     __slots__ = ("page", "options", "want_written", "request_id", "correlation_id")
