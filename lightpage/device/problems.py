@@ -38,7 +38,6 @@ _TYPES = {
     "string_too_short": "at least one character",
     "tuple_type": "a list",
     "list_type": "a list",
-    "too_short": "at least one entry",
     "model_type": "a table",
     "model_attributes_type": "a table",
     "dict_type": "a table",
@@ -153,6 +152,9 @@ def expected_of(error: ErrorDetails) -> str:
     if kind in _BOUNDS:
         bound = _BOUNDS[kind]
         return f"{_SIDES[bound]} {_number(context[bound])}"
+    if kind == "too_short":
+        least = context["min_length"]
+        return "at least one entry" if least == 1 else f"at least {least} entries"
     if kind == "literal_error":
         return str(context["expected"]).replace("'", "")
     return _TYPES.get(kind, error["msg"])

@@ -6,14 +6,17 @@ leaves unexplained.
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Annotated, Self
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from lightpage.device.profile import Finite, TomlTable
+from lightpage.errors import CalibrationError
 
 Real = NDArray[np.float64]
 
@@ -23,6 +26,8 @@ _CLASSES = 60
 """Classes of samples of like expected counts, each with a mean and a variance of its own."""
 _MEAN_DEGREE, _VARIANCE_DEGREE = 7, 5
 """Degrees of the Chebyshev series over the root of the expected count."""
+_FEWEST_CLASSES = 2 * (_MEAN_DEGREE + 1)
+"""Classes that the series need: twice as many as the longer one has coefficients."""
 _STORED = 33
 """Points by which the functions are kept."""
 _BEYOND = 1.3
@@ -32,7 +37,35 @@ _LEAST_VARIANCE = 1e-6
 _LEAST_SLOPE = 1e-3
 """Least slope of the mean: where counts do not grow with the light, they tell next to nothing."""
 
-Values = Annotated[tuple[Finite, ...], Field(min_length=4, strict=False)]
+_FEWEST_POINTS = 4
+
+Values = Annotated[tuple[Finite, ...], Field(strict=False)]
+
+
+def check_points(expected: Sequence[float], mean: Sequence[float], variance: Sequence[float], camera: str = "") -> None:
+    """Check points of the functions of a camera's counts, see `CountStatistics`.
+
+    Args:
+        expected, mean, variance: points.
+        camera: beginning of the keys' names, such as `in_phase_`.
+
+    Raises:
+        ValueError: too few points, lists of different lengths, expected counts that do not increase from 0 or more, or
+            a variance that is not above 0. It says what came and what was wanted.
+    """
+    name, count = f"{camera}expected", len(expected)
+    if count < _FEWEST_POINTS:
+        raise ValueError(f"{name} of {count} numbers, wanted at least {_FEWEST_POINTS}")
+    for key, values in (("mean", mean), ("variance", variance)):
+        if len(values) != count:
+            raise ValueError(f"{camera}{key} of {len(values)} numbers, wanted {count}, as many as {name} has")
+    if expected[0] < 0:
+        raise ValueError(f"{name} that begins with {expected[0]:g}, wanted counts of 0 or more")
+    for lower, upper in pairwise(expected):
+        if not upper > lower:
+            raise ValueError(f"{name} with {upper:g} after {lower:g}, wanted counts that increase")
+    if not (least := min(variance)) > 0:
+        raise ValueError(f"{camera}variance of {least:g}, wanted more than 0")
 
 
 class CountStatistics(TomlTable):
@@ -47,22 +80,40 @@ class CountStatistics(TomlTable):
     mean: Values
     variance: Values
 
+    @model_validator(mode="after")
+    def _checked(self) -> Self:
+        check_points(self.expected, self.mean, self.variance)
+        return self
+
     @classmethod
-    def measured(cls, expected: Real, counts: Real) -> CountStatistics:
+    def measured(cls, expected: Real, counts: Real, subject: str = "counts") -> CountStatistics:
         """Fit smooth functions to samples.
 
         Args:
             expected: counts that the fitted device should give, [N].
             counts: counts that came, [N].
+            subject: name of the counts, for errors.
+
+        Raises:
+            CalibrationError: the samples show no variance or too few different expected counts, as of a dark frame.
         """
-        edges = np.quantile(expected, np.linspace(0, 1, _CLASSES + 1))
-        number = np.clip(np.searchsorted(edges, expected) - 1, 0, _CLASSES - 1)
-        size = np.maximum(np.bincount(number, minlength=_CLASSES), 1)
-        middle = np.bincount(number, expected, _CLASSES) / size
-        mean = np.bincount(number, counts, _CLASSES) / size
+        if counts.size and np.ptp(counts) == 0:
+            raise CalibrationError(
+                subject, f"{counts.flat[0]:g} everywhere", "counts of a page, which has light and noise"
+            )
+        edges = np.quantile(expected, np.linspace(0, 1, _CLASSES + 1)) if expected.size else np.zeros(_CLASSES + 1)
+        classes, number = np.unique(np.clip(np.searchsorted(edges, expected) - 1, 0, _CLASSES - 1), return_inverse=True)
+        if len(classes) < _FEWEST_CLASSES:
+            got = f"samples in {len(classes)} classes of expected counts"
+            raise CalibrationError(subject, got, f"at least {_FEWEST_CLASSES}, as the light of a page gives")
+        size = np.bincount(number)
+        middle = np.bincount(number, expected) / size
+        mean = np.bincount(number, counts) / size
         slope = np.gradient(mean, middle)
         residual = counts - mean[number] - slope[number] * (expected - middle[number])
-        variance = np.bincount(number, residual**2, _CLASSES) / size
+        variance = np.bincount(number, residual**2) / size
+        if not variance.max() > 0:
+            raise CalibrationError(subject, "no variance about their mean", "counts of a page, which has noise")
         variance = np.maximum(variance, _LEAST_VARIANCE * variance.max())
         root = np.sqrt(middle)
         series = np.polynomial.chebyshev.Chebyshev

@@ -211,8 +211,9 @@ class InformationFit:
             CountStatistics.measured(
                 np.concatenate([expected[camera] for expected, _ in samples]),
                 np.concatenate([counts[camera] for _, counts in samples]),
+                f"known pages: counts of the {name} camera",
             )
-            for camera in (0, 1)
+            for camera, name in enumerate(("in-phase", "quadrature"))
         ]
         return both[0], both[1]
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from lightpage.calibration.likelihood.counts import CountStatistics, Values
+from lightpage.calibration.likelihood.counts import CountStatistics, Values, check_points
 from lightpage.calibration.waves.wave_model import ILLUMINATIONS, LaunchConditions
 from lightpage.device.profile import Finite, TomlTable
 
@@ -37,6 +37,12 @@ class Statistics(TomlTable):
     quadrature_expected: Values
     quadrature_mean: Values
     quadrature_variance: Values
+
+    @model_validator(mode="after")
+    def _checked(self) -> Self:
+        check_points(self.in_phase_expected, self.in_phase_mean, self.in_phase_variance, "in_phase_")
+        check_points(self.quadrature_expected, self.quadrature_mean, self.quadrature_variance, "quadrature_")
+        return self
 
     @classmethod
     def of(

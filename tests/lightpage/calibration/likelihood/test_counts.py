@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 import scipy
+from pydantic import ValidationError
 
 from lightpage.calibration.likelihood.counts import KNOTS, CountStatistics
+from lightpage.errors import CalibrationError
 
 GAIN, ELECTRONS, READ = 0.9, 8.0, 1.5
 """Counts for one that is expected, electrons of a count, and read noise in counts."""
@@ -69,3 +71,53 @@ def test_correlated_samples_tell_less_and_fit_as_well(statistics: CountStatistic
     expected, counts = seen(3)
     score, tables = scores(together, statistics.scale, expected, counts)
     assert np.mean(score**2 / tables[3]) == pytest.approx(1, abs=0.03)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("expected", "counts", "got"),
+    [
+        (np.linspace(1, 100, 1000), np.zeros(1000), "0 everywhere"),
+        (np.linspace(1, 100, 1000), np.full(1000, 255.0), "255 everywhere"),
+        (np.full(1000, 7.0), np.arange(1000.0), "samples in 1 classes"),
+        (np.repeat([1.0, 2.0, 3.0], 500), np.arange(1500.0), "samples in 3 classes"),
+        (np.zeros(0), np.zeros(0), "samples in 0 classes"),
+    ],
+)
+def test_a_dark_or_constant_frame_has_no_statistics(expected: np.ndarray, counts: np.ndarray, got: str) -> None:
+    with pytest.raises(CalibrationError, match=f"^in-phase: got {got}"):
+        CountStatistics.measured(expected, counts, "in-phase")
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_share_of_equal_expected_counts_does_no_harm(statistics: CountStatistics) -> None:
+    """A margin without light is one value of the expected count, and fills several quantiles."""
+    expected, counts = seen(2)
+    dark = np.arange(len(expected)) < len(expected) // 5
+    other = CountStatistics.measured(np.where(dark, 0.25, expected), np.where(dark, 0.1, counts))
+    bright = np.array(statistics.expected) > 20
+    mean = np.interp(np.array(statistics.expected)[bright], other.expected, other.mean)
+    np.testing.assert_allclose(mean, np.array(statistics.mean)[bright], rtol=0.02)
+
+
+RIGHT = {"expected": (0.0, 1.0, 2.0, 3.0), "mean": (0.0, 1.0, 2.0, 3.0), "variance": (1.0,) * 4}
+
+
+@pytest.mark.parametrize(
+    ("key", "values", "problem"),
+    [
+        ("expected", (0.0, 1.0, 1.0, 3.0), "expected with 1 after 1, wanted counts that increase"),
+        ("expected", (3.0, 2.0, 1.0, 0.0), "expected with 2 after 3, wanted counts that increase"),
+        ("expected", (-1.0, 1.0, 2.0, 3.0), "expected that begins with -1, wanted counts of 0 or more"),
+        ("expected", (0.0, 1.0, 2.0), "expected of 3 numbers, wanted at least 4"),
+        ("expected", (0.0, 1.0, 2.0, float("nan")), "finite"),
+        ("mean", (0.0, 1.0, 2.0), "mean of 3 numbers, wanted 4, as many as expected has"),
+        ("variance", (1.0,) * 5, "variance of 5 numbers, wanted 4, as many as expected has"),
+        ("variance", (1.0, 0.0, 1.0, 1.0), "variance of 0, wanted more than 0"),
+        ("variance", (1.0, -2.0, 1.0, 1.0), "variance of -2, wanted more than 0"),
+        ("variance", (1.0, float("inf"), 1.0, 1.0), "finite"),
+    ],
+)
+def test_points_that_are_no_function_are_refused(key: str, values: tuple[float, ...], problem: str) -> None:
+    with pytest.raises(ValidationError, match=problem):
+        CountStatistics.model_validate({**RIGHT, key: values})
