@@ -20,6 +20,7 @@ from lightpage.export.estimator_graphs import estimator_files
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import pilot_mask
 from lightpage.progress import Progress, warn
+from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording
 from lightpage.runtime.model.execution.estimator_graph import NOISE, EstimatorFiles, EstimatorGraph
@@ -32,6 +33,9 @@ from lightpage.train.trainers.whole_run import own_pilots
 
 MOST_PAGES = 4
 """Known pages by which information and noise are measured, at most."""
+MOST_CHI_SQUARE = 2.0
+"""Largest mean square of a known page's residuals over their variance. A small device's page has 0.9; with references
+at 0.9 times their exposure it has 5, with mirrored ones 11, with ones that are 20 pixels away 3."""
 
 
 @dataclass(frozen=True)
@@ -82,14 +86,14 @@ def estimated_device(
         progress: function that takes every step.
 
     Raises:
-        CalibrationError: a calibration without statistics, or of other pages.
+        CalibrationError: a calibration without statistics, or of other pages or references.
         ProfileError: a calibration of another profile.
         RecordingError: the recording is of another device.
     """
     calibration.check_profile(profile)
     recording.header.check_against(profile)
     if (statistics := calibration.statistics) is None:
-        raise CalibrationError("calibration: statistics", "none", "those of the counts: calibrate anew")
+        raise CalibrationError("calibration: statistics", "none", "statistics of the counts: calibrate anew")
     used, bits = calibrated_pages(calibration, recording), recording.bit_depth
     pages = [KnownPage(narrow(page.pair, bits), page.symbols) for page in known_pages(recording, profile, used)]
     device = calibration.device(profile, narrow(recording.references(), bits))
@@ -108,8 +112,27 @@ def estimated_device(
     progress("noise of the known pages", 0.0)
     graph = EstimatorGraph(graphs, HeldTable(table), "estimator", None)
     known = [(page.pair, np.angle(page.light(device.modulation))) for page in pages]
+    check_counts(graph, pages[0].pair, f"recording {recording.path}, page {used[0]}")
     table[NOISE] = measured_noise(graph, known, mask, steps)
     return EstimatedDevice(device, twin, estimator, graphs, table, pages, mask, own)
+
+
+def check_counts(graph: EstimatorGraph, pair: FramePair, subject: str) -> None:
+    """Check that a known page's counts scatter about the expected ones as the calibration's statistics say.
+
+    Args:
+        graph: graph of the calibrated device, with as many steps as a page can do with.
+        pair: frames of a page that the calibration was made of.
+        subject: name of the page, for the error.
+
+    Raises:
+        CalibrationError: they scatter more, as with other references than those of the calibration.
+    """
+    (chi_square,) = graph.run(["chi_square"], {"in_phase": pair.in_phase, "quadrature": pair.quadrature})
+    if not float(chi_square) <= MOST_CHI_SQUARE:
+        got = f"counts that scatter {float(chi_square):.3g} times as much as the calibration says"
+        expected = f"at most {MOST_CHI_SQUARE:g} times; are these the calibration's references? Or calibrate anew"
+        raise CalibrationError(subject, got, expected)
 
 
 def calibrated_pages(calibration: Calibration, recording: Recording) -> list[int]:

@@ -68,11 +68,14 @@ def test_a_range_is_read_and_its_record_says_what_it_was(operation: Operation, a
     assert bool(record.confidence_bins) == (operation is Operation.EVALUATE)
 
 
-def test_a_range_is_read_in_batches_of_the_size_that_is_asked_for(asked: Callable[..., Task], monkeypatch: Any) -> None:
-    monkeypatch.setattr(Decoder, "load", opened := Mock(wraps=Decoder.load))
-    choices = Choices(operation=Operation.DECODE, tracking=False, batches=4)
-    assert isinstance(Worker(1).work(asked(choices=choices)), Done)
-    assert opened.call_args.args[-2].largest == 4
+def test_a_range_is_read_in_batches_and_steps_as_many_as_are_asked_for(
+    asked: Callable[..., Task], monkeypatch: Any
+) -> None:
+    monkeypatch.setattr("lightpage.runtime.archives.workers.work.Decoder", opened := Mock(wraps=Decoder))
+    choices = Choices(operation=Operation.DECODE, tracking=False, batches=4, steps=2)
+    assert isinstance(Worker(1).work(asked(choices=choices)), Done)  # a network's bundle, too
+    assert opened.call_args.kwargs["batching"].largest == 4
+    assert opened.call_args.kwargs["steps"] == 2
 
 
 @pytest.mark.parametrize("operation", OPERATIONS)
