@@ -11,21 +11,31 @@ from lightpage.calibration.likelihood.measure import measured_statistics
 from lightpage.calibration.waves.wave_fit import WaveFit
 from lightpage.device.state import Device
 from lightpage.errors import CalibrationError, InvalidInputError
-from lightpage.export import from_calibration
+from lightpage.export import from_calibration, proof
+from lightpage.export.estimated_device import check_counts
 from lightpage.export.from_calibration import export_calibration
 from lightpage.metrics.measures import measure
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols
 from lightpage.recording.reader import Recording
+from lightpage.runtime.archives.run.job import Job
+from lightpage.runtime.archives.run.task import Choices, NamedBundle, Operation
+from lightpage.runtime.client.client import LightpageClient
+from lightpage.runtime.commands.client.decode import page_report
+from lightpage.runtime.console.last_pages import LastPages
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import DECODER, TWIN
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
+from lightpage.runtime.model.execution.estimator_graph import EstimatorGraph
 from lightpage.runtime.model.execution.session import open_session
 from lightpage.runtime.model.execution.twin import OnnxTwin
 from lightpage.runtime.recalibration.known_pages import KnownPages
 from lightpage.runtime.recalibration.recalibration import recalibrate
 from lightpage.runtime.recalibration.refit import refit
+from lightpage.runtime.service.assembly import assembled
+from lightpage.runtime.service.server.server import LightpageServer
+from lightpage.runtime.service.settings import ServiceSettings
 from lightpage.simulator.simulator import Simulator
 from lightpage.train.models.likelihood.estimator import PhaseEstimator
 from lightpage.train.models.likelihood.torch_likelihood import TorchLikelihood
@@ -118,6 +128,83 @@ def test_calibrations_of_before_and_of_other_pages_are_refused(
             with pytest.raises(CalibrationError, match=subject):
                 export_calibration(wrong, recording, PROFILE, tmp_path / "B.zip")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_services_models_take_no_more_steps_than_it_is_asked_for(
+    bundle: Path, small_bundle: Path, small_device: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    steps = STEPS - 1
+    table = {"bundle": str(bundle), "steps": steps, "threads": 1, "tracking": False}
+    with Recording.open(small_device[3]) as recording:
+        pair = recording.frames(2)
+    with assembled(ServiceSettings.model_validate({"service": table}), LastPages()) as made:
+        with LightpageServer(made.plane, made.recalibrator) as server, LightpageClient(server.target) as client:
+            page = client.frames.decode(pair)
+            assert page.timings.steps == steps
+            assert page_report(page)["steps"] == steps
+        base = made.plane.models.current.decoder
+        assert base.decode(pair).timings.steps == steps
+        network = base.of_another(Bundle.open(small_bundle))
+        assert network.decode(pair).timings.steps == 0
+        for later in (network.of_another(Bundle.open(bundle)), base.with_table({}), base.of_bundle(base.bundle)):
+            assert later.infer(pair).steps == steps
+        many = Decoder(base.bundle, 1, steps=STEPS + 4)
+        assert many.infer(pair).steps == STEPS
+    wrong = ServiceSettings.model_validate({"service": {**table, "steps": STEPS + 1}})
+    refused = pytest.raises(InvalidInputError, match=f"steps: got {STEPS + 1}, wanted 1 to {STEPS}")
+    with refused, assembled(wrong, LastPages()):
+        pass
+    with assembled(ServiceSettings.model_validate({"service": {**table, "bundle": str(small_bundle)}}), LastPages()):
+        assert "is of a network" in caplog.text
+
+
+def test_a_followed_page_counts_the_steps_of_every_attempt(bundle: Path, small_device: list[str]) -> None:
+    decoder = Decoder.load(bundle, 1, steps=2)
+    with Recording.open(small_device[3]) as recording:
+        page = tracker_for(decoder).decode(recording.frames(2), 256)
+    assert page.timings.steps >= 2
+    assert page.timings.steps % 2 == 0
+
+
+def test_a_bulk_run_takes_the_steps_that_one_of_its_bundles_has(bundle: Path, small_bundle: Path) -> None:
+    def run(steps: int, *paths: Path) -> Job:
+        bundles = tuple(NamedBundle(path=path, sha256="0" * 64, version="1") for path in paths)
+        return Job(choices=Choices(operation=Operation.DECODE, steps=steps), bundles=bundles, sources=())
+
+    run(STEPS, small_bundle, bundle).check_steps()
+    with pytest.raises(InvalidInputError, match=f"steps: got {STEPS + 1}, wanted 1 to {STEPS}"):
+        run(STEPS + 1, bundle).check_steps()
+
+
+def test_a_page_beside_other_references_is_refused(bundle: Path, small_device: list[str]) -> None:
+    graph = Decoder.load(bundle, 1).graph
+    assert isinstance(graph, EstimatorGraph)
+    with Recording.open(small_device[3]) as recording:
+        pair, references = recording.frames(USED[0]), recording.references()
+    check_counts(graph, pair, "page 0")
+    table = {"reference_in_phase": references.in_phase, "reference_quadrature": references.quadrature}
+    mirrored = {name: np.ascontiguousarray(frame[:, ::-1]) for name, frame in table.items()}
+    with pytest.raises(CalibrationError, match=r"page 0: got counts that scatter .* references"):
+        check_counts(graph.with_table(mirrored), pair, "page 0")
+
+
+def test_an_interrupted_export_leaves_nothing_and_the_next_one_works(
+    calibration: Calibration, bundle: Path, small_device: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = Bundle.open(bundle)
+
+    def interrupt(decoder: Decoder, *_: object) -> None:
+        assert decoder.bundle.path.parent == tmp_path
+        raise KeyboardInterrupt
+
+    files = dict(made.files)
+    with Recording.open(small_device[3]) as recording:
+        monkeypatch.setattr(proof, "choose_code", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            proof.proven(tmp_path / "B.zip", made.manifest, files, recording.path, lambda what, share: None)
+        assert not list(tmp_path.iterdir())
+    monkeypatch.undo()
+    assert proof.proven(tmp_path / "B.zip", made.manifest, files, None, lambda what, share: None)[1] == files
 
 
 def test_steps_are_those_that_the_bundle_has(bundle: Path, small_bundle: Path) -> None:

@@ -44,12 +44,12 @@ def printed(*arguments: str | Path, **environment: str) -> str:
 def test_every_option_is_above_the_environment_and_printed_settings_open_nothing(tmp_path: Path) -> None:
     environment = {"BUNDLE": "other", "STORE": "other", "THREADS": "1", "TRACKING": "true", "ADDRESS": "127.0.0.1:1"}
     options = f"""--bundle b.zip --source recording:a --pages p.h5 --address 127.0.0.1:7 --store {tmp_path}/s
-        --recordings . --threads 3 --no-tracking --metrics-port 9 --metrics-host 127.0.0.2 --self-calibrate
+        --recordings . --threads 3 --steps 2 --no-tracking --metrics-port 9 --metrics-host 127.0.0.2 --self-calibrate
         --flight-recorder f --flight-recorder-pages 9"""
     text = printed(*options.split(), **{f"LIGHTPAGE_SERVICE__{name}": value for name, value in environment.items()})
     told = tomllib.loads(text)
     service = {"bundle": "b.zip", "source": "recording:a", "pages": "p.h5", "address": "127.0.0.1:7"}
-    service |= {"store": f"{tmp_path}/s", "recordings": ".", "threads": 3, "tracking": False}
+    service |= {"store": f"{tmp_path}/s", "recordings": ".", "threads": 3, "steps": 2, "tracking": False}
     for table, expected in (
         ("service", service),
         ("metrics", {"port": 9, "host": "127.0.0.2"}),
@@ -67,6 +67,7 @@ def test_every_option_is_above_the_environment_and_printed_settings_open_nothing
         ("--self-calibrate", "--self-calibrate"),
         ("--source simulator:bench --calibration-page 1", "--calibration-page"),
         ("--incoming {folder}", "--incoming"),
+        ("--steps 0", "--steps"),
     ],
 )
 def test_what_cannot_work_is_refused_at_once(

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from lightpage.errors import CallerLeft, RecalibrationRefusedError, WorkerError
+from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.tracking import NoTracker
 from lightpage.runtime.recalibration import worker
@@ -107,6 +108,12 @@ def test_a_process_that_comes_to_no_good_end_changes_nothing(
     assert ["ZeroDivisionError" in record.getMessage() for record in caplog.records] == [True] * (worker == "Broken")
     assert list(tmp_path.iterdir()) == [folder]
     assert list(folder.iterdir()) == []
+
+
+def test_it_takes_no_more_steps_than_the_service(toy_zip: Path, tmp_path: Path) -> None:
+    limited = Decoder(Bundle.open(toy_zip), 1, steps=2)
+    with pytest.raises(RecalibrationRefusedError, match="steps: got 2"):
+        Apart(limited, tmp_path / "new.zip", "Limited").run()
 
 
 @pytest.mark.parametrize(("shares", "looks"), [([ROOM], 1), ([0.1, ROOM - 0.01, ROOM + 0.01, 0.1], 3), ([1.0], 1)])

@@ -61,6 +61,13 @@ class Refusing(Helper):
         raise RecalibrationRefusedError("fit", "worse", "better")
 
 
+class Limited(Helper):
+    """Says how many steps of a page it may take."""
+
+    def recalibrate(self, *task: Any, progress: Progress) -> None:
+        raise RecalibrationRefusedError("steps", task[-1], "none")
+
+
 class Broken(Helper):
     def recalibrate(self, *task: Any, progress: Progress) -> None:
         raise ZeroDivisionError

@@ -28,6 +28,7 @@ UNREAD = NamedBundle(path=Path("/toy.zip"), sha256="", version="")
         ({"operation": Operation.EVALUATE}, "operation"),
         ({"parts": 2}, "parts"),
         ({"provider": "cuda"}, "provider"),
+        ({"steps": 1}, "steps"),
         ({"fine_tuning": FineTuning()}, "fine_tuning"),
     ],
 )
@@ -37,6 +38,14 @@ def test_another_choice_is_another_question(choices: dict[str, Any], subject: st
         job().check(Path("out"), asked)
     assert error.value.subject == f"bulk run out: {subject}"
     job().check(Path("out"), job())
+
+
+def test_steps_that_no_bundle_of_a_run_has_are_refused(toy_zip: Path) -> None:
+    network = NamedBundle(path=toy_zip, sha256="0" * 64, version="toy-1")
+    asked = job().model_copy(update={"choices": job().choices.model_copy(update={"steps": 2})})
+    with pytest.raises(InvalidInputError, match=r"toy\.zip: steps: got 2, wanted none: its decoder is a network"):
+        asked.model_copy(update={"bundles": (UNREAD, network)}).check_steps()
+    asked.model_copy(update={"bundles": (UNREAD,)}).check_steps()  # the workers tell why it is not read
 
 
 def test_other_recordings_bundles_or_runs_are_another_question_and_files_that_have_gone_are_not(tmp_path: Path) -> None:

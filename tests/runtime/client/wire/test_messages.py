@@ -18,7 +18,7 @@ def test_a_page_goes_there_and_back_by_the_names_of_its_fields() -> None:
     named = {*pb.DecodeReply.DESCRIPTOR.fields_by_name, *pb.ReadPageReply.DESCRIPTOR.fields_by_name}
     assert {field.name for field in fields(answers.RemotePage)} <= named  # else one keeps its default for ever
     symbols, mask = np.arange(6, dtype=np.uint8).reshape(2, 3), np.eye(2, 3, dtype=bool)
-    timings, image = answers.RemoteTimings(1, 2, 3, 4), ImagePosition(0.5, -1.0, found=True)
+    timings, image = answers.RemoteTimings(1, 2, 3, 4, 5), ImagePosition(0.5, -1.0, found=True)
     page = answers.RemotePage(
         symbols, np.float32(symbols / 8), None, np.float32(-symbols), 16, 0.5, 0.25, "toy-1", timings, image=image
     )

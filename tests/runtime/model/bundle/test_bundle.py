@@ -20,9 +20,19 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle import archive
 from lightpage.runtime.model.bundle.archive import read_files
 from lightpage.runtime.model.bundle.bundle import Bundle, in_few_counts, npz, shows_page, write_bundle
-from lightpage.runtime.model.bundle.manifest import GOLDEN, MANIFEST, PILOTS, TABLE, parse_manifest
+from lightpage.runtime.model.bundle.manifest import (
+    DECODER,
+    ESTIMATOR_FILES,
+    GOLDEN,
+    MANIFEST,
+    PILOTS,
+    TABLE,
+    Manifest,
+    parse_manifest,
+)
 from lightpage.runtime.model.bundle.signature import BundleKey
 from lightpage.runtime.model.bundle.signature_file import signature_path
+from lightpage.runtime.model.decoding.decoder import Decoder
 from tests.runtime import toy
 
 
@@ -95,6 +105,29 @@ def test_what_is_no_whole_zip_is_refused(toy_zip: Path, tmp_path: Path) -> None:
 def test_a_missing_or_unlisted_file_is_named(name: str, content: bytes | None, toy_zip: Path, tmp_path: Path) -> None:
     with pytest.raises(BundleError, match=name):
         Bundle.open(rewrite_zip(toy_zip, tmp_path / "other.zip", {name: content}))
+
+
+@pytest.mark.parametrize("lacking", ESTIMATOR_FILES)
+def test_some_graphs_of_an_estimator_are_a_damaged_bundle(lacking: str, toy_zip: Path, tmp_path: Path) -> None:
+    graphs = {name: b"graph" for name in ESTIMATOR_FILES if name != lacking}
+    with pytest.raises(BundleError, match=f"files: got no {lacking}, wanted operators.onnx, .*, or none of them"):
+        write_bundle(tmp_path / "partial.zip", toy.manifest(), {**toy.files(), **graphs})
+    whole = write_bundle(tmp_path / "whole.zip", toy.manifest(), {**toy.files(), **graphs, lacking: b"graph"})
+    files = read_files(whole)
+    manifest = json.loads(files.pop(MANIFEST))
+    del manifest["files"][lacking], manifest["manifest_sha256"]
+    text = Manifest.model_validate_json(json.dumps(manifest)).to_json()
+    with pytest.raises(BundleError, match=f"got no {lacking}"):
+        Bundle.open(rewrite_zip(whole, tmp_path / "cut.zip", {lacking: None, MANIFEST: text}))
+
+
+def test_an_estimator_without_the_noise_of_its_steps_is_a_damaged_bundle(toy_zip: Path, tmp_path: Path) -> None:
+    graphs = dict.fromkeys(ESTIMATOR_FILES, toy.files()[DECODER])
+    path = write_bundle(tmp_path / "no-noise.zip", toy.manifest(), {**toy.files(), **graphs})
+    with pytest.raises(BundleError, match=r"decoder\.onnx: table input noise: got nothing, wanted float32"):
+        Decoder.load(path, steps=1)
+    with pytest.raises(BundleError, match="table input noise: got nothing, wanted float32"):
+        Decoder.load(path)
 
 
 def test_a_newer_schema_says_which(toy_zip: Path) -> None:

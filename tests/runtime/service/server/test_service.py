@@ -69,6 +69,7 @@ def test_a_sent_pair_comes_back_as_the_local_decoder_would_decode_it(service: Ru
     assert (there.model_version, there.levels) == ("toy-1", 16)
     assert (there.frames, there.replayed, there.recalibration_reasons) == ((), False, ())
     assert 0 < there.timings.inference_s < there.timings.decode_s < there.timings.total_s
+    assert there.timings.steps == 0  # a network's bundle
     assert service.plane.received.used == 0
 
 
