@@ -106,15 +106,15 @@ RIGHT = {"expected": (0.0, 1.0, 2.0, 3.0), "mean": (0.0, 1.0, 2.0, 3.0), "varian
 @pytest.mark.parametrize(
     ("key", "values", "problem"),
     [
-        ("expected", (0.0, 1.0, 1.0, 3.0), "expected with 1 after 1, wanted counts that increase"),
-        ("expected", (3.0, 2.0, 1.0, 0.0), "expected with 2 after 3, wanted counts that increase"),
-        ("expected", (-1.0, 1.0, 2.0, 3.0), "expected that begins with -1, wanted counts of 0 or more"),
-        ("expected", (0.0, 1.0, 2.0), "expected of 3 numbers, wanted at least 4"),
+        ("expected", (0.0, 1.0, 1.0, 3.0), "expected with 1 after 1"),
+        ("expected", (3.0, 2.0, 1.0, 0.0), "expected with 2 after 3"),
+        ("expected", (-1.0, 1.0, 2.0, 3.0), "expected that begins with -1"),
+        ("expected", (0.0, 1.0, 2.0), "expected of 3 numbers"),
         ("expected", (0.0, 1.0, 2.0, float("nan")), "finite"),
-        ("mean", (0.0, 1.0, 2.0), "mean of 3 numbers, wanted 4, as many as expected has"),
-        ("variance", (1.0,) * 5, "variance of 5 numbers, wanted 4, as many as expected has"),
-        ("variance", (1.0, 0.0, 1.0, 1.0), "variance of 0, wanted more than 0"),
-        ("variance", (1.0, -2.0, 1.0, 1.0), "variance of -2, wanted more than 0"),
+        ("mean", (0.0, 1.0, 2.0), "mean of 3 numbers"),
+        ("variance", (1.0,) * 5, "variance of 5 numbers"),
+        ("variance", (1.0, 0.0, 1.0, 1.0), "variance of 0"),
+        ("variance", (1.0, -2.0, 1.0, 1.0), "variance of -2"),
         ("variance", (1.0, float("inf"), 1.0, 1.0), "finite"),
     ],
 )

@@ -22,9 +22,9 @@ def test_it_comes_back_from_toml() -> None:
 @pytest.mark.parametrize(
     ("key", "values", "problem"),
     [
-        ("in_phase_expected", "[0.0, 2.0, 1.0, 3.0]", "in_phase_expected with 1 after 2, wanted counts that increase"),
-        ("quadrature_mean", "[0.0, 1.0]", "quadrature_mean of 2 numbers, wanted 4, as many as quadrature_expected"),
-        ("quadrature_variance", "[1.0, 1.0, 0.0, 1.0]", "quadrature_variance of 0, wanted more than 0"),
+        ("in_phase_expected", "[0.0, 2.0, 1.0, 3.0]", "in_phase_expected with 1 after 2"),
+        ("quadrature_mean", "[0.0, 1.0]", "quadrature_mean of 2 numbers"),
+        ("quadrature_variance", "[1.0, 1.0, 0.0, 1.0]", "quadrature_variance of 0"),
         ("in_phase_mean", "[0.0, nan, 2.0, 3.0]", "in_phase_mean.1 = nan .wanted a finite number"),
         ("illumination_real", "[1.0]", f"illumination_real = .1.0. .wanted at least {ILLUMINATIONS} entries"),
         ("correlation", "0.0", "correlation = 0.0 .wanted more than 0"),

@@ -43,7 +43,7 @@ def test_another_choice_is_another_question(choices: dict[str, Any], subject: st
 def test_steps_that_no_bundle_of_a_run_has_are_refused(toy_zip: Path) -> None:
     network = NamedBundle(path=toy_zip, sha256="0" * 64, version="toy-1")
     asked = job().model_copy(update={"choices": job().choices.model_copy(update={"steps": 2})})
-    with pytest.raises(InvalidInputError, match=r"toy\.zip: steps: got 2, wanted none: its decoder is a network"):
+    with pytest.raises(InvalidInputError, match=r"toy\.zip: steps: got"):
         asked.model_copy(update={"bundles": (UNREAD, network)}).check_steps()
     asked.model_copy(update={"bundles": (UNREAD,)}).check_steps()  # the workers tell why it is not read
 

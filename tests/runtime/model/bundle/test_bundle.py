@@ -110,7 +110,7 @@ def test_a_missing_or_unlisted_file_is_named(name: str, content: bytes | None, t
 @pytest.mark.parametrize("lacking", ESTIMATOR_FILES)
 def test_some_graphs_of_an_estimator_are_a_damaged_bundle(lacking: str, toy_zip: Path, tmp_path: Path) -> None:
     graphs = {name: b"graph" for name in ESTIMATOR_FILES if name != lacking}
-    with pytest.raises(BundleError, match=f"files: got no {lacking}, wanted operators.onnx, .*, or none of them"):
+    with pytest.raises(BundleError, match=f"got no {lacking}"):
         write_bundle(tmp_path / "partial.zip", toy.manifest(), {**toy.files(), **graphs})
     whole = write_bundle(tmp_path / "whole.zip", toy.manifest(), {**toy.files(), **graphs, lacking: b"graph"})
     files = read_files(whole)
@@ -124,9 +124,9 @@ def test_some_graphs_of_an_estimator_are_a_damaged_bundle(lacking: str, toy_zip:
 def test_an_estimator_without_the_noise_of_its_steps_is_a_damaged_bundle(toy_zip: Path, tmp_path: Path) -> None:
     graphs = dict.fromkeys(ESTIMATOR_FILES, toy.files()[DECODER])
     path = write_bundle(tmp_path / "no-noise.zip", toy.manifest(), {**toy.files(), **graphs})
-    with pytest.raises(BundleError, match=r"decoder\.onnx: table input noise: got nothing, wanted float32"):
+    with pytest.raises(BundleError, match=r"decoder\.onnx: .* noise"):
         Decoder.load(path, steps=1)
-    with pytest.raises(BundleError, match="table input noise: got nothing, wanted float32"):
+    with pytest.raises(BundleError, match="input noise"):
         Decoder.load(path)
 
 
