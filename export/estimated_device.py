@@ -25,6 +25,7 @@ from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording
 from lightpage.runtime.model.execution.estimator_graph import NOISE, EstimatorFiles, EstimatorGraph
 from lightpage.runtime.model.execution.table_graph import HeldTable
+from lightpage.runtime.recalibration.estimator import KNOWN_CONCENTRATION
 from lightpage.runtime.recalibration.noise import MOST_STEPS, measured_noise
 from lightpage.train.models.likelihood.estimator import PhaseEstimator
 from lightpage.train.models.likelihood.torch_likelihood import TorchLikelihood
@@ -34,8 +35,9 @@ from lightpage.train.trainers.whole_run import own_pilots
 MOST_PAGES = 4
 """Known pages by which information and noise are measured, at most."""
 MOST_CHI_SQUARE = 2.0
-"""Largest mean square of a known page's residuals over their variance. A small device's page has 0.9; with references
-at 0.9 times their exposure it has 5, with mirrored ones 11, with ones that are 20 pixels away 3."""
+"""Largest mean square of a known page's residuals over their variance, which is measured so that it is 1. A small
+device's page has 5.5 with references at 0.9 times their exposure, 11 with mirrored ones, and 3.3 with ones that are 20
+pixels away."""
 
 
 @dataclass(frozen=True)
@@ -112,25 +114,33 @@ def estimated_device(
     progress("noise of the known pages", 0.0)
     graph = EstimatorGraph(graphs, HeldTable(table), "estimator", None)
     known = [(page.pair, np.angle(page.light(device.modulation))) for page in pages]
-    check_counts(graph, pages[0].pair, f"recording {recording.path}, page {used[0]}")
+    check_counts(graph, *known[0], f"recording {recording.path}, page {used[0]}")
     table[NOISE] = measured_noise(graph, known, mask, steps)
     return EstimatedDevice(device, twin, estimator, graphs, table, pages, mask, own)
 
 
-def check_counts(graph: EstimatorGraph, pair: FramePair, subject: str) -> None:
+def check_counts(graph: EstimatorGraph, pair: FramePair, phases: NDArray[np.float64], subject: str) -> None:
     """Check that a known page's counts scatter about the expected ones as the calibration's statistics say.
 
     Args:
-        graph: graph of the calibrated device, with as many steps as a page can do with.
+        graph: graph of the calibrated device.
         pair: frames of a page that the calibration was made of.
+        phases: phases of its light, radians [ny, nx].
         subject: name of the page, for the error.
 
     Raises:
         CalibrationError: they scatter more, as with other references than those of the calibration.
     """
-    (chi_square,) = graph.run(["chi_square"], {"in_phase": pair.in_phase, "quadrature": pair.quadrature})
-    if not float(chi_square) <= MOST_CHI_SQUARE:
-        got = f"counts that scatter {float(chi_square):.3g} times as much as the calibration says"
+    p = (KNOWN_CONCENTRATION * np.stack([np.cos(phases), np.sin(phases)])).astype(np.float32)
+    page = graph.begun({"in_phase": pair.in_phase, "quadrature": pair.quadrature})
+    nuisance = page["nuisance"]
+    chi_square = np.inf
+    for _ in range(MOST_STEPS):
+        step = graph.derivatives(page, {}, p, nuisance, ("nuisance", "chi_square"))
+        nuisance = step["nuisance"]
+        chi_square = float(step["chi_square"])
+    if not chi_square <= MOST_CHI_SQUARE:
+        got = f"counts that scatter {chi_square:.3g} times as much as the calibration says"
         expected = f"at most {MOST_CHI_SQUARE:g} times; are these the calibration's references? Or calibrate anew"
         raise CalibrationError(subject, got, expected)
 

@@ -20,7 +20,7 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.execution.estimator_graph import NOISE, EstimatorGraph
 from lightpage.runtime.recalibration.noise import measured_noise
 
-_SURE = 1e6
+KNOWN_CONCENTRATION = 1e6
 """Concentration of known phases."""
 _OF_COUNTS = ("count_scale", "count_weights", "information", "responses", "nuisance_covariance", "nuisance_precision")
 """Tensors that no constant follows from: they are fed with each evaluation."""
@@ -50,7 +50,7 @@ class GraphLikelihood:
             measured = self._own.begun({"in_phase": pair.in_phase, "quadrature": pair.quadrature})
             kept = self._pages[id(pair)] = pair, measured
         page = kept[1]
-        p = (_SURE * np.stack([np.cos(phases), np.sin(phases)])).astype(np.float32)
+        p = (KNOWN_CONCENTRATION * np.stack([np.cos(phases), np.sin(phases)])).astype(np.float32)
         fed = {name: own[name] for name in _OF_COUNTS if name in own}
         found = self._own.derivatives(page, fed, p, np.asarray(nuisance, np.float32))
         (expected, counts), every = sampled_evenly(page["lit"] > 0, found["expected"], page["counts"])

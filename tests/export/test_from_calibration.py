@@ -180,12 +180,13 @@ def test_a_page_beside_other_references_is_refused(bundle: Path, small_device: l
     graph = Decoder.load(bundle, 1).graph
     assert isinstance(graph, EstimatorGraph)
     with Recording.open(small_device[3]) as recording:
-        pair, references = recording.frames(USED[0]), recording.references()
-    check_counts(graph, pair, "page 0")
+        (page,), references = known_pages(recording, PROFILE, USED[:1]), recording.references()
+    phases = np.angle(page.symbols)
+    check_counts(graph, page.pair, phases, "page 0")
     table = {"reference_in_phase": references.in_phase, "reference_quadrature": references.quadrature}
     mirrored = {name: np.ascontiguousarray(frame[:, ::-1]) for name, frame in table.items()}
     with pytest.raises(CalibrationError, match="page 0"):
-        check_counts(graph.with_table(mirrored), pair, "page 0")
+        check_counts(graph.with_table(mirrored), page.pair, phases, "page 0")
 
 
 def test_an_interrupted_export_leaves_nothing_and_the_next_one_works(
@@ -211,3 +212,5 @@ def test_steps_are_those_that_the_bundle_has(bundle: Path, small_bundle: Path) -
     for path, steps in ((bundle, STEPS + 1), (bundle, 0), (small_bundle, 1)):
         with pytest.raises(InvalidInputError, match="steps"):
             Decoder.load(path, steps=steps)
+    with pytest.raises(InvalidInputError, match="steps"):
+        Decoder(Bundle.open(bundle), steps=0)

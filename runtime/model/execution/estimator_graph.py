@@ -166,16 +166,18 @@ class EstimatorGraph:
         feeds: Mapping[str, NDArray[Any]],
         p: NDArray[np.float32],
         nuisance: NDArray[np.float32],
+        outputs: Sequence[str] = DERIVATIVES,
     ) -> dict[str, NDArray[Any]]:
-        """Return `DERIVATIVES` at an estimate, by name.
+        """Return outputs of a step from an estimate, by name.
 
         Args:
             page: measurements of the page, as `begun` returns them.
             feeds: table tensors for this evaluation alone.
             p, nuisance: the estimate.
+            outputs: names of `STEP_OUTPUTS`.
         """
         found = {**page, "p": p, "nuisance": nuisance}
-        return self._stepped(self._step, found, self.value(NOISE)[1], feeds, DERIVATIVES)
+        return self._stepped(self._step, found, self.value(NOISE)[1], feeds, outputs)
 
     def begun(self, feeds: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         """Return the first estimate and the measurements of a page, by name; feeds as for `run`."""

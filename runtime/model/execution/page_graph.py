@@ -26,8 +26,11 @@ def open_graph(
 
     Raises:
         BundleError: no ONNX model, or its table is not the one of the manifest, or does not fit.
+        InvalidInputError: fewer `steps` than one.
         ProviderError: there is no such provider here.
     """
+    if steps is not None and steps < 1:
+        raise InvalidInputError("steps", steps, "1 or more")
     subject = f"{bundle.subject}: {DECODER}"
     file = GraphFile(bundle.files[DECODER], subject)
     if set(file.table_inputs) != set(bundle.manifest.table_inputs):
