@@ -18,7 +18,6 @@ from lightpage.runtime.archives.run.task import Choices, NamedBundle, Plain, Pro
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.manifest import MANIFEST
 from lightpage.runtime.model.bundle.shipped import bundle_path
-from lightpage.runtime.model.execution.page_graph import check_steps
 
 FILE = "job.json"
 
@@ -159,6 +158,10 @@ class Job(Plain):
         Raises:
             InvalidInputError: none has; the error is that of the first bundle.
         """
+        from lightpage.runtime.model.execution.page_graph import (
+            check_steps,
+        )  # a finished run loads nothing that decodes
+
         refusals = []
         for named in (*self.bundles, *self.rounds):
             try:
