@@ -11,7 +11,7 @@ import scipy
 from numpy.typing import NDArray
 
 from lightpage.calibration.calibrated_device import CalibratedDevice
-from lightpage.calibration.goodness.frame_noise import noise_like
+from lightpage.calibration.goodness.frame_noise import CountCurve, noise_like, on_pixels
 from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.parameters import PARAMETERS, SEEN_BY_CAMERAS, STEPS
 from lightpage.calibration.samplers import smooth_reference
@@ -74,16 +74,17 @@ class SeenLight:
         edge, size = len(self._grid.prefilter), np.array(pair.in_phase.shape[::-1])
         self._seen = np.all((pixels > edge) & (pixels < size - edge), axis=(0, 3))
         self._at = _rows_and_columns(pixels)
-        levels = [smooth_reference(each) for each in (device.references.in_phase, device.references.quadrature)]
-        self.references = _looked_at(levels, self._at)
+        self._levels = [smooth_reference(each) for each in (device.references.in_phase, device.references.quadrature)]
+        self.references = _looked_at(self._levels, self._at)
         amplitude = np.sqrt(self.references[0])
         self._amplitude = amplitude / amplitude[self._seen].mean()
         self._arms = np.exp(1j * np.array([0.0, device.quadrature_phase_rad]))[:, None, None]
         seen, empty = ((each.in_phase, each.quadrature) for each in (pair, device.references))
         beyond = [one.astype(np.float32) - other for one, other in zip(seen, empty, strict=True)]
-        self._images = self._filtered(beyond)
+        self._images = _filtered(beyond, self._grid.prefilter)
         self.counts = _looked_at(self._images, self._at) / (2 * self.references)
         self.fields = self.waves.to_cameras(self.page)
+        self._excess = np.zeros_like(self.counts)  # of the mean counts over the expected ones, see `correct_counts`
 
     @property
     def left(self) -> Complex:
@@ -94,23 +95,29 @@ class SeenLight:
         """A small change of the light of both cameras as it comes back from their equations."""
         return self._mending((change / self._amplitude * self._along().conj()).real)
 
+    def expected_frames(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Counts that the model predicts for both cameras' pixels, [H, W]; NaN beyond the common grid."""
+        in_phase, quadrature = (
+            on_pixels(brightness, at, level.shape) * level
+            for brightness, at, level in zip(self.brightness, self._at, self._levels, strict=True)
+        )
+        return in_phase, quadrature
+
     def noise_of_frames(self) -> Complex:
-        """Noise like that of the frames, as light of both cameras."""
+        """Noise like that of the frames over the light that the model predicts, as light of both cameras."""
         pair, references = self._pair, self._device.references
         frames = [pair.in_phase, references.in_phase, pair.quadrature, references.quadrature]
-        drawn = list(zip(frames, np.random.default_rng(0).spawn(len(frames)), strict=True))
+        in_phase, quadrature = self.expected_frames()
+        expected = [in_phase, self._levels[0], quadrature, self._levels[1]]
+        drawn = list(zip(frames, expected, np.random.default_rng(0).spawn(len(frames)), strict=True))
         noise = list(in_parallel(lambda one: noise_like(*one), drawn))
         beyond = [noise[0] - noise[1], noise[2] - noise[3]]
-        return self._mending(_looked_at(self._filtered(beyond), self._at) / (2 * self.references))
+        return self._mending(_looked_at(_filtered(beyond, self._grid.prefilter), self._at) / (2 * self.references))
 
     def noise_of_modulator(self) -> Complex:
         """Return the light that the modulator's phase noise of 1 rad a sample adds for both cameras, to first order."""
         noise = np.random.default_rng(1).standard_normal(self.page.shape)
         return self.seen_of(self.waves.to_cameras(1j * noise * self.page))
-
-    def to_exit(self, seen: Complex) -> Complex:
-        """Light of both cameras back to the exit facet."""
-        return self.waves.back_to_exit(seen)
 
     def errors(self, leaving: Complex) -> Complex:
         """Light on the exit facet as relative errors of the symbols, over the power of each, [ny, nx]."""
@@ -141,6 +148,16 @@ class SeenLight:
             share * radius2(waves) ** power for share, power in zip(found[2 * terms :], _LOSSES, strict=True)
         )
         self.fields = waves.from_exit(waves.to_exit(self.page, passed))
+
+    def correct_counts(self) -> None:
+        """Give the model the mean count over the expected count: cameras clip at zero, and may not be linear.
+
+        A network learns that by itself, and an estimator has such statistics in its table.
+        """
+        for camera, (level, brightness) in enumerate(zip(self.references, self.brightness, strict=True)):
+            expected, counts = level * brightness, level * (1 + 2 * self.counts[camera])
+            excess = CountCurve.measured(expected[self._seen], (counts - expected)[self._seen])
+            self._excess[camera] = excess.at(expected) / (2 * level)
 
     def equations(self, left: Real) -> Real:
         """Equations [2, Gy, Gx], or on the coarse grid, over their noise, on that grid; flat."""
@@ -202,7 +219,7 @@ class SeenLight:
     def _lacking(self) -> Real:
         """Counts that the model lacks, [2, Gy, Gx], over twice the reference's."""
         field = self.fields / self._amplitude
-        return np.asarray(self.counts - (field * self._arms.conj()).real - np.abs(field) ** 2 / 2)
+        return np.asarray(self.counts - self._excess - (field * self._arms.conj()).real - np.abs(field) ** 2 / 2)
 
     def _along(self, where: tuple[slice, slice] = _EVERYWHERE) -> Complex:
         """Directions of the field along which the cameras' counts grow, at some places of the grid."""
@@ -212,15 +229,6 @@ class SeenLight:
         """Light of both cameras that mends what is left of their equations, each weighted by its noise."""
         along = self._along()
         return np.asarray(self._seen * self._amplitude * along * left / (np.abs(along) ** 2 + READ_NOISE))
-
-    def _filtered(self, images: Sequence[NDArray[np.float32]]) -> list[NDArray[np.float32]]:
-        """Images filtered as a decoder filters what frames have beyond their references, float32 [H, W]."""
-
-        def filtered(image: NDArray[np.float32]) -> NDArray[np.float32]:
-            down = scipy.ndimage.convolve1d(image, self._grid.prefilter, axis=0)
-            return np.asarray(scipy.ndimage.convolve1d(down, self._grid.prefilter, axis=1))
-
-        return list(in_parallel(filtered, images))
 
 
 def places_on_facet(waves: FittedWaves) -> tuple[Real, Real]:
@@ -249,3 +257,13 @@ def _looked_at(images: Sequence[NDArray[np.float32]], at: Sequence[Sequence[Real
         for one, pixels in zip(images, at, strict=True)
     ]
     return np.stack(seen).astype(np.float64)
+
+
+def _filtered(images: Sequence[NDArray[np.float32]], taps: Real) -> list[NDArray[np.float32]]:
+    """Images filtered as a decoder filters what frames have beyond their references, float32 [H, W]."""
+
+    def filtered(image: NDArray[np.float32]) -> NDArray[np.float32]:
+        down = scipy.ndimage.convolve1d(image, taps, axis=0)
+        return np.asarray(scipy.ndimage.convolve1d(down, taps, axis=1))
+
+    return list(in_parallel(filtered, images))

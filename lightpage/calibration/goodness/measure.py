@@ -1,10 +1,11 @@
 """Measure how well a fitted device explains the light of a known page: in bits, by place, and the likeliest cause.
 
 What the cameras should have seen of the page, by the fitted waves, is taken off what they saw. The rest is sent back to
-the modulator. There it is an error of each symbol, as a decoder meets it that knows all others. Noise of the frames is
-measured by the frames themselves, and is sent the same way. Noise of the modulator makes errors of phase, and few of
-amplitude. Light that the model puts in another place makes as much of either. So errors of amplitude, beyond those of
-noise, are errors that a better model would not make.
+the modulator. There it is an error of each symbol, as a decoder meets it that knows all others. The mean count over the
+expected count is measured, and is part of what the cameras should have seen. The variance of the frames' noise over the
+expected count is measured at frequencies above those of the light, and noise like it is sent the same way. Noise of the
+modulator makes errors of phase, and few of amplitude. Light that the model puts in another place makes as much of
+either. So errors of amplitude, beyond those of noise, are errors that a better model would not make.
 """
 
 from __future__ import annotations
@@ -66,10 +67,12 @@ def measure_goodness(
     light = SeenLight(twin, device, conditions, pair, symbols)
     progress(0.2)
     light.correct_amplitude()
+    light.correct_counts()
     progress(0.4)
-    at_exit = [light.to_exit(each) for each in (light.left, light.noise_of_frames(), light.noise_of_modulator())]
+    back = light.waves.back_to_exit
+    at_exit = [back(each) for each in (light.left, light.noise_of_frames(), light.noise_of_modulator())]
     progress(0.6)
-    gain = _smooth(light.errors(light.to_exit(light.seen_of(light.fields))).real)
+    gain = _smooth(light.errors(back(light.seen_of(light.fields))).real)
     seen = gain > _SEEN * max(float(np.median(gain)), _NOTHING)
     if not seen.any():
         raise CalibrationError("calibration, verdict", "no symbol whose light both cameras see", "some")

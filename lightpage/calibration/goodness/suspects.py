@@ -116,5 +116,3 @@ def _suspects(light: SeenLight) -> Iterator[tuple[str, list[Real]]]:
     length = light.waves.channel.geometry.pipe_length_m
     ghost = light.changed(pipe_length_m=3 * length).to_cameras(page)
     yield "light that passes the pipe three times", [light.equations_of(each) for each in (ghost, 1j * ghost)]
-    bright = light.references * light.brightness**2
-    yield "counts that are not in proportion to the light", [light.equations(bright * each) for each in (one, 1 - one)]

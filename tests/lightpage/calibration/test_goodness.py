@@ -6,14 +6,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from lightpage.calibration.goodness.frame_noise import noise_like, noise_variance
+from lightpage.calibration.calibrated_device import CalibratedDevice
+from lightpage.calibration.goodness.frame_noise import noise_curve, noise_like, on_pixels
+from lightpage.calibration.goodness.light import SeenLight
 from lightpage.calibration.goodness.measure import measure_goodness
 from lightpage.calibration.goodness.verdict import Goodness
 from lightpage.calibration.parameters import NAMES
 from lightpage.calibration.waves.wave_fit import LevelPrior, WaveFit
-from lightpage.device.state import Device
+from lightpage.calibration.waves.wave_model import LaunchConditions
+from lightpage.device.state import Device, Sensor
 from lightpage.page.symbols import symbol_phases
+from lightpage.recording.frame_pair import FramePair
+from lightpage.simulator.cameras import to_counts
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import perfectly_calibrated
 from lightpage.train.models.twin import RayTwin, TorchTwin
@@ -24,8 +30,10 @@ TWIN = TorchTwin(RayTwin(PROFILE))
 STILL = ("drift.shift_px=0",)
 
 
-def goodness_of(*settings: str, wrong_symbols: float = 0.0, stated: float = 1.0) -> Goodness:
-    """Return the goodness of a calibration that knows all of a device but what it has no parameter for.
+def fitted_page(
+    *settings: str, wrong_symbols: float = 0.0, stated: float = 1.0
+) -> tuple[CalibratedDevice, LaunchConditions, FramePair, NDArray[np.complex128]]:
+    """Return a calibration that knows all of a device but what it has no parameter for, and a page as it is known.
 
     The profile states `stated` times the pipe's length.
     """
@@ -45,7 +53,20 @@ def goodness_of(*settings: str, wrong_symbols: float = 0.0, stated: float = 1.0)
     length = NAMES.index("pipe_length_relative")
     parameters[length] = (1 + parameters[length]) / stated - 1
     fitted = replace(known, profile=profile, parameters=parameters, modulation=found.modulation)
-    return measure_goodness(TWIN, fitted, found.conditions, pair, told)
+    return fitted, found.conditions, pair, told
+
+
+def goodness_of(*settings: str, wrong_symbols: float = 0.0, stated: float = 1.0) -> Goodness:
+    """Return the goodness of such a calibration."""
+    return measure_goodness(TWIN, *fitted_page(*settings, wrong_symbols=wrong_symbols, stated=stated))
+
+
+def true_variance(sensor: Sensor, expected: float, count: int = 100_000) -> float:
+    """Variance of the counts of a pixel that a perfect camera would give `expected` counts."""
+    rng = np.random.default_rng(1)
+    light = rng.poisson(expected * sensor.full_well_e / (2**sensor.bit_depth - 1), count)
+    counts = to_counts(light + sensor.read_noise_e * rng.standard_normal(count), sensor)
+    return float(np.var(counts))
 
 
 BLURRED, DIM = ("sensor.full_well_e=1000", "slm.blur_px=0.5"), ("sensor.full_well_e=32",)
@@ -87,16 +108,69 @@ def test_a_wrong_fit_says_what_is_likeliest(settings: tuple[str, ...], wrong_sym
     assert np.max(found.by_facet) > 3
 
 
-def test_a_frames_noise_is_known_by_the_frame_itself() -> None:
+def test_noise_in_dim_light_hides_no_fault_and_looks_like_none() -> None:
+    """Counts at 32 electrons are clipped at zero, which no wave explains."""
+    assert goodness_of(*DIM).bits_lost < 0.03
+    ghost = "geometry.ghost_relative=0.15"
+    dim, bright = goodness_of(*DIM, ghost), goodness_of(ghost)
+    assert dim.verdict == "wrong"
+    assert dim.unexplained_relative == pytest.approx(bright.unexplained_relative, rel=0.15)
+
+
+def test_counts_that_are_not_in_proportion_to_the_light_cost_nothing() -> None:
+    bent, straight = goodness_of("sensor.nonlinearity_relative=-0.15"), goodness_of()
+    assert bent.bits_lost == pytest.approx(straight.bits_lost, abs=0.01)
+
+
+@pytest.mark.parametrize("settings", [DIM, BLURRED, ("sensor.bit_depth=12",)])
+def test_the_noise_of_the_verdict_is_that_of_the_sensor_at_every_brightness(settings: tuple[str, ...]) -> None:
+    sensor = Device().with_settings(settings).sensor
+    known, conditions, pair, symbols = fitted_page(*settings)
+    light = SeenLight(TWIN, known, conditions, pair, symbols)
+    light.correct_amplitude()
+    for frame, expected in zip((pair.in_phase, pair.quadrature), light.expected_frames(), strict=True):
+        levels = np.geomspace(*np.nanquantile(expected, [0.05, 0.98]), 6)
+        true = [true_variance(sensor, level) for level in levels]
+        np.testing.assert_allclose(noise_curve(frame, expected).at(levels), true, rtol=0.15)
+
+
+def test_defects_and_saturated_pixels_are_no_noise() -> None:
     rng = np.random.default_rng(0)
-    light = 120 + 80 * np.cos(np.arange(400) * 0.5)[:, None] * np.cos(np.arange(300) * 0.4)
+    light = (120 + 80 * np.cos(np.arange(400) * 0.5)[:, None] * np.cos(np.arange(300) * 0.4)).astype(np.float32)
     frame = rng.normal(light, np.sqrt(2 + 0.05 * light)).round().astype(np.uint8)
     frame[rng.random(frame.shape) < 1e-3] = 255
-    fixed, by_count = noise_variance(frame)
-    assert fixed + 120 * by_count == pytest.approx(8, rel=0.1)
-    assert np.var(noise_like(frame, rng)) == pytest.approx(8, rel=0.15)
-    few = np.clip(np.rint(8 * rng.poisson(light / 8)), 0, 255).astype(np.uint8)  # electrons, eight counts each
-    assert np.var(noise_like(few, rng)) == pytest.approx(8 * light.mean(), rel=0.05)
-    frame[:100] = 255
-    fixed, by_count = noise_variance(frame)
-    assert fixed + 120 * by_count == pytest.approx(8, rel=0.1)
+    curve = noise_curve(frame, light)
+    np.testing.assert_allclose(curve.at(np.array([60, 120, 180])), [5, 8, 11], rtol=0.15)
+    assert np.var(noise_like(frame, light, rng)) == pytest.approx(8, rel=0.1)
+    frame[:100], light[:100] = 255, 300
+    curve = noise_curve(frame, light)
+    np.testing.assert_allclose(curve.at(np.array([60, 120, 180])), [5, 8, 11], rtol=0.15)
+    assert curve.at(np.array([300.0])) == pytest.approx(0, abs=0.5)
+
+
+def test_pixels_that_the_grid_does_not_reach_are_no_noise_either() -> None:
+    rng = np.random.default_rng(0)
+    light = np.full((600, 500), 100, np.float32)
+    frame = rng.poisson(light).astype(np.uint16)
+    frame[:200], light[:200] = 30 * rng.poisson(3, (200, 500)), np.nan
+    assert noise_curve(frame, light).at(np.array([100.0])) == pytest.approx(100, rel=0.1)
+    assert np.isfinite(noise_like(frame, light, rng)).all()
+    assert not noise_like(frame, np.full_like(light, np.nan), rng).any()
+
+
+def test_values_of_the_grid_come_to_the_pixels_that_see_them() -> None:
+    rows, columns = np.indices((60, 80)).astype(np.float64)
+
+    def wave(row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        return np.cos(0.9 * row) * np.sin(0.7 * column + 0.3)
+
+    turned = [150 - 2.02 * columns + 0.03 * rows + 1e-4 * rows * columns, 12 + 1.98 * rows - 0.02 * columns]
+    image = on_pixels(wave(rows, columns), turned, (160, 140))
+    at = np.rint(turned).astype(int)
+    inside = (slice(8, -8), slice(8, -8))
+    near = image[at[0], at[1]]
+    back = np.linalg.inv([[0.03, -2.02], [1.98, -0.02]])
+    off = np.stack([at[0] - turned[0], at[1] - turned[1]])
+    row, column = np.stack([rows, columns]) + np.tensordot(back, off, 1)
+    np.testing.assert_allclose(near[inside], wave(row, column)[inside], atol=0.03)
+    assert np.isnan(image[:, -1]).all()
