@@ -23,7 +23,13 @@ from lightpage.progress import Progress, warn
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording
-from lightpage.runtime.model.execution.estimator_graph import NOISE, EstimatorFiles, EstimatorGraph
+from lightpage.runtime.model.execution.estimator_graph import (
+    DEVIATION_PRECISION,
+    NO_DEVIATIONS,
+    NOISE,
+    EstimatorFiles,
+    EstimatorGraph,
+)
 from lightpage.runtime.model.execution.table_graph import HeldTable
 from lightpage.runtime.recalibration.estimator import KNOWN_CONCENTRATION
 from lightpage.runtime.recalibration.noise import MOST_STEPS, measured_noise
@@ -31,6 +37,7 @@ from lightpage.train.models.likelihood.estimator import PhaseEstimator
 from lightpage.train.models.likelihood.torch_likelihood import TorchLikelihood
 from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.train.trainers.whole_run import own_pilots
+from lightpage.waves.grid import symbol_samples
 
 MOST_PAGES = 4
 """Known pages by which information and noise are measured, at most."""
@@ -108,14 +115,15 @@ def estimated_device(
     mask = pilot_mask(profile) if mask is None else mask
     own = own_pilots(recording, profile, mask, used)
     table |= pilot_tensors(_pilots(device, mask, own))
-    table[NOISE] = np.tile(np.array([1, 0], np.float32), (MOST_STEPS + 1, 1))
+    table |= {NOISE: np.tile(np.array([1, 0], np.float32), (MOST_STEPS + 1, 1)), DEVIATION_PRECISION: NO_DEVIATIONS}
     progress("graphs to ONNX", 0.0)
     graphs = estimator_files(estimator, pages[0].pair.in_phase.dtype.name, device.apart_inputs, table)
     progress("noise of the known pages", 0.0)
     graph = EstimatorGraph(graphs, HeldTable(table), "estimator", None)
     known = [(page.pair, np.angle(page.light(device.modulation))) for page in pages]
     check_counts(graph, *known[0], f"recording {recording.path}, page {used[0]}")
-    table[NOISE] = measured_noise(graph, known, mask, steps)
+    prior_scale = symbol_samples(profile) ** 2 * statistics.correlation
+    table |= measured_noise(graph, known, mask, prior_scale, steps)
     return EstimatedDevice(device, twin, estimator, graphs, table, pages, mask, own)
 
 

@@ -17,6 +17,7 @@ from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.export.graph import FRAME_INPUTS, TABLE_INPUTS, answers
 from lightpage.export.onnx_files import exported
 from lightpage.runtime.model.execution.estimator_graph import (
+    ANSWERS,
     BEFORE,
     EARLY_STEPS,
     ESTIMATE,
@@ -33,11 +34,13 @@ DEVICE = ("parameters", "blur", "illumination")
 PILOTS = (PILOT_PHASORS, PILOT_MASK)
 FIRST = (*TABLE_INPUTS, "information", *PILOTS)
 """Inputs of the first estimate beside frames, its noise, cameras that stand apart, and operators."""
-COUNTS = ("amplitude_series", "count_scale", "count_weights")
+COUNTS = ("amplitude_series", "slope_power", "count_scale", "count_weights")
 STEP = (
     "homodyne",
     *COUNTS,
     "information",
+    "point_spread",
+    "deviation_precision",
     "responses",
     "nuisance_covariance",
     "nuisance_precision",
@@ -84,12 +87,12 @@ class FirstGraph(nn.Module):
         self.names = (*FIRST, *apart)
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
-        """Frames, noise, `names` and operators to p, phase, concentration, nuisance, residual and page."""
+        """Frames, noise, `names` and operators to p, phase, concentration, nuisance, deviations, residual and page."""
         frames, noise, given = tensors[:2], tensors[2], 3 + len(self.names)
         table = dict(zip(self.names, tensors[3:given], strict=True))
         operators = restored(self._structure, self._used, tensors[given:])
         estimate, page, residual = self.estimator.first(operators, table, noise, *frames)
-        return *answers(estimate.p), estimate.nuisance, residual, *page
+        return *answers(estimate.p), estimate.nuisance, estimate.deviations, residual, *page
 
 
 class StepGraph(nn.Module):
@@ -115,20 +118,20 @@ class StepGraph(nn.Module):
         self.names = (*STEP, *apart)
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
-        """Estimate (p, nuisance), noise, page, `names` and operators to p, phase, concentration, nuisance, chi-square.
+        """Estimate, noise, page, `names` and operators to p, phase, concentration, nuisance, deviations, chi-square.
 
         Beside them come the derivatives of the log-likelihood at the estimate that was given, and its expected counts.
         """
         state = len(ESTIMATE) + 1
-        p, nuisance, noise = tensors[:state]
+        estimate, noise = Estimate(*tensors[: state - 1]), tensors[state - 1]
         page = Page(*tensors[state : state + len(PAGE)])
         given = state + len(PAGE)
         table = dict(zip(self.names, tensors[given : given + len(self.names)], strict=True))
         operators = restored(self._structure, self._used, tensors[given + len(self.names) :])
         cameras = self.estimator.recovery.cameras(*(table[name] for name in self._apart))
-        found = self.estimator.likelihood(operators, table, page, Estimate(p, nuisance), cameras, coarse=self._coarse)
-        after, chi_square = self.estimator.advanced(table, page, Estimate(p, nuisance), found, noise)
-        return *answers(after.p), after.nuisance, chi_square, *found
+        found = self.estimator.likelihood(operators, table, page, estimate, cameras, coarse=self._coarse)
+        after, chi_square = self.estimator.advanced(table, page, estimate, found, noise)
+        return *answers(after.p), after.nuisance, after.deviations, chi_square, *found
 
 
 class WholeGraph(nn.Module):
@@ -204,7 +207,7 @@ def estimator_files(
             numbers: StepGraph(estimator, apart, structure, numbers, coarse=numbers != everything)
             for numbers in (tuple(backward), everything)
         }
-    outputs = [*STEP_OUTPUTS[:4], "residual", *PAGE]
+    outputs = [*ANSWERS, RESIDUAL, *PAGE]
     made = dict(zip(outputs, begun, strict=True))
     given = (*(made[name] for name in ESTIMATE), tensors[NOISE][1], *(made[name] for name in PAGE))
     files = [
@@ -252,7 +255,7 @@ def whole_onnx(files: EstimatorFiles, steps: int, table: SamplingTable) -> bytes
     _append(whole, device, "", {entry.name: entry.name for entry in device.graph.output})
     kept = {entry.name: entry.name for entry in first.graph.output}
     kept |= {NOISE: f"{NOISE}_0", RESIDUAL: f"{RESIDUAL}_0"}
-    kept |= {name: f"{name}_0" for name in STEP_OUTPUTS[:4]}
+    kept |= {name: f"{name}_0" for name in ANSWERS}
     _append(whole, first, "first.", kept)
     for number in range(1, steps + 1):
         kept = {name: f"{name}_{number}" for name in (NOISE, *STEP_OUTPUTS)}

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError, ProfileError
+from lightpage.waves.resampling import CorrectedInterpolation, corrected_interpolation
 
 Real = NDArray[np.float64]
 
@@ -67,6 +68,11 @@ class FieldGrid:
         """Taps applied along each axis of the field on the grid: the pipe's band."""
         edge = self.edge * self.step_px
         return _low_pass(_BAND_TAPS, _BAND_HEADROOM * edge, _BAND_STOP * edge)
+
+    @cached_property
+    def resampling(self) -> CorrectedInterpolation:
+        """Filters around a linear interpolation of raw frames that is corrected for its places between pixels."""
+        return corrected_interpolation(self.edge, self.step_px)
 
     @property
     def shape(self) -> tuple[int, int]:

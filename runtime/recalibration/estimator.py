@@ -19,6 +19,7 @@ from lightpage.calibration.waves.wave_model import LaunchConditions
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.execution.estimator_graph import NOISE, EstimatorGraph
 from lightpage.runtime.recalibration.noise import measured_noise
+from lightpage.waves.grid import symbol_samples
 
 KNOWN_CONCENTRATION = 1e6
 """Concentration of known phases."""
@@ -87,4 +88,6 @@ def measured_anew(
     table = {name: value for name, value in table.items() if name in graph.ports}
     known = [(page.pair, np.angle(page.light(device.modulation))) for page in pages]
     steps = len(graph.value(NOISE)) - 1
-    return statistics, {**table, NOISE: measured_noise(graph.with_table(table), known, mask, steps)}
+    prior_scale = symbol_samples(device.profile) ** 2 * statistics.correlation
+    noise = measured_noise(graph.with_table(table), known, mask, prior_scale, steps)
+    return statistics, table | noise

@@ -149,7 +149,7 @@ def traced(
         **sampling_table(twin, fitted.vector, fitted.turn_rad, profile),
     }
     if (statistics := fitted.statistics) is not None:
-        table |= launch_tensors(profile, statistics.conditions, fitted.modulator)
+        table |= launch_tensors(profile, fitted.vector, statistics.conditions, fitted.modulator)
     return RefitResult(
         table=decoder.taken(table),
         calibration_toml=fitted.to_toml(),

@@ -152,6 +152,7 @@ class FieldRecovery(nn.Module):
         binning: camera pixels along each axis whose mean is sampled; one filters the frames first instead, which takes
             longer and loses less.
         grid: the common grid, where it is not the usual one.
+        corrected: whether interpolation is corrected for places between pixels, see `lightpage.waves.resampling`.
 
     Raises:
         InvalidInputError: a binning that the blocks of the reference are no multiple of.
@@ -166,6 +167,7 @@ class FieldRecovery(nn.Module):
         reflections: int = 0,
         binning: int = 1,
         grid: FieldGrid | None = None,
+        corrected: bool = False,
     ) -> None:
         super().__init__()
         if binning < 1 or _REFERENCE_BLOCK_PX % binning:
@@ -177,9 +179,11 @@ class FieldRecovery(nn.Module):
         self.rows_px, self.columns_px = profile.frame_shape
         # the outer pixels' centres, where blocks' outer edges lie at -1 and 1
         blocked = [(count, -(-count // binning) * binning) for count in profile.frame_shape]
+        self._size = [extent for _, extent in reversed(blocked)]
         self._edge = min(min(1 - 1 / extent, (2 * count - 1) / extent - 1) for count, extent in blocked)
         corner = profile.corner_m
-        self.prefilter = SeparableFilter(grid.prefilter)
+        self.prefilter = SeparableFilter(grid.resampling.prefilter if corrected else grid.prefilter)
+        self.correction = SeparableFilter(grid.resampling.correction) if corrected else None
         self.band = SeparableFilter(grid.band)
         self.u: Tensor
         self.v: Tensor
@@ -218,7 +222,7 @@ class FieldRecovery(nn.Module):
         references = self.in_blocks(reference_in_phase, reference_quadrature)
         seen = self.references(references, registration)
         beyond = self.filtered(self.in_blocks(in_phase, quadrature) - references)
-        a, b = seen.lit * sampled(beyond, seen.where) / (2 * seen.reference)
+        a, b = seen.lit * self._resampled(beyond, seen.where) / (2 * seen.reference)
         return Measured(a, b, homodyne[0], homodyne[1], seen.amplitude, seen.lit, self.cameras(*apart))
 
     def cameras(self, *apart: Tensor) -> Cameras | None:
@@ -334,6 +338,16 @@ class FieldRecovery(nn.Module):
         along_rows = (by_power @ self.u[:, ::step]).permute(0, 2, 3, 1)
         places = self.v[:, ::step].T @ along_rows.flatten(2)
         return places.reshape(*places.shape[:2], -1, 2)
+
+    def _resampled(self, images: Tensor, where: Tensor) -> Tensor:
+        """Filtered frames [2, rows, columns] at the places [2, ny, nx, 2], [2, ny, nx]."""
+        samples = sampled(images, where)
+        if self.correction is None:
+            return samples
+        # counted in pixels; what lies beyond the frame has no reference
+        beyond_x, beyond_y = torch.remainder((where + 1) * where.new_tensor(self._size) / 2 - 0.5, 1).unbind(-1)
+        samples = samples + beyond_x * (1 - beyond_x) * self.correction.along_rows(samples)
+        return samples + beyond_y * (1 - beyond_y) * self.correction.along_columns(samples)
 
     def _reference(self, references: Tensor, registration: Tensor) -> Tensor:
         """Binned references on the grid, [2, ny, nx]: beams are smooth, so few places are looked at."""

@@ -22,32 +22,48 @@ class SeparableFilter(nn.Module):
 
     def __init__(self, taps: NDArray[np.float64]) -> None:
         super().__init__()
-        self.reach = len(taps) // 2
         self.weights: Tensor
         self.register_buffer("weights", block_weights(torch.tensor(taps, dtype=torch.float32))[:, None])
 
     def forward(self, images: Tensor) -> Tensor:
         """Filtered images [C, H, W]."""
-        height, width = images.shape[1:]
-        missing_rows, missing_columns = -height % BLOCK, -width % BLOCK
-        if missing_rows or missing_columns:
-            images = functional.pad(images, (0, missing_columns, 0, missing_rows))
-        filtered = self._along_columns(self._along_rows(images))
-        return filtered[:, :height, :width] if missing_rows or missing_columns else filtered
+        return filtered(images, self.weights)
 
-    def _along_rows(self, images: Tensor) -> Tensor:
-        """Each row with the taps."""
-        split = functional.conv2d(
-            images[:, None], self.weights[:, :, None, :], stride=(1, BLOCK), padding=(0, self.reach)
-        )
-        return split.permute(0, 2, 3, 1).reshape(images.shape)
+    def along_rows(self, images: Tensor) -> Tensor:
+        """Images [C, H, W] filtered along their rows alone."""
+        return _rows(_in_blocks(images), self.weights)[:, : images.shape[1], : images.shape[2]]
 
-    def _along_columns(self, images: Tensor) -> Tensor:
-        """Each column with the taps."""
-        split = functional.conv2d(
-            images[:, None], self.weights[:, :, :, None], stride=(BLOCK, 1), padding=(self.reach, 0)
-        )
-        return split.permute(0, 2, 1, 3).reshape(images.shape)
+    def along_columns(self, images: Tensor) -> Tensor:
+        """Images [C, H, W] filtered along their columns alone."""
+        return _columns(_in_blocks(images), self.weights)[:, : images.shape[1], : images.shape[2]]
+
+
+def filtered(images: Tensor, weights: Tensor) -> Tensor:
+    """Images [C, H, W] filtered along both axes, with the `block_weights` of a kernel as [BLOCK, 1, BLOCK + K - 1]."""
+    height, width = images.shape[1:]
+    both = _columns(_rows(_in_blocks(images), weights), weights)
+    return both if both.shape == images.shape else both[:, :height, :width]
+
+
+def _rows(images: Tensor, weights: Tensor) -> Tensor:
+    """Each row with the taps."""
+    reach = (weights.shape[-1] - BLOCK) // 2
+    split = functional.conv2d(images[:, None], weights[:, :, None, :], stride=(1, BLOCK), padding=(0, reach))
+    return split.permute(0, 2, 3, 1).reshape(images.shape)
+
+
+def _columns(images: Tensor, weights: Tensor) -> Tensor:
+    """Each column with the taps."""
+    reach = (weights.shape[-1] - BLOCK) // 2
+    split = functional.conv2d(images[:, None], weights[:, :, :, None], stride=(BLOCK, 1), padding=(reach, 0))
+    return split.permute(0, 2, 1, 3).reshape(images.shape)
+
+
+def _in_blocks(images: Tensor) -> Tensor:
+    """Images [C, H, W] on whole blocks, zeros added at the right and below."""
+    height, width = images.shape[1:]
+    missing_rows, missing_columns = -height % BLOCK, -width % BLOCK
+    return functional.pad(images, (0, missing_columns, 0, missing_rows)) if missing_rows or missing_columns else images
 
 
 def block_weights(taps: Tensor) -> Tensor:

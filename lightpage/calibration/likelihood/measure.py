@@ -31,7 +31,7 @@ def light_table(twin: Twin, device: CalibratedDevice, conditions: LaunchConditio
         "reference_in_phase": device.references.in_phase,
         "reference_quadrature": device.references.quadrature,
         **{name: value for name, value in traced.items() if name not in left_out},
-        **launch_tensors(device.profile, conditions, device.modulation),
+        **launch_tensors(device.profile, device.parameters, conditions, device.modulation),
     }
 
 

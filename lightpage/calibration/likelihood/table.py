@@ -6,39 +6,82 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.calibration.likelihood.counts import CountStatistics
+from lightpage.calibration.parameters import as_dict
 from lightpage.calibration.sampling_table import SamplingTable
-from lightpage.calibration.waves.wave_model import LaunchConditions
+from lightpage.calibration.waves.wave_model import LaunchConditions, fitted_geometry
 from lightpage.device.profile import Profile
 from lightpage.page.modulation import Modulation
 from lightpage.page.pilots import Pilots
 from lightpage.waves.grid import symbol_samples
+from lightpage.waves.lens import entrance_window
+
+Real = NDArray[np.float64]
 
 HARMONICS = 6
 """Order of the series of the amplitude over the phase of light."""
 _FINE = 512
+POINT_SPREAD_REACH = 6
+"""Samples of the modulator to which the light of one spreads, by forward and adjoint waves."""
+_FACET = 257
 PILOT_PHASORS, PILOT_MASK = "pilot_phasors", "pilot_mask"
 """Names of the tensors that differ from page to page, with the levels that are written."""
 
 
-def launch_tensors(profile: Profile, conditions: LaunchConditions, modulation: Modulation) -> SamplingTable:
+def launch_tensors(
+    profile: Profile, parameters: Real, conditions: LaunchConditions, modulation: Modulation
+) -> SamplingTable:
     """Tensors of the light that is launched.
 
     Args:
         profile: nominal device.
+        parameters: [P] fitted.
         conditions: illumination and blur of a known page.
         modulation: light that the modulator makes of its levels.
 
     Returns:
-        blur []; illumination [2, 6], of one sample that stands for a symbol, without its phase; amplitude_series [13],
-        see `lightpage.train.models.likelihood.modulator`.
+        blur []; illumination [2, 6], without its phase; amplitude_series [13] and slope_power [], see
+        `lightpage.train.models.likelihood.modulator`; point_spread [7].
     """
-    one_sample = symbol_samples(profile) * np.exp(-1j * np.angle(conditions.illumination[0]))
-    coefficients = conditions.illumination * one_sample
+    coefficients = conditions.illumination * np.exp(-1j * np.angle(conditions.illumination[0]))
+    series = amplitude_series(modulation)
     return {
         "blur": np.array(conditions.blur, np.float32),
         "illumination": np.stack([coefficients.real, coefficients.imag]).astype(np.float32),
-        "amplitude_series": amplitude_series(modulation),
+        "amplitude_series": series,
+        "slope_power": slope_power(series, modulation),
+        "point_spread": point_spread(profile, parameters, conditions.blur),
     }
+
+
+def point_spread(profile: Profile, parameters: Real, blur: float) -> NDArray[np.float32]:
+    """Share of a sample's light that forward and adjoint waves bring to its neighbours along an axis.
+
+    All light that enters the pipe comes back; so this is the autocorrelation of the modulator's samples by what the
+    entrance facet passes of them.
+
+    Args:
+        profile, parameters, blur: see `launch_tensors`.
+
+    Returns:
+        Relative to the sample's own, at distances of 0 to 6 samples, [1 + POINT_SPREAD_REACH].
+    """
+    geometry = fitted_geometry(profile, as_dict(parameters))
+    pitch = profile.symbol_pitch_m / symbol_samples(profile)
+    facet = np.linspace(-0.5, 0.5, _FACET) * geometry.pipe_width_m
+    passed = entrance_window(geometry, facet, np.zeros(1), pitch, blur * profile.slm.pitch_m**2)[0] ** 2
+    turns = facet * pitch / (geometry.wavelength_m * geometry.focal_length_m)
+    spread = np.cos(2 * np.pi * np.arange(1 + POINT_SPREAD_REACH)[:, None] * turns) @ passed
+    return np.asarray(spread / spread[0], np.float32)
+
+
+def slope_power(series: NDArray[np.float32], modulation: Modulation) -> NDArray[np.float32]:
+    """Mean square of the derivative of the light by its phase over all levels, []."""
+    phase = np.angle(modulation.light(2 * np.pi * (np.arange(_FINE) + 0.5) / _FINE))
+    numbers = np.arange(1, HARMONICS + 1)
+    cosine, sine = np.cos(numbers * phase[:, None]), np.sin(numbers * phase[:, None])
+    amplitude = np.exp(series[0] + cosine @ series[1::2] + sine @ series[2::2])
+    slope = (numbers * cosine) @ series[2::2] - (numbers * sine) @ series[1::2]
+    return np.array(np.mean(amplitude**2 * (1 + slope**2)), np.float32)
 
 
 def amplitude_series(modulation: Modulation) -> NDArray[np.float32]:

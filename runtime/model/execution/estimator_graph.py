@@ -14,18 +14,24 @@ from lightpage.runtime.model.execution.providers import ON_CPU, Provider
 from lightpage.runtime.model.execution.session import BoundSession, Port, Session, open_session, running
 from lightpage.runtime.model.execution.table_graph import GraphFile, HeldTable, check_table
 
-ESTIMATE = ("p", "nuisance")
+ESTIMATE = ("p", "nuisance", "deviations")
 """State of the estimation, that a step takes and gives."""
 BEFORE = {name: f"{name}_before" for name in ESTIMATE}
 """Names of the estimate as a step's input, by that of its output."""
 PAGE = ("counts", "reference", "amplitude", "lit")
 """Measurements of a page on the common grid, which all steps share."""
+DEVIATION_PRECISION = "deviation_precision"
+"""Inverse variance of what the phases of the modulator's samples differ from their symbols'."""
+NO_DEVIATIONS = np.array(1e12, np.float32)
+"""Precision that keeps them at zero."""
 NOISE = "noise"
 """Noise of a number of steps, a row each, from that of the first estimate on."""
 EARLY_STEPS = 1
 """Steps whose light may be predicted coarsely: what they err, later ones mend."""
 DERIVATIVES = ("by_phase", "by_nuisance", "expected")
-STEP_OUTPUTS = ("p", "phase", "concentration", "nuisance", "chi_square", *DERIVATIVES)
+ANSWERS = ("p", "phase", "concentration", "nuisance", "deviations")
+"""Outputs of the first estimate, and of each step."""
+STEP_OUTPUTS = (*ANSWERS, "chi_square", *DERIVATIVES, "by_sample")
 RESIDUAL = "residual"
 """Output of the first estimate that no step changes."""
 _FRAMES = ("in_phase", "quadrature")
@@ -151,7 +157,7 @@ class EstimatorGraph:
         found, steps = self.begun(feeds), self.steps if steps is None else steps
         noise = self.value(NOISE)
         for number in range(steps):
-            wanted = STEP_OUTPUTS[:5] if number == steps - 1 else ESTIMATE
+            wanted = (*ANSWERS, "chi_square") if number == steps - 1 else ESTIMATE
             session = self._early if number < EARLY_STEPS else self._step
             found |= self._stepped(session, found, noise[number + 1], feeds, wanted)
         return [found[name] for name in outputs]
@@ -171,7 +177,7 @@ class EstimatorGraph:
         """Return outputs of a step from an estimate, by name.
 
         Args:
-            page: measurements of the page, as `begun` returns them.
+            page: measurements of the page and deviations, as `begun` returns them.
             feeds: table tensors for this evaluation alone.
             p, nuisance: the estimate.
             outputs: names of `STEP_OUTPUTS`.

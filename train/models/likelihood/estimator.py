@@ -18,12 +18,13 @@ from lightpage.device.profile import Profile
 from lightpage.train.models.apart import Cameras
 from lightpage.train.models.field import FieldRecovery, Measured, relative_power
 from lightpage.train.models.likelihood.counts import looked_up, score_of_counts
-from lightpage.train.models.likelihood.modulator import amplitude_and_slope
+from lightpage.train.models.likelihood.local_hessian import LocalHessian
+from lightpage.train.models.likelihood.modulator import amplitude_and_slope, summed, to_samples
 from lightpage.train.models.likelihood.nuisances import PageNuisances
-from lightpage.train.models.parts import Parts, conjugate, multiply, parts, scaled
+from lightpage.train.models.parts import Parts, conjugate, multiply, parts, phasor, scaled
 from lightpage.train.models.prediction import expected_phasors
 from lightpage.train.models.waves import Fidelity, Real, WaveMatrices, Waves
-from lightpage.waves.grid import FieldGrid
+from lightpage.waves.grid import FieldGrid, symbol_samples
 
 FORWARD, BACKWARD = Fidelity(0.005, 0.007), Fidelity(0.06, 0.05)
 """Fidelity of the predicted light, and of the way back: an error of that one moves the estimate by its share of the
@@ -39,7 +40,7 @@ class Operators(NamedTuple):
 
     Attributes:
         forward, backward: matrices to the cameras, and back.
-        illumination: light of a symbol of phase zero and unit amplitude, [ny, nx].
+        illumination: light of the modulator's samples of phase zero and unit amplitude, [ny S, nx S].
     """
 
     forward: WaveMatrices
@@ -69,10 +70,18 @@ class Estimate(NamedTuple):
     Attributes:
         p: phase and concentration of each symbol as a vector, [2, ny, nx]; the page's piston is taken off.
         nuisance: see `lightpage.train.models.likelihood.nuisances`, [6].
+        deviations: what the phases of the modulator's samples differ from their symbols', [ny S, nx S].
     """
 
     p: Tensor
     nuisance: Tensor
+    deviations: Tensor
+
+    @property
+    def direction(self) -> Parts:
+        """Unit phasors of the symbols' phases, [ny, nx]."""
+        length = torch.sqrt(self.p.square().sum(0) + 1e-20)
+        return self.p[0] / length, self.p[1] / length
 
 
 class Likelihood(NamedTuple):
@@ -82,11 +91,13 @@ class Likelihood(NamedTuple):
         by_phase: derivative by each symbol's phase, [ny, nx].
         by_nuisance: derivatives by the nuisance parameters, [6].
         expected: counts that the light would give perfect cameras, [2, Gy, Gx].
+        by_sample: derivative by the phase of each of the modulator's samples, [ny S, nx S].
     """
 
     by_phase: Tensor
     by_nuisance: Tensor
     expected: Tensor
+    by_sample: Tensor
 
 
 class PhaseEstimator(nn.Module):
@@ -109,9 +120,10 @@ class PhaseEstimator(nn.Module):
     ) -> None:
         super().__init__()
         # the root nearest to the linear field is enough: the first step mends more than rounds of its own would
-        self.recovery = FieldRecovery(profile, rounds=0, grid=grid)
-        self.waves = Waves(profile, parameters, 1, forward, filled=True, grid=grid)
-        self.back = Waves(profile, parameters, 1, backward, filled=True, grid=grid)
+        self.recovery = FieldRecovery(profile, rounds=0, grid=grid, corrected=True)
+        self.samples = symbol_samples(profile)
+        self.waves = Waves(profile, parameters, self.samples, forward, filled=True, grid=grid)
+        self.back = Waves(profile, parameters, self.samples, backward, filled=True, grid=grid)
         self.nuisances = PageNuisances(profile, self.recovery.grid)
         self._half_width, self._half_height = profile.page_width_m / 2, profile.page_height_m / 2
 
@@ -148,12 +160,13 @@ class PhaseEstimator(nn.Module):
         """
         page, measured = self.measured(table, *frames)
         field, unexplained = self.recovery.solve(measured)
-        light = self._to_page(operators, parts(field * page.lit))
+        real, imaginary = self._to_page(operators, parts(field * page.lit))
+        light = summed(real, self.samples), summed(imaginary, self.samples)
         phasors = scaled(light, torch.rsqrt(light[0] * light[0] + light[1] * light[1] + 1e-20))
         concentration = _concentration(table["information"], noise)
         direction, piston = without_piston(phasors, concentration, table)
         nuisance = torch.cat([torch.stack(piston), table["information"].new_zeros(4)])
-        estimate = Estimate(torch.stack(direction) * concentration, nuisance)
+        estimate = Estimate(torch.stack(direction) * concentration, nuisance, torch.zeros_like(real))
         return estimate, page, relative_power(unexplained, field)
 
     def likelihood(
@@ -175,32 +188,35 @@ class PhaseEstimator(nn.Module):
             coarse: whether light is predicted with the fidelity of the way back, as is enough for a first step.
         """
         waves, forward = (self.back, operators.backward) if coarse else (self.waves, operators.forward)
-        x, y = parts(expected_phasors(estimate.p))
-        length = torch.sqrt(estimate.p.square().sum(0) + 1e-20)
-        direction = estimate.p[0] / length, estimate.p[1] / length
+        direction, turned = estimate.direction, phasor(estimate.deviations)
         amplitude, slope = amplitude_and_slope(direction, table["amplitude_series"])
-        light = multiply(scaled((x, y), amplitude), operators.illumination)
+        light = multiply(self._on_samples(scaled(parts(expected_phasors(estimate.p)), amplitude)), turned)
+        light = multiply(light, operators.illumination)
         at_camera = parts(waves.to_camera(forward, torch.stack(light)))
         field, tilt = self.nuisances(at_camera, estimate.nuisance)
         score, expected = _score(table, page, field, cameras)
         back = self._to_page(operators, multiply(score, conjugate(tilt)))
-        real, imaginary = estimate.nuisance[0], estimate.nuisance[1]
-        symbol = multiply(scaled(direction, amplitude), (real, imaginary))
+        gain = estimate.nuisance[0], estimate.nuisance[1]
+        symbol = multiply(self._on_samples(multiply(scaled(direction, amplitude), gain)), turned)
         by_log = symbol[0] * back[0] + symbol[1] * back[1]
-        turned = symbol[0] * back[1] - symbol[1] * back[0]
-        return Likelihood(turned + slope * by_log, self.nuisances.gradient(field, score), expected)
+        by_turn = symbol[0] * back[1] - symbol[1] * back[0]
+        by_sample = by_turn + to_samples(slope, self.samples) * by_log
+        by_nuisance = self.nuisances.gradient(field, score)
+        return Likelihood(summed(by_sample, self.samples), by_nuisance, expected, by_sample)
 
     def advanced(
         self, table: Mapping[str, Tensor], page: Page, estimate: Estimate, found: Likelihood, noise: Tensor
     ) -> tuple[Estimate, Tensor]:
         """Move an estimate by the Gauss-Newton step of all phases and nuisance parameters together.
 
-        The Fisher information of the phases is taken for diagonal, but for what they share with the nuisance
-        parameters: `responses` are the changes of all phases by which the light says the least of a nuisance parameter.
+        The Fisher information of the phases is taken for local (`LocalHessian`), but for what they share with the
+        nuisance parameters: `responses` are the changes of all phases by which the light says the least of a nuisance
+        parameter.
 
         Args:
-            table: `count_scale`, `count_weights`, `information`, `responses`, `nuisance_precision`,
-                `nuisance_covariance`, `pilot_phasors`, `pilot_mask`.
+            table: `amplitude_series`, `slope_power`, `count_scale`, `count_weights`, `information`, `responses`,
+                `nuisance_precision`, `nuisance_covariance`, `point_spread`, `deviation_precision`, `pilot_phasors`,
+                `pilot_mask`.
             page, estimate: see there.
             found: derivatives at the estimate, see `likelihood`.
             noise: see `_concentration`, [2].
@@ -209,24 +225,40 @@ class PhaseEstimator(nn.Module):
             The next estimate, and the mean square of the counts' residuals over their variance, [].
         """
         gain2 = estimate.nuisance[0] ** 2 + estimate.nuisance[1] ** 2
-        information, responses = gain2 * table["information"], table["responses"]
-        length = torch.sqrt(estimate.p.square().sum(0) + 1e-20)
-        direction = estimate.p[0] / length, estimate.p[1] / length
+        direction = estimate.direction
+        amplitude, slope = amplitude_and_slope(direction, table["amplitude_series"])
+        power = amplitude * amplitude * (1 + slope * slope) / table["slope_power"]
+        information, responses = gain2 * power * table["information"], table["responses"]
         five = torch.cat([found.by_nuisance[:1], found.by_nuisance[2:]])
         prior = torch.cat([torch.zeros_like(five[:1]), table["nuisance_precision"] * estimate.nuisance[2:]])
         right = five - prior - (responses * found.by_phase).sum((1, 2))
         change = table["nuisance_covariance"] @ right / gain2
-        turn = found.by_phase / information - (responses * change[:, None, None]).sum(0)
+        turn, changes = self._hessian(table, estimate, slope, information).solve(found.by_sample, estimate.deviations)
+        turn = turn - (responses * change[:, None, None]).sum(0)
         turn = torch.clamp(turn, -LARGEST_STEP_RAD, LARGEST_STEP_RAD)
         concentration = _concentration(information, noise)
         turned = multiply(direction, (torch.cos(turn), torch.sin(turn)))
         direction, piston = without_piston(turned, concentration, table)
         gain = multiply(scaled(parts(estimate.nuisance[:2]), 1 + change[0]), piston)
         nuisance = torch.cat([torch.stack(gain), estimate.nuisance[2:] + change[1:]])
-        return Estimate(torch.stack(direction) * concentration, nuisance), _chi_square(table, page, found.expected)
+        after = Estimate(torch.stack(direction) * concentration, nuisance, estimate.deviations + changes)
+        return after, _chi_square(table, page, found.expected)
+
+    def _hessian(
+        self, table: Mapping[str, Tensor], estimate: Estimate, slope: Tensor, information: Tensor
+    ) -> LocalHessian:
+        """Local Hessian at an estimate, of symbols with so much information, [ny, nx]."""
+        length = torch.rsqrt(1 + slope * slope)
+        along = multiply(scaled(estimate.direction, length), (slope, torch.ones_like(slope)))
+        along = multiply(self._on_samples(along), phasor(estimate.deviations))
+        return LocalHessian(along, information, table["point_spread"], table["deviation_precision"])
+
+    def _on_samples(self, symbols: Parts) -> Parts:
+        """Light of symbols [ny, nx] on the modulator's samples, [ny S, nx S]."""
+        return to_samples(symbols[0], self.samples), to_samples(symbols[1], self.samples)
 
     def _to_page(self, operators: Operators, field: Parts) -> Parts:
-        """Field on the common grid [Gy, Gx] back to the symbols, by the adjoint waves and illumination, [ny, nx]."""
+        """Field on the common grid [Gy, Gx] back to the modulator by adjoint waves and illumination, [ny S, nx S]."""
         page = parts(self.back.to_page(operators.backward, torch.stack(field)))
         return multiply(page, conjugate(operators.illumination))
 

@@ -1,4 +1,4 @@
-"""The modulator's curve: amplitude of its light, and what a change of phase does to it."""
+"""The modulator: amplitude of its light, what a change of phase does to it, and the samples that stand for a symbol."""
 
 from __future__ import annotations
 
@@ -25,3 +25,15 @@ def amplitude_and_slope(direction: Parts, series: Tensor) -> tuple[Tensor, Tenso
         slope = slope + number * (sine * turn[0] - cosine * turn[1])
         turn = multiply(turn, direction)
     return torch.exp(logarithm), slope
+
+
+def to_samples(symbols: Tensor, samples: int) -> Tensor:
+    """Values of symbols [ny, nx] at so many samples along either axis of each, [ny samples, nx samples]."""
+    ny, nx = symbols.shape
+    return symbols[:, None, :, None].expand(ny, samples, nx, samples).reshape(ny * samples, nx * samples)
+
+
+def summed(samples: Tensor, count: int) -> Tensor:
+    """Sum of `count` samples along either axis, [ny, nx] of [ny count, nx count]."""
+    ny, nx = samples.shape
+    return samples.reshape(ny // count, count, nx // count, count).sum((1, 3))

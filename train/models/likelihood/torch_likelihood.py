@@ -36,7 +36,8 @@ class TorchLikelihood:
         with torch.no_grad():
             operators, page = self.operators(table, tensors), self.page(pair, tensors)
             p = torch.from_numpy(_SURE * np.stack([np.cos(phases), np.sin(phases)])).float()
-            estimate = Estimate(p, torch.from_numpy(np.asarray(nuisance)).float())
+            still = torch.zeros_like(operators.illumination[0])
+            estimate = Estimate(p, torch.from_numpy(np.asarray(nuisance)).float(), still)
             found = self._estimator.likelihood(operators, tensors, page, estimate, self.cameras(tensors))
         by_phase, by_nuisance = (part.numpy().astype(np.float64) for part in (found.by_phase, found.by_nuisance))
         (expected, counts), every = sampled_evenly(page.lit.numpy() > 0, found.expected.numpy(), page.counts.numpy())
