@@ -124,11 +124,11 @@ class WaysBack(nn.Module):
         self.register_buffer("down", torch.from_numpy(down).float(), persistent=False)
         self.register_buffer("across", torch.from_numpy(across).float(), persistent=False)
 
-    def tables(self, parameters: Tensor) -> Tables:
-        """Constants of a device."""
+    def tables(self, parameters: Tensor, blur: Tensor | float = 0.0) -> Tables:
+        """Constants of a device; the arguments are those of `BatchedWaves.tables`."""
         lens = self.waves.first
         down, across = lens.laid_out(self.down, "y"), lens.laid_out(self.across, "x")
-        return {"down": padded(down, -2), "across": padded(across, -2)} | self.waves.tables(parameters)
+        return {"down": padded(down, -2), "across": padded(across, -2)} | self.waves.tables(parameters, blur)
 
     def forward(self, field: Parts, tables: Tables) -> Tensor:
         """E, [B, ny, nx] each of whole multiples, to [B, 2 S, ny, nx] over the light's root mean square."""

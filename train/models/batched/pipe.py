@@ -51,6 +51,8 @@ class BatchedPipe(PipeModes):
         # the rest of the detuning comes between two steps
         super().__init__(geometry, cells, max(2, splitting_steps(geometry, (y_modes, x_modes), error)))
         self.sign = -1 if backwards else 1
+        # between which steps it comes: of an odd number, those that make either way the other's adjoint
+        self._middle = (self.steps - (2 if backwards else 1)) // 2
 
     def tables(self, geometry: WaveGeometry) -> tuple[Tables, tuple[Parts, Parts], tuple[Parts, Parts]]:
         """Constants for a geometry of tensors (float64); the ways into the pipe and out of it along (y', x).
@@ -100,7 +102,7 @@ class BatchedPipe(PipeModes):
                 light = self._rotated(light, tables)
             if step == self.steps - 1:
                 break
-            if step != (self.steps - 1) // 2:
+            if step != self._middle:
                 light = self._through(light, tables, "step")
             else:
                 light = self._through(light, tables, "out")
