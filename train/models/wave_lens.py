@@ -73,7 +73,7 @@ class TilePhases:
     Attributes:
         lens: phase of the lens.
         a, b: centres of the tiles, [Tx, 1, 1, 1] and [1, Ty, 1, 1], metres.
-        few: the samples of the facet, (X [cx], Y' [cy, 1]), metres.
+        sparse: the samples of the facet, (X [cx], Y' [cy, 1]), metres.
         x: between a tile's columns and the facet's, [Tx, Ty, nx, cx].
         between: between a tile's rows and the facet's columns, [Tx, Ty, ny, cx].
         y: between the facet's rows and a tile's, [Tx, Ty, cy, ny].
@@ -85,7 +85,7 @@ class TilePhases:
     lens: LensPath
     a: Tensor
     b: Tensor
-    few: tuple[Tensor, Tensor]
+    sparse: tuple[Tensor, Tensor]
     x: Tensor
     between: Tensor
     y: Tensor
@@ -109,7 +109,7 @@ class TilePhases:
 
     def beyond_tilts(self) -> Tensor:
         """Phases of the tiles' centres less their `tilts` at the few samples, [Tx, Ty, cy, cx]."""
-        (across, up), factors = self.few, self.lens.factors
+        (across, up), factors = self.sparse, self.lens.factors
         crossed = self.a * factors.x_to_y * up + self.b * factors.y_to_x * across
         path = self.lens.path.of_both(self.a, self.b, *on_facet(factors, across, up))
         return torch.as_tensor(path - self.lens.per_metre * crossed)
@@ -176,10 +176,9 @@ class TiledLens(nn.Module):
         ]
         self.centres = [axis[0] + at * pitch for axis, at, pitch in zip(plane, inside, pitches, strict=True)]
         slopes = facet_slopes(geometry, path, _PLACES)
-        highest = self.highest(slopes, lambda a, b: (slopes(a, 0.0)[0], slopes(a, b)[1]))
-        units, few = self.few_samples(highest)
-        up_x, up_y = (interpolation(unit, own, OVERSAMPLING) for unit, own in zip(units, few, strict=True))
-        self._thinned = tuple(own is not unit for own, unit in zip(few, units, strict=True))
+        units, sparse = self.facet_samples(slopes, lambda a, b: (slopes(a, 0.0)[0], slopes(a, b)[1]))
+        up_x, up_y = (interpolation(unit, own, OVERSAMPLING) for unit, own in zip(units, sparse, strict=True))
+        self._thinned = tuple(own is not unit for own, unit in zip(sparse, units, strict=True))
         terms = _terms(geometry, path, self.centres, self.offsets, roll_margin, tolerance)
         self.offset_x: Tensor
         self.offset_y: Tensor
@@ -187,30 +186,25 @@ class TiledLens(nn.Module):
         self.inside_y: Tensor
         self.unit_x: Tensor
         self.unit_y: Tensor
-        self.few_x: Tensor
-        self.few_y: Tensor
+        self.sparse_x: Tensor
+        self.sparse_y: Tensor
         self.up_x: Tensor
         self.up_y: Tensor
         self.nodes: Tensor
         self.weights: Tensor
         self.on_x: Tensor
         self.on_y: Tensor
-        tiled = (*self.tiles, *terms.nodes.shape[1:])
-        for name, value in {
-            "offset_x": self.offsets[0],
-            "offset_y": self.offsets[1],
-            "inside_x": inside[0] * pitches[0],
-            "inside_y": inside[1] * pitches[1],
-            "unit_x": units[0],
-            "unit_y": units[1],
-            "few_x": few[0],
-            "few_y": few[1],
-            "up_x": up_x.T,
-            "up_y": up_y,
-            "nodes": terms.nodes.reshape(tiled),
-            "on_x": terms.axes[1].T,
-            "on_y": terms.axes[0],
-        }.items():
+        by_axis = {
+            "offset": self.offsets,
+            "inside": [at * pitch for at, pitch in zip(inside, pitches, strict=True)],
+            "unit": units,
+            "sparse": sparse,
+            "up": (up_x.T, up_y),
+            "on": (terms.axes[1].T, terms.axes[0]),
+        }
+        buffers = {f"{name}_{axis}": both[number] for name, both in by_axis.items() for number, axis in enumerate("xy")}
+        buffers["nodes"] = terms.nodes.reshape(*self.tiles, *terms.nodes.shape[1:])
+        for name, value in buffers.items():
             self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(value)).float(), persistent=False)
         weights = terms.weights.reshape(*self.tiles, *terms.weights.shape[1:])
         self.register_buffer("weights", stacked(weights), persistent=False)
@@ -220,45 +214,42 @@ class TiledLens(nn.Module):
         """Number of terms of each tile."""
         return self.nodes.shape[2]
 
-    def highest(self, slopes: Slopes, carrier: Slopes) -> tuple[float, float]:
-        """Frequencies along X and Y' that tiles see of a facet, cycles over its width.
+    def facet_samples(self, slopes: Slopes, carrier: Slopes) -> tuple[list[Real], list[Real]]:
+        """All samples of the facet along (X, Y'), over its width, and the sparse ones from which its light is known.
 
         Args:
             slopes: slopes of the phase at (x, y), rad/m.
-            carrier: slopes that are taken off all of a tile, by its centre.
+            carrier: slopes that are subtracted from those of a tile with centre (x, y).
         """
-        most = [0.0, 0.0]
+        steepest = [0.0, 0.0]
         for a, b in product(*self.centres):
-            taken = carrier(a, b)
+            carried = carrier(a, b)
             for x, y in product(*((offset[0], offset[-1]) for offset in self.offsets)):
                 at_corner = slopes(a + x, b + y)
                 for axis in (0, 1):
-                    most[axis] = max(most[axis], float(np.abs(at_corner[axis] - taken[axis]).max()))
-        along_x, along_y = (slope * self.geometry.pipe_width_m / (2 * np.pi) for slope in most)
-        return along_x, along_y
-
-    def few_samples(self, highest: tuple[float, float]) -> tuple[list[Real], list[Real]]:
-        """All samples of the facet along (X, Y'), over its width, and few that hold light up to these frequencies."""
+                    steepest[axis] = max(steepest[axis], float(np.abs(at_corner[axis] - carried[axis]).max()))
         units: list[Real] = [np.arange(1, count) / count - 0.5 for count in reversed(self.cells)]
-        few = [sparse_axis(unit, frequency, OVERSAMPLING) for unit, frequency in zip(units, highest, strict=True)]
-        return units, few
+        cycles = self.geometry.pipe_width_m / (2 * np.pi)  # over the facet's width, of one rad/m
+        sparse = [sparse_axis(unit, slope * cycles, OVERSAMPLING) for unit, slope in zip(units, steepest, strict=True)]
+        return units, sparse
 
-    def phases(self, placed: PlacedLens, few: tuple[Tensor, Tensor]) -> TilePhases:
+    def phases(self, placed: PlacedLens, sparse: tuple[Tensor, Tensor]) -> TilePhases:
         """Return the phases of the tiles, for parameters as tensors.
 
         Args:
             placed: the lens.
-            few: samples of the facet along (X, Y'), over its width.
+            sparse: samples of the facet along (X, Y'), over its width.
         """
         geometry, path, start, *_ = placed
         dtype = start[0].dtype
-        few_x, few_y = few[0].to(dtype) * geometry.pipe_width_m, (few[1].to(dtype) * geometry.pipe_width_m)[:, None]
+        sparse_x = sparse[0].to(dtype) * geometry.pipe_width_m
+        sparse_y = (sparse[1].to(dtype) * geometry.pipe_width_m)[:, None]
         a = (start[0] + self.inside_x.to(dtype))[:, None, None, None]
         b = (start[1] + self.inside_y.to(dtype))[None, :, None, None]
         lens = LensPath(geometry, path, couplings(geometry, functions))
         x, y = self.offset_x.to(dtype), self.offset_y.to(dtype)
         node_x, node_y = (self.nodes.to(dtype)[..., axis, None, None] for axis in (0, 1))
-        area = (x[1] - x[0]) * (y[1] - y[0]) * (few_x[1] - few_x[0]) * (few_y[1, 0] - few_y[0, 0])
+        area = (x[1] - x[0]) * (y[1] - y[0]) * (sparse_x[1] - sparse_x[0]) * (sparse_y[1, 0] - sparse_y[0, 0])
         shear: Any = geometry.pipe_angle  # a tensor here, like all of it
         unitary = torch.sqrt(area / torch.cos(shear)) / (geometry.wavelength_m * geometry.focal_length_m)
         on_x, on_y = self.on_x.to(dtype), self.on_y.to(dtype)
@@ -267,18 +258,19 @@ class TiledLens(nn.Module):
             lens,
             a,
             b,
-            (few_x, few_y),
-            lens.phase(x[:, None], 0.0, few_x, 0.0, a, b),
-            lens.phase(0.0, y[:, None], few_x, 0.0, a, b),
-            lens.phase(0.0, y, 0.0, few_y, a, b),
-            lens.rest(node_x, node_y, few_x, few_y, a[..., None], b[..., None]),
+            (sparse_x, sparse_y),
+            lens.phase(x[:, None], 0.0, sparse_x, 0.0, a, b),
+            lens.phase(0.0, y[:, None], sparse_x, 0.0, a, b),
+            lens.phase(0.0, y, 0.0, sparse_y, a, b),
+            lens.rest(node_x, node_y, sparse_x, sparse_y, a[..., None], b[..., None]),
             scaled(plane, unitary),
         )
 
     def matrices(self, placed: PlacedLens) -> LensMatrices:
         """The lens for parameters as tensors."""
-        phases, width = self.phases(placed, (self.few_x, self.few_y)), placed.geometry.pipe_width_m
-        facet_x, facet_y, few_x = self.unit_x * width, self.unit_y * width, phases.few[0]
+        width: Any = placed.geometry.pipe_width_m
+        facet_x, facet_y = self.unit_x * width, self.unit_y * width
+        phases = self.phases(placed, (self.sparse_x, self.sparse_y))
         strip = phasor(phases.strips(facet_x, facet_y[:, None]))
         return LensMatrices(
             phases.plane,
@@ -286,7 +278,7 @@ class TiledLens(nn.Module):
             phasor(phases.between.unsqueeze(2)),
             Matrix.of(phasor(phases.y.unsqueeze(2))),
             phasor(phases.rest),
-            phasor(phases.tiles(few_x, facet_y[:, None])),
+            phasor(phases.tiles(phases.sparse[0], facet_y[:, None])),
             strip if placed.window is None else scaled(strip, placed.window(facet_x, facet_y)),
         )
 

@@ -15,7 +15,7 @@ from lightpage.device.profile import Profile
 from lightpage.device.state import Device
 from lightpage.simulator.true_optics import true_parameters
 from lightpage.train.models import wave_lens, wave_pipe
-from lightpage.train.models.batched.decoder import WaysBack
+from lightpage.train.models.batched.decoder import WaysBack, WaysThere
 from lightpage.train.models.batched.products import PAD
 from lightpage.train.models.batched.waves import BatchedWaves
 from lightpage.train.models.parts import stacked
@@ -93,17 +93,14 @@ class ManyPages:
     """The form for many pages: the page comes second in a batch, behind itself at half the amplitude."""
 
     def __init__(self, waves: Waves) -> None:
-        self.waves = waves
-        self.there, self.back = BatchedWaves(waves, to_page=False), WaysBack(waves)
+        self.waves, self.grid_shape = waves, (len(waves.grid_y_m), len(waves.grid_x_m))
+        self.there, self.back = WaysThere(waves), WaysBack(waves)
 
     def to_camera(self, page: np.ndarray, parameters: Parameters = None, blur: float = 0.0) -> np.ndarray:
         tables = self._constants(self.there.tables, parameters, blur)
-        down, across = (
-            self.there.first.laid_out(torch.eye(count), axis) for count, axis in zip(page.shape, "yx", strict=True)
-        )
-        leaving = self.there(down.T @ batch_of(page) @ across, tables)
-        up_y, up_x = (torch.from_numpy(each).float() for each in self.waves.interpolations)
-        return last_of(up_y @ self.there.last.cropped(leaving) @ up_x.T)
+        real, imaginary = self.there.on_grid(self.there(batch_of(page), tables), tables)
+        ny, nx = self.grid_shape
+        return last_of(torch.stack([real, imaginary], 1)[..., :ny, :nx])
 
     def to_page(self, field: np.ndarray, parameters: Parameters = None, blur: float = 0.0) -> np.ndarray:
         tables = self._constants(self.back.tables, parameters, blur)

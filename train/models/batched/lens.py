@@ -50,11 +50,12 @@ class BatchedLens(nn.Module):
         geometry, factors = tiled.geometry, couplings(tiled.geometry)
         per_metre = geometry.wave_number / geometry.focal_length_m
         slopes = facet_slopes(geometry, tiled.path, _EDGES)
-        highest = tiled.highest(slopes, lambda a, b: (-per_metre * factors.x_to_x * a, -per_metre * factors.y_to_y * b))
-        units, few = tiled.few_samples(highest)
-        for name, unit, own, cell in zip("xy", units, few, reversed(tiled.cells), strict=True):
+        units, sparse = tiled.facet_samples(
+            slopes, lambda a, b: (-per_metre * factors.x_to_x * a, -per_metre * factors.y_to_y * b)
+        )
+        for name, unit, own, cell in zip("xy", units, sparse, reversed(tiled.cells), strict=True):
             up = np.eye(len(unit)) if own is unit else interpolation(unit, own, OVERSAMPLING)
-            for label, value in (("few", own), ("up", up), ("numbers", modes_by_parity(cell))):
+            for label, value in (("sparse", own), ("up", up), ("numbers", modes_by_parity(cell))):
                 self.register_buffer(f"{label}_{name}", torch.from_numpy(value).float(), persistent=False)
 
     def tables(self, placed: PlacedLens, way: tuple[Parts, Parts]) -> Tables:
@@ -65,10 +66,10 @@ class BatchedLens(nn.Module):
             way: of `BatchedPipe.tables`, into the pipe or out of it along (y', x).
         """
         tiled, width = self.tiled, placed.geometry.pipe_width_m
-        phases = tiled.phases(placed, (self._axis("few_x"), self._axis("few_y")))
+        phases = tiled.phases(placed, (self._axis("sparse_x"), self._axis("sparse_y")))
         light = phasor(phases.rest + phases.beyond_tilts()[:, :, None])
         if placed.window is not None:
-            light = scaled(light, placed.window(phases.few[0], phases.few[1][:, 0]))
+            light = scaled(light, placed.window(phases.sparse[0], phases.sparse[1][:, 0]))
         turned = phasor(placed.on_plane)
         plane = multiply(phases.plane, (tiled.split(turned[0]), tiled.split(turned[1])))
         tilt_x, tilt_y = map(phasor, phases.tilts(tiled.unit_x.double() * width, tiled.unit_y.double() * width))
@@ -83,11 +84,13 @@ class BatchedLens(nn.Module):
         self, to_x: Parts, between: Parts, to_y: Parts, facet: Parts, plane: Parts, y: Parts, x: Parts, way: Any
     ) -> Tables:
         """Constants of the way from the plane."""
-        y, x = _by_parity(way[0], y, odd=True), _by_parity(way[1], x, odd=False)  # [tiles, 2, K, few]
-        ty, few_y = sizes(y[0])[0], sizes(y[0])[-1]
-        along_y = real_form((_columns(y[0]), _columns(y[1]))).reshape(2, ty, few_y, -1)  # [r, ty, few, (r', p, k)]
+        y, x = _by_parity(way[0], y, odd=True), _by_parity(way[1], x, odd=False)  # [tiles, 2, K, sparse]
+        ty, sparse_y = sizes(y[0])[0], sizes(y[0])[-1]
+        along_y = real_form((_columns(y[0]), _columns(y[1]))).reshape(
+            2, ty, sparse_y, -1
+        )  # [r, ty, sparse, (r', p, k)]
         return _between(plane, to_x, _transposed(between), _transposed(to_y), _transposed(facet)) | {
-            "modes_y": along_y.permute(1, 0, 2, 3).reshape(ty * 2 * few_y, -1),
+            "modes_y": along_y.permute(1, 0, 2, 3).reshape(ty * 2 * sparse_y, -1),
             "modes_x": real_form((_columns(x[0]), _columns(x[1])), "kr"),
         }
 
@@ -98,7 +101,7 @@ class BatchedLens(nn.Module):
         tables: Tables = {}
         for name, modes, out in (("y", y, way[0]), ("x", x, way[1])):
             for parity in (0, 1):
-                back = adjoint((modes[0][:, parity], modes[1][:, parity]))  # [tiles, few, K]
+                back = adjoint((modes[0][:, parity], modes[1][:, parity]))  # [tiles, sparse, K]
                 made = matmul(back, (out[0][parity], out[1][parity]))
                 if name == "y" and parity:
                     made = _times_i(made)  # light odd along y' is held times -i
@@ -112,29 +115,31 @@ class BatchedLens(nn.Module):
         tx, ty = self.tiles
         _, _, rows, _, _, columns = sizes(tables["near_0"])
         field = field.reshape(-1, 2, ty, rows, tx, columns).permute(4, 2, 0, 3, 1, 5)
-        light = _from_near(field.reshape(tx * ty, -1, rows, 1, 2, columns), tables)  # [T, B, few x, r, few y]
-        few_x, few_y = sizes(tables["far_0_0"])[2::2]
-        light = light.reshape(tx, ty, -1, few_x, 2, few_y).permute(2, 0, 3, 1, 4, 5)
-        light = light.reshape(-1, tx * few_x, ty * 2 * few_y) @ tables["modes_y"]  # [B, (tx, few x), (r, p, ky)]
+        light = _from_near(field.reshape(tx * ty, -1, rows, 1, 2, columns), tables)  # [T, B, sparse x, r, sparse y]
+        sparse_x, sparse_y = sizes(tables["far_0_0"])[2::2]
+        light = light.reshape(tx, ty, -1, sparse_x, 2, sparse_y).permute(2, 0, 3, 1, 4, 5)
+        light = (
+            light.reshape(-1, tx * sparse_x, ty * 2 * sparse_y) @ tables["modes_y"]
+        )  # [B, (tx, sparse x), (r, p, ky)]
         modes_y, modes_x = (sizes(tables[f"modes_{axis}"])[1] // 4 for axis in "yx")
-        light = turned_product(light.reshape(-1, tx * few_x * 2, 2 * modes_y), tables["modes_x"])
+        light = turned_product(light.reshape(-1, tx * sparse_x * 2, 2 * modes_y), tables["modes_x"])
         split = light.reshape(-1, 2, 2 * modes_y, 2, modes_x)  # [B, p, (ky, r), q, kx]
         return [split[:, p, :, q] for p in (0, 1) for q in (0, 1)]
 
     def to_plane(self, light: Light, tables: Tables) -> Tensor:
         """Light in the pipe to a field on the plane, `laid_out`, [B, 2, Ty ny, Tx nx]."""
         tx, ty = self.tiles
-        _, _, few_x, _, _, few_y = sizes(tables["near_0"])
+        _, _, sparse_x, _, _, sparse_y = sizes(tables["near_0"])
         total: Tensor | None = None
         for q in (0, 1):
             modes = sizes(light[q])[-1]
             even, odd = (turned_product(light[2 * p + q], tables[f"modes_y_{p}"]) for p in (0, 1))
-            along_y = (even + odd).reshape(-1, 2 * modes, ty * few_y)  # [B, (kx, r), (ty, few y)]
+            along_y = (even + odd).reshape(-1, 2 * modes, ty * sparse_y)  # [B, (kx, r), (ty, sparse y)]
             one = turned_product(along_y, tables[f"modes_x_{q}"])
             total = one if total is None else total + one
         assert total is not None
-        facet = total.reshape(-1, ty, few_y, 2, tx, few_x).permute(4, 1, 0, 5, 3, 2)
-        tiled = _from_near(facet.reshape(tx * ty, -1, few_x, 1, 2, few_y), tables)  # [T, B, ny, r, nx]
+        facet = total.reshape(-1, ty, sparse_y, 2, tx, sparse_x).permute(4, 1, 0, 5, 3, 2)
+        tiled = _from_near(facet.reshape(tx * ty, -1, sparse_x, 1, 2, sparse_y), tables)  # [T, B, ny, r, nx]
         rows, columns = sizes(tables["far_0_0"])[2::2]
         field = tiled.reshape(tx, ty, -1, rows, 2, columns).permute(2, 4, 1, 3, 0, 5)
         return field.reshape(-1, 2, ty * rows, tx * columns)
@@ -158,7 +163,7 @@ class BatchedLens(nn.Module):
         return torch.as_tensor(self.get_buffer(name)).double()
 
     def _modes(self, axis: str, tilt: Parts) -> Parts:
-        """Return sine modes by parity [tiles, 2, K, few] of a facet's few samples, by each tile's tilt [tiles, f]."""
+        """Return sine modes by parity [tiles, 2, K, sparse] of sparse samples, by each tile's tilt [tiles, f]."""
         cells = self.tiled.cells["yx".index(axis)]
         sine, up = sine_modes(self._axis(f"numbers_{axis}"), cells), self._axis(f"up_{axis}")
         real, imaginary = (padded(sine @ (part[:, None, :, None] * up), -1, -2) for part in tilt)
@@ -228,12 +233,12 @@ def _times_i(value: Parts) -> Parts:
 
 
 def _columns(modes: Tensor) -> Tensor:
-    """[tiles, parities, K, few] to [(tiles, few), (parities, K)]."""
+    """[tiles, parities, K, sparse] to [(tiles, sparse), (parities, K)]."""
     return modes.permute(0, 3, 1, 2).flatten(2).flatten(0, 1)
 
 
 def _by_parity(way: Parts, modes: Parts, *, odd: bool) -> Parts:
-    """A matrix of either parity [2, K, K] times sine modes [tiles, 2, K, few]; odd ones times -i if asked."""
+    """A matrix of either parity [2, K, K] times sine modes [tiles, 2, K, sparse]; odd ones times -i if asked."""
     real, imaginary = matmul(way, modes)
     if not odd:
         return real, imaginary
