@@ -140,8 +140,7 @@ class LensMatrices(NamedTuple):
 class TiledLens(nn.Module):
     """`lightpage.waves.lens.FourierLens` with tensors as geometry, for about the geometry that it is made for.
 
-    Strips share their reduction along X: so one page on a CPU takes fewer operations than by `BatchedLens`, whose few
-    large products with the pipe's modes suit a GPU.
+    One page on a CPU takes less time so than by the large products of `BatchedLens` (docs/guides/speed.md).
 
     Args:
         geometry: the device.

@@ -112,8 +112,8 @@ class TiledPipe(nn.Module):
     it, its light is turned by a = t kx ky L / (n k) radians. The error of s steps grows as a s^-1.5 (measured), so that
     the same sum of steps errs least with s as the square root of a.
 
-    For one page on a CPU, it takes less than half of the operations of whole planes
-    (`lightpage.train.models.batched.pipe.BatchedPipe`), since blocks of low modes need few steps.
+    One page on a CPU takes less time so than by the whole planes of `BatchedPipe` (docs/guides/speed.md), since blocks
+    of low modes need few steps.
 
     Args:
         geometry: the device.

@@ -3,8 +3,8 @@
 It does what `FittedWaves` does. The matrices are made from the parameters in the graph itself, so that a device that
 has drifted is decoded by feeding other parameters.
 
-`Waves` is the form for one page: on a CPU its tiles and blocks take fewer operations. For many pages on a GPU,
-`lightpage.train.models.batched.waves.BatchedWaves` does the same in few large products.
+`Waves` is the form for one page: a CPU computes its tiles and blocks in less time than the large products of the form
+for batches on a GPU, `lightpage.train.models.batched.waves.BatchedWaves` (docs/guides/speed.md).
 """
 
 from __future__ import annotations

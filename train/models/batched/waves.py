@@ -13,7 +13,7 @@ from lightpage.train.models.waves import Waves
 class BatchedWaves(nn.Module):
     """Modulator to the sparse samples of the common grid, or back, as `lightpage.train.models.waves.Waves` does.
 
-    A GPU is many times as fast by its few large products as by the small ones of `Waves`; on a CPU it takes longer.
+    A GPU is many times as fast by its few large products as by the small ones of `Waves`; a CPU takes longer.
 
     Args:
         waves: the model, for its sampling.
