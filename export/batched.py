@@ -30,7 +30,7 @@ from lightpage.train.models.batched.decoder import BatchedDecoder
 PAGES = "pages"
 """Name of the axis of pages, which a session may be opened with a number for."""
 OUTPUTS = (*ANSWERS, "residual")
-_MATRICES = re.compile(r"\.(sine_.|up_.|down|across|network\.\S*weight|unet\.\S*weight)$")
+_MATRICES = re.compile(r"\.(up_.|down|across|network\.\S*weight|unet\.\S*weight)$")
 """Names of buffers that are factors of products in float16 anyway. The pipe's bases stay exact: their products must be
 unitary."""
 _EXAMPLE = 1

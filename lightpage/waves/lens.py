@@ -72,6 +72,11 @@ class LensPath:
     path: SeidelTerms
     factors: Couplings
 
+    @property
+    def per_metre(self) -> Any:
+        """k/f, rad/m^2."""
+        return self.geometry.wave_number / self.geometry.focal_length_m
+
     def on_facet(self, across: Any, up: Any) -> Any:
         """Return the part of the path's phase that depends on the facet's point alone, radians."""
         return self.path.of_both(0.0, 0.0, *on_facet(self.factors, across, up))
@@ -85,12 +90,11 @@ class LensPath:
     def phase(self, x: Any, y: Any, across: Any, up: Any, a: Any = 0.0, b: Any = 0.0) -> Any:
         """Return `beyond` of the whole lens, with the ideal lens's phase, radians."""
         along, upward = on_facet(self.factors, across, up)
-        per_metre = self.geometry.wave_number / self.geometry.focal_length_m
-        return self.beyond(x, y, across, up, a, b) - per_metre * (x * along + y * upward)
+        return self.beyond(x, y, across, up, a, b) - self.per_metre * (x * along + y * upward)
 
     def rest(self, x: Any, y: Any, across: Any, up: Any, a: Any = 0.0, b: Any = 0.0) -> Any:
         """Return the phase, radians, that no factor of the couplings takes in, the roll's term in (x, Y') included."""
-        rolled = -self.geometry.wave_number / self.geometry.focal_length_m * self.factors.x_to_y * x * up
+        rolled = -self.per_metre * self.factors.x_to_y * x * up
         to_x, to_both = self.beyond(x, 0.0, across, 0.0, a, b), self.beyond(0.0, y, across, 0.0, a, b)
         to_y = self.beyond(0.0, y, 0.0, up, a, b)
         return rolled + self.beyond(x, y, across, up, a, b) - to_x - to_both - to_y

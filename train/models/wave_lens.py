@@ -3,11 +3,16 @@
 A small tile at (a, b) of the plane sees the facet through phases that vary slowly, once the phase of its own centre is
 taken off. So few samples of the facet serve it. A real lens's path and a roll, which factor over no pair of axes, then
 leave little, and few terms of it are needed. Strips of tiles with the same a share a first reduction along X.
+
+`TiledLens` is the form for one page, `lightpage.train.models.batched.lens.BatchedLens` that for many on a GPU. Both
+assemble their matrices from the same `TilePhases`.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +22,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lightpage.device.lens_path import SeidelTerms
+from lightpage.train.models import functions
 from lightpage.train.models.parts import Matrix, Parts, conjugate, multiply, phasor, scaled, stacked
 from lightpage.waves.geometry import WaveGeometry, couplings, on_facet
 from lightpage.waves.lens import LensPath
@@ -33,6 +39,80 @@ ROLL_MARGIN = np.deg2rad(0.05)
 """Roll to either side of the fitted one that the terms of the lenses' expansions still serve."""
 _PLACES = 3
 """Places along an axis that are asked how fast the phase varies."""
+Slopes = Callable[[float, float], tuple[Any, Any]]
+"""Slopes of a phase by X and Y', rad/m, as a tile or a sample at (x, y) sees the facet."""
+Window = Callable[[Tensor, Tensor], Tensor]
+"""Transmission [fy, fx] of a facet at X [fx] and Y' [fy], metres."""
+
+
+class PlacedLens(NamedTuple):
+    """Lens of a device with given parameters. Numbers are tensors of one type, in which its matrices are computed.
+
+    Attributes:
+        geometry: the device.
+        path: path of this lens, beyond an ideal one's.
+        start: first sample (x, y) of its plane, metres.
+        on_plane: phase that light of the plane's samples takes on, [ny, nx], radians.
+        window: transmission of the facet; None for one.
+    """
+
+    geometry: WaveGeometry
+    path: SeidelTerms
+    start: tuple[Tensor, Tensor]
+    on_plane: Tensor
+    window: Window | None
+
+
+@dataclass(frozen=True)
+class TilePhases:
+    """Phases of a lens between its tiles and samples of the facet, tiles [Tx, Ty] first, radians.
+
+    The phase of a tile's centre comes on top of the attributes, divided among strips and tiles, or among tilts that
+    factor over the axes and the rest.
+
+    Attributes:
+        lens: phase of the lens.
+        a, b: centres of the tiles, [Tx, 1, 1, 1] and [1, Ty, 1, 1], metres.
+        sparse: the samples of the facet, (X [cx], Y' [cy, 1]), metres.
+        x: between a tile's columns and the facet's, [Tx, Ty, nx, cx].
+        between: between a tile's rows and the facet's columns, [Tx, Ty, ny, cx].
+        y: between the facet's rows and a tile's, [Tx, Ty, cy, ny].
+        rest: at the nodes of the expansion, [Tx, Ty, R, cy, cx].
+        plane: weights of its terms at a tile's samples, times the factor that makes the lens unitary,
+            [Tx, Ty, R, ny, nx].
+    """
+
+    lens: LensPath
+    a: Tensor
+    b: Tensor
+    sparse: tuple[Tensor, Tensor]
+    x: Tensor
+    between: Tensor
+    y: Tensor
+    rest: Tensor
+    plane: Parts
+
+    def strips(self, across: Tensor, up: Tensor) -> Tensor:
+        """Phases of the strips' centres at X [fx] and Y' [fy, 1] of the facet, [Tx, fy, fx]."""
+        return torch.as_tensor(self.lens.phase(self.a[:, 0], 0.0, across, up) + self.lens.on_facet(across, up))
+
+    def tiles(self, across: Tensor, up: Tensor) -> Tensor:
+        """Phases of the tiles' centres against their strips', [Tx, Ty, fy, fx]."""
+        return torch.as_tensor(self.lens.phase(0.0, self.b, across, up, self.a))
+
+    def tilts(self, across: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
+        """Phases of the tiles' centres in an ideal lens that depend on X or Y' alone, [Tx, fx] and [Ty, fy]."""
+        factors, per_metre = self.lens.factors, self.lens.per_metre
+        along_x = -per_metre * factors.x_to_x * self.a[:, 0, 0] * across
+        along_y = -per_metre * factors.y_to_y * self.b[0, :, 0] * up
+        return along_x, along_y
+
+    def beyond_tilts(self) -> Tensor:
+        """Phases of the tiles' centres less their `tilts` at the few samples, [Tx, Ty, cy, cx]."""
+        (across, up), factors = self.sparse, self.lens.factors
+        crossed = self.a * factors.x_to_y * up + self.b * factors.y_to_x * across
+        path = self.lens.path.of_both(self.a, self.b, *on_facet(factors, across, up))
+        return torch.as_tensor(path - self.lens.per_metre * crossed)
 
 
 class LensMatrices(NamedTuple):
@@ -60,6 +140,8 @@ class LensMatrices(NamedTuple):
 class TiledLens(nn.Module):
     """`lightpage.waves.lens.FourierLens` with tensors as geometry, for about the geometry that it is made for.
 
+    One page on a CPU takes less time so than by the large products of `BatchedLens` (docs/guides/speed.md).
+
     Args:
         geometry: the device.
         path: path of this lens, beyond an ideal one's.
@@ -80,47 +162,48 @@ class TiledLens(nn.Module):
     ) -> None:
         super().__init__()
         wave = geometry.wavelength_m * geometry.focal_length_m / geometry.pipe_width_m
+        self.geometry, self.path, self.cells = geometry, path, cells
         self.shape = len(plane[1]), len(plane[0])
         self.tiles = tuple(max(1, round(float(np.ptp(axis)) / wave / WAVES_A_TILE)) for axis in plane)
         self.sides = tuple(-(-len(axis) // tiles) for axis, tiles in zip(plane, self.tiles, strict=True))
         pitches = [float(axis[1] - axis[0]) for axis in plane]
-        offsets = [(np.arange(side) - (side - 1) / 2) * pitch for side, pitch in zip(self.sides, pitches, strict=True)]
+        self.offsets = [
+            (np.arange(side) - (side - 1) / 2) * pitch for side, pitch in zip(self.sides, pitches, strict=True)
+        ]
         inside = [
             (np.arange(tiles) * side + (side - 1) / 2) for tiles, side in zip(self.tiles, self.sides, strict=True)
         ]
-        centres = [axis[0] + at * pitch for axis, at, pitch in zip(plane, inside, pitches, strict=True)]
-        units = [np.arange(1, count) / count - 0.5 for count in reversed(cells)]
-        highest = _highest(geometry, path, centres, offsets)
-        few = [sparse_axis(unit, frequency, OVERSAMPLING) for unit, frequency in zip(units, highest, strict=True)]
-        up_x, up_y = (interpolation(unit, own, OVERSAMPLING) for unit, own in zip(units, few, strict=True))
-        self._thinned = tuple(own is not unit for own, unit in zip(few, units, strict=True))
-        terms = _terms(geometry, path, centres, offsets, roll_margin, tolerance)
+        self.centres = [axis[0] + at * pitch for axis, at, pitch in zip(plane, inside, pitches, strict=True)]
+        slopes = facet_slopes(geometry, path, _PLACES)
+        units, sparse = self.facet_samples(slopes, lambda a, b: (slopes(a, 0.0)[0], slopes(a, b)[1]))
+        up_x, up_y = (interpolation(unit, own, OVERSAMPLING) for unit, own in zip(units, sparse, strict=True))
+        self._thinned = tuple(own is not unit for own, unit in zip(sparse, units, strict=True))
+        terms = _terms(geometry, path, self.centres, self.offsets, roll_margin, tolerance)
         self.offset_x: Tensor
         self.offset_y: Tensor
         self.inside_x: Tensor
         self.inside_y: Tensor
-        self.few_x: Tensor
-        self.few_y: Tensor
+        self.unit_x: Tensor
+        self.unit_y: Tensor
+        self.sparse_x: Tensor
+        self.sparse_y: Tensor
         self.up_x: Tensor
         self.up_y: Tensor
         self.nodes: Tensor
         self.weights: Tensor
         self.on_x: Tensor
         self.on_y: Tensor
-        tiled = (*self.tiles, *terms.nodes.shape[1:])
-        for name, value in {
-            "offset_x": offsets[0],
-            "offset_y": offsets[1],
-            "inside_x": inside[0] * pitches[0],
-            "inside_y": inside[1] * pitches[1],
-            "few_x": few[0],
-            "few_y": few[1],
-            "up_x": up_x.T,
-            "up_y": up_y,
-            "nodes": terms.nodes.reshape(tiled),
-            "on_x": terms.axes[1].T,
-            "on_y": terms.axes[0],
-        }.items():
+        by_axis = {
+            "offset": self.offsets,
+            "inside": [at * pitch for at, pitch in zip(inside, pitches, strict=True)],
+            "unit": units,
+            "sparse": sparse,
+            "up": (up_x.T, up_y),
+            "on": (terms.axes[1].T, terms.axes[0]),
+        }
+        buffers = {f"{name}_{axis}": both[number] for name, both in by_axis.items() for number, axis in enumerate("xy")}
+        buffers["nodes"] = terms.nodes.reshape(*self.tiles, *terms.nodes.shape[1:])
+        for name, value in buffers.items():
             self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(value)).float(), persistent=False)
         weights = terms.weights.reshape(*self.tiles, *terms.weights.shape[1:])
         self.register_buffer("weights", stacked(weights), persistent=False)
@@ -130,51 +213,77 @@ class TiledLens(nn.Module):
         """Number of terms of each tile."""
         return self.nodes.shape[2]
 
-    def matrices(
-        self,
-        geometry: WaveGeometry,
-        path: SeidelTerms,
-        start: tuple[Tensor, Tensor],
-        facet: tuple[Tensor, Tensor],
-        window: Tensor,
-    ) -> LensMatrices:
-        """The lens for parameters as tensors.
+    def facet_samples(self, slopes: Slopes, carrier: Slopes) -> tuple[list[Real], list[Real]]:
+        """All samples of the facet along (X, Y'), over its width, and the sparse ones from which its light is known.
 
         Args:
-            geometry, path: the device, and the lens's path.
-            start: the plane's first sample (x, y), metres.
-            facet: sample positions along the facet's axes, [fx] and [fy].
-            window: transmission of the facet, [fy, fx].
+            slopes: slopes of the phase at (x, y), rad/m.
+            carrier: slopes that are subtracted from those of a tile with centre (x, y).
         """
-        (across, up), width = facet, geometry.pipe_width_m
-        few_x, few_y = self.few_x * width, (self.few_y * width)[:, None]
-        a, b = (start[0] + self.inside_x)[:, None, None, None], (start[1] + self.inside_y)[None, :, None, None]
-        whole = LensPath(geometry, path, couplings(geometry, torch))
-        x, y = self.offset_x, self.offset_y
-        strip = whole.phase(a[:, 0], 0.0, across, up[:, None]) + whole.on_facet(across, up[:, None])
-        tile = whole.phase(0.0, b, few_x, up[:, None], a)
-        to_x = whole.phase(x[:, None], 0.0, few_x, 0.0, a, b)
-        to_both = whole.phase(0.0, y[:, None], few_x, 0.0, a, b)
-        to_y = whole.phase(0.0, y, 0.0, few_y, a, b)
-        node_x, node_y = (self.nodes[..., axis, None, None] for axis in (0, 1))
-        rest = whole.rest(node_x, node_y, few_x, few_y, a[..., None], b[..., None])
-        area = (x[1] - x[0]) * (y[1] - y[0]) * (few_x[1] - few_x[0]) * (few_y[1, 0] - few_y[0, 0])
+        steepest = [0.0, 0.0]
+        for a, b in product(*self.centres):
+            carried = carrier(a, b)
+            for x, y in product(*((offset[0], offset[-1]) for offset in self.offsets)):
+                at_corner = slopes(a + x, b + y)
+                for axis in (0, 1):
+                    steepest[axis] = max(steepest[axis], float(np.abs(at_corner[axis] - carried[axis]).max()))
+        units: list[Real] = [np.arange(1, count) / count - 0.5 for count in reversed(self.cells)]
+        cycles = self.geometry.pipe_width_m / (2 * np.pi)  # over the facet's width, of one rad/m
+        sparse = [sparse_axis(unit, slope * cycles, OVERSAMPLING) for unit, slope in zip(units, steepest, strict=True)]
+        return units, sparse
+
+    def phases(self, placed: PlacedLens, sparse: tuple[Tensor, Tensor]) -> TilePhases:
+        """Return the phases of the tiles, for parameters as tensors.
+
+        Args:
+            placed: the lens.
+            sparse: samples of the facet along (X, Y'), over its width.
+        """
+        geometry, path, start, *_ = placed
+        dtype = start[0].dtype
+        sparse_x = sparse[0].to(dtype) * geometry.pipe_width_m
+        sparse_y = (sparse[1].to(dtype) * geometry.pipe_width_m)[:, None]
+        a = (start[0] + self.inside_x.to(dtype))[:, None, None, None]
+        b = (start[1] + self.inside_y.to(dtype))[None, :, None, None]
+        lens = LensPath(geometry, path, couplings(geometry, functions))
+        x, y = self.offset_x.to(dtype), self.offset_y.to(dtype)
+        node_x, node_y = (self.nodes.to(dtype)[..., axis, None, None] for axis in (0, 1))
+        area = (x[1] - x[0]) * (y[1] - y[0]) * (sparse_x[1] - sparse_x[0]) * (sparse_y[1, 0] - sparse_y[0, 0])
         shear: Any = geometry.pipe_angle  # a tensor here, like all of it
         unitary = torch.sqrt(area / torch.cos(shear)) / (geometry.wavelength_m * geometry.focal_length_m)
-        plane = self.on_y @ self.weights[0] @ self.on_x, self.on_y @ self.weights[1] @ self.on_x
-        return LensMatrices(
+        on_x, on_y = self.on_x.to(dtype), self.on_y.to(dtype)
+        plane = on_y @ self.weights[0].to(dtype) @ on_x, on_y @ self.weights[1].to(dtype) @ on_x
+        return TilePhases(
+            lens,
+            a,
+            b,
+            (sparse_x, sparse_y),
+            lens.phase(x[:, None], 0.0, sparse_x, 0.0, a, b),
+            lens.phase(0.0, y[:, None], sparse_x, 0.0, a, b),
+            lens.phase(0.0, y, 0.0, sparse_y, a, b),
+            lens.rest(node_x, node_y, sparse_x, sparse_y, a[..., None], b[..., None]),
             scaled(plane, unitary),
-            Matrix.of(phasor(to_x.unsqueeze(2))),
-            phasor(to_both.unsqueeze(2)),
-            Matrix.of(phasor(to_y.unsqueeze(2))),
-            phasor(rest),
-            phasor(tile),
-            scaled(phasor(strip), window),
+        )
+
+    def matrices(self, placed: PlacedLens) -> LensMatrices:
+        """The lens for parameters as tensors."""
+        width: Any = placed.geometry.pipe_width_m
+        facet_x, facet_y = self.unit_x * width, self.unit_y * width
+        phases = self.phases(placed, (self.sparse_x, self.sparse_y))
+        strip = phasor(phases.strips(facet_x, facet_y[:, None]))
+        return LensMatrices(
+            phases.plane,
+            Matrix.of(phasor(phases.x.unsqueeze(2))),
+            phasor(phases.between.unsqueeze(2)),
+            Matrix.of(phasor(phases.y.unsqueeze(2))),
+            phasor(phases.rest),
+            phasor(phases.tiles(phases.sparse[0], facet_y[:, None])),
+            strip if placed.window is None else scaled(strip, placed.window(facet_x, facet_y)),
         )
 
     def to_facet(self, lens: LensMatrices, field: Parts) -> Parts:
         """Field on the plane [ny, nx] to the facet's grid [fy, fx]."""
-        split = [self._split(part) for part in field]
+        split = [self.split(part) for part in field]
         total: Parts | None = None
         for number in range(self.tiles[0]):
             one = _strip(lens, number)
@@ -208,7 +317,7 @@ class TiledLens(nn.Module):
     def _across(self, light: Parts, matrix: Tensor) -> Parts:
         return (light[0] @ matrix, light[1] @ matrix) if self._thinned[0] else light
 
-    def _split(self, part: Tensor) -> Tensor:
+    def split(self, part: Tensor) -> Tensor:
         """[ny, nx] to tiles [Tx, Ty, 1, ny, nx], with zeros where they reach beyond."""
         (tiles_x, tiles_y), (side_x, side_y) = self.tiles, self.sides
         part = functional.pad(part, (0, tiles_x * side_x - self.shape[1], 0, tiles_y * side_y - self.shape[0]))
@@ -220,13 +329,11 @@ class TiledLens(nn.Module):
         return whole[: self.shape[0], : self.shape[1]]
 
 
-def _highest(
-    geometry: WaveGeometry, path: SeidelTerms, centres: list[Real], offsets: list[Real]
-) -> tuple[float, float]:
-    """Frequencies along X and Y' that tiles see of a facet, cycles over its width."""
+def facet_slopes(geometry: WaveGeometry, path: SeidelTerms, count: int) -> Slopes:
+    """Slopes of a lens's phase by X and Y' at so many places along either axis of the facet, rad/m."""
     half, factors = geometry.pipe_width_m / 2, couplings(geometry)
     per_metre = geometry.wave_number / geometry.focal_length_m
-    edge = np.linspace(-half, half, _PLACES)
+    edge = np.linspace(-half, half, count)
     across, up = np.meshgrid(edge, edge, indexing="ij")
 
     def slopes(x: float, y: float) -> tuple[Real, Real]:
@@ -234,18 +341,7 @@ def _highest(
         along, upward = along - per_metre * x, upward - per_metre * y
         return factors.x_to_x * along + factors.y_to_x * upward, factors.x_to_y * along + factors.y_to_y * upward
 
-    (x_centres, y_centres), most = centres, [0.0, 0.0]
-    for a in x_centres:
-        of_strip = slopes(a, 0.0)[0]
-        for b in y_centres:
-            of_tile = slopes(a, b)[1]
-            for x in (offsets[0][0], offsets[0][-1]):
-                for y in (offsets[1][0], offsets[1][-1]):
-                    here = slopes(a + x, b + y)
-                    most[0] = max(most[0], float(np.abs(here[0] - of_strip).max()))
-                    most[1] = max(most[1], float(np.abs(here[1] - of_tile).max()))
-    along_x, along_y = (slope * geometry.pipe_width_m / (2 * np.pi) for slope in most)
-    return along_x, along_y
+    return slopes
 
 
 def _terms(

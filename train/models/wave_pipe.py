@@ -7,6 +7,7 @@ followed with a rim of neighbours around it, which is then dropped. The blocks o
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -35,12 +36,84 @@ class BlockMatrices(NamedTuple):
     sin: Tensor
 
 
+class SplittingStep(NamedTuple):
+    """Splitting step of the pipe, for a geometry of tensors.
+
+    Attributes:
+        length_m: length of the step.
+        detuning: kz - nk of each mode, [2, 2, Ky, Kx], rad/m.
+        angle: turn by the shear of each pair of modes in the singular basis, [Ky, Kx], radians.
+    """
+
+    length_m: Tensor
+    detuning: Tensor
+    angle: Tensor
+
+
+class PipeModes(nn.Module):
+    """Modes of both parities along either axis, and the singular basis of their coupling by a shear.
+
+    Args:
+        geometry: the device, about.
+        cells: sample intervals along (y', x).
+        steps: splitting steps over the pipe's length.
+        chosen: modes of each parity along (y', x); all if left out.
+
+    Attributes:
+        y_numbers, x_numbers: numbers of the modes, [2, K].
+        y_couplings, x_couplings: singular values of the coupling, [K].
+        y_singular, x_singular: its singular vectors, [2, 1, Ky, Ky] and [1, 2, Kx, Kx].
+    """
+
+    def __init__(
+        self,
+        geometry: WaveGeometry,
+        cells: tuple[int, int],
+        steps: int,
+        chosen: Sequence[slice] = (slice(None), slice(None)),
+    ) -> None:
+        super().__init__()
+        self.steps, self.sheared = steps, abs(geometry.pipe_angle) > 0
+        nk = geometry.refractive_index * geometry.wave_number
+        lag = geometry.pipe_length_m / steps * (np.pi / geometry.pipe_width_m) ** 2 / (2 * nk)
+        self.y_numbers: Tensor
+        self.x_numbers: Tensor
+        self.y_couplings: Tensor
+        self.x_couplings: Tensor
+        self.y_singular: Tensor
+        self.x_singular: Tensor
+        for axis, cell, modes, other in zip("yx", cells, chosen, (1, 0), strict=True):
+            basis = ParityBasis(cell, lag, modes)
+            for name, value in (
+                ("numbers", basis.mode_numbers),
+                ("couplings", basis.couplings),
+                ("singular", np.expand_dims(basis.singular, other)),
+            ):
+                kept = torch.from_numpy(np.ascontiguousarray(value)).float()
+                self.register_buffer(f"{axis}_{name}", kept, persistent=False)
+
+    def step(self, geometry: WaveGeometry) -> SplittingStep:
+        """Return the splitting step for a geometry of tensors, in their type."""
+        width: Any = geometry.pipe_width_m
+        shear: Any = geometry.pipe_angle
+        y, x = self.y_numbers.to(width.dtype), self.x_numbers.to(width.dtype)
+        couplings = self.y_couplings.to(width.dtype)[:, None] * self.x_couplings.to(width.dtype)
+        nk = geometry.refractive_index * geometry.wave_number
+        length: Any = geometry.pipe_length_m / self.steps
+        squares = y[:, None, :, None] ** 2 + x[None, :, None, :] ** 2
+        slow = detuning(nk, squares * (math.pi / width) ** 2, torch.sqrt)
+        return SplittingStep(length, slow, length / nk * torch.sin(shear) / width**2 * couplings)
+
+
 class TiledPipe(nn.Module):
     """`lightpage.waves.pipe.PipePropagator` with tensors as geometry, for about the geometry that it is made for.
 
     With t the shear, kx and ky the transverse wave numbers of a block, L the pipe's length and n k the wave number in
     it, its light is turned by a = t kx ky L / (n k) radians. The error of s steps grows as a s^-1.5 (measured), so that
     the same sum of steps errs least with s as the square root of a.
+
+    One page on a CPU takes less time so than by the whole planes of `BatchedPipe` (docs/guides/speed.md), since blocks
+    of low modes need few steps.
 
     Args:
         geometry: the device.
@@ -86,7 +159,7 @@ class TiledPipe(nn.Module):
         factors, which ONNX Runtime gets wrong on a GPU (`lightpage.export.operators.check.repeated_products`).
         """
         y_modes, x_modes = (
-            _sine_modes(numbers, cells).flatten(0, 1)
+            sine_modes(numbers, cells).flatten(0, 1)
             for numbers, cells in zip((self.y_numbers, self.x_numbers), self._cells, strict=True)
         )
         together = y_modes @ torch.stack(field) @ x_modes.transpose(-1, -2)
@@ -98,7 +171,7 @@ class TiledPipe(nn.Module):
         return real, imaginary
 
 
-class _Block(nn.Module):
+class _Block(PipeModes):
     """Block of modes of both parities along either axis, and their neighbours."""
 
     def __init__(
@@ -110,56 +183,33 @@ class _Block(nn.Module):
         steps: int,
         counts: list[int],
     ) -> None:
-        super().__init__()
-        width, nk = geometry.pipe_width_m, geometry.refractive_index * geometry.wave_number
-        self._steps, self._sheared = steps, abs(geometry.pipe_angle) > 0
-        lag = geometry.pipe_length_m / steps * (np.pi / width) ** 2 / (2 * nk)
         taken = [
             slice(max(0, a - rim), min(count, b + rim)) for (a, b), rim, count in zip(own, rims, counts, strict=True)
         ]
+        super().__init__(geometry, cells, steps, taken)
         self._taken = taken
         self._own = [slice(a - some.start, b - some.start) for (a, b), some in zip(own, taken, strict=True)]
-        y, x = (ParityBasis(cell, lag, some) for cell, some in zip(cells, taken, strict=True))
-        self.y_numbers: Tensor
-        self.x_numbers: Tensor
-        self.y_couplings: Tensor
-        self.x_couplings: Tensor
-        self.y_singular: Tensor
-        self.x_singular: Tensor
+        signs = np.array([-1.0, 1.0])[:, None, None] * np.array([[1.0, -1.0], [-1.0, 1.0]])
         self.signs: Tensor
-        for name, value in (
-            ("y_numbers", y.mode_numbers),
-            ("x_numbers", x.mode_numbers),
-            ("y_couplings", y.couplings),
-            ("x_couplings", x.couplings),
-            ("y_singular", y.singular[:, None]),
-            ("x_singular", x.singular[None]),
-            ("signs", np.array([-1.0, 1.0])[:, None, None] * np.array([[1.0, -1.0], [-1.0, 1.0]])),
-        ):
-            self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(value)).float(), persistent=False)
+        self.register_buffer("signs", torch.from_numpy(signs).float(), persistent=False)
 
     def matrices(self, geometry: WaveGeometry) -> BlockMatrices:
         """Return the block's matrices, for a geometry of tensors."""
-        width, nk = geometry.pipe_width_m, geometry.refractive_index * geometry.wave_number
-        step = geometry.pipe_length_m / self._steps
-        squares = self.y_numbers[:, None, :, None] ** 2 + self.x_numbers[None, :, None, :] ** 2
-        slow = detuning(nk, squares * (math.pi / width) ** 2, torch.sqrt)
-        shear: Any = geometry.pipe_angle
-        angle = step / nk * torch.sin(shear) / width**2 * (self.y_couplings[:, None] * self.x_couplings)
-        return BlockMatrices(phasor(0.5 * step * slow), torch.cos(angle), torch.sin(angle))
+        length, slow, angle = self.step(geometry)
+        return BlockMatrices(phasor(0.5 * length * slow), torch.cos(angle), torch.sin(angle))
 
     def forward(self, modes: Tensor, at: BlockMatrices, *, backwards: bool) -> Tensor:
         """All modes [2, 2, 2, Ky, Kx] before the pipe to this block's own behind it."""
         half, sin = (conjugate(at.half_step), -at.sin) if backwards else (at.half_step, at.sin)
         full, signs = multiply(half, half), self.signs[..., None, None] * sin
         modes = _times(modes[..., self._taken[0], self._taken[1]], half)
-        for step in range(self._steps):
-            if self._sheared:
+        for step in range(self.steps):
+            if self.sheared:
                 # what is (p, q) by parity comes from (1 - p, 1 - q), with i and a sign that is one for equal parities
                 inner = self.y_singular.transpose(-1, -2) @ modes @ self.x_singular
                 turned = at.cos * inner + signs * _reversed(inner.flatten(0, 2)).reshape(inner.shape)
                 modes = self.y_singular @ turned @ self.x_singular.transpose(-1, -2)
-            modes = _times(modes, full if step < self._steps - 1 else half)
+            modes = _times(modes, full if step < self.steps - 1 else half)
         return modes[..., self._own[0], self._own[1]]
 
 
@@ -190,7 +240,7 @@ def _mean_wave(modes: tuple[int, int], width: float) -> float:
     return float(np.sqrt(np.mean((numbers * np.pi / width) ** 2)))
 
 
-def _sine_modes(numbers: Tensor, cells: int) -> Tensor:
+def sine_modes(numbers: Tensor, cells: int) -> Tensor:
     """Samples of the sine modes with these numbers by parity [2, K], [2, K, cells - 1]; a mode 0 is none."""
     places = torch.arange(1, cells, device=numbers.device)
     return math.sqrt(2 / cells) * torch.sin(math.pi / cells * torch.remainder(numbers[..., None] * places, 2 * cells))

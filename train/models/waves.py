@@ -2,6 +2,9 @@
 
 It does what `FittedWaves` does. The matrices are made from the parameters in the graph itself, so that a device that
 has drifted is decoded by feeding other parameters.
+
+`Waves` is the form for one page: a CPU computes its tiles and blocks in less time than the large products of the form
+for batches on a GPU, `lightpage.train.models.batched.waves.BatchedWaves` (docs/guides/speed.md).
 """
 
 from __future__ import annotations
@@ -21,8 +24,9 @@ from lightpage.calibration.waves.wave_model import (
     modulator_axes,
 )
 from lightpage.device.profile import Profile
+from lightpage.train.models import functions
 from lightpage.train.models.parts import Parts, conjugate, multiply, parts, phasor
-from lightpage.train.models.wave_lens import OVERSAMPLING, ROLL_MARGIN, LensMatrices, TiledLens
+from lightpage.train.models.wave_lens import OVERSAMPLING, ROLL_MARGIN, LensMatrices, PlacedLens, TiledLens
 from lightpage.train.models.wave_pipe import BlockMatrices, TiledPipe
 from lightpage.waves.geometry import cells_for, highest_frequencies
 from lightpage.waves.grid import FieldGrid, field_grid, symbol_samples
@@ -99,9 +103,8 @@ class Waves(nn.Module):
         ]
         common = cells, ROLL_MARGIN, fidelity.lenses
         self.geometry, self.cells, self.fidelity = geometry, cells, fidelity
-        self.planes = (x + centre[0], y + centre[1]), (sparse[0], sparse[1])
-        self.launch = TiledLens(geometry, geometry.lens_path, self.planes[0], *common)
-        self.delaunch = TiledLens(geometry, geometry.camera_path, self.planes[1], *common)
+        self.launch = TiledLens(geometry, geometry.lens_path, (x + centre[0], y + centre[1]), *common)
+        self.delaunch = TiledLens(geometry, geometry.camera_path, (sparse[0], sparse[1]), *common)
         self._pipe = TiledPipe(geometry, cells, fidelity.pipe)
         self.profile, self.envelope_m = profile, profile.symbol_pitch_m / samples if filled else 0.0
         self.x_m: Tensor
@@ -110,8 +113,6 @@ class Waves(nn.Module):
         self.grid_y_m: Tensor
         self.sparse_x_m: Tensor
         self.sparse_y_m: Tensor
-        self.facet_x: Tensor
-        self.facet_y: Tensor
         for name, buffer in {
             "x_m": x,
             "y_m": y,
@@ -119,8 +120,6 @@ class Waves(nn.Module):
             "grid_y_m": grid.y_m,
             "sparse_x_m": sparse[0],
             "sparse_y_m": sparse[1],
-            "facet_x": np.arange(1, cells[1]) / cells[1] - 0.5,
-            "facet_y": np.arange(1, cells[0]) / cells[0] - 0.5,
         }.items():
             self.register_buffer(name, torch.from_numpy(buffer).to(torch.float32), persistent=False)
         across, down = (
@@ -132,6 +131,35 @@ class Waves(nn.Module):
         self.default: Tensor
         self.register_buffer("default", torch.from_numpy(parameters).to(torch.float32), persistent=False)
 
+    def lenses(
+        self, parameters: Tensor, blur: Tensor | float, camera: tuple[Tensor, Tensor]
+    ) -> tuple[PlacedLens, PlacedLens]:
+        """Return both lenses with the device's smooth phases, in the type of the parameters.
+
+        Args:
+            parameters: [P].
+            blur: see `matrices`.
+            camera: places (x, y) on the camera plane at which the second lens has its phase, metres.
+        """
+        value = dict(zip(NAMES, parameters.unbind(), strict=True))
+        geometry = fitted_geometry(self.profile, value)
+        x, y, grid_x, grid_y = (axis.to(parameters.dtype) for axis in (self.x_m, self.y_m, *camera))
+        page_x, page_y = x + value["page_centre_x_m"], y + value["page_centre_y_m"]
+        at_launch = fitted_launch_phase(self.profile, value, geometry, x[None, :], y[:, None])
+        at_launch = at_launch + geometry.lens_path.of_field(page_x[None, :], page_y[:, None])
+        at_camera = fitted_camera_phase(self.profile, value, geometry, grid_x[None, :], grid_y[:, None])
+        at_camera = at_camera - geometry.camera_path.of_field(grid_x[None, :], grid_y[:, None])
+        sparse = self.sparse_x_m[0].to(parameters.dtype), self.sparse_y_m[0].to(parameters.dtype)
+
+        def window(across: Tensor, up: Tensor) -> Tensor:
+            blur_m2 = blur * self.profile.slm.pitch_m**2
+            return torch.as_tensor(entrance_window(geometry, across, up, self.envelope_m, blur_m2, functions))
+
+        return (
+            PlacedLens(geometry, geometry.lens_path, (page_x[0], page_y[0]), at_launch, window),
+            PlacedLens(geometry, geometry.camera_path, sparse, -at_camera, None),
+        )
+
     def matrices(self, parameters: Tensor | None = None, blur: Tensor | float = 0.0) -> WaveMatrices:
         """Return the matrices of both ways.
 
@@ -139,25 +167,14 @@ class Waves(nn.Module):
             parameters: [P]; those that the model was made with if left out.
             blur: variance of the modulator's blur, over the square of its pixels' pitch.
         """
-        value = dict(zip(NAMES, (self.default if parameters is None else parameters).unbind(), strict=True))
-        geometry = fitted_geometry(self.profile, value)
-        x = self.x_m + value["page_centre_x_m"], self.y_m + value["page_centre_y_m"]
         grid = self.grid_x_m, self.grid_y_m
-        facet = self.facet_x * geometry.pipe_width_m, self.facet_y * geometry.pipe_width_m
-        window = entrance_window(geometry, *facet, self.envelope_m, blur * self.profile.slm.pitch_m**2, torch)
-        at_launch = fitted_launch_phase(self.profile, value, geometry, self.x_m[None, :], self.y_m[:, None])
-        at_camera = fitted_camera_phase(self.profile, value, geometry, grid[0][None, :], grid[1][:, None])
-        path, mirrored = geometry.lens_path, geometry.camera_path
-        at_launch = at_launch + path.of_field(x[0][None, :], x[1][:, None])
-        at_camera = at_camera - mirrored.of_field(grid[0][None, :], grid[1][:, None])
-        start = x[0][0], x[1][0]
-        sparse = self.sparse_x_m[0], self.sparse_y_m[0]
+        launch, camera = self.lenses(self.default if parameters is None else parameters, blur, grid)
         return WaveMatrices(
-            self.launch.matrices(geometry, path, start, facet, window),
-            self.delaunch.matrices(geometry, mirrored, sparse, facet, torch.ones_like(window[:1, :1])),
-            phasor(at_launch),
-            phasor(at_camera),
-            self._pipe.matrices(geometry),
+            self.launch.matrices(launch),
+            self.delaunch.matrices(camera),
+            phasor(launch.on_plane),
+            conjugate(phasor(camera.on_plane)),
+            self._pipe.matrices(launch.geometry),
         )
 
     def to_camera(self, at: WaveMatrices, page: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""The decoder for many pages says what that for one page says, part by part."""
+"""The field of many pages is that of each alone. `test_waves` compares both forms of the waves."""
 
 from functools import cache
 
@@ -6,69 +6,25 @@ import numpy as np
 import pytest
 import torch
 
-from lightpage.calibration.parameters import NAMES, PRIORS
 from lightpage.calibration.sampling_table import sampling_table
-from lightpage.calibration.waves.wave_model import FittedWaves
 from lightpage.device.state import Device
 from lightpage.page.symbols import random_symbols
 from lightpage.recording.frame_pair import FramePair
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
-from lightpage.train.models.batched.decoder import WaysBack
 from lightpage.train.models.batched.field import BatchedField, Seen
 from lightpage.train.models.batched.frames import BatchedFrames
 from lightpage.train.models.batched.products import Tables
-from lightpage.train.models.batched.waves import BatchedWaves
 from lightpage.train.models.field import FieldRecovery
-from lightpage.train.models.parts import stacked
 from lightpage.train.models.twin import RayTwin, TorchTwin
-from lightpage.train.models.waves import EXACT, Waves
 from lightpage.waves.grid import field_grid
-from tests.lightpage.small import THICK, small_profile
+from tests.lightpage.small import small_profile
 
 PROFILE = small_profile()
 
 
 def relative(found: torch.Tensor, expected: torch.Tensor) -> float:
     return float((found.float() - expected).norm() / expected.norm())
-
-
-def knocked() -> np.ndarray:
-    """Parameters none of which is zero: the pipe sheared and rolled, planes off their place and tilted, all phases."""
-    parameters = true_parameters(PROFILE, Device())
-    drawn = 0.5 * PRIORS * np.random.default_rng(3).standard_normal(len(NAMES))
-    parameters = np.where(parameters == 0, drawn, parameters)
-    parameters[NAMES.index("pipe_angle_rad")] = -0.01
-    assert np.all(parameters)
-    return parameters
-
-
-@pytest.mark.parametrize("shear", [1.0, 0.0], ids=["sheared", "square"])
-def test_waves_go_both_ways_as_those_of_one_page(shear: float) -> None:
-    profile, parameters = PROFILE.model_copy(update={"lens_path": THICK}), knocked()
-    parameters[NAMES.index("pipe_angle_rad")] *= shear
-    usual, fitted = Waves(profile, parameters, 4, EXACT), FittedWaves(profile, parameters, 4)
-    light = np.exp(2j * np.pi * np.random.default_rng(0).random(fitted.launch.shape)).astype(np.complex64)
-    page, field = stacked(light), stacked(fitted.to_camera(light))
-    back, there = WaysBack(usual), BatchedWaves(usual, to_page=False)
-    down, across = (torch.from_numpy(each).float() for each in usual.interpolations)
-    with torch.no_grad():
-        tables = _typed(back.tables(usual.default), torch.float32)
-        missing = 0, -field.shape[-1] % 8, 0, -field.shape[-2] % 8
-        two = torch.nn.functional.pad(torch.stack([field, 0.5 * field]), missing)
-        found = back.waves.last.cropped(back.waves(back.sparse((two[:, 0], two[:, 1]), tables), tables))
-        expected = usual.to_page(usual.matrices(), field)
-        spread_y, spread_x = (
-            there.first.laid_out(torch.eye(count), axis) for axis, count in zip("yx", page.shape[1:], strict=True)
-        )
-        tables = _typed(there.tables(usual.default), torch.float32)
-        sparse = there.last.cropped(there((spread_y.T @ page @ spread_x)[None], tables))[0]
-    for number, factor in enumerate((1, 2)):
-        assert relative(factor * found[number], expected) < 0.006
-    assert relative(found[0], stacked(fitted.to_page(fitted.to_camera(light)))) < 0.02
-    seen = down @ sparse @ across.T
-    assert relative(seen, usual.to_camera(usual.matrices(), page)) < 0.006
-    assert relative(seen, field) < 0.02
 
 
 @cache

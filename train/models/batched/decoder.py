@@ -107,6 +107,45 @@ class BatchedDecoder(nn.Module):
         return [refiner for refiner in self.refiners if isinstance(refiner, BatchedRefiner)]
 
 
+class WaysThere(nn.Module):
+    """Pages on the modulator to the common grid.
+
+    Args:
+        waves: of one page.
+    """
+
+    def __init__(self, waves: Waves) -> None:
+        super().__init__()
+        self.waves = BatchedWaves(waves, to_page=False)
+        down, across = waves.interpolations
+        self.down: Tensor
+        self.across: Tensor
+        self.register_buffer("down", torch.from_numpy(down).float(), persistent=False)
+        self.register_buffer("across", torch.from_numpy(across).float(), persistent=False)
+
+    def tables(self, parameters: Tensor, blur: Tensor | float = 0.0) -> Tables:
+        """Constants of a device; the arguments are those of `BatchedWaves.tables`."""
+        made = self.waves.tables(parameters, blur)
+        page, camera = self.waves.first, self.waves.last
+        for axis, count, grid in zip("yx", page.shape, (self.down, self.across), strict=True):
+            made[f"page_{axis}"] = page.laid_out(torch.eye(count, device=grid.device), axis)
+            made[f"up_{axis}"] = padded(camera.laid_out(grid, axis), -2).transpose(-1, -2)
+        return made
+
+    def forward(self, page: Tensor, tables: Tables) -> Tensor:
+        """Pages [B, 2, ny, nx] to the sparse samples of the common grid, as the lens has them."""
+        laid_out = turned_product(turned_product(page, tables["page_y"]), tables["page_x"])
+        return torch.as_tensor(self.waves(laid_out, tables))
+
+    @staticmethod
+    def on_grid(sparse: Tensor, tables: Tables) -> Parts:
+        """A field on the sparse samples to the common grid, real and imaginary part, [B, ny, nx] of whole multiples."""
+        real, imaginary = (
+            turned_product(turned_product(sparse[:, part], tables["up_y"]), tables["up_x"]) for part in (0, 1)
+        )
+        return real, imaginary
+
+
 class WaysBack(nn.Module):
     """A field on the common grid back to the modulator, as features at symbol pitch.
 
@@ -124,11 +163,11 @@ class WaysBack(nn.Module):
         self.register_buffer("down", torch.from_numpy(down).float(), persistent=False)
         self.register_buffer("across", torch.from_numpy(across).float(), persistent=False)
 
-    def tables(self, parameters: Tensor) -> Tables:
-        """Constants of a device."""
+    def tables(self, parameters: Tensor, blur: Tensor | float = 0.0) -> Tables:
+        """Constants of a device; the arguments are those of `BatchedWaves.tables`."""
         lens = self.waves.first
         down, across = lens.laid_out(self.down, "y"), lens.laid_out(self.across, "x")
-        return {"down": padded(down, -2), "across": padded(across, -2)} | self.waves.tables(parameters)
+        return {"down": padded(down, -2), "across": padded(across, -2)} | self.waves.tables(parameters, blur)
 
     def forward(self, field: Parts, tables: Tables) -> Tensor:
         """E, [B, ny, nx] each of whole multiples, to [B, 2 S, ny, nx] over the light's root mean square."""
@@ -181,7 +220,7 @@ class Unexplained(nn.Module):
 
     def __init__(self, prediction: Prediction) -> None:
         super().__init__()
-        self.there = BatchedWaves(prediction.waves, to_page=False)
+        self.there = WaysThere(prediction.waves)
         self.back = WaysBack(prediction.back)
         self.floor = prediction.floor
         illumination = torch.tensordot(prediction.illumination, torch.stack(prediction.terms()), 1)
@@ -193,32 +232,23 @@ class Unexplained(nn.Module):
         there, back = self.there.tables(parameters), self.back.tables(parameters)
         made = {f"there.{name}": value for name, value in there.items()}
         made |= {f"back.{name}": value for name, value in back.items()}
-        page, camera = self.there.first, self.there.last
-        for axis, count, grid in zip(
-            "yx", sizes(self.illumination)[-2:], (self.back.down, self.back.across), strict=True
-        ):
-            made[f"page_{axis}"] = page.laid_out(torch.eye(count), axis)
-            made[f"up_{axis}"] = padded(camera.laid_out(grid, axis), -2).transpose(-1, -2)
         return made | {"illumination": self.illumination, "floor": self.floor}
 
     def forward(
         self, solver: BatchedField, seen: Seen, field: Parts, p: Tensor, tables: Tables, of_field: Tables
     ) -> Tensor:
         """Light that estimated pages p [B, 2, ny, nx] leave unexplained, [B, 2 S, ny, nx]."""
-        dtype, back = field[0].dtype, of_part(tables, "back")
+        dtype, back, there = field[0].dtype, of_part(tables, "back"), of_part(tables, "there")
         written = expected_phasors(p, 1).to(dtype)
-        lit = _multiplied(written, tables["illumination"])
-        lit = turned_product(turned_product(lit, tables["page_y"]), tables["page_x"])
-        expected = self.there(lit, of_part(tables, "there"))  # on the sparse samples
-        up_y, up_x = tables["up_y"], tables["up_x"]
-        planes = [turned_product(turned_product(expected[:, part], up_y), up_x) for part in (0, 1)]
+        expected = self.there(_multiplied(written, tables["illumination"]), there)  # on the sparse samples
+        planes = self.there.on_grid(expected, there)
         # sums over the grid: beyond it there are sparse samples too, but known light has none there
         turned = _multiplied(self.back.sparse(field, back), torch.cat([expected[:, :1], -expected[:, 1:]], 1))
         rows, columns = sizes(turned)[-2:]
         both = (turned @ turned.new_full((columns, 8), 1 / columns))[..., 0].to(torch.float32).mean(-1)
         ny, nx = solver.recovery.grid.shape
         share = rows * columns / (2 * ny * nx)
-        real, imaginary = (share * both / (solver.power((planes[0], planes[1])) + 1e-12)[:, None]).to(dtype).unbind(1)
+        real, imaginary = (share * both / (solver.power(planes) + 1e-12)[:, None]).to(dtype).unbind(1)
         a, b = real[:, None, None], imaginary[:, None, None]
         scaled = a * planes[0] - b * planes[1], a * planes[1] + b * planes[0]
         left = solver.innovation(seen, scaled, of_field, tables["floor"])

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lightpage.device.lens_path import SeidelTerms
-from lightpage.train.models.batched import functions
 from lightpage.train.models.batched.pipe import Light
 from lightpage.train.models.batched.products import (
     Tables,
@@ -23,28 +19,14 @@ from lightpage.train.models.batched.products import (
     with_phasor,
 )
 from lightpage.train.models.parts import Parts, adjoint, conjugate, matmul, multiply, phasor, scaled
-from lightpage.train.models.wave_lens import OVERSAMPLING, TiledLens
-from lightpage.waves.geometry import WaveGeometry, couplings, on_facet, sine_matrix
-from lightpage.waves.lens import LensPath
+from lightpage.train.models.wave_lens import OVERSAMPLING, PlacedLens, TiledLens, facet_slopes
+from lightpage.train.models.wave_pipe import sine_modes
+from lightpage.waves.geometry import couplings
 from lightpage.waves.pipe import modes_by_parity
-from lightpage.waves.sinc_interpolation import interpolation, sparse_axis
+from lightpage.waves.sinc_interpolation import interpolation
 
-Real = NDArray[np.floating]
 _EDGES = 5
 """Places along an axis of the facet that are asked how fast the phase varies."""
-
-
-@dataclass(frozen=True)
-class Facet:
-    """Constants of facet and plane that no lens decides.
-
-    Attributes:
-        window: transmission at (X, Y'), [fx] and [fy, 1], metres, as [fy, fx]; None for one.
-        on_plane: phase of the plane's samples, [ny, nx], radians.
-    """
-
-    window: Any
-    on_plane: Tensor
 
 
 class BatchedLens(nn.Module):
@@ -54,77 +36,44 @@ class BatchedLens(nn.Module):
     Interpolation to the facet's own grid, the tilt of the tile's centre, the sum over tiles, sine modes and the pipe's
     first half step are then one matrix along either axis.
 
+    A GPU is many times as fast by its few large products as by the strips of `TiledLens`.
+
     Args:
-        geometry, path, plane, cells: as of the tiled lens.
-        tiled: which has the terms of the lens's rest.
+        tiled: the lens, with its tiles and the terms of its rest.
         to_plane: whether light goes from the pipe to the plane, by the adjoint.
     """
 
-    def __init__(
-        self,
-        geometry: WaveGeometry,
-        path: SeidelTerms,
-        plane: tuple[Real, Real],
-        cells: tuple[int, int],
-        tiled: TiledLens,
-        *,
-        to_plane: bool,
-    ) -> None:
+    def __init__(self, tiled: TiledLens, *, to_plane: bool) -> None:
         super().__init__()
         self.tiled, self.backwards = tiled, to_plane
         self.shape, self.tiles, self.sides = tiled.shape, tiled.tiles, tiled.sides
-        units = [np.arange(1, count) / count - 0.5 for count in reversed(cells)]
-        highest = _highest(geometry, path, plane, self.tiles, self.sides)
-        few = [sparse_axis(unit, frequency, OVERSAMPLING) for unit, frequency in zip(units, highest, strict=True)]
-        for name, unit, own, cell in zip("xy", units, few, reversed(cells), strict=True):
+        geometry, factors = tiled.geometry, couplings(tiled.geometry)
+        per_metre = geometry.wave_number / geometry.focal_length_m
+        slopes = facet_slopes(geometry, tiled.path, _EDGES)
+        units, sparse = tiled.facet_samples(
+            slopes, lambda a, b: (-per_metre * factors.x_to_x * a, -per_metre * factors.y_to_y * b)
+        )
+        for name, unit, own, cell in zip("xy", units, sparse, reversed(tiled.cells), strict=True):
             up = np.eye(len(unit)) if own is unit else interpolation(unit, own, OVERSAMPLING)
-            sine = np.concatenate([np.zeros((1, cell - 1)), sine_matrix(cell)])[modes_by_parity(cell).astype(int)]
-            for label, value in (("unit", unit), ("few", own), ("up", up), ("sine", sine)):
+            for label, value in (("sparse", own), ("up", up), ("numbers", modes_by_parity(cell))):
                 self.register_buffer(f"{label}_{name}", torch.from_numpy(value).float(), persistent=False)
 
-    def tables(
-        self,
-        geometry: WaveGeometry,
-        path: SeidelTerms,
-        start: tuple[Tensor, Tensor],
-        facet: Facet,
-        way: tuple[Parts, Parts],
-    ) -> Tables:
-        """Constants for a geometry of tensors (float64).
+    def tables(self, placed: PlacedLens, way: tuple[Parts, Parts]) -> Tables:
+        """Constants of a lens with tensors of float64.
 
         Args:
-            geometry, path: the device, and the lens's path.
-            start: the plane's first sample (x, y), metres.
-            facet: see there.
+            placed: the lens.
             way: of `BatchedPipe.tables`, into the pipe or out of it along (y', x).
         """
-        tiled, width = self.tiled, geometry.pipe_width_m
-        few = {name: self._axis(f"few_{name}") * width for name in "xy"}
-        few_x, few_y = few["x"], few["y"][:, None]
-        inside = tiled.inside_x.double(), tiled.inside_y.double()
-        a, b = (start[0] + inside[0])[:, None, None, None], (start[1] + inside[1])[None, :, None, None]
-        factors = couplings(geometry, functions)
-        whole, per_metre = LensPath(geometry, path, factors), geometry.wave_number / geometry.focal_length_m
-        x, y = tiled.offset_x.double(), tiled.offset_y.double()
-        to_x = phasor(whole.phase(x[:, None], 0.0, few_x, 0.0, a, b))
-        between = phasor(whole.phase(0.0, y[:, None], few_x, 0.0, a, b))
-        to_y = phasor(whole.phase(0.0, y, 0.0, few_y, a, b))
-        node_x, node_y = (tiled.nodes.double()[..., axis, None, None] for axis in (0, 1))
-        rest = whole.rest(node_x, node_y, few_x, few_y, a[..., None], b[..., None])
-        own = path.of_both(a, b, *on_facet(factors, few_x, few_y))
-        own = own - per_metre * (a * factors.x_to_y * few_y + b * factors.y_to_x * few_x)
-        light = phasor(rest + own[:, :, None])
-        if facet.window is not None:
-            light = scaled(light, facet.window(few_x, few["y"]))
-        area = (x[1] - x[0]) * (y[1] - y[0]) * (few_x[1] - few_x[0]) * (few_y[1, 0] - few_y[0, 0])
-        shear: Any = geometry.pipe_angle
-        unitary = torch.sqrt(area / torch.cos(shear)) / (geometry.wavelength_m * geometry.focal_length_m)
-        on_y, on_x = tiled.on_y.double() * unitary, tiled.on_x.double()
-        plane = on_y @ tiled.weights[0].double() @ on_x, on_y @ tiled.weights[1].double() @ on_x
-        turned = phasor(facet.on_plane)
-        plane = multiply(plane, (self._tiled(turned[0]), self._tiled(turned[1])))
-        tilt_x = phasor(-per_metre * factors.x_to_x * a[:, 0, 0] * (self._axis("unit_x") * width))
-        tilt_y = phasor(-per_metre * factors.y_to_y * b[0, :, 0] * (self._axis("unit_y") * width))
+        tiled, width = self.tiled, placed.geometry.pipe_width_m
+        phases = tiled.phases(placed, (self._axis("sparse_x"), self._axis("sparse_y")))
+        light = phasor(phases.rest + phases.beyond_tilts()[:, :, None])
+        if placed.window is not None:
+            light = scaled(light, placed.window(phases.sparse[0], phases.sparse[1][:, 0]))
+        turned = phasor(placed.on_plane)
+        plane = multiply(phases.plane, (tiled.split(turned[0]), tiled.split(turned[1])))
+        tilt_x, tilt_y = map(phasor, phases.tilts(tiled.unit_x.double() * width, tiled.unit_y.double() * width))
+        to_x, between, to_y = (phasor(phase) for phase in (phases.x, phases.between, phases.y))
         to_x, between, to_y, light, plane = map(self._flat, (to_x, between, to_y, light, plane))
         along_y, along_x = self._modes("y", tilt_y), self._modes("x", tilt_x)
         if self.backwards:
@@ -135,11 +84,13 @@ class BatchedLens(nn.Module):
         self, to_x: Parts, between: Parts, to_y: Parts, facet: Parts, plane: Parts, y: Parts, x: Parts, way: Any
     ) -> Tables:
         """Constants of the way from the plane."""
-        y, x = _by_parity(way[0], y, odd=True), _by_parity(way[1], x, odd=False)  # [tiles, 2, K, few]
-        ty, few_y = sizes(y[0])[0], sizes(y[0])[-1]
-        along_y = real_form((_columns(y[0]), _columns(y[1]))).reshape(2, ty, few_y, -1)  # [r, ty, few, (r', p, k)]
+        y, x = _by_parity(way[0], y, odd=True), _by_parity(way[1], x, odd=False)  # [tiles, 2, K, sparse]
+        ty, sparse_y = sizes(y[0])[0], sizes(y[0])[-1]
+        along_y = real_form((_columns(y[0]), _columns(y[1]))).reshape(
+            2, ty, sparse_y, -1
+        )  # [r, ty, sparse, (r', p, k)]
         return _between(plane, to_x, _transposed(between), _transposed(to_y), _transposed(facet)) | {
-            "modes_y": along_y.permute(1, 0, 2, 3).reshape(ty * 2 * few_y, -1),
+            "modes_y": along_y.permute(1, 0, 2, 3).reshape(ty * 2 * sparse_y, -1),
             "modes_x": real_form((_columns(x[0]), _columns(x[1])), "kr"),
         }
 
@@ -150,7 +101,7 @@ class BatchedLens(nn.Module):
         tables: Tables = {}
         for name, modes, out in (("y", y, way[0]), ("x", x, way[1])):
             for parity in (0, 1):
-                back = adjoint((modes[0][:, parity], modes[1][:, parity]))  # [tiles, few, K]
+                back = adjoint((modes[0][:, parity], modes[1][:, parity]))  # [tiles, sparse, K]
                 made = matmul(back, (out[0][parity], out[1][parity]))
                 if name == "y" and parity:
                     made = _times_i(made)  # light odd along y' is held times -i
@@ -164,29 +115,31 @@ class BatchedLens(nn.Module):
         tx, ty = self.tiles
         _, _, rows, _, _, columns = sizes(tables["near_0"])
         field = field.reshape(-1, 2, ty, rows, tx, columns).permute(4, 2, 0, 3, 1, 5)
-        light = _from_near(field.reshape(tx * ty, -1, rows, 1, 2, columns), tables)  # [T, B, few x, r, few y]
-        few_x, few_y = sizes(tables["far_0_0"])[2::2]
-        light = light.reshape(tx, ty, -1, few_x, 2, few_y).permute(2, 0, 3, 1, 4, 5)
-        light = light.reshape(-1, tx * few_x, ty * 2 * few_y) @ tables["modes_y"]  # [B, (tx, few x), (r, p, ky)]
+        light = _from_near(field.reshape(tx * ty, -1, rows, 1, 2, columns), tables)  # [T, B, sparse x, r, sparse y]
+        sparse_x, sparse_y = sizes(tables["far_0_0"])[2::2]
+        light = light.reshape(tx, ty, -1, sparse_x, 2, sparse_y).permute(2, 0, 3, 1, 4, 5)
+        light = (
+            light.reshape(-1, tx * sparse_x, ty * 2 * sparse_y) @ tables["modes_y"]
+        )  # [B, (tx, sparse x), (r, p, ky)]
         modes_y, modes_x = (sizes(tables[f"modes_{axis}"])[1] // 4 for axis in "yx")
-        light = turned_product(light.reshape(-1, tx * few_x * 2, 2 * modes_y), tables["modes_x"])
+        light = turned_product(light.reshape(-1, tx * sparse_x * 2, 2 * modes_y), tables["modes_x"])
         split = light.reshape(-1, 2, 2 * modes_y, 2, modes_x)  # [B, p, (ky, r), q, kx]
         return [split[:, p, :, q] for p in (0, 1) for q in (0, 1)]
 
     def to_plane(self, light: Light, tables: Tables) -> Tensor:
         """Light in the pipe to a field on the plane, `laid_out`, [B, 2, Ty ny, Tx nx]."""
         tx, ty = self.tiles
-        _, _, few_x, _, _, few_y = sizes(tables["near_0"])
+        _, _, sparse_x, _, _, sparse_y = sizes(tables["near_0"])
         total: Tensor | None = None
         for q in (0, 1):
             modes = sizes(light[q])[-1]
             even, odd = (turned_product(light[2 * p + q], tables[f"modes_y_{p}"]) for p in (0, 1))
-            along_y = (even + odd).reshape(-1, 2 * modes, ty * few_y)  # [B, (kx, r), (ty, few y)]
+            along_y = (even + odd).reshape(-1, 2 * modes, ty * sparse_y)  # [B, (kx, r), (ty, sparse y)]
             one = turned_product(along_y, tables[f"modes_x_{q}"])
             total = one if total is None else total + one
         assert total is not None
-        facet = total.reshape(-1, ty, few_y, 2, tx, few_x).permute(4, 1, 0, 5, 3, 2)
-        tiled = _from_near(facet.reshape(tx * ty, -1, few_x, 1, 2, few_y), tables)  # [T, B, ny, r, nx]
+        facet = total.reshape(-1, ty, sparse_y, 2, tx, sparse_x).permute(4, 1, 0, 5, 3, 2)
+        tiled = _from_near(facet.reshape(tx * ty, -1, sparse_x, 1, 2, sparse_y), tables)  # [T, B, ny, r, nx]
         rows, columns = sizes(tables["far_0_0"])[2::2]
         field = tiled.reshape(tx, ty, -1, rows, 2, columns).permute(2, 4, 1, 3, 0, 5)
         return field.reshape(-1, 2, ty * rows, tx * columns)
@@ -209,15 +162,10 @@ class BatchedLens(nn.Module):
         """A buffer as float64."""
         return torch.as_tensor(self.get_buffer(name)).double()
 
-    def _tiled(self, part: Tensor) -> Tensor:
-        """[ny, nx] to tiles [Tx, Ty, 1, ny, nx], with zeros where they reach beyond."""
-        (tx, ty), (side_x, side_y) = self.tiles, self.sides
-        part = functional.pad(part, (0, tx * side_x - self.shape[1], 0, ty * side_y - self.shape[0]))
-        return part.reshape(ty, side_y, tx, side_x).permute(2, 0, 1, 3)[:, :, None]
-
     def _modes(self, axis: str, tilt: Parts) -> Parts:
-        """Return sine modes by parity [tiles, 2, K, few] of a facet's few samples, by each tile's tilt [tiles, f]."""
-        sine, up = self._axis(f"sine_{axis}"), self._axis(f"up_{axis}")
+        """Return sine modes by parity [tiles, 2, K, sparse] of sparse samples, by each tile's tilt [tiles, f]."""
+        cells = self.tiled.cells["yx".index(axis)]
+        sine, up = sine_modes(self._axis(f"numbers_{axis}"), cells), self._axis(f"up_{axis}")
         real, imaginary = (padded(sine @ (part[:, None, :, None] * up), -1, -2) for part in tilt)
         return real, imaginary
 
@@ -285,41 +233,13 @@ def _times_i(value: Parts) -> Parts:
 
 
 def _columns(modes: Tensor) -> Tensor:
-    """[tiles, parities, K, few] to [(tiles, few), (parities, K)]."""
+    """[tiles, parities, K, sparse] to [(tiles, sparse), (parities, K)]."""
     return modes.permute(0, 3, 1, 2).flatten(2).flatten(0, 1)
 
 
 def _by_parity(way: Parts, modes: Parts, *, odd: bool) -> Parts:
-    """A matrix of either parity [2, K, K] times sine modes [tiles, 2, K, few]; odd ones times -i if asked."""
+    """A matrix of either parity [2, K, K] times sine modes [tiles, 2, K, sparse]; odd ones times -i if asked."""
     real, imaginary = matmul(way, modes)
     if not odd:
         return real, imaginary
     return torch.stack([real[:, 0], imaginary[:, 1]], 1), torch.stack([imaginary[:, 0], -real[:, 1]], 1)
-
-
-def _highest(
-    geometry: WaveGeometry, path: SeidelTerms, plane: tuple[Real, Real], tiles: tuple[int, ...], sides: tuple[int, ...]
-) -> tuple[float, float]:
-    """Frequencies along X and Y' that tiles see of a facet, their centre's tilt taken off, cycles over its width."""
-    half, factors = geometry.pipe_width_m / 2, couplings(geometry)
-    per_metre = geometry.wave_number / geometry.focal_length_m
-    edge = np.linspace(-half, half, _EDGES)
-    across, up = np.meshgrid(edge, edge, indexing="ij")
-    pitches = [float(axis[1] - axis[0]) for axis in plane]
-    centres = [
-        axis[0] + (np.arange(count) * side + (side - 1) / 2) * pitch
-        for axis, count, side, pitch in zip(plane, tiles, sides, pitches, strict=True)
-    ]
-    reach = [(side - 1) / 2 * pitch for side, pitch in zip(sides, pitches, strict=True)]
-    most = [0.0, 0.0]
-    for a in centres[0]:
-        for b in centres[1]:
-            for x in (-reach[0], reach[0]):
-                for y in (-reach[1], reach[1]):
-                    along, upward = path.slope(a + x, b + y, *on_facet(factors, across, up))
-                    along, upward = along - per_metre * (a + x), upward - per_metre * (b + y)
-                    on_x = factors.x_to_x * along + factors.y_to_x * upward + per_metre * a * factors.x_to_x
-                    on_y = factors.x_to_y * along + factors.y_to_y * upward + per_metre * b * factors.y_to_y
-                    most = [max(most[0], float(np.abs(on_x).max())), max(most[1], float(np.abs(on_y).max()))]
-    across_x, across_y = (slope * geometry.pipe_width_m / (2 * np.pi) for slope in most)
-    return across_x, across_y

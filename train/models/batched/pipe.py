@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from typing import Any
-
-import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from lightpage.train.models.batched.products import (
     Tables,
@@ -19,9 +15,8 @@ from lightpage.train.models.batched.products import (
     with_phasor,
 )
 from lightpage.train.models.parts import Parts, phasor
-from lightpage.train.models.wave_pipe import MODES_A_BLOCK, splitting_steps
-from lightpage.waves.geometry import WaveGeometry, detuning
-from lightpage.waves.pipe import ParityBasis
+from lightpage.train.models.wave_pipe import MODES_A_BLOCK, PipeModes, splitting_steps
+from lightpage.waves.geometry import WaveGeometry
 
 _OF_BLOCKS = 0.75
 """Error of the whole over that which is wanted, where one page's pipe is of several blocks: those of high modes take
@@ -33,8 +28,10 @@ Those odd along y' are held times -i, by which the coupling becomes a rotation o
 """
 
 
-class BatchedPipe(nn.Module):
+class BatchedPipe(PipeModes):
     """`lightpage.train.models.wave_pipe.TiledPipe` in few steps of whole planes.
+
+    A GPU, which computes a page of blocks in thousands of small kernels, is many times as fast so.
 
     A step is a rotation of pairs and a complex product along either axis: back to modes, their detuning and into the
     singular basis again. The detuning is a sum of a function of either axis's mode but for a rest, which is half a
@@ -48,32 +45,14 @@ class BatchedPipe(nn.Module):
     """
 
     def __init__(self, geometry: WaveGeometry, cells: tuple[int, int], error: float, *, backwards: bool) -> None:
-        super().__init__()
         y_modes, x_modes = ((0, count // 2) for count in cells)
         if max(cells) // 2 >= 2 * MODES_A_BLOCK:
             error *= _OF_BLOCKS
-        self.sheared = abs(geometry.pipe_angle) > 0
         # the rest of the detuning comes between two steps
-        self.steps = max(2, splitting_steps(geometry, (y_modes, x_modes), error))
+        super().__init__(geometry, cells, max(2, splitting_steps(geometry, (y_modes, x_modes), error)))
         self.sign = -1 if backwards else 1
-        width, nk = geometry.pipe_width_m, geometry.refractive_index * geometry.wave_number
-        lag = geometry.pipe_length_m / self.steps * (np.pi / width) ** 2 / (2 * nk)
-        y, x = (ParityBasis(cell, lag) for cell in cells)
-        self.y_numbers: Tensor
-        self.x_numbers: Tensor
-        self.y_couplings: Tensor
-        self.x_couplings: Tensor
-        self.y_singular: Tensor
-        self.x_singular: Tensor
-        for name, value in (
-            ("y_numbers", y.mode_numbers),
-            ("x_numbers", x.mode_numbers),
-            ("y_couplings", y.couplings),
-            ("x_couplings", x.couplings),
-            ("y_singular", y.singular),
-            ("x_singular", x.singular),
-        ):
-            self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(value)).float(), persistent=False)
+        # between which steps it comes: of an odd number, those that make either way the other's adjoint
+        self._middle = (self.steps - (2 if backwards else 1)) // 2
 
     def tables(self, geometry: WaveGeometry) -> tuple[Tables, tuple[Parts, Parts], tuple[Parts, Parts]]:
         """Constants for a geometry of tensors (float64); the ways into the pipe and out of it along (y', x).
@@ -82,15 +61,9 @@ class BatchedPipe(nn.Module):
             Constants; from modes to the singular basis and half a step on, [2, K, K] along either axis, rows being of
             the singular basis; and from the singular basis half a step on and to modes, columns being of the basis.
         """
-        width, nk = geometry.pipe_width_m, geometry.refractive_index * geometry.wave_number
-        step = geometry.pipe_length_m / self.steps
-        squares = [(numbers.double() * math.pi / width) ** 2 for numbers in (self.y_numbers, self.x_numbers)]
-        slow = detuning(nk, squares[0][:, None, :, None] + squares[1][None, :, None, :], torch.sqrt)
+        step, slow, turn = self.step(geometry)
         along_y, along_x = slow.mean((1, 3)), slow.mean((0, 2)) - slow.mean()
         rest = slow - along_y[:, None, :, None] - along_x[None, :, None, :]
-        shear: Any = geometry.pipe_angle
-        couplings = self.y_couplings.double()[:, None] * self.x_couplings.double()
-        turn = step / nk * torch.sin(shear) / width**2 * couplings
         tables = {
             "cos": padded(torch.cos(turn), -1, -2)[:, None],
             "sin": padded(self.sign * torch.sin(turn), -1, -2)[:, None],
@@ -103,7 +76,7 @@ class BatchedPipe(nn.Module):
         enter, leave = [], []
         for axis, basis, function in (("y", self.y_singular, along_y), ("x", self.x_singular, along_x)):
             half, whole = (phasor(self.sign * share * step * function) for share in (0.5, 1.0))
-            vectors = basis.double()
+            vectors = basis.flatten(0, 1).to(function.dtype)
             back = vectors.transpose(-1, -2)
             into = tuple(back * part[:, None, :] for part in half)  # modes, half a step on, to the basis
             out = tuple(part[:, :, None] * vectors for part in half)
@@ -129,7 +102,7 @@ class BatchedPipe(nn.Module):
                 light = self._rotated(light, tables)
             if step == self.steps - 1:
                 break
-            if step != (self.steps - 1) // 2:
+            if step != self._middle:
                 light = self._through(light, tables, "step")
             else:
                 light = self._through(light, tables, "out")
