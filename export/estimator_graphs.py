@@ -130,7 +130,7 @@ class StepGraph(nn.Module):
         operators = restored(self._structure, self._used, tensors[given + len(self.names) :])
         cameras = self.estimator.recovery.cameras(*(table[name] for name in self._apart))
         found = self.estimator.likelihood(operators, table, page, estimate, cameras, coarse=self._coarse)
-        after, chi_square = self.estimator.advanced(table, page, estimate, found, noise)
+        after, chi_square = self.estimator.advanced(table, page, estimate, found, noise, coarse=self._coarse)
         return *answers(after.p), after.nuisance, after.deviations, chi_square, *found
 
 
@@ -159,7 +159,8 @@ class WholeGraph(nn.Module):
         for number in range(self.steps):
             coarse = number < EARLY_STEPS
             found = self.estimator.likelihood(operators, table, page, estimate, cameras, coarse=coarse)
-            estimate, chi_square = self.estimator.advanced(table, page, estimate, found, table[NOISE][number + 1])
+            noise = table[NOISE][number + 1]
+            estimate, chi_square = self.estimator.advanced(table, page, estimate, found, noise, coarse=coarse)
         return *answers(estimate.p), residual, estimate.nuisance, chi_square
 
 

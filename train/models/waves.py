@@ -179,19 +179,33 @@ class Waves(nn.Module):
 
     def to_camera(self, at: WaveMatrices, page: Tensor) -> Tensor:
         """Field on the modulator [2, ny samples, nx samples] to the common grid [2, Gy, Gx], against the reference."""
-        entrance = self.launch.to_facet(at.launch, multiply(parts(page), at.at_launch))
-        leaving = self._pipe(entrance, at.pipe, backwards=False)
-        sparse = torch.stack(self.delaunch.to_plane(at.delaunch, leaving))
-        light = self._across(self._down(sparse).transpose(-1, -2)).transpose(-1, -2)
-        return torch.stack(multiply(parts(light), at.against_reference))
+        return torch.stack(self.exit_to_camera(at, self.to_exit(at, parts(page))))
 
     def to_page(self, at: WaveMatrices, field: Tensor) -> Tensor:
         """Field on the common grid [2, Gy, Gx] back to the modulator, by the adjoint."""
-        light = torch.stack(multiply(parts(field), conjugate(at.against_reference)))
+        return torch.stack(self.exit_to_page(at, self.back_to_exit(at, parts(field))))
+
+    def to_exit(self, at: WaveMatrices, page: Parts) -> Parts:
+        """Field on the modulator [ny samples, nx samples] to the pipe's exit facet, [fy, fx]."""
+        entrance = self.launch.to_facet(at.launch, multiply(page, at.at_launch))
+        return self._pipe(entrance, at.pipe, backwards=False)
+
+    def exit_to_camera(self, at: WaveMatrices, leaving: Parts) -> Parts:
+        """Field on the exit facet to the common grid [Gy, Gx], against the reference."""
+        sparse = torch.stack(self.delaunch.to_plane(at.delaunch, leaving))
+        light = self._across(self._down(sparse).transpose(-1, -2)).transpose(-1, -2)
+        return multiply(parts(light), at.against_reference)
+
+    def back_to_exit(self, at: WaveMatrices, field: Parts) -> Parts:
+        """Field on the common grid back to the exit facet, by the adjoint."""
+        light = torch.stack(multiply(field, conjugate(at.against_reference)))
         sparse = self._back(self._up(light).transpose(-1, -2)).transpose(-1, -2)
-        leaving = self.delaunch.to_facet(at.delaunch, parts(sparse))
+        return self.delaunch.to_facet(at.delaunch, parts(sparse))
+
+    def exit_to_page(self, at: WaveMatrices, leaving: Parts) -> Parts:
+        """Field on the exit facet back to the modulator, by the adjoint."""
         page = self.launch.to_plane(at.launch, self._pipe(leaving, at.pipe, backwards=True))
-        return torch.stack(multiply(page, conjugate(at.at_launch)))
+        return multiply(page, conjugate(at.at_launch))
 
 
 _BLOCK = 64

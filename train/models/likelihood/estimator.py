@@ -124,7 +124,7 @@ class PhaseEstimator(nn.Module):
         self.samples = symbol_samples(profile)
         self.waves = Waves(profile, parameters, self.samples, forward, filled=True, grid=grid)
         self.back = Waves(profile, parameters, self.samples, backward, filled=True, grid=grid)
-        self.nuisances = PageNuisances(profile, self.recovery.grid)
+        self.nuisances = PageNuisances(profile, self.waves.geometry, self.waves.cells, self.recovery.grid)
         self._half_width, self._half_height = profile.page_width_m / 2, profile.page_height_m / 2
 
     def operators(self, table: Mapping[str, Tensor]) -> Operators:
@@ -160,9 +160,10 @@ class PhaseEstimator(nn.Module):
         """
         page, measured = self.measured(table, *frames)
         field, unexplained = self.recovery.solve(measured)
-        real, imaginary = self._to_page(operators, parts(field * page.lit))
-        light = summed(real, self.samples), summed(imaginary, self.samples)
-        phasors = scaled(light, torch.rsqrt(light[0] * light[0] + light[1] * light[1] + 1e-20))
+        light = self.back.to_page(operators.backward, field * page.lit)
+        real, imaginary = multiply(parts(light), conjugate(operators.illumination))
+        symbols = summed(real, self.samples), summed(imaginary, self.samples)
+        phasors = scaled(symbols, torch.rsqrt(symbols[0] * symbols[0] + symbols[1] * symbols[1] + 1e-20))
         concentration = _concentration(table["information"], noise)
         direction, piston = without_piston(phasors, concentration, table)
         nuisance = torch.cat([torch.stack(piston), table["information"].new_zeros(4)])
@@ -191,21 +192,29 @@ class PhaseEstimator(nn.Module):
         direction, turned = estimate.direction, phasor(estimate.deviations)
         amplitude, slope = amplitude_and_slope(direction, table["amplitude_series"])
         light = multiply(self._on_samples(scaled(parts(expected_phasors(estimate.p)), amplitude)), turned)
-        light = multiply(light, operators.illumination)
-        at_camera = parts(waves.to_camera(forward, torch.stack(light)))
-        field, tilt = self.nuisances(at_camera, estimate.nuisance)
+        exit_factor, tilt = self.nuisances.at_exit(estimate.nuisance), self.nuisances.tilt(estimate.nuisance)
+        leaving = multiply(waves.to_exit(forward, multiply(light, operators.illumination)), exit_factor)
+        field = multiply(waves.exit_to_camera(forward, leaving), tilt)
         score, expected = _score(table, page, field, cameras)
-        back = self._to_page(operators, multiply(score, conjugate(tilt)))
-        gain = estimate.nuisance[0], estimate.nuisance[1]
-        symbol = multiply(self._on_samples(multiply(scaled(direction, amplitude), gain)), turned)
+        at_exit = self.back.back_to_exit(operators.backward, multiply(score, conjugate(tilt)))
+        back = self.back.exit_to_page(operators.backward, multiply(at_exit, conjugate(exit_factor)))
+        back = multiply(back, conjugate(operators.illumination))
+        symbol = multiply(self._on_samples(scaled(direction, amplitude)), turned)
         by_log = symbol[0] * back[0] + symbol[1] * back[1]
         by_turn = symbol[0] * back[1] - symbol[1] * back[0]
         by_sample = by_turn + to_samples(slope, self.samples) * by_log
-        by_nuisance = self.nuisances.gradient(field, score)
+        by_nuisance = self.nuisances.gradient(leaving, at_exit, field, score)
         return Likelihood(summed(by_sample, self.samples), by_nuisance, expected, by_sample)
 
     def advanced(
-        self, table: Mapping[str, Tensor], page: Page, estimate: Estimate, found: Likelihood, noise: Tensor
+        self,
+        table: Mapping[str, Tensor],
+        page: Page,
+        estimate: Estimate,
+        found: Likelihood,
+        noise: Tensor,
+        *,
+        coarse: bool = False,
     ) -> tuple[Estimate, Tensor]:
         """Move an estimate by the Gauss-Newton step of all phases and nuisance parameters together.
 
@@ -220,6 +229,7 @@ class PhaseEstimator(nn.Module):
             page, estimate: see there.
             found: derivatives at the estimate, see `likelihood`.
             noise: see `_concentration`, [2].
+            coarse: whether light was predicted coarsely; deviations would follow its errors, and stay.
 
         Returns:
             The next estimate, and the mean square of the counts' residuals over their variance, [].
@@ -233,7 +243,8 @@ class PhaseEstimator(nn.Module):
         prior = torch.cat([torch.zeros_like(five[:1]), table["nuisance_precision"] * estimate.nuisance[2:]])
         right = five - prior - (responses * found.by_phase).sum((1, 2))
         change = table["nuisance_covariance"] @ right / gain2
-        turn, changes = self._hessian(table, estimate, slope, information).solve(found.by_sample, estimate.deviations)
+        hessian = self._hessian(table, estimate, slope, information)
+        turn, deviations = hessian.solve(found.by_sample, None if coarse else estimate.deviations)
         turn = turn - (responses * change[:, None, None]).sum(0)
         turn = torch.clamp(turn, -LARGEST_STEP_RAD, LARGEST_STEP_RAD)
         concentration = _concentration(information, noise)
@@ -241,7 +252,7 @@ class PhaseEstimator(nn.Module):
         direction, piston = without_piston(turned, concentration, table)
         gain = multiply(scaled(parts(estimate.nuisance[:2]), 1 + change[0]), piston)
         nuisance = torch.cat([torch.stack(gain), estimate.nuisance[2:] + change[1:]])
-        after = Estimate(torch.stack(direction) * concentration, nuisance, estimate.deviations + changes)
+        after = Estimate(torch.stack(direction) * concentration, nuisance, deviations)
         return after, _chi_square(table, page, found.expected)
 
     def _hessian(
@@ -256,11 +267,6 @@ class PhaseEstimator(nn.Module):
     def _on_samples(self, symbols: Parts) -> Parts:
         """Light of symbols [ny, nx] on the modulator's samples, [ny S, nx S]."""
         return to_samples(symbols[0], self.samples), to_samples(symbols[1], self.samples)
-
-    def _to_page(self, operators: Operators, field: Parts) -> Parts:
-        """Field on the common grid [Gy, Gx] back to the modulator by adjoint waves and illumination, [ny S, nx S]."""
-        page = parts(self.back.to_page(operators.backward, torch.stack(field)))
-        return multiply(page, conjugate(operators.illumination))
 
 
 def without_piston(phasors: Parts, weights: Tensor, table: Mapping[str, Tensor]) -> tuple[Parts, Parts]:

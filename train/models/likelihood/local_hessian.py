@@ -40,43 +40,57 @@ class LocalHessian:
         self._information, self._precision = information, precision
         self._own = to_samples(information, self._samples) / self._samples**2 + precision
 
-    def solve(self, gradient: Tensor, deviations: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the changes of the symbols' phases [ny, nx] and of their samples' deviations, [ny S, nx S].
+    def solve(self, gradient: Tensor, deviations: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Return the changes of the symbols' phases [ny, nx], and the samples' next deviations, [ny S, nx S].
 
         Conjugate gradients of both together, preconditioned by the diagonal.
 
         Args:
             gradient: derivative of the log-likelihood by the samples' phases, [ny S, nx S].
-            deviations: what the samples' phases differ from their symbols', radians; their mean is zero.
+            deviations: what the samples' phases differ from their symbols', radians, with a mean of zero; None where
+                they are to stay zero.
         """
-        symbols, samples = self._split(gradient)
-        samples = samples - self._precision * deviations
-        phases, changes = torch.zeros_like(symbols), torch.zeros_like(samples)
-        by_symbol, by_sample = symbols / self._information, samples / self._own
-        ahead, beside = by_symbol, by_sample
-        power = (symbols * by_symbol).sum() + (samples * by_sample).sum()
+        symbols = summed(gradient, self._samples)
+        if deviations is None:
+            (phases,) = self._conjugate_gradients([symbols])
+            return phases, torch.zeros_like(gradient)
+        samples = self._without_mean(gradient, symbols) - self._precision * deviations
+        phases, changes = self._conjugate_gradients([symbols, samples])
+        limited = torch.clamp(changes, -LARGEST_DEVIATION_RAD, LARGEST_DEVIATION_RAD)
+        return phases, deviations + limited
+
+    def _conjugate_gradients(self, residual: list[Tensor]) -> list[Tensor]:
+        """Solve for changes of phases, and of deviations where the residual has both."""
+        diagonal = [self._information, self._own][: len(residual)]
+        solution = [torch.zeros_like(part) for part in residual]
+        scaled_residual = [part / own for part, own in zip(residual, diagonal, strict=True)]
+        along, power = scaled_residual, _product(residual, scaled_residual)
         for number in range(ROUNDS):
-            curved, bent = self._times(ahead, beside)
-            length = power / ((ahead * curved).sum() + (beside * bent).sum() + _LEAST)
-            phases, changes = phases + length * ahead, changes + length * beside
+            curved = self._times(along)
+            length = power / (_product(along, curved) + _LEAST)
+            solution = [part + length * way for part, way in zip(solution, along, strict=True)]
             if number == ROUNDS - 1:
                 break
-            symbols, samples = symbols - length * curved, samples - length * bent
-            by_symbol, by_sample = symbols / self._information, samples / self._own
-            before = power
-            power = (symbols * by_symbol).sum() + (samples * by_sample).sum()
+            residual = [part - length * way for part, way in zip(residual, curved, strict=True)]
+            scaled_residual = [part / own for part, own in zip(residual, diagonal, strict=True)]
+            before, power = power, _product(residual, scaled_residual)
             share = power / (before + _LEAST)
-            ahead, beside = by_symbol + share * ahead, by_sample + share * beside
-        return phases, torch.clamp(changes, -LARGEST_DEVIATION_RAD, LARGEST_DEVIATION_RAD)
+            along = [part + share * way for part, way in zip(scaled_residual, along, strict=True)]
+        return solution
 
-    def _times(self, phases: Tensor, deviations: Tensor) -> tuple[Tensor, Tensor]:
-        """Product of the Hessian, with the deviations' precision, and changes of phases and deviations."""
-        change = to_samples(phases, self._samples) + deviations
-        spread = filtered(torch.stack(scaled(self._light, change)), self._weights)
-        symbols, samples = self._split(self._light[0] * spread[0] + self._light[1] * spread[1])
-        return symbols, samples + self._precision * deviations
-
-    def _split(self, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradient by phases [ny, nx], and by deviations of zero mean, [ny S, nx S]."""
+    def _times(self, change: list[Tensor]) -> list[Tensor]:
+        """Product of the Hessian, with the deviations' precision, and changes of phases, and of deviations if given."""
+        samples = sum(change[1:], to_samples(change[0], self._samples))
+        spread = filtered(torch.stack(scaled(self._light, samples)), self._weights)
+        gradient = self._light[0] * spread[0] + self._light[1] * spread[1]
         symbols = summed(gradient, self._samples)
-        return symbols, gradient - to_samples(symbols / self._samples**2, self._samples)
+        return [symbols, *(self._without_mean(gradient, symbols) + self._precision * part for part in change[1:])]
+
+    def _without_mean(self, samples: Tensor, sums: Tensor) -> Tensor:
+        """Samples less their mean over each symbol."""
+        return samples - to_samples(sums / self._samples**2, self._samples)
+
+
+def _product(left: list[Tensor], right: list[Tensor]) -> Tensor:
+    total: Tensor = sum((one * other).sum() for one, other in zip(left, right, strict=True))  # type: ignore[assignment]
+    return total

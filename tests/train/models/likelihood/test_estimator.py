@@ -66,7 +66,8 @@ class Posed:
 
     def at(self, phases: np.ndarray, nuisance: np.ndarray) -> Likelihood:
         p = torch.from_numpy(SURE * np.stack([np.cos(phases), np.sin(phases)])).float()
-        estimate = Estimate(p, torch.from_numpy(nuisance).float())
+        still = torch.zeros_like(self.operators.illumination[0])
+        estimate = Estimate(p, torch.from_numpy(nuisance).float(), still)
         cameras = self.estimator.recovery.cameras(*(self.table[name] for name in APART if name in self.table))
         return self.estimator.likelihood(self.operators, self.table, self.page, estimate, cameras)
 
@@ -101,7 +102,7 @@ def posed(request: pytest.FixtureRequest) -> Posed:
 
 
 PHASES = random_phases(PROFILE, 3)
-NUISANCE = np.array([0.9, -0.3, 0.05, -0.03, 0.0, 0.0])
+NUISANCE = np.array([0.9, -0.3, 0.05, -0.03, 0.1, -0.2])
 
 
 def test_the_derivative_by_phases_is_that_of_the_likelihood(posed: Posed) -> None:
@@ -129,7 +130,7 @@ def test_the_way_back_is_the_adjoint_of_the_way_there(posed: Posed) -> None:
     rng = np.random.default_rng(0)
     page, field = (
         torch.from_numpy(rng.standard_normal((2, *shape))).float()
-        for shape in (PROFILE.page_shape, posed.page.lit.shape)
+        for shape in (posed.operators.illumination[0].shape, posed.page.lit.shape)
     )
     there, back = waves.to_camera(matrices, page).double(), waves.to_page(matrices, field).double()
     left, right = float((there * field).sum()), float((page * back).sum())
@@ -142,12 +143,14 @@ class Fitted:
 
     estimator: PhaseEstimator
     table: SamplingTable
+    precision: float = 1e12
 
     def read(
         self, pair: FramePair, phases: np.ndarray, turn: float = 0.0, steps: int = STEPS
     ) -> tuple[list[Estimate], list[float]]:
         """Estimates of a page from the first one on, and chi-square at each but the last; pilots may be turned."""
         table = tensors(self.table | pilot_tensors(Pilots(MASK, phases[MASK] + turn)))
+        table["deviation_precision"] = torch.tensor(self.precision)
         operators = self.estimator.operators(table)
         frames = torch.from_numpy(pair.in_phase), torch.from_numpy(pair.quadrature)
         estimate, page, _ = self.estimator.first(operators, table, NOISE, *frames)
@@ -155,7 +158,7 @@ class Fitted:
         for number in range(steps):
             early = number < EARLY_STEPS
             found = self.estimator.likelihood(operators, table, page, estimates[-1], coarse=early)
-            estimate, chi_square = self.estimator.advanced(table, page, estimates[-1], found, NOISE)
+            estimate, chi_square = self.estimator.advanced(table, page, estimates[-1], found, NOISE, coarse=early)
             estimates.append(estimate)
             chi_squares.append(float(chi_square))
         return estimates, chi_squares
