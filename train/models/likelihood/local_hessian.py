@@ -17,6 +17,9 @@ from lightpage.train.models.parts import Parts, scaled
 ROUNDS = 4
 """Rounds of conjugate gradients; more bring nothing, since the Hessian is known no better."""
 LARGEST_DEVIATION_RAD = 0.5
+DAMPING = 0.3
+"""Curvature that deviations get beside their own, over a sample's information (Levenberg): the point spread alone has
+none outside the pipe's band, where the true Hessian has a little."""
 _LEAST = 1e-20
 
 
@@ -37,8 +40,9 @@ class LocalHessian:
         apart = torch.arange(self._samples)
         of_symbol = point_spread[(apart[:, None] - apart).abs()].sum() ** 2
         self._light = scaled(direction, torch.sqrt(to_samples(information / of_symbol, self._samples)))
+        of_sample = to_samples(information / self._samples**2, self._samples)
         self._information, self._precision = information, precision
-        self._own = to_samples(information, self._samples) / self._samples**2 + precision
+        self._beside, self._own = precision + DAMPING * of_sample, precision + of_sample
 
     def solve(self, gradient: Tensor, deviations: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return the changes of the symbols' phases [ny, nx], and the samples' next deviations, [ny S, nx S].
@@ -57,7 +61,7 @@ class LocalHessian:
         samples = self._without_mean(gradient, symbols) - self._precision * deviations
         phases, changes = self._conjugate_gradients([symbols, samples])
         limited = torch.clamp(changes, -LARGEST_DEVIATION_RAD, LARGEST_DEVIATION_RAD)
-        return phases, deviations + limited
+        return phases, deviations + self._without_mean(limited, summed(limited, self._samples))
 
     def _conjugate_gradients(self, residual: list[Tensor]) -> list[Tensor]:
         """Solve for changes of phases, and of deviations where the residual has both."""
@@ -79,12 +83,12 @@ class LocalHessian:
         return solution
 
     def _times(self, change: list[Tensor]) -> list[Tensor]:
-        """Product of the Hessian, with the deviations' precision, and changes of phases, and of deviations if given."""
+        """Product of the Hessian, with the deviations' precision and damping, and changes of phases, and of deviations if given."""
         samples = sum(change[1:], to_samples(change[0], self._samples))
         spread = filtered(torch.stack(scaled(self._light, samples)), self._weights)
         gradient = self._light[0] * spread[0] + self._light[1] * spread[1]
         symbols = summed(gradient, self._samples)
-        return [symbols, *(self._without_mean(gradient, symbols) + self._precision * part for part in change[1:])]
+        return [symbols, *(self._without_mean(gradient, symbols) + self._beside * part for part in change[1:])]
 
     def _without_mean(self, samples: Tensor, sums: Tensor) -> Tensor:
         """Samples less their mean over each symbol."""

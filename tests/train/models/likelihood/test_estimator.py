@@ -19,10 +19,11 @@ from lightpage.page.correction import wrapped
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols, symbol_phases
 from lightpage.recording.frame_pair import FramePair
-from lightpage.runtime.model.execution.estimator_graph import EARLY_STEPS
+from lightpage.runtime.model.execution.estimator_graph import EARLY_STEPS, NO_DEVIATIONS
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import perfectly_calibrated
 from lightpage.train.models.likelihood.estimator import Estimate, Likelihood, Operators, Page, PhaseEstimator
+from lightpage.train.models.likelihood.modulator import summed, to_samples
 from lightpage.train.models.likelihood.torch_likelihood import TorchLikelihood
 from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.train.models.waves import Fidelity
@@ -143,14 +144,13 @@ class Fitted:
 
     estimator: PhaseEstimator
     table: SamplingTable
-    precision: float = 1e12
 
     def read(
         self, pair: FramePair, phases: np.ndarray, turn: float = 0.0, steps: int = STEPS
     ) -> tuple[list[Estimate], list[float]]:
         """Estimates of a page from the first one on, and chi-square at each but the last; pilots may be turned."""
         table = tensors(self.table | pilot_tensors(Pilots(MASK, phases[MASK] + turn)))
-        table["deviation_precision"] = torch.tensor(self.precision)
+        table["deviation_precision"] = torch.tensor(NO_DEVIATIONS)
         operators = self.estimator.operators(table)
         frames = torch.from_numpy(pair.in_phase), torch.from_numpy(pair.quadrature)
         estimate, page, _ = self.estimator.first(operators, table, NOISE, *frames)
@@ -221,3 +221,29 @@ def test_turned_pilots_turn_the_answer_and_the_gain(
         assert np.abs(wrapped(decoded(turned) - decoded(straight) - turn)).max() < 1e-3
         gain, found = (complex(*each.nuisance[:2].tolist()) for each in (straight, turned))
         assert found == pytest.approx(gain * np.exp(-1j * turn), abs=1e-3)
+
+
+def test_deviations_of_the_modulators_samples_are_told_from_the_symbols_phases(fitted: Fitted) -> None:
+    phases, samples = symbol_phases(written(2), 256), fitted.estimator.samples
+    table = tensors(fitted.table | pilot_tensors(Pilots(MASK, phases[MASK])))
+    operators = fitted.estimator.operators(table)
+    size = operators.illumination[0].shape
+    drawn = torch.from_numpy(np.random.default_rng(0).normal(0, 0.05, size)).float()
+    deviations = drawn - to_samples(summed(drawn, samples) / samples**2, samples)
+    p = torch.from_numpy(SURE * np.stack([np.cos(phases), np.sin(phases)])).float()
+    nuisance, grid = torch.eye(6)[0], fitted.estimator.recovery.grid.shape
+    references = torch.full((2, *grid), 50.0)
+    page = Page(references, references, torch.ones(grid), torch.ones(grid))
+    still = Estimate(p, nuisance, torch.zeros(size))
+    page = page._replace(
+        counts=fitted.estimator.likelihood(operators, table, page, still._replace(deviations=deviations)).expected
+    )
+    errors = []
+    for precision in (1e12, 100.0):
+        table["deviation_precision"], estimate = torch.tensor(precision), still
+        for _ in range(STEPS + 1):
+            derivatives = fitted.estimator.likelihood(operators, table, page, estimate)
+            estimate, _ = fitted.estimator.advanced(table, page, estimate, derivatives, torch.tensor([0.0, 1e-6]))
+        errors.append(float(np.mean(wrapped(decoded(estimate) - phases) ** 2)))
+    assert errors[1] < 0.95 * errors[0]
+    assert np.corrcoef(estimate.deviations.ravel(), deviations.ravel())[0, 1] > 0.6
