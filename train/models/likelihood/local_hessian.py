@@ -83,7 +83,7 @@ class LocalHessian:
         return solution
 
     def _times(self, change: list[Tensor]) -> list[Tensor]:
-        """Product of the Hessian, with the deviations' precision and damping, and changes of phases, and of deviations if given."""
+        """Product of the damped Hessian and changes of phases, and of deviations where they are given."""
         samples = sum(change[1:], to_samples(change[0], self._samples))
         spread = filtered(torch.stack(scaled(self._light, samples)), self._weights)
         gradient = self._light[0] * spread[0] + self._light[1] * spread[1]
