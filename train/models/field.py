@@ -219,11 +219,30 @@ class FieldRecovery(nn.Module):
             apart: those of `lightpage.calibration.sampling_table.cameras_apart`, on the usual grid, that
                 `apart_inputs` names.
         """
-        references = self.in_blocks(reference_in_phase, reference_quadrature)
-        seen = self.references(references, registration)
-        beyond = self.filtered(self.in_blocks(in_phase, quadrature) - references)
-        a, b = seen.lit * self._resampled(beyond, seen.where) / (2 * seen.reference)
-        return Measured(a, b, homodyne[0], homodyne[1], seen.amplitude, seen.lit, self.cameras(*apart))
+        blocks = self.in_blocks(reference_in_phase, reference_quadrature)
+        return self.measure_against(
+            blocks, self.references(blocks, registration), in_phase, quadrature, homodyne, *apart
+        )
+
+    def measure_against(
+        self,
+        blocks: Tensor,
+        references: References,
+        in_phase: Tensor,
+        quadrature: Tensor,
+        homodyne: Tensor,
+        *apart: Tensor,
+    ) -> Measured:
+        """Measure the field against references that are known on the common grid already.
+
+        Args:
+            blocks: references in blocks, [2, rows, columns].
+            references: the same on the common grid.
+            in_phase, quadrature, homodyne, apart: see `measure`.
+        """
+        beyond = self.filtered(self.in_blocks(in_phase, quadrature) - blocks)
+        a, b = references.lit * self._resampled(beyond, references.where) / (2 * references.reference)
+        return Measured(a, b, homodyne[0], homodyne[1], references.amplitude, references.lit, self.cameras(*apart))
 
     def cameras(self, *apart: Tensor) -> Cameras | None:
         """Cameras that stand apart, by what `measure` takes; None where both see the same plane."""

@@ -188,7 +188,8 @@ class Waves(nn.Module):
     def to_exit(self, at: WaveMatrices, page: Parts) -> Parts:
         """Field on the modulator [ny samples, nx samples] to the pipe's exit facet, [fy, fx]."""
         entrance = self.launch.to_facet(at.launch, multiply(page, at.at_launch))
-        return self._pipe(entrance, at.pipe, backwards=False)
+        real, imaginary = self._pipe(entrance, at.pipe, backwards=False)
+        return real, imaginary
 
     def exit_to_camera(self, at: WaveMatrices, leaving: Parts) -> Parts:
         """Field on the exit facet to the common grid [Gy, Gx], against the reference."""

@@ -144,11 +144,11 @@ class PhaseEstimator(nn.Module):
             frames: in-phase and quadrature frame [H, W].
         """
         apart = [table[name] for name in ("apart", "apart_beside", "apart_tilt") if name in table]
-        references = table["reference_in_phase"], table["reference_quadrature"]
-        both = self.recovery.references(self.recovery.in_blocks(*references), table["registration"])
-        measured = self.recovery.measure(*frames, *references, table["registration"], table["homodyne"], *apart)
-        brightness = 1 + 2 * torch.stack([measured.a, measured.b])
-        return Page(both.reference * brightness, both.reference, both.amplitude, both.lit), measured
+        blocks = self.recovery.in_blocks(table["reference_in_phase"], table["reference_quadrature"])
+        references = self.recovery.references(blocks, table["registration"])
+        measured = self.recovery.measure_against(blocks, references, *frames, table["homodyne"], *apart)
+        counts = references.reference * (1 + 2 * torch.stack([measured.a, measured.b]))
+        return Page(counts, references.reference, references.amplitude, references.lit), measured
 
     def first(
         self, operators: Operators, table: Mapping[str, Tensor], noise: Tensor, *frames: Tensor
