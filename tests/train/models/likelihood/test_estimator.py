@@ -233,14 +233,14 @@ def test_deviations_of_the_modulators_samples_are_told_from_the_symbols_phases(f
     p = torch.from_numpy(SURE * np.stack([np.cos(phases), np.sin(phases)])).float()
     nuisance, grid = torch.eye(6)[0], fitted.estimator.recovery.grid.shape
     references = torch.full((2, *grid), 50.0)
-    page = Page(references, references, torch.ones(grid), torch.ones(grid))
-    still = Estimate(p, nuisance, torch.zeros(size))
-    page = page._replace(
-        counts=fitted.estimator.likelihood(operators, table, page, still._replace(deviations=deviations)).expected
-    )
+    even, still = torch.ones(grid), torch.zeros(size)
+    unknown = Page(references, references, even, even)
+    expected = fitted.estimator.likelihood(operators, table, unknown, Estimate(p, nuisance, deviations)).expected
+    page = Page(expected, references, even, even)
     errors = []
     for precision in (1e12, 100.0):
-        table["deviation_precision"], estimate = torch.tensor(precision), still
+        table["deviation_precision"] = torch.tensor(precision)
+        estimate = Estimate(p, nuisance, still)
         for _ in range(STEPS + 1):
             derivatives = fitted.estimator.likelihood(operators, table, page, estimate)
             estimate, _ = fitted.estimator.advanced(table, page, estimate, derivatives, torch.tensor([0.0, 1e-6]))
