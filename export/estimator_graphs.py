@@ -315,6 +315,9 @@ def _append(whole: onnx.ModelProto, part: onnx.ModelProto, prefix: str, names: d
             copied = whole.graph.initializer.add()
             copied.CopyFrom(tensor)
             copied.name = initializers[tensor.name]
+        if tensor.name in names:  # an output that no node computes, since it is constant
+            constant = onnx.helper.make_node("Identity", [initializers[tensor.name]], [names[tensor.name]])
+            whole.graph.node.append(constant)
 
     def renamed(name: str) -> str:
         if not name:  # an optional input that is left out
