@@ -27,7 +27,7 @@ class Statistics(TomlTable):
         quadrature_expected, quadrature_mean, quadrature_variance: the same of the quadrature camera.
     """
 
-    blur: Finite
+    blur: Annotated[float, Field(ge=0, allow_inf_nan=False)]
     illumination_real: Coefficients
     illumination_imaginary: Coefficients
     correlation: Annotated[float, Field(gt=0, allow_inf_nan=False)]
