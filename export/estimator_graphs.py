@@ -1,8 +1,9 @@
-"""The phase estimator as graphs: constants of a device's table, a first estimate, one step, and all in one."""
+"""The phase estimator as ONNX graphs: operators of a device, first estimate, step, and all of them in one graph."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import islice
 
 import numpy as np
 import onnx
@@ -17,10 +18,10 @@ from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.export.graph import FRAME_INPUTS, TABLE_INPUTS, answers
 from lightpage.export.onnx_files import exported
 from lightpage.runtime.model.execution.estimator_graph import (
-    ANSWERS,
-    BEFORE,
     EARLY_STEPS,
     ESTIMATE,
+    ESTIMATE_INPUTS,
+    ESTIMATE_OUTPUTS,
     NOISE,
     PAGE,
     RESIDUAL,
@@ -30,10 +31,10 @@ from lightpage.runtime.model.execution.estimator_graph import (
 from lightpage.train.models.likelihood.estimator import Estimate, Operators, Page, PhaseEstimator
 
 DEVICE = ("parameters", "blur", "illumination")
-"""Inputs that the wave operators follow from."""
+"""Tensors of the table from which the wave operators are computed."""
 PILOTS = (PILOT_PHASORS, PILOT_MASK)
 FIRST = (*TABLE_INPUTS, "information", *PILOTS)
-"""Inputs of the first estimate beside frames, its noise, cameras that stand apart, and operators."""
+"""Tensors of the table that the first estimate takes, without those of cameras in different planes."""
 COUNTS = ("amplitude_series", "slope_power", "count_scale", "count_weights")
 STEP = (
     "homodyne",
@@ -46,61 +47,72 @@ STEP = (
     "nuisance_precision",
     *PILOTS,
 )
-"""Inputs of a step beside the page, the estimate, its noise, cameras that stand apart, and operators."""
+"""Tensors of the table that a step takes, without those of cameras in different planes."""
 
 
 class OperatorsGraph(nn.Module):
-    """A device's table to its wave operators.
+    """Graph from a device's table to its wave operators.
 
     Args:
-        estimator: of the device.
+        estimator: estimator of the device.
+
+    Attributes:
+        structure: tree of the operators' tensors; None before the first call.
     """
 
     def __init__(self, estimator: PhaseEstimator) -> None:
         super().__init__()
         self.estimator = estimator
         self.structure: tree.TreeSpec | None = None
-        """Structure of the operators, known once they were computed."""
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
-        """`DEVICE` to the tensors of the operators."""
-        made = self.estimator.operators(dict(zip(DEVICE, tensors, strict=True)))
-        flat, self.structure = tree.tree_flatten(made)
-        return tuple(flat)
+        """Compute the tensors of the operators from those of `DEVICE`."""
+        operators = self.estimator.operators(dict(zip(DEVICE, tensors, strict=True)))
+        leaves, self.structure = tree.tree_flatten(operators)
+        return tuple(leaves)
 
 
 class FirstGraph(nn.Module):
-    """Frames to the first estimate and the page.
+    """Graph from frames to the first estimate and the page's measurements.
 
     Args:
-        estimator: of the device.
-        apart: names of the tensors of cameras that stand apart.
-        structure: of the operators.
-        used: numbers of the operators' tensors that are inputs.
+        estimator: estimator of the device.
+        apart: names of the tensors of cameras in different planes.
+        structure: tree of the operators' tensors.
+        used: indices of the operators' tensors that are inputs.
+
+    Attributes:
+        names: names of the table's tensors that are inputs.
     """
 
     def __init__(
         self, estimator: PhaseEstimator, apart: tuple[str, ...], structure: tree.TreeSpec, used: Sequence[int]
     ) -> None:
         super().__init__()
-        self.estimator, self._structure, self._used = estimator, structure, tuple(used)
+        self.estimator = estimator
+        self._structure = structure
+        self._used = tuple(used)
         self.names = (*FIRST, *apart)
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
-        """Frames, noise, `names` and operators to p, phase, concentration, nuisance, deviations, residual and page."""
-        frames, noise, given = tensors[:2], tensors[2], 3 + len(self.names)
-        table = dict(zip(self.names, tensors[3:given], strict=True))
-        operators = restored(self._structure, self._used, tensors[given:])
-        estimate, page, residual = self.estimator.first(operators, table, noise, *frames)
+        """Compute `ESTIMATE_OUTPUTS`, `RESIDUAL` and `PAGE` from frames, noise, the table's tensors and operators."""
+        in_phase, quadrature, noise = tensors[:3]
+        end = 3 + len(self.names)
+        table = dict(zip(self.names, tensors[3:end], strict=True))
+        operators = restored(self._structure, self._used, tensors[end:])
+        estimate, page, residual = self.estimator.first(operators, table, noise, in_phase, quadrature)
         return *answers(estimate.p), estimate.nuisance, estimate.deviations, residual, *page
 
 
 class StepGraph(nn.Module):
-    """An estimate to the next one.
+    """Graph from an estimate to the next one.
 
     Args:
         estimator, apart, structure, used: see `FirstGraph`.
         coarse: see `PhaseEstimator.likelihood`.
+
+    Attributes:
+        names: names of the table's tensors that are inputs.
     """
 
     def __init__(
@@ -113,44 +125,50 @@ class StepGraph(nn.Module):
         coarse: bool,
     ) -> None:
         super().__init__()
-        self.estimator, self._apart, self._structure, self._used = estimator, apart, structure, tuple(used)
+        self.estimator = estimator
+        self._apart = apart
+        self._structure = structure
+        self._used = tuple(used)
         self._coarse = coarse
         self.names = (*STEP, *apart)
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
-        """Estimate, noise, page, `names` and operators to p, phase, concentration, nuisance, deviations, chi-square.
-
-        Beside them come the derivatives of the log-likelihood at the estimate that was given, and its expected counts.
-        """
-        state = len(ESTIMATE) + 1
-        estimate, noise = Estimate(*tensors[: state - 1]), tensors[state - 1]
-        page = Page(*tensors[state : state + len(PAGE)])
-        given = state + len(PAGE)
-        table = dict(zip(self.names, tensors[given : given + len(self.names)], strict=True))
-        operators = restored(self._structure, self._used, tensors[given + len(self.names) :])
+        """Compute `STEP_OUTPUTS` from `ESTIMATE`, noise, `PAGE`, the table's tensors and operators."""
+        remaining = iter(tensors)
+        estimate = Estimate(*islice(remaining, len(ESTIMATE)))
+        noise = next(remaining)
+        page = Page(*islice(remaining, len(PAGE)))
+        table = dict(zip(self.names, islice(remaining, len(self.names)), strict=True))
+        operators = restored(self._structure, self._used, [*remaining])
         cameras = self.estimator.recovery.cameras(*(table[name] for name in self._apart))
-        found = self.estimator.likelihood(operators, table, page, estimate, cameras, coarse=self._coarse)
-        after, chi_square = self.estimator.advanced(table, page, estimate, found, noise, coarse=self._coarse)
-        return *answers(after.p), after.nuisance, after.deviations, chi_square, *found
+        likelihood = self.estimator.likelihood(operators, table, page, estimate, cameras, coarse=self._coarse)
+        advanced, chi_square = self.estimator.advanced(table, page, estimate, likelihood, noise, coarse=self._coarse)
+        return *answers(advanced.p), advanced.nuisance, advanced.deviations, chi_square, *likelihood
 
 
 class WholeGraph(nn.Module):
-    """Frames and table to the estimate after a fixed number of steps.
+    """Graph from frames and table to the estimate after a fixed number of steps.
 
     Args:
         estimator, apart: see `FirstGraph`.
         steps: number of steps.
+
+    Attributes:
+        outputs: names of the outputs.
+        table_inputs: names of the table's tensors that are inputs.
     """
 
     outputs = ("p", "phase", "concentration", "residual", "nuisance", "chi_square")
 
     def __init__(self, estimator: PhaseEstimator, apart: tuple[str, ...], steps: int) -> None:
         super().__init__()
-        self.estimator, self.steps, self._apart = estimator, steps, apart
+        self.estimator = estimator
+        self.steps = steps
+        self._apart = apart
         self.table_inputs = tuple(dict.fromkeys((*FIRST, *DEVICE, *STEP, NOISE, *apart)))
 
     def forward(self, in_phase: Tensor, quadrature: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
-        """Frames and `table_inputs` to `outputs`."""
+        """Compute `outputs` from frames and `table_inputs`."""
         table = dict(zip(self.table_inputs, tensors, strict=True))
         operators = self.estimator.operators(table)
         cameras = self.estimator.recovery.cameras(*(table[name] for name in self._apart))
@@ -158,18 +176,24 @@ class WholeGraph(nn.Module):
         chi_square = torch.zeros_like(residual)
         for number in range(self.steps):
             coarse = number < EARLY_STEPS
-            found = self.estimator.likelihood(operators, table, page, estimate, cameras, coarse=coarse)
+            likelihood = self.estimator.likelihood(operators, table, page, estimate, cameras, coarse=coarse)
             noise = table[NOISE][number + 1]
-            estimate, chi_square = self.estimator.advanced(table, page, estimate, found, noise, coarse=coarse)
+            estimate, chi_square = self.estimator.advanced(table, page, estimate, likelihood, noise, coarse=coarse)
         return *answers(estimate.p), residual, estimate.nuisance, chi_square
 
 
 def restored(structure: tree.TreeSpec, used: Sequence[int], tensors: Sequence[Tensor]) -> Operators:
-    """Operators of those of their tensors that are there; the others are not looked at."""
-    whole: list[Tensor | None] = [None] * structure.num_leaves
-    for number, tensor in zip(used, tensors, strict=True):
-        whole[number] = tensor
-    operators: Operators = tree.tree_unflatten(whole, structure)
+    """Rebuild operators from their tensors.
+
+    Args:
+        structure: tree of the operators' tensors.
+        used: indices of those that the caller needs; the others become None.
+        tensors: tensors at these indices.
+    """
+    leaves: list[Tensor | None] = [None] * structure.num_leaves
+    for index, tensor in zip(used, tensors, strict=True):
+        leaves[index] = tensor
+    operators: Operators = tree.tree_unflatten(leaves, structure)
     return operators
 
 
@@ -180,67 +204,57 @@ def estimator_files(
 
     Args:
         estimator: estimator of the device.
-        frame_dtype: type of a frame's counts.
-        apart: names of the tensors of cameras that stand apart.
+        frame_dtype: numpy type of a frame's counts.
+        apart: names of the tensors of cameras in different planes.
         table: every tensor of the device.
     """
     tensors = {name: torch.from_numpy(np.array(value, order="C")) for name, value in table.items()}
     frame = torch.from_numpy(np.zeros(table["reference_in_phase"].shape, frame_dtype))
-    frames = frame, frame.clone()
+    device_inputs = tuple(tensors[name] for name in DEVICE)
     with torch.no_grad():
-        device = OperatorsGraph(estimator)
-        flat = device(*(tensors[name] for name in DEVICE))
-        structure = device.structure
+        device_graph = OperatorsGraph(estimator)
+        operators = device_graph(*device_inputs)
+        structure = device_graph.structure
         assert structure is not None
-        names = [f"operator_{number}" for number in range(len(flat))]
-        numbered = tree.tree_unflatten(list(range(len(flat))), structure)
-        backward = tree.tree_flatten((numbered.backward, numbered.illumination))[0]
-        everything = tuple(range(len(flat)))
-        first = FirstGraph(estimator, apart, structure, backward)
-        asked = (
-            *frames,
+        names = tuple(f"operator_{index}" for index in range(len(operators)))
+        everything = tuple(range(len(operators)))
+        indices = tree.tree_unflatten(list(everything), structure)
+        backward = tuple(tree.tree_leaves((indices.backward, indices.illumination)))
+        first_graph = FirstGraph(estimator, apart, structure, backward)
+        first_inputs = (
+            frame,
+            frame.clone(),
             tensors[NOISE][0],
-            *(tensors[name] for name in first.names),
-            *(flat[number] for number in backward),
+            *(tensors[name] for name in first_graph.names),
+            *(operators[index] for index in backward),
         )
-        begun = first(*asked)
-        steps = {
-            numbers: StepGraph(estimator, apart, structure, numbers, coarse=numbers != everything)
-            for numbers in (tuple(backward), everything)
-        }
-    outputs = [*ANSWERS, RESIDUAL, *PAGE]
-    made = dict(zip(outputs, begun, strict=True))
-    given = (*(made[name] for name in ESTIMATE), tensors[NOISE][1], *(made[name] for name in PAGE))
-    files = [
-        exported(device, tuple(tensors[name] for name in DEVICE), DEVICE, tuple(names), None),
-        exported(
-            first,
-            asked,
-            (*FRAME_INPUTS, NOISE, *first.names, *(names[number] for number in backward)),
-            tuple(outputs),
-            None,
-        ),
-        *(
-            exported(
-                step,
-                (*given, *(tensors[name] for name in step.names), *(flat[number] for number in numbers)),
-                (*BEFORE.values(), NOISE, *PAGE, *step.names, *(names[number] for number in numbers)),
-                STEP_OUTPUTS,
-                None,
-            )
-            for numbers, step in steps.items()
-        ),
+        first_outputs = (*ESTIMATE_OUTPUTS, RESIDUAL, *PAGE)
+        state = dict(zip(first_outputs, first_graph(*first_inputs), strict=True))
+    step_inputs = (*(state[name] for name in ESTIMATE), tensors[NOISE][1], *(state[name] for name in PAGE))
+    first_names = (*FRAME_INPUTS, NOISE, *first_graph.names, *(names[index] for index in backward))
+
+    def step_model(used: tuple[int, ...], *, coarse: bool) -> onnx.ModelProto:
+        graph = StepGraph(estimator, apart, structure, used, coarse=coarse)
+        inputs = (*step_inputs, *(tensors[name] for name in graph.names), *(operators[index] for index in used))
+        input_names = (*ESTIMATE_INPUTS.values(), NOISE, *PAGE, *graph.names, *(names[index] for index in used))
+        return exported(graph, inputs, input_names, STEP_OUTPUTS, None)
+
+    models = [
+        exported(device_graph, device_inputs, DEVICE, names, None),
+        exported(first_graph, first_inputs, first_names, first_outputs, None),
+        step_model(backward, coarse=True),
+        step_model(everything, coarse=False),
     ]
-    for file in files:
-        onnx.checker.check_model(file)
-    return EstimatorFiles(*(bytes(file.SerializeToString()) for file in files))
+    for model in models:
+        onnx.checker.check_model(model)
+    return EstimatorFiles(*(bytes(model.SerializeToString()) for model in models))
 
 
 def whole_onnx(files: EstimatorFiles, steps: int, table: SamplingTable) -> bytes:
-    """Join the graphs of operators, first estimate and step to one, with `table` as the defaults of its inputs.
+    """Join the graphs of operators, first estimate and steps into one, with `table` as the defaults of its inputs.
 
     Args:
-        files: of `estimator_files`.
+        files: graphs, see `estimator_files`.
         steps: number of steps.
         table: every tensor of the device.
 
@@ -252,68 +266,80 @@ def whole_onnx(files: EstimatorFiles, steps: int, table: SamplingTable) -> bytes
     whole.CopyFrom(first)
     for field in ("node", "initializer", "input", "output", "value_info"):
         whole.graph.ClearField(field)
-    inputs = {entry.name: entry for model in (device, first, early, step) for entry in model.graph.input}
     _append(whole, device, "", {entry.name: entry.name for entry in device.graph.output})
-    kept = {entry.name: entry.name for entry in first.graph.output}
-    kept |= {NOISE: f"{NOISE}_0", RESIDUAL: f"{RESIDUAL}_0"}
-    kept |= {name: f"{name}_0" for name in ANSWERS}
-    _append(whole, first, "first.", kept)
+    names = {entry.name: entry.name for entry in first.graph.output}
+    names |= {name: f"{name}_0" for name in (NOISE, RESIDUAL, *ESTIMATE_OUTPUTS)}
+    _append(whole, first, "first.", names)
     for number in range(1, steps + 1):
-        kept = {name: f"{name}_{number}" for name in (NOISE, *STEP_OUTPUTS)}
-        kept |= {entry: f"{name}_{number - 1}" for name, entry in BEFORE.items()}
-        part, title = (early, "early") if number <= EARLY_STEPS else (step, "step")
-        _append(whole, part, f"{title}{number}.", kept)
-    make = onnx.helper.make_node
+        names = {name: f"{name}_{number}" for name in (NOISE, *STEP_OUTPUTS)}
+        names |= {entry: f"{name}_{number - 1}" for name, entry in ESTIMATE_INPUTS.items()}
+        if number <= EARLY_STEPS:
+            _append(whole, early, f"early{number}.", names)
+        else:
+            _append(whole, step, f"step{number}.", names)
+    node = onnx.helper.make_node
     rows = [f"{NOISE}_row_{number}" for number in range(steps + 1)]
-    split = [make("Split", [NOISE], rows, axis=0, num_outputs=steps + 1)]
-    split += [make("Squeeze", [row, "first_axis"], [f"{NOISE}_{number}"]) for number, row in enumerate(rows)]
+    noise_nodes = [node("Split", [NOISE], rows, axis=0, num_outputs=steps + 1)]
+    noise_nodes += [node("Squeeze", [row, "first_axis"], [f"{NOISE}_{number}"]) for number, row in enumerate(rows)]
     whole.graph.initializer.append(numpy_helper.from_array(np.array([0], np.int64), "first_axis"))
-    last = {name: f"{name}_{0 if name == RESIDUAL else steps}" for name in WholeGraph.outputs}
-    nodes = [*split, *whole.graph.node, *(make("Identity", [source], [name]) for name, source in last.items())]
+    sources = {name: f"{name}_{0 if name == RESIDUAL else steps}" for name in WholeGraph.outputs}
+    output_nodes = [node("Identity", [source], [name]) for name, source in sources.items()]
+    nodes = [*noise_nodes, *whole.graph.node, *output_nodes]
     whole.graph.ClearField("node")
     whole.graph.node.extend(nodes)
-    known = {entry.name: entry for model in (first, step) for entry in model.graph.output}
-    whole.graph.output.extend(known[name] for name in WholeGraph.outputs)
-    whole.graph.input.extend(inputs[name] for name in FRAME_INPUTS)
-    _with_defaults(whole, table)
+    outputs = {entry.name: entry for model in (first, step) for entry in model.graph.output}
+    frames = {entry.name: entry for entry in first.graph.input}
+    whole.graph.output.extend(outputs[name] for name in WholeGraph.outputs)
+    whole.graph.input.extend(frames[name] for name in FRAME_INPUTS)
+    _add_inputs_with_defaults(whole, table)
     onnx.checker.check_model(whole)
     return bytes(whole.SerializeToString())
 
 
-def _append(whole: onnx.ModelProto, part: onnx.ModelProto, prefix: str, kept: dict[str, str]) -> None:
-    """Append the nodes of a graph to another one.
+def _append(whole: onnx.ModelProto, part: onnx.ModelProto, prefix: str, names: dict[str, str]) -> None:
+    """Append the nodes of one graph to another.
 
     Args:
-        whole, part: both graphs.
-        prefix: prefix of the names of tensors that nodes of the part compute.
-        kept: names of tensors in `whole`, by those in the part; inputs that are not there keep their names.
+        whole: graph that grows.
+        part: graph that is appended.
+        prefix: prefix in `whole` of the tensors that nodes of `part` compute. Parts that differ only in the number at
+            its end share their initializers.
+        names: names in `whole` of the part's inputs and outputs. Inputs that are not listed keep their names.
     """
     title = prefix.rstrip("0123456789.") or "operators"
-    present = {held.name for held in whole.graph.initializer}
+    present = {tensor.name for tensor in whole.graph.initializer}
     inputs = {entry.name for entry in part.graph.input}
-    renamed = {held.name: f"{title}.{held.name}" for held in part.graph.initializer}
-    for held in part.graph.initializer:
-        if renamed[held.name] not in present:
-            whole.graph.initializer.add().CopyFrom(held)
-            whole.graph.initializer[-1].name = renamed[held.name]
+    initializers = {tensor.name: f"{title}.{tensor.name}" for tensor in part.graph.initializer}
+    for tensor in part.graph.initializer:
+        if initializers[tensor.name] not in present:
+            copied = whole.graph.initializer.add()
+            copied.CopyFrom(tensor)
+            copied.name = initializers[tensor.name]
+        if tensor.name in names:  # an output that no node computes, since it is constant
+            constant = onnx.helper.make_node("Identity", [initializers[tensor.name]], [names[tensor.name]])
+            whole.graph.node.append(constant)
 
-    def name_of(name: str) -> str:
-        if not name or name in kept:
-            return kept.get(name, name)
-        return renamed.get(name, name if name in inputs else prefix + name)
+    def renamed(name: str) -> str:
+        if not name:  # an optional input that is left out
+            return name
+        if name in names:
+            return names[name]
+        if name in initializers:
+            return initializers[name]
+        return name if name in inputs else prefix + name
 
     for node in part.graph.node:
         copy = whole.graph.node.add()
         copy.CopyFrom(node)
         copy.name = prefix + node.name
-        copy.input[:] = map(name_of, node.input)
-        copy.output[:] = map(name_of, node.output)
+        copy.input[:] = map(renamed, node.input)
+        copy.output[:] = map(renamed, node.output)
 
 
-def _with_defaults(model: onnx.ModelProto, table: SamplingTable) -> None:
-    """Give a graph an input with a default for each tensor of a table, be it used or not."""
+def _add_inputs_with_defaults(model: onnx.ModelProto, table: SamplingTable) -> None:
+    """Add an input with a default for each tensor of a table, including tensors that no node uses."""
     for name, value in table.items():
         array: NDArray[np.generic] = np.array(value, order="C")
-        kind = onnx.helper.np_dtype_to_tensor_dtype(array.dtype)
+        element_type = onnx.helper.np_dtype_to_tensor_dtype(array.dtype)
         model.graph.initializer.append(numpy_helper.from_array(array, name))
-        model.graph.input.append(onnx.helper.make_tensor_value_info(name, kind, array.shape))
+        model.graph.input.append(onnx.helper.make_tensor_value_info(name, element_type, array.shape))

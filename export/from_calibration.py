@@ -1,4 +1,4 @@
-"""The bundle of a calibration alone: pages are estimated by the fitted waves, without a training run."""
+"""Export of a bundle from a calibration alone: the fitted waves estimate its pages, without a training run."""
 
 from __future__ import annotations
 
@@ -49,22 +49,26 @@ def export_calibration(
 
     Args:
         calibration, profile, steps: see `estimated_device`.
-        recording: recording with the pages that the calibration was made of; other pages with known symbols choose the
-            code of user bytes.
-        out: new bundle.
-        name, version: name and version of the bundle.
-        progress: function that takes every step.
+        recording: recording with the calibration's pages. Other pages with known symbols choose the code of user
+            bytes.
+        out: path of the new bundle.
+        name: name of the bundle; the profile's if left out.
+        version: version of the bundle; made of name, time and content if left out.
+        progress: see `estimated_device`.
 
     Returns:
         The bundle as opened again, and the relative error of p against torch on the golden page.
 
     Raises:
-        CalibrationError, ProfileError, RecordingError: see `estimated_device`.
-        BundleError: `version` is none, or the graphs do not say what torch says; nothing stays at `out`.
+        CalibrationError, InvalidInputError, ProfileError, RecordingError: see `estimated_device`.
+        BundleError: `out` exists, `version` is malformed, or the graphs do not compute what torch computes. Nothing
+            is left at `out` then.
     """
     check_new(out, version)
     estimated = estimated_device(calibration, recording, profile, steps, progress)
-    device, table, bits = estimated.device, estimated.table, recording.bit_depth
+    device = estimated.device
+    table = estimated.table
+    bits = recording.bit_depth
     progress("ask torch", 0.7)
     whole = WholeGraph(estimated.estimator, device.apart_inputs, estimated.steps).eval()
     defaults = {name: np.asarray(table[name]) for name in whole.table_inputs}
@@ -74,7 +78,8 @@ def export_calibration(
     once = open_session(decoder, f"{out}: {DECODER}", once=True)
     (answer,) = once.run(["p"], {"in_phase": pair.in_phase, "quadrature": pair.quadrature})
     error = check_parity(expected["p"], np.asarray(answer), str(out))
-    name, created = name or profile.name, datetime.now(UTC)
+    name = name or profile.name
+    created = datetime.now(UTC)
     manifest = Manifest(
         name=name,
         version=version or version_of(name, created, decoder),
@@ -97,8 +102,10 @@ def export_calibration(
 
 
 def _files(estimated: EstimatedDevice, decoder: bytes, golden: bytes) -> dict[str, bytes]:
-    """Contents of the bundle's files by name."""
-    device, mask, own = estimated.device, estimated.pilot_mask, estimated.pilot_phases
+    """Contents of the bundle's files, by name."""
+    device = estimated.device
+    mask = estimated.pilot_mask
+    own = estimated.pilot_phases
     field = FieldGraph(device.profile, REFLECTIONS, device.apart_inputs)
     tensors = {name: np.asarray(estimated.table[name]) for name in field.table_inputs}
     return {

@@ -1,12 +1,12 @@
-"""Times of both forms of the wave operators, in turns in one run: tiles and blocks for one page, planes for many.
+"""Times of both forms of the wave operators, in turns in one run: tiles for one page, planes for many.
 
     python -m analysis.gpu.wave_forms --threads 2 --json F
     python -m analysis.gpu.wave_forms --profile paper --threads 2 --json F
     python -m analysis.gpu.wave_forms --profile paper --device cuda --json F
 
-Both forms take pages from the modulator to the cameras, and fields back by the adjoint, with the sampling and fidelity
-of the wave localizer. They run as graphs in ONNX Runtime, as a service runs them: eager torch says something else.
-Their matrices are made before. On a GPU the planes are timed in batches of 1 and 4, in float16 as batches are decoded.
+Both forms compute light from the modulator to the cameras, and back by the adjoint, with the sampling and fidelity of
+the wave localizer. They run as graphs in ONNX Runtime, as in a service; times of eager torch differ. The time of their
+matrices is not included. On a GPU, planes are timed in batches of 1 and 4, in float16, as batches are decoded.
 """
 
 from __future__ import annotations
@@ -43,18 +43,19 @@ from lightpage.train.models.batched.products import PAD, Tables
 from lightpage.train.models.waves import WaveMatrices, Waves
 from lightpage.waves.grid import symbol_samples
 
-_LIGHT, _ANSWER = "light", "answer"
+_LIGHT = "light"
+_ANSWER = "answer"
 Operator = Callable[[Tensor, tuple[Tensor, ...]], Tensor]
-"""Computes light [..., rows, columns] by constants."""
+"""Function of light [..., rows, columns] and of constants, to light."""
 
 
 class Way(nn.Module):
-    """Forward or adjoint of a form, with its constants.
+    """Forward or adjoint operator of a form, with its constants.
 
     Args:
-        operator: the computation.
-        light: example of what it takes.
-        constants: constants that it needs.
+        operator: computation of the operator.
+        light: example of its input.
+        constants: constants that it takes.
         modules: modules that it uses.
     """
 
@@ -62,15 +63,16 @@ class Way(nn.Module):
         self, operator: Operator, light: Tensor, constants: Sequence[Tensor], modules: Sequence[nn.Module]
     ) -> None:
         super().__init__()
-        self.operator, self.used = operator, nn.ModuleList(modules)
+        self.operator = operator
+        self.used = nn.ModuleList(modules)
         self.inputs = (light, *constants)
 
     def forward(self, light: Tensor, *constants: Tensor) -> Tensor:
-        """Light [..., rows, columns] through the operator."""
+        """Apply the operator to light [..., rows, columns]."""
         return self.operator(light, constants)
 
     def opened(self, provider: Provider, threads: int, *, rounded: bool) -> Any:
-        """A session and the binding of its inputs and its answer, where it computes."""
+        """Open a session of the operator, and bind its inputs and its output on the provider's device."""
         names = [_LIGHT, *(f"constant_{number}" for number in range(len(self.inputs) - 1))]
         model = traced(self, self.inputs, tuple(names), (_ANSWER,))
         entries = {entry.name for entry in model.graph.input}
@@ -86,14 +88,14 @@ class Way(nn.Module):
 
 @dataclass(frozen=True)
 class Row:
-    """Times of a form.
+    """Times of one form.
 
     Attributes:
         form: name of the form.
         pages: pages of a batch.
-        forward_ms, adjoint_ms: median time a page to the cameras, and back.
-        forward_ratio, adjoint_ratio: median of the same over the time of the form for one page in the same turn.
-        deviation: largest relative deviation of either answer from that of the form for one page.
+        forward_ms, adjoint_ms: median time of a page, to the cameras and back.
+        forward_ratio, adjoint_ratio: median ratio of this time to that of the form for one page, in the same turn.
+        deviation: larger relative deviation of the two outputs from those of the form for one page.
     """
 
     form: str
@@ -106,24 +108,26 @@ class Row:
 
 
 class Timed:
-    """A form while it is timed.
+    """Timed form.
 
     Args:
         form, pages: see `Row`.
-        ways: forward and adjoint.
-        machine: machine that computes it.
+        ways: forward and adjoint operator.
+        machine: machine that computes them.
         threads: threads of a CPU.
     """
 
     def __init__(self, form: str, pages: int, ways: tuple[Way, Way], machine: Machine, threads: int) -> None:
-        self.form, self.pages, self.machine = form, pages, machine
+        self.form = form
+        self.pages = pages
+        self.machine = machine
         self.seconds: tuple[list[float], list[float]] = ([], [])
         self.answers: list[NDArray[np.float32]] = []
         rounded = ways[0].inputs[0].dtype == torch.float16
         self._opened = [way.opened(machine.provider, threads, rounded=rounded) for way in ways]
 
     def run(self) -> None:
-        """Time both ways once."""
+        """Time both operators once."""
         self.answers = []
         for (session, binding), seconds in zip(self._opened, self.seconds, strict=True):
             time.sleep(SETTLE_S)
@@ -135,7 +139,7 @@ class Timed:
             self.answers.append(answer.reshape(-1, *answer.shape[-3:])[0])
 
     def row(self, usual: Timed) -> Row:
-        """Return its figures beside those of the form for one page; the first time of either way does not count."""
+        """Compare the times with those of the form for one page. The first time of each operator is not used."""
         own, others = (np.array(form.seconds)[:, 1:] / form.pages for form in (self, usual))
         forward, adjoint = 1e3 * np.median(own, 1)
         forward_ratio, adjoint_ratio = np.median(own / others, 1)
@@ -144,18 +148,18 @@ class Timed:
             for answer, other in zip(self.answers, usual.answers, strict=True)
         )
         return Row(
-            self.form,
-            self.pages,
-            float(forward),
-            float(adjoint),
-            float(forward_ratio),
-            float(adjoint_ratio),
-            deviation,
+            form=self.form,
+            pages=self.pages,
+            forward_ms=float(forward),
+            adjoint_ms=float(adjoint),
+            forward_ratio=float(forward_ratio),
+            adjoint_ratio=float(adjoint_ratio),
+            deviation=deviation,
         )
 
 
 def tiles(waves: Waves, page: Tensor, light: Tensor) -> tuple[Way, Way]:
-    """Forward and adjoint of the form for one page, of a page and its light at the cameras."""
+    """Forward and adjoint operator of the form for one page, with a page and its light at the cameras as examples."""
     constants, spec = pytree.tree_flatten(waves.matrices())
 
     def way(operator: Callable[[WaveMatrices, Tensor], Tensor], taken: Tensor) -> Way:
@@ -167,9 +171,11 @@ def tiles(waves: Waves, page: Tensor, light: Tensor) -> tuple[Way, Way]:
 
 
 def planes(waves: Waves, page: Tensor, light: Tensor, pages: int, dtype: torch.dtype) -> tuple[Way, Way]:
-    """Forward and adjoint of the form for many pages, of a batch of the same page."""
-    there, back = WaysThere(waves), WaysBack(waves)
-    with_page, with_light = there.tables(waves.default), back.tables(waves.default)
+    """Forward and adjoint operator of the form for many pages, with a batch of copies of a page as example."""
+    there = WaysThere(waves)
+    back = WaysBack(waves)
+    forward_tables = there.tables(waves.default)
+    adjoint_tables = back.tables(waves.default)
     ny, nx = light.shape[1:]
 
     def batch(one: Tensor) -> Tensor:
@@ -179,23 +185,23 @@ def planes(waves: Waves, page: Tensor, light: Tensor, pages: int, dtype: torch.d
         return [value.to(dtype) for value in tables.values()]
 
     def forward(batch: Tensor, constants: tuple[Tensor, ...]) -> Tensor:
-        tables = dict(zip(with_page, constants, strict=True))
+        tables = dict(zip(forward_tables, constants, strict=True))
         return torch.stack(there.on_grid(there(batch, tables), tables), 1)[..., :ny, :nx]
 
     def adjoint(batch: Tensor, constants: tuple[Tensor, ...]) -> Tensor:
-        tables = dict(zip(with_light, constants, strict=True))
+        tables = dict(zip(adjoint_tables, constants, strict=True))
         sparse = back.sparse((batch[:, 0], batch[:, 1]), tables)
         return back.waves.last.cropped(back.waves(sparse, tables))
 
-    whole = functional.pad(light, (0, -nx % PAD, 0, -ny % PAD))
+    padded = functional.pad(light, (0, -nx % PAD, 0, -ny % PAD))
     return (
-        Way(forward, batch(page), typed(with_page), [there]),
-        Way(adjoint, batch(whole), typed(with_light), [back]),
+        Way(forward, batch(page), typed(forward_tables), [there]),
+        Way(adjoint, batch(padded), typed(adjoint_tables), [back]),
     )
 
 
 def measured(profile: Profile, machine: Machine, threads: int, repeats: int) -> list[Row]:
-    """Time all forms in turns, `repeats` times after one that does not count."""
+    """Time all forms in turns, `repeats` times after a first run that is not used."""
     waves = Waves(profile, true_parameters(profile, Device()), symbol_samples(profile)).eval()
     rng = np.random.default_rng(0)
     phases = torch.from_numpy(2 * np.pi * rng.random((len(waves.y_m), len(waves.x_m)))).float()
@@ -221,7 +227,8 @@ def measured(profile: Profile, machine: Machine, threads: int, repeats: int) -> 
 @click.option("--json", "json_path", type=OutputFile(), required=True, help="Write the figures to this file.")
 def main(profile_name: str, device_name: str, repeats: int, threads: int | None, json_path: Path) -> None:
     """Print the times of both forms of the wave operators, and their ratios."""
-    profile, threads = load_profile(profile_name), threads or available_cpus()
+    profile = load_profile(profile_name)
+    threads = threads or available_cpus()
     torch.set_num_threads(threads)
     with torch.no_grad():
         rows = measured(profile, Machine.of(device_name), threads, repeats)

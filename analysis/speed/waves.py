@@ -1,12 +1,12 @@
-"""AIR of a device that is read by its fitted waves alone, from two known pages, over the bound of its light.
+"""AIR of a device whose pages are read by its fitted waves alone, calibrated on two known pages.
 
     python -m analysis.speed.waves --json F
     python -m analysis.speed.waves --set sensor.full_well_e=32 --pages 24 --json F
 
-A device is simulated and calibrated, its calibration exported, and further pages are decoded as a service decodes them:
-by the bundle's steps, and by fewer. Beside each stand its time over that of the shipped decoder, both timed in turns in
-this run, and, where the file of `python -m analysis.comparison.bound` is given, its share of that bound. Interrupted,
-the same command goes on: recording, calibration and bundle are kept in `--out`.
+A device is simulated and calibrated, and its calibration is exported. Further pages are decoded as a service decodes
+them, with each number of steps up to the bundle's. The time of a page is compared with that of the shipped decoder, in
+turns in the same run. With the figures of `python -m analysis.comparison.bound`, the AIR is compared with the bound of
+the light. `--out` keeps recording, calibration and bundle, so that an interrupted command can be repeated to continue.
 """
 
 from __future__ import annotations
@@ -41,21 +41,21 @@ from lightpage.train.commands.calibrate import calibrate_recording
 from lightpage.train.runs import begin
 
 _TIMED = 7
-"""Turns in which decoders are timed."""
+"""Timed inferences of each decoder."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """Figures of a number of steps.
+    """Figures of one number of steps.
 
     Attributes:
         steps: Gauss-Newton steps.
-        air: AIR of unseen pages, bits a symbol.
-        over_bound: the same over the bound of the light; None where that is not given.
-        ece: calibration error of confidences.
-        over_claim: information that is claimed, less the AIR.
+        air: AIR of pages that were not calibrated on, bits a symbol.
+        over_bound: AIR over the bound of the light; None if the bound is not given.
+        ece: expected calibration error of the confidences.
+        over_claim: claimed information minus the AIR, bits a symbol.
         seconds: median time of a page's inference.
-        over_shipped: the same over the shipped decoder's, timed in turns.
+        over_shipped: this time over that of the shipped decoder.
     """
 
     steps: int
@@ -68,21 +68,21 @@ class Row:
 
 
 def timed(decoders: list[Decoder], pair: FramePair) -> list[float]:
-    """Median seconds of an inference of each decoder, taking turns."""
+    """Median time of an inference by each decoder, seconds. Decoders take turns; their first inference is not timed."""
     seconds: list[list[float]] = [[] for _ in decoders]
     for number in range(_TIMED + 1):
-        for own, decoder in zip(seconds, decoders, strict=True):
+        for times, decoder in zip(seconds, decoders, strict=True):
             start = time.perf_counter()
             decoder.infer(pair, doubtful=True)
             if number:
-                own.append(time.perf_counter() - start)
-    return [float(np.median(own)) for own in seconds]
+                times.append(time.perf_counter() - start)
+    return [float(np.median(times)) for times in seconds]
 
 
 def _bits(path: Path) -> float:
-    """Bound of a light, bits a symbol, as `analysis.comparison.bound` or `analysis.results` keeps it."""
-    kept = json.loads(path.read_text("utf-8"))
-    return float(kept.get("figures", kept)["bits"])
+    """Read the bound of the light, bits a symbol, from a file of `analysis.comparison.bound` or `analysis.results`."""
+    document = json.loads(path.read_text("utf-8"))
+    return float(document.get("figures", document)["bits"])
 
 
 @click.command()
@@ -122,7 +122,9 @@ def main(
     asked |= {"--levels": levels, "--seed": seed}
     out.mkdir(parents=True, exist_ok=True)
     begin(out, asked)
-    recording, calibration, bundle = out / "recording.h5", out / "calibration.toml", out / "bundle.zip"
+    recording = out / "recording.h5"
+    calibration = out / "calibration.toml"
+    bundle = out / "bundle.zip"
     simulate(recording, profile, device, CALIBRATED + pages, seed, levels)
     limit = None if bound is None else _bits(bound)
     with Recording.open(recording) as file, percent_bar() as progress:
@@ -135,20 +137,20 @@ def main(
     rows = []
     with Recording.open(recording) as file:
         shipped, *seconds = timed([Decoder.load(bundle_path(DEFAULT)), *decoders], file.frames(CALIBRATED))
-        asked_steps = zip(track(decoders, "decode", unit="number of steps"), seconds, strict=True)
-        for steps, (decoder, own) in enumerate(asked_steps, 1):
+        timed_decoders = zip(track(decoders, "decode", unit="number of steps"), seconds, strict=True)
+        for steps, (decoder, duration) in enumerate(timed_decoders, 1):
             figures = evaluate(decoder, file, tracker_for(decoder)).figures
             air = figures.air_bits_per_symbol
             share = None if limit is None else air / limit
             rows.append(
                 Row(
-                    steps,
-                    air,
-                    share,
-                    figures.ece,
-                    figures.over_claim_bits_per_symbol,
-                    own,
-                    own / shipped,
+                    steps=steps,
+                    air=air,
+                    over_bound=share,
+                    ece=figures.ece,
+                    over_claim=figures.over_claim_bits_per_symbol,
+                    seconds=duration,
+                    over_shipped=duration / shipped,
                 )
             )
     for row in rows:

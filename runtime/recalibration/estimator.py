@@ -1,8 +1,8 @@
-"""Statistics, information and noise of an estimator's device, measured anew by its own graphs."""
+"""Statistics, information and noise of a re-fitted device, measured with its estimator's own graphs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,52 +11,70 @@ from numpy.typing import NDArray
 from lightpage.calibration.calibrate import KnownPage
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.interfaces import Twin
-from lightpage.calibration.likelihood.interfaces import Derivatives, Real, sampled_evenly
+from lightpage.calibration.likelihood.interfaces import Derivatives, ProgressCallback, Real, sampled_evenly
 from lightpage.calibration.likelihood.measure import estimator_table, measured_statistics
 from lightpage.calibration.likelihood.statistics import Statistics
 from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.calibration.waves.wave_model import LaunchConditions
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.execution.estimator_graph import NOISE, EstimatorGraph
-from lightpage.runtime.recalibration.noise import measured_noise
-from lightpage.waves.grid import symbol_samples
+from lightpage.runtime.recalibration.noise import KnownPhases, deviation_prior_scale, measured_noise
 
 KNOWN_CONCENTRATION = 1e6
-"""Concentration of known phases."""
-_OF_COUNTS = ("count_scale", "count_weights", "information", "responses", "nuisance_covariance", "nuisance_precision")
-"""Tensors that no constant follows from: they are fed with each evaluation."""
+"""Concentration of a known phase."""
+_FED = ("count_scale", "count_weights", "information", "responses", "nuisance_covariance", "nuisance_precision")
+"""Tensors from which no wave operator is computed. They are fed with each evaluation."""
 
 
 class GraphLikelihood:
-    """The likelihood of a device's pages by an estimator's graphs; see `PageLikelihood`.
+    """Likelihood of a device's pages, computed by an estimator's graphs; see `PageLikelihood`.
+
+    It keeps the operators and the pages' measurements of the last table.
 
     Args:
-        graph: of a bundle of the same device, drifted or not.
+        graph: graph of a bundle of the same device. The device may have drifted since.
     """
 
     def __init__(self, graph: EstimatorGraph) -> None:
-        self._graph = self._own = graph
+        self._graph = graph
+        self._refitted = graph
         self._key: list[bytes] = []
         self._pages: dict[int, tuple[FramePair, dict[str, NDArray[Any]]]] = {}
 
     def __call__(self, pair: FramePair, table: SamplingTable, phases: Real, nuisance: Real) -> Derivatives:
         """See `PageLikelihood`."""
-        own = {name: np.asarray(value) for name, value in table.items() if name in self._graph.ports}
-        fixed = {name: value for name, value in own.items() if name not in _OF_COUNTS}
-        key = [value.tobytes() for value in fixed.values()]
+        tensors = {name: np.asarray(value) for name, value in table.items() if name in self._graph.ports}
+        fed = {name: value for name, value in tensors.items() if name in _FED}
+        constants = {name: value for name, value in tensors.items() if name not in _FED}
+        key = [value.tobytes() for value in constants.values()]
         if key != self._key:
-            self._own, self._key, self._pages = self._graph.with_table(fixed), key, {}
+            self._refitted = self._graph.with_table(constants)
+            self._key = key
+            self._pages = {}
+        page = self._page(pair)
+        outputs = self._refitted.derivatives(page, fed, known_p(phases), np.asarray(nuisance, np.float32))
+        (expected, counts), stride = sampled_evenly(page["lit"] > 0, outputs["expected"], page["counts"])
+        return Derivatives(
+            by_phase=outputs["by_phase"].astype(np.float64),
+            by_nuisance=outputs["by_nuisance"].astype(np.float64),
+            expected=expected,
+            counts=counts,
+            stride=stride,
+        )
+
+    def _page(self, pair: FramePair) -> dict[str, NDArray[Any]]:
+        """Measurements of a page, computed once for each pair of frames."""
         kept = self._pages.get(id(pair))
-        if kept is None or kept[0] is not pair:
-            measured = self._own.begun({"in_phase": pair.in_phase, "quadrature": pair.quadrature})
-            kept = self._pages[id(pair)] = pair, measured
-        page = kept[1]
-        p = (KNOWN_CONCENTRATION * np.stack([np.cos(phases), np.sin(phases)])).astype(np.float32)
-        fed = {name: own[name] for name in _OF_COUNTS if name in own}
-        found = self._own.derivatives(page, fed, p, np.asarray(nuisance, np.float32))
-        (expected, counts), every = sampled_evenly(page["lit"] > 0, found["expected"], page["counts"])
-        by_phase, by_nuisance = (found[name].astype(np.float64) for name in ("by_phase", "by_nuisance"))
-        return Derivatives(by_phase, by_nuisance, expected, counts, every)
+        if kept is None or kept[0] is not pair:  # an id may be that of an earlier pair, which is gone
+            frames = {"in_phase": pair.in_phase, "quadrature": pair.quadrature}
+            kept = pair, self._refitted.first_estimate(frames)
+            self._pages[id(pair)] = kept
+        return kept[1]
+
+
+def known_p(phases: Real) -> NDArray[np.float32]:
+    """Phases [ny, nx] that are known as the `p` of an estimate, [2, ny, nx]."""
+    return (KNOWN_CONCENTRATION * np.stack([np.cos(phases), np.sin(phases)])).astype(np.float32)
 
 
 def measured_anew(
@@ -66,28 +84,31 @@ def measured_anew(
     pages: Sequence[KnownPage],
     conditions: LaunchConditions,
     mask: NDArray[np.bool_],
-    progress: Callable[[float], None],
+    progress: ProgressCallback,
 ) -> tuple[Statistics, SamplingTable]:
     """Measure what the estimator needs of a re-fitted device.
 
     Args:
-        graph: of the bundle of before.
+        graph: graph of the bundle before the re-fit.
         twin: ray tracer of the nominal device.
         device: re-fitted device.
         pages: known pages.
-        conditions: illumination and blur of its pages.
-        mask: places of the pilots, bool [ny, nx].
-        progress: function that takes the share of the work that is done.
+        conditions: illumination and blur of the pages.
+        mask: positions of the pilots, bool [ny, nx].
+        progress: called with the finished share of the work.
 
     Returns:
-        Statistics, and the tensors of the table.
+        Statistics of the counts, and the tensors of the graph's table that change.
+
+    Raises:
+        CalibrationError: the pages' light does not agree with the device.
     """
     likelihood = GraphLikelihood(graph)
     statistics = measured_statistics(likelihood, twin, device, pages, conditions, lambda share: progress(0.4 * share))
     table = estimator_table(likelihood, twin, device, pages, statistics, lambda share: progress(0.4 + 0.4 * share))
     table = {name: value for name, value in table.items() if name in graph.ports}
-    known = [(page.pair, np.angle(page.light(device.modulation))) for page in pages]
+    known = [KnownPhases.of(page, device) for page in pages]
     steps = len(graph.value(NOISE)) - 1
-    prior_scale = symbol_samples(device.profile) ** 2 * statistics.correlation
+    prior_scale = deviation_prior_scale(device.profile, statistics)
     noise = measured_noise(graph.with_table(table), known, mask, prior_scale, steps)
     return statistics, table | noise

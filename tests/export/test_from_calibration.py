@@ -8,6 +8,7 @@ import pytest
 from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.calibration.known_pages import known_pages
 from lightpage.calibration.likelihood.measure import measured_statistics
+from lightpage.calibration.likelihood.table import pilot_tensors
 from lightpage.calibration.waves.wave_fit import WaveFit
 from lightpage.device.state import Device
 from lightpage.errors import CalibrationError, InvalidInputError
@@ -31,6 +32,7 @@ from lightpage.runtime.model.execution.estimator_graph import EstimatorGraph
 from lightpage.runtime.model.execution.session import open_session
 from lightpage.runtime.model.execution.twin import OnnxTwin
 from lightpage.runtime.recalibration.known_pages import KnownPages
+from lightpage.runtime.recalibration.noise import MOST_STEPS, KnownPhases
 from lightpage.runtime.recalibration.recalibration import recalibrate
 from lightpage.runtime.recalibration.refit import refit
 from lightpage.runtime.service.assembly import assembled
@@ -181,12 +183,35 @@ def test_a_page_beside_other_references_is_refused(bundle: Path, small_device: l
     assert isinstance(graph, EstimatorGraph)
     with Recording.open(small_device[3]) as recording:
         (page,), references = known_pages(recording, PROFILE, USED[:1]), recording.references()
-    phases = np.angle(page.symbols)
-    check_counts(graph, page.pair, phases, "page 0")
+    known = KnownPhases(page.pair, np.angle(page.symbols))
+    mask = Bundle.open(bundle).pilot_mask
+    check_counts(graph, known, mask, "page 0")
     table = {"reference_in_phase": references.in_phase, "reference_quadrature": references.quadrature}
     mirrored = {name: np.ascontiguousarray(frame[:, ::-1]) for name, frame in table.items()}
     with pytest.raises(CalibrationError, match="page 0"):
-        check_counts(graph.with_table(mirrored), page.pair, phases, "page 0")
+        check_counts(graph.with_table(mirrored), known, mask, "page 0")
+
+
+def test_a_page_whose_pilots_are_not_the_devices_agrees_with_its_calibration(
+    bundle: Path, small_device: list[str]
+) -> None:
+    graph = Decoder.load(bundle, 1).graph
+    assert isinstance(graph, EstimatorGraph)
+    mask = Bundle.open(bundle).pilot_mask
+    others = Pilots(mask, 2 * np.pi * np.random.default_rng(0).random(np.count_nonzero(mask)))
+    with Recording.open(small_device[3]) as recording:
+        (page,) = known_pages(recording, PROFILE, USED[:1])
+    known = KnownPhases(page.pair, np.angle(page.symbols))
+    check_counts(graph.with_table(pilot_tensors(others)), known, mask, "page 0")
+
+
+@pytest.mark.parametrize("steps", [0, MOST_STEPS + 1])
+def test_an_export_refuses_more_steps_than_are_measured(
+    calibration: Calibration, small_device: list[str], tmp_path: Path, steps: int
+) -> None:
+    with Recording.open(small_device[3]) as recording, pytest.raises(InvalidInputError, match=f"steps: got {steps}"):
+        export_calibration(calibration, recording, PROFILE, tmp_path / "B.zip", steps=steps)
+    assert not list(tmp_path.iterdir())
 
 
 def test_an_interrupted_export_leaves_nothing_and_the_next_one_works(

@@ -1,4 +1,4 @@
-"""The picture of how well a calibration explains the light of a known page."""
+"""Figure of a verdict: unexplained light over the page and over the exit facet."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from lightpage.calibration.goodness.verdict import Goodness, Map
 _SIZE = (7.2, 3.1)
 """Inches."""
 _MOST = 30.0
-"""Times the noise at the end of the colours."""
+"""Largest ratio of the colour scale."""
 
 
 def goodness_figure(goodness: Goodness) -> Figure:
-    """Draw the light that is left over what noise leaves, over the page and over the pipe's exit facet."""
+    """Draw the power of the residual over that of noise, over the page and over the pipe's exit facet."""
     figure = Figure(figsize=_SIZE, layout="constrained")
     FigureCanvasAgg(figure)
     page, facet = figure.subplots(1, 2, width_ratios=(1.5, 1))
     _draw(page, goodness.by_page, "over the page", None)
     shown = _draw(facet, goodness.by_facet, "over the exit facet", 1.0)
-    bar = figure.colorbar(shown, ax=[page, facet], label="light that is left, over noise", extend="max")
+    bar = figure.colorbar(shown, ax=[page, facet], label="residual over noise", extend="max")
     bar.set_ticks([1, 3, 10, _MOST], labels=["1, noise", "3", "10", f"{_MOST:g}"])
     bar.ax.minorticks_off()
     what = f"{goodness.verdict}: about {goodness.bits_lost:.2f} bit a symbol lost"

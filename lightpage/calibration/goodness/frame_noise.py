@@ -1,7 +1,7 @@
-"""Counts of frames over the expected counts, which the fitted waves predict: means, variance of noise, and such noise.
+"""Statistics of a frame's counts over the expected counts: their mean, and the variance of their noise.
 
-Noise is what varies faster from pixel to pixel than light through the pipe can, so that light that the waves do not
-explain is no part of it.
+Noise is measured at spatial frequencies above those of light through the pipe. So it does not include light that the
+fitted waves fail to explain.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ Real = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 _HIGH_PASS = np.array((1.0, -4.0, 6.0, -4.0, 1.0)) / np.sqrt(70)
-"""Taps along both axes, of unit power. They pass less than 2% of the amplitude of light at 0.2 cycles a pixel, the
-highest frequency of the pipe's."""
+"""Taps along both axes, of unit power. They pass less than 2% of the amplitude at 0.2 cycles a pixel, the highest
+frequency of the pipe's light."""
 _CLASSES = 60
-"""Classes of samples of like expected counts."""
+"""Classes of samples with similar expected counts."""
 _MOST_PIXELS = 2_000_000
-"""Approximate limit of the pixels that are measured: an even share of a larger frame's."""
+"""Approximate limit of the pixels that are measured, evenly chosen in a larger frame."""
 _NORMAL = 0.6745
 """Median of the magnitude of normal noise, in standard deviations."""
 _OUTLIER = 4.0
-"""Standard deviations, as a median has them, beyond which a pixel shows a defect. Noise of few electrons is not normal:
-the median alone would call it weaker."""
+"""Standard deviations, estimated by the median, beyond which a pixel is a defect. The noise itself is not estimated by
+the median, which underestimates noise of few electrons."""
 _DEGREE = 3
-"""Degree of the polynomials along each axis by which pixels find their places on the grid, as registrations have it."""
+"""Degree, along each axis, of the polynomial from pixels to places of the grid; that of registrations."""
 _PLACES = 24
-"""Places of the grid along each axis to which these are fitted, at most."""
+"""Approximate number of places along each axis to which it is fitted: fewer than twice as many."""
 _BAND = 256
-"""Rows of pixels that are resampled at once: a large frame's places all together would take much memory."""
+"""Rows of pixels that are resampled at once, so that a large frame takes little memory."""
 
 
 class CountCurve(NamedTuple):
@@ -51,12 +51,12 @@ class CountCurve(NamedTuple):
 
     @classmethod
     def measured(cls, expected: NDArray[np.floating], values: NDArray[np.floating], most: float = np.inf) -> CountCurve:
-        """Average values in classes of like expected counts.
+        """Average values in classes of similar expected counts.
 
         Args:
             expected: expected counts of samples, [n].
-            values: the quantity at each, [n].
-            most: values above so many medians of their class are left out.
+            values: the quantity at each sample, [n].
+            most: largest value that is averaged, over the median of its class.
         """
         if not len(expected):
             return cls(np.zeros(1), np.zeros(1))
@@ -70,21 +70,21 @@ class CountCurve(NamedTuple):
         return cls(np.array(levels), np.array(means))
 
     def at(self, expected: NDArray[np.floating]) -> Real:
-        """Mean at expected counts; beyond those of the samples that of the nearest, of the darkest where NaN."""
+        """Interpolate the mean at expected counts, with the nearest class outside of them and the darkest for NaN."""
         return np.asarray(np.interp(np.nan_to_num(expected), self.expected, self.means))
 
 
 def noise_curve(frame: NDArray[np.integer], expected: Image) -> CountCurve:
     """Measure the variance of a frame's noise over the expected count, counts squared.
 
-    Hot pixels and the edges of specks do not count.
+    Outliers, such as hot pixels and the edges of specks, are excluded.
 
     Args:
         frame: counts [H, W].
-        expected: counts that the light would give a perfect camera, NaN where that is not known, [H, W].
+        expected: counts that the light would give a perfect camera, NaN where these are unknown, [H, W].
     """
     noise = _filtered(frame.astype(np.float32), _HIGH_PASS)
-    # The squares of the taps weigh the variances of the pixels, and so the counts that these depend on.
+    # A sum of pixels has their variances weighted by the squares of the taps, so its expected count is weighted alike.
     level = _filtered(expected, _HIGH_PASS**2)
     known = np.isfinite(level)
     every = -(-noise.size // _MOST_PIXELS)
@@ -92,24 +92,24 @@ def noise_curve(frame: NDArray[np.integer], expected: Image) -> CountCurve:
 
 
 def noise_like(frame: NDArray[np.integer], expected: Image, rng: np.random.Generator) -> Image:
-    """Noise like a frame's own, counts [H, W]; it is neither rounded nor cut off where counts end.
+    """Draw normal noise with the variance of a frame's own, counts [H, W], neither rounded nor clipped.
 
     Args:
         frame: counts [H, W].
-        expected: counts that the light would give a perfect camera, NaN where that is not known, [H, W].
-        rng: generator that draws it.
+        expected: counts that the light would give a perfect camera, NaN where these are unknown, [H, W].
+        rng: random generator.
     """
     deviation = np.sqrt(noise_curve(frame, expected).at(expected))
     return np.asarray(deviation * rng.standard_normal(frame.shape, dtype=np.float32), np.float32)
 
 
 def on_pixels(values: Real, at: Sequence[Real], shape: tuple[int, int]) -> Image:
-    """Values of the common grid at the pixels of a camera, by cubic splines; NaN where the grid does not reach.
+    """Resample values of the common grid to the pixels of a camera by cubic splines, NaN outside of the grid.
 
     Args:
-        values: [Gy, Gx].
-        at: rows and columns of the pixels that see the grid's places, [2, Gy, Gx].
-        shape: (H, W) of the camera.
+        values: values on the common grid, [Gy, Gx].
+        at: rows and columns of the pixels at the places of the grid, [2, Gy, Gx].
+        shape: shape (H, W) of the camera.
     """
     middle = (np.array(shape) - 1) / 2
     every = tuple(slice(None, None, max(1, size // _PLACES)) for size in values.shape)
@@ -121,8 +121,8 @@ def on_pixels(values: Real, at: Sequence[Real], shape: tuple[int, int]) -> Image
     rows, columns = ((np.arange(size) - half) / half for size, half in zip(shape, middle, strict=True))
 
     def resampled(band: Real) -> Image:
-        there = [np.polynomial.polynomial.polygrid2d(band, columns, each) for each in inverse]
-        values = scipy.ndimage.map_coordinates(spline, there, order=3, prefilter=False, mode="constant", cval=np.nan)
+        places = [np.polynomial.polynomial.polygrid2d(band, columns, each) for each in inverse]
+        values = scipy.ndimage.map_coordinates(spline, places, order=3, prefilter=False, mode="constant", cval=np.nan)
         return np.asarray(values, np.float32)
 
     bands = [rows[start : start + _BAND] for start in range(0, len(rows), _BAND)]
@@ -130,7 +130,7 @@ def on_pixels(values: Real, at: Sequence[Real], shape: tuple[int, int]) -> Image
 
 
 def _filtered(image: Image, taps: Real) -> Image:
-    """Convolution along both axes, without the pixels at the edges, which lack neighbours."""
+    """Convolve along both axes, and crop the pixels at the edges, which lack neighbours."""
     edge = len(taps) // 2
     both = scipy.ndimage.convolve1d(scipy.ndimage.convolve1d(image, taps, axis=0), taps, axis=1)
     return np.asarray(both[edge:-edge, edge:-edge])

@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from lightpage.calibration.goodness.light import SeenLight, places_on_facet, radius2
+from lightpage.calibration.goodness.light import PageLight, places_on_facet, radius2
 from lightpage.calibration.parameters import NAMES, PRIORS, indices
 
 Real = NDArray[np.float64]
@@ -20,13 +20,13 @@ _STEP = 1e-4
 _RANK = 1e-4
 """Singular values are dropped below this share of the largest."""
 _LOCAL = 0.3
-"""Share of what is left in a hundredth of the equations from which on it lies in few places; noise has 0.08."""
+"""Least share of the residual's power in a hundredth of the equations that shows a local fault; noise has 0.08."""
 _FOREIGN = 0.1
-"""Mean square of the symbols' relative errors from which on light belongs to other symbols."""
-_TELLING = 0.2
-"""Share of the unexplained light from which on a correction of the model is called the likeliest cause."""
+"""Least mean square of the symbols' relative errors that shows the light of other symbols."""
+_LEAST_SHARE = 0.2
+"""Least share of the unexplained light that a correction of the model explains to be called the likeliest cause."""
 _UNLIKELY = 8.0
-"""Standard deviations of the prior from which on a length is another one than the profile states."""
+"""Least deviation of a length that shows another device than the profile's, in standard deviations of the prior."""
 
 LEVELS = "levels whose phases no smooth curve tells: is the modulator's lookup table right?"
 NEIGHBOURS = "phases that go with those of the symbols beside: is there crosstalk between the modulator's pixels?"
@@ -45,25 +45,25 @@ def unlike_profile(parameters: Real) -> str:
     return f"a {name} {parameters[furthest]:+.1%} off the profile's: is this the device's profile?"
 
 
-def likeliest(light: SeenLight, errors: Complex) -> str:
+def likeliest(light: PageLight, errors: Complex) -> str:
     """Name the likeliest error of the model or of the page, in words.
 
     Args:
         light: light of a known page.
-        errors: errors of its symbols, less their smooth part.
+        errors: errors of its symbols, minus their smooth part.
     """
     fitted = scipy.linalg.orth(_of_unit_length(list(light.equations_of_fit())), rcond=_RANK)
-    left = _beside(fitted, light.left_of_equations[:, None])[:, 0]
+    residual = _orthogonal_part(fitted, light.equation_residual[:, None])[:, 0]
 
     def share(columns: list[Real]) -> float:
-        matrix = _beside(fitted, _of_unit_length(columns))
-        found = np.linalg.lstsq(matrix, left, rcond=_RANK)[0]
-        return 1 - float(np.sum((left - matrix @ found) ** 2) / np.sum(left**2))
+        matrix = _orthogonal_part(fitted, _of_unit_length(columns))
+        solution = np.linalg.lstsq(matrix, residual, rcond=_RANK)[0]
+        return 1 - float(np.sum((residual - matrix @ solution) ** 2) / np.sum(residual**2))
 
-    words, most = max(((words, share(columns)) for words, columns in _suspects(light)), key=lambda found: found[1])
-    if most > _TELLING:
+    words, most = max(((words, share(columns)) for words, columns in _suspects(light)), key=lambda suspect: suspect[1])
+    if most > _LEAST_SHARE:
         return f"{words} ({most:.0%} of what is left)"
-    power = np.sort(left**2)
+    power = np.sort(residual**2)
     if power[-len(power) // 100 :].sum() > _LOCAL * power.sum():
         return "light in few places: is there dust, are there hot pixels?"
     if np.mean(np.abs(errors) ** 2) > _FOREIGN:
@@ -72,17 +72,17 @@ def likeliest(light: SeenLight, errors: Complex) -> str:
 
 
 def _of_unit_length(columns: list[Real]) -> Real:
-    """Columns that are not zero, side by side."""
+    """Matrix of the columns that are not zero, each divided by its length."""
     lengths = [float(np.linalg.norm(column)) for column in columns]
     return np.stack([column / length for column, length in zip(columns, lengths, strict=True) if length > 0], axis=1)
 
 
-def _beside(fitted: Real, columns: Real) -> Real:
-    """Return the part of the columns that is orthogonal to `fitted`, which has orthonormal columns."""
+def _orthogonal_part(fitted: Real, columns: Real) -> Real:
+    """Part of the columns that is orthogonal to `fitted`, whose columns are orthonormal."""
     return np.asarray(columns - fitted @ (fitted.T @ columns))
 
 
-def _suspects(light: SeenLight) -> Iterator[tuple[str, list[Real]]]:
+def _suspects(light: PageLight) -> Iterator[tuple[str, list[Real]]]:
     """Yield each possible cause in words, with the columns by which it would change the equations."""
     coarse, page = light.coarse, light.page
     leaving, (across, up), squares = coarse.to_exit(page), places_on_facet(coarse), radius2(coarse)

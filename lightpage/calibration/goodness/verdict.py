@@ -12,8 +12,9 @@ NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Map = list[list[NonNegative]]
 Verdict = Literal["good", "usable", "wrong"]
 
-GOOD, USABLE = 0.1, 0.3
-"""Bits a symbol that a fit may lose against one that explains all light, to be called so."""
+GOOD = 0.1
+USABLE = 0.3
+"""Bits a symbol below which a fit is called so, lost against a fit that explains all light."""
 
 
 class Goodness(TomlTable):
@@ -25,7 +26,7 @@ class Goodness(TomlTable):
         unexplained_relative: power of what a better model would explain, over the signal's, symbol by symbol.
         noise_relative: power of all noise, over the signal's: that of the frames and that of the modulator.
         modulator_noise_rad: noise of phase of the modulator, a sample of `symbol_samples`.
-        by_page: light that is left over what noise leaves, in blocks over the page, rows from the top; 1 is noise.
+        by_page: power of the residual over that of noise, in blocks over the page, rows from the top; 1 is noise alone.
         by_facet: the same over the pipe's exit facet.
         cause: likeliest error, in words; empty where nothing is wrong.
     """

@@ -1,1 +1,1 @@
-"""Statistics of a device's counts, and the Fisher information of its symbols: what maximum likelihood needs."""
+"""Statistics of a device's counts and Fisher information of its symbols, for estimation by maximum likelihood."""

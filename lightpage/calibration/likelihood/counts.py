@@ -1,7 +1,7 @@
 """Statistics of one camera's counts on the common grid: mean and variance as smooth functions of the expected count.
 
-Gain, clipping at zero, read noise, quantisation and non-linearity of a camera all show there, and so does what the fit
-leaves unexplained.
+They include gain, clipping at zero, read noise, quantisation and non-linearity of the camera, and the light that the
+fitted device does not explain.
 """
 
 from __future__ import annotations
@@ -23,21 +23,23 @@ Real = NDArray[np.float64]
 KNOTS = 2048
 """Places of a look-up table: the step from one to the next changes a weight by less than a thousandth."""
 _CLASSES = 60
-"""Classes of samples of like expected counts, each with a mean and a variance of its own."""
-_MEAN_DEGREE, _VARIANCE_DEGREE = 7, 5
-"""Degrees of the Chebyshev series over the root of the expected count."""
+"""Classes of samples with similar expected counts, each with its own mean and variance."""
+_MEAN_DEGREE = 7
+"""Degree of the mean's Chebyshev series over the root of the expected count."""
+_VARIANCE_DEGREE = 5
+"""Degree of the same series of the variance's logarithm."""
 _FEWEST_CLASSES = 2 * (_MEAN_DEGREE + 1)
-"""Classes that the series need: twice as many as the longer one has coefficients."""
-_STORED = 33
-"""Points by which the functions are kept."""
-_BEYOND = 1.3
-"""Largest expected count of a table, over the largest that was met."""
+"""Fewest classes for the series: twice as many as the longer one has coefficients."""
+_POINTS = 33
+"""Points that are stored of each function."""
+_HEADROOM = 1.3
+"""Largest expected count of a look-up table, over the largest that was measured."""
 _LEAST_VARIANCE = 1e-6
-"""Least variance over the largest one."""
+"""Least variance of a class, over the largest one."""
 _LEAST_SLOPE = 1e-3
-"""Least slope of the mean: where counts do not grow with the light, they tell next to nothing."""
-
+"""Least slope of the mean. Where counts do not grow with the light, they carry almost no information about it."""
 _FEWEST_POINTS = 4
+"""Fewest points of a function."""
 
 Values = Annotated[tuple[Finite, ...], Field(strict=False)]
 
@@ -51,9 +53,10 @@ def check_points(expected: Sequence[float], mean: Sequence[float], variance: Seq
 
     Raises:
         ValueError: too few points, lists of different lengths, expected counts that do not increase from 0 or more, or
-            a variance that is not above 0. It says what came and what was wanted.
+            a variance that is not above 0.
     """
-    name, count = f"{camera}expected", len(expected)
+    name = f"{camera}expected"
+    count = len(expected)
     if count < _FEWEST_POINTS:
         raise ValueError(f"{name} of {count} numbers, wanted at least {_FEWEST_POINTS}")
     for key, values in (("mean", mean), ("variance", variance)):
@@ -73,7 +76,7 @@ class CountStatistics(TomlTable):
 
     Attributes:
         expected: counts that the light would give a perfect camera, increasing.
-        mean, variance: mean and variance of the counts that came, at each of these.
+        mean, variance: mean and variance of the measured counts, at each of these.
     """
 
     expected: Values
@@ -90,12 +93,12 @@ class CountStatistics(TomlTable):
         """Fit smooth functions to samples.
 
         Args:
-            expected: counts that the fitted device should give, [N].
-            counts: counts that came, [N].
+            expected: counts that the fitted light would give a perfect camera, [N].
+            counts: measured counts, [N].
             subject: name of the counts, for errors.
 
         Raises:
-            CalibrationError: the samples show no variance or too few different expected counts, as of a dark frame.
+            CalibrationError: the samples have no variance or too few different expected counts, as in a dark frame.
         """
         if counts.size and np.ptp(counts) == 0:
             raise CalibrationError(
@@ -119,7 +122,7 @@ class CountStatistics(TomlTable):
         series = np.polynomial.chebyshev.Chebyshev
         smooth_mean = series.fit(root, mean, _MEAN_DEGREE, w=np.sqrt(size / variance))
         smooth_variance = series.fit(root, np.log(variance), _VARIANCE_DEGREE, w=np.sqrt(size))
-        at = np.linspace(root[0], root[-1], _STORED)
+        at = np.linspace(root[0], root[-1], _POINTS)
         return cls(
             expected=tuple((at**2).tolist()),
             mean=tuple(smooth_mean(at).tolist()),
@@ -128,25 +131,26 @@ class CountStatistics(TomlTable):
 
     @property
     def scale(self) -> float:
-        """Places of the look-up tables for a root of one count."""
-        return float((KNOTS - 1) / np.sqrt(_BEYOND * self.expected[-1]))
+        """Index into the look-up tables at an expected count of one; it grows with the root of the count."""
+        return float((KNOTS - 1) / np.sqrt(_HEADROOM * self.expected[-1]))
 
     def weights(self, correlation: float = 1.0) -> NDArray[np.float32]:
-        """Tables over the root of the expected count, [4, KNOTS]: m'/v, m m'/v, m'^2/v, and the variance of the first
-        one's residuals, m'^2/v^2 times that of a count.
-
-        With m the mean and v the variance of a count, for sums over correlated samples.
+        """Compute look-up tables over the root of the expected count.
 
         Args:
-            correlation: factor of the variance of a sum of neighbouring samples over that of independent ones.
+            correlation: variance of a sum of neighbouring samples, over that of independent ones.
+
+        Returns:
+            With m the mean of a count, m' its slope, v its variance and c the correlation: m'/(c v), m m'/(c v),
+            m'^2/(c v), and m'^2/(c^2 v), [4, KNOTS]. The first two give the score of a count n, m'/(c v) (n - m); the
+            third is its Fisher information; the last is the variance of the score.
         """
         counts = (np.arange(KNOTS) / self.scale) ** 2
-        known, mean = np.array(self.expected), np.array(self.mean)
-        curve = scipy.interpolate.PchipInterpolator(known, mean)
-        inside = np.clip(counts, known[0], known[-1])
+        expected = np.array(self.expected)
+        curve = scipy.interpolate.PchipInterpolator(expected, np.array(self.mean))
+        inside = np.clip(counts, expected[0], expected[-1])
         slope = np.maximum(curve.derivative()(inside), _LEAST_SLOPE)
         level = curve(inside) + slope * (counts - inside)
-        variance = np.exp(np.interp(inside, known, np.log(self.variance)))
-        information = slope / (variance * correlation)
-        chi_square = information**2 * variance
-        return np.stack([information, level * information, slope * information, chi_square]).astype(np.float32)
+        variance = np.exp(np.interp(inside, expected, np.log(self.variance)))
+        weight = slope / (variance * correlation)
+        return np.stack([weight, level * weight, slope * weight, weight**2 * variance]).astype(np.float32)

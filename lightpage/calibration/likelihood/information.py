@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from lightpage.calibration.calibrate import KnownPage
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.likelihood.counts import KNOTS, CountStatistics
-from lightpage.calibration.likelihood.interfaces import Derivatives, PageLikelihood
+from lightpage.calibration.likelihood.interfaces import Derivatives, PageLikelihood, ProgressCallback
 from lightpage.calibration.likelihood.statistics import Statistics
 from lightpage.calibration.likelihood.table import count_tensors
 from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.calibration.waves.wave_model import LaunchConditions
 from lightpage.errors import CalibrationError
+from lightpage.recording.frame_pair import FramePair
 
 Real = NDArray[np.float64]
 
@@ -26,43 +27,65 @@ GAIN = slice(0, 2)
 PRIOR_DEVIATIONS = np.array([0.1, 0.1, 0.15, 0.15])
 """Standard deviations of a page's tilt, radians, and of its shift from where the tracker expects it, camera pixels."""
 _STEPS = np.array([0.01, 0.01, 0.005, 0.005, 0.01, 0.01])
-"""Finite differences of the nuisance parameters."""
-_PROBE_RAD = 0.02
+"""Finite differences of the nuisance parameters: gain (relative change, and phase in radians), tilt and shift."""
+_PHASE_STEP_RAD = 0.02
+"""Finite difference of the phases, root mean square."""
 _PROBES = 4
-"""Random directions in which the curvature is probed, of each page."""
+"""Random directions for each page in which the curvature is probed."""
 _SMOOTHED = 1.5
-"""Standard deviation, symbols, over which the information is smoothed: it varies slowly but at the walls' shadows."""
+"""Standard deviation, symbols, of the filter of the information, which varies slowly except at the walls' shadows."""
 _MEDIAN = 5
 """Side of the median filter of couplings and responses, symbols."""
 _SOLVER_ROUNDS = 5
+"""Rounds of conjugate gradients for each response."""
 _FITTED = [0, 2, 3, 4, 5]
-"""Nuisance parameters that steps fit: the phase of the gain, a page's piston, is taken off by pilots."""
+"""Nuisance parameters that a step fits. The phase of the gain is the page's piston, which the pilots give."""
 _LEAST_INFORMATION = 1e-3
-"""Least information over the page's median."""
+"""Least information, over the page's median."""
 _ROUNDS = 3
-_SAMPLES = 20_000
-"""Samples of each camera by which a page's gain is found."""
+"""Gauss-Newton steps of a page's nuisance parameters."""
+_GAIN_SAMPLES = 20_000
+"""Samples of each camera from which a page's first gain is fitted."""
+_GAIN_STARTS = 8
+"""Phases from which that fit may start."""
 _LEAST_COUNT = 1e-3
+"""Least count of a reference in the weights of that fit."""
 
 
 @dataclass
-class _Known:
-    """A known page, and the nuisance parameters that fit it."""
+class _FittedPage:
+    """A known page, and the nuisance parameters that fit it.
 
-    page: KnownPage
+    Attributes:
+        pair: frames of the page.
+        phases: phases of the symbols' light, radians [ny, nx].
+        nuisance: see `PageLikelihood`, [6].
+    """
+
+    pair: FramePair
     phases: Real
     nuisance: Real
+
+    @property
+    def gain(self) -> complex:
+        """Complex gain of the page's light."""
+        return complex(*self.nuisance[GAIN])
+
+    @property
+    def power_gain(self) -> float:
+        """Square of the gain's magnitude, by which the information of all phases grows."""
+        return float(np.sum(self.nuisance[GAIN] ** 2))
 
 
 class InformationFit:
     """Measurement of a device's statistics and information.
 
     Args:
-        likelihood: of its pages.
-        table: tensors of its geometry and of the light that is launched.
+        likelihood: likelihood of the device's pages.
+        table: tensors of the device's geometry and of the launched light.
         pages: known pages.
         device: calibrated device.
-        progress: function that takes the share of the work that is done; it may raise to stop it.
+        progress: called with the finished share of the work.
     """
 
     def __init__(
@@ -71,35 +94,43 @@ class InformationFit:
         table: SamplingTable,
         pages: Sequence[KnownPage],
         device: CalibratedDevice,
-        progress: Callable[[float], None] = lambda share: None,
+        progress: ProgressCallback = lambda share: None,
     ) -> None:
-        self._likelihood, self._progress = likelihood, progress
-        self.table: SamplingTable = dict(table)
-        self._pages = [_Known(page, np.angle(page.light(device.modulation)), np.eye(6)[0]) for page in pages]
+        self._likelihood = likelihood
+        self._progress = progress
+        self._table: SamplingTable = dict(table)
+        self._pages = [
+            _FittedPage(page.pair, np.angle(page.light(device.modulation)), np.array([1.0, 0, 0, 0, 0, 0]))
+            for page in pages
+        ]
 
     def statistics(self, conditions: LaunchConditions) -> Statistics:
-        """Measure the statistics of light that was launched under `conditions`.
+        """Measure the statistics of the pages' counts.
+
+        Args:
+            conditions: illumination and blur of the pages.
 
         Raises:
             CalibrationError: the pages' light does not agree with the device.
         """
-        first = [self._first_counts(known) for known in self._pages]
+        evaluations = [self._fit_gain(page) for page in self._pages]
         for number in range(_ROUNDS):
             self._progress(number / (_ROUNDS + 1))
-            cameras = self._measured(first if number == 0 else None)
-            self.table |= count_tensors(cameras, 1.0)
-            for known in self._pages:
-                known.nuisance = self._fitted(known)
-        cameras = self._measured(None)
-        self.table |= count_tensors(cameras, 1.0)
-        powers, curvatures = [], []
-        for known in self._pages:
-            here = self._at(known)
-            powers.append(float(np.mean(here.by_phase**2)))
-            direction = np.random.default_rng(0).choice([-1.0, 1.0], known.phases.shape)
-            curvatures.append(float(np.mean(direction * self._hessian(known, here, direction))))
+            self._table |= count_tensors(_camera_statistics(evaluations), 1.0)
+            for page in self._pages:
+                page.nuisance = self._gauss_newton_step(page)
+            evaluations = [self._evaluate(page) for page in self._pages]
+        cameras = _camera_statistics(evaluations)
+        self._table |= count_tensors(cameras, 1.0)
+        score_powers: list[float] = []
+        curvatures: list[float] = []
+        for page in self._pages:
+            current = self._evaluate(page)
+            score_powers.append(float(np.mean(current.by_phase**2)))
+            probe = np.random.default_rng(0).choice([-1.0, 1.0], page.phases.shape)
+            curvatures.append(float(np.mean(probe * self._hessian_product(page, current, probe))))
         self._progress(1.0)
-        correlation = float(np.mean(powers) / max(float(np.mean(curvatures)), 1e-30))
+        correlation = float(np.mean(score_powers) / max(float(np.mean(curvatures)), 1e-30))
         if not np.isfinite(correlation) or correlation <= 0:
             raise CalibrationError("calibration, statistics of the counts", "light that no page shows", "known pages")
         return Statistics.of(conditions, cameras, correlation)
@@ -107,38 +138,44 @@ class InformationFit:
     def information(self, statistics: Statistics) -> SamplingTable:
         """Measure the Fisher information of the symbols, and how they couple with the nuisance parameters.
 
+        Args:
+            statistics: statistics of the device's counts.
+
         Returns:
-            `count_scale`, `count_weights`; information [ny, nx] of a page of unit gain; responses [5, ny, nx] of the
-            phases to its relative gain, tilt and shift; nuisance_covariance [5, 5]; and nuisance_precision [4].
+            `count_scale` and `count_weights`, see `count_tensors`; `information` [ny, nx] of the symbols of a page of
+            unit gain; `responses` [5, ny, nx] of the phases to relative gain, tilt and shift; `nuisance_covariance`
+            [5, 5] of these; and `nuisance_precision` [4] of tilt and shift before a page is read.
         """
-        for known in self._pages:
-            self._first_counts(known)
-        self.table |= count_tensors(statistics.cameras, statistics.correlation)
+        for page in self._pages:
+            self._fit_gain(page)
+        self._table |= count_tensors(statistics.cameras, statistics.correlation)
         shape = self._pages[0].phases.shape
-        curvature, couplings, normal = np.zeros(shape), np.zeros((6, *shape)), np.zeros((6, 6))
+        curvature = np.zeros(shape)
+        couplings = np.zeros((len(_STEPS), *shape))
+        normal = np.zeros((len(_STEPS), len(_STEPS)))
         rng = np.random.default_rng(0)
-        for number, known in enumerate(self._pages):
+        for number, page in enumerate(self._pages):
             self._progress(number / (len(self._pages) + 1))
             for _ in range(_ROUNDS):
-                known.nuisance = self._fitted(known)
-            here, gain2 = self._at(known), float(np.sum(known.nuisance[GAIN] ** 2))
+                page.nuisance = self._gauss_newton_step(page)
+            current = self._evaluate(page)
             for _ in range(_PROBES):
-                direction = rng.choice([-1.0, 1.0], shape)
-                curvature += direction * self._hessian(known, here, direction) / _PROBES / gain2
-            columns, slopes = self._jacobian(known, here)
-            couplings += slopes / gain2
-            normal += self._normal(columns, here) / gain2
+                probe = rng.choice([-1.0, 1.0], shape)
+                curvature += probe * self._hessian_product(page, current, probe) / _PROBES / page.power_gain
+            jacobian, mixed = self._by_nuisance(page, current)
+            couplings += mixed / page.power_gain
+            normal += self._normal_matrix(jacobian, current) / page.power_gain
         count = len(self._pages)
         information = scipy.ndimage.gaussian_filter(curvature / count, _SMOOTHED)
         information = np.maximum(information, _LEAST_INFORMATION * np.median(information))
-        couplings = np.stack([scipy.ndimage.median_filter(one, _MEDIAN) for one in couplings[_FITTED] / count])
+        couplings = np.stack([scipy.ndimage.median_filter(each, _MEDIAN) for each in couplings[_FITTED] / count])
         self._progress(count / (count + 1))
         responses = self._responses(information, couplings)
         precision = 1 / PRIOR_DEVIATIONS**2
         schur = (normal / count)[np.ix_(_FITTED, _FITTED)] - np.einsum("kyx,lyx->kl", couplings, responses)
         schur = (schur + schur.T) / 2 + np.diag([0.0, *precision])
         return {
-            **{name: self.table[name] for name in ("count_scale", "count_weights")},
+            **{name: self._table[name] for name in ("count_scale", "count_weights")},
             "information": information.astype(np.float32),
             "responses": responses.astype(np.float32),
             "nuisance_covariance": np.linalg.inv(schur).astype(np.float32),
@@ -146,130 +183,148 @@ class InformationFit:
         }
 
     def _responses(self, information: Real, couplings: Real) -> Real:
-        """Solve for the change of all phases by which the light says the least of a nuisance parameter, [K, ny, nx].
+        """Solve the Hessian of the phases for each coupling [K, ny, nx], at the first page.
 
-        Conjugate gradients, preconditioned by the diagonal.
+        A response is the change of all phases that compensates a unit change of a nuisance parameter best.
         """
-        known = self._pages[0]
-        here, gain2 = self._at(known), float(np.sum(known.nuisance[GAIN] ** 2))
-        solutions = []
-        for coupling in couplings:
-            solution, left = np.zeros_like(coupling), coupling
-            along = scaled = left / information
-            power = np.sum(left * scaled)
-            for _ in range(_SOLVER_ROUNDS):
-                size = float(np.sqrt(np.mean(along**2)))
-                curved = self._hessian(known, here, along / size) * size / gain2
-                length = power / np.sum(along * curved)
-                solution, left = solution + length * along, left - length * curved
-                scaled = left / information
-                before, power = power, np.sum(left * scaled)
-                along = scaled + power / before * along
-            solutions.append(scipy.ndimage.median_filter(solution, _MEDIAN))
-        return np.stack(solutions)
+        page = self._pages[0]
+        current = self._evaluate(page)
 
-    def _at(self, known: _Known, nuisance: Real | None = None, phases: Real | None = None) -> Derivatives:
+        def product(direction: Real) -> Real:
+            size = float(np.sqrt(np.mean(direction**2)))
+            return self._hessian_product(page, current, direction / size) * size / page.power_gain
+
+        solutions = [_conjugate_gradients(product, coupling, information) for coupling in couplings]
+        return np.stack([scipy.ndimage.median_filter(solution, _MEDIAN) for solution in solutions])
+
+    def _evaluate(self, page: _FittedPage, nuisance: Real | None = None, phases: Real | None = None) -> Derivatives:
+        """Evaluate the likelihood of a page at its own phases and nuisance parameters, or at those given."""
         return self._likelihood(
-            known.page.pair,
-            self.table,
-            known.phases if phases is None else phases,
-            known.nuisance if nuisance is None else nuisance,
+            page.pair,
+            self._table,
+            page.phases if phases is None else phases,
+            page.nuisance if nuisance is None else nuisance,
         )
 
-    def _first_counts(self, known: _Known) -> tuple[Real, Real]:
-        """Counts of a page with the gain that fits it best, found without statistics; it becomes the page's gain.
+    def _fit_gain(self, page: _FittedPage) -> Derivatives:
+        """Fit a page's gain without statistics, set its nuisance parameters to it, and evaluate the page there.
 
-        Counts are a quadratic in the gain, which four evaluations tell.
+        The expected counts are a quadratic in the gain, which four evaluations determine.
         """
-        self.table |= _plain_tables()
-        dark, plus, minus, turned = (
-            self._at(known, np.array([real, imaginary, 0, 0, 0, 0]))
+        self._table |= _neutral_count_tensors()
+        dark, plus, minus, quadrature = (
+            self._evaluate(page, np.array([real, imaginary, 0, 0, 0, 0]))
             for real, imaginary in ((0, 0), (1, 0), (-1, 0), (0, 1))
         )
-        every = slice(None, None, max(1, plus.counts[0].size // _SAMPLES))
-        level, counts = dark.expected[:, every], plus.counts[:, every]
-        power = (plus.expected + minus.expected)[:, every] / 2 - level
-        real, imaginary = (plus.expected - minus.expected)[:, every] / 2, turned.expected[:, every] - level - power
-        weight = 1 / np.sqrt(np.maximum(level, _LEAST_COUNT))
+        stride = slice(None, None, max(1, plus.counts[0].size // _GAIN_SAMPLES))
+        counts = plus.counts[:, stride]
+        reference = dark.expected[:, stride]
+        power = (plus.expected + minus.expected)[:, stride] / 2 - reference
+        by_real = (plus.expected - minus.expected)[:, stride] / 2
+        by_imaginary = quadrature.expected[:, stride] - reference - power
+        weight = 1 / np.sqrt(np.maximum(reference, _LEAST_COUNT))
 
         def residual(gain: Real) -> Real:
-            expected = level + gain[0] * real + gain[1] * imaginary + np.sum(gain**2) * power
+            expected = reference + gain[0] * by_real + gain[1] * by_imaginary + np.sum(gain**2) * power
             return np.asarray(((counts - expected) * weight).ravel())
 
-        starts = [np.array([np.cos(angle), np.sin(angle)]) for angle in np.arange(8) * np.pi / 4]
+        angles = 2 * np.pi * np.arange(_GAIN_STARTS) / _GAIN_STARTS
+        starts = [np.array([np.cos(angle), np.sin(angle)]) for angle in angles]
         best = min(starts, key=lambda gain: float(np.sum(residual(gain) ** 2)))
         gain = scipy.optimize.least_squares(residual, best).x
-        known.nuisance = np.array([*gain, 0, 0, 0, 0])
-        here = self._at(known)
-        return here.expected, here.counts
+        page.nuisance = np.array([*gain, 0, 0, 0, 0])
+        return self._evaluate(page)
 
-    def _measured(self, samples: list[tuple[Real, Real]] | None) -> tuple[CountStatistics, CountStatistics]:
-        """Statistics of both cameras by all pages."""
-        if samples is None:
-            samples = [(here.expected, here.counts) for here in map(self._at, self._pages)]
-        both = [
-            CountStatistics.measured(
-                np.concatenate([expected[camera] for expected, _ in samples]),
-                np.concatenate([counts[camera] for _, counts in samples]),
-                f"known pages: counts of the {name} camera",
-            )
-            for camera, name in enumerate(("in-phase", "quadrature"))
-        ]
-        return both[0], both[1]
-
-    def _looked_up(self, here: Derivatives) -> Real:
-        """Values of the cameras' tables at the expected counts, [2, 4, N]."""
-        roots = self.table["count_scale"][:, None] * np.sqrt(here.expected)
+    def _count_weights_at(self, current: Derivatives) -> Real:
+        """Look up the cameras' tables at the expected counts, [2, 4, N]."""
+        roots = self._table["count_scale"][:, None] * np.sqrt(current.expected)
         places = np.minimum((roots + 0.5).astype(np.int64), KNOTS - 1)
-        tables = self.table["count_weights"].astype(np.float64)
+        tables = self._table["count_weights"].astype(np.float64)
         return np.stack([table[:, place] for table, place in zip(tables, places, strict=True)])
 
-    def _normal(self, columns: Real, here: Derivatives) -> Real:
-        """Fisher information of the nuisance parameters, with derivatives [6, 2, N], of all samples, [6, 6]."""
-        return np.asarray(here.every * np.einsum("knp,np,lnp->kl", columns, self._looked_up(here)[:, 2], columns))
+    def _normal_matrix(self, jacobian: Real, current: Derivatives) -> Real:
+        """Fisher information of the nuisance parameters, [6, 6], by the Jacobian [6, 2, N] of the expected counts."""
+        information = self._count_weights_at(current)[:, 2]
+        return np.asarray(current.stride * np.einsum("knp,np,lnp->kl", jacobian, information, jacobian))
 
-    def _score(self, here: Derivatives) -> Real:
+    def _score(self, current: Derivatives) -> Real:
         """Derivative of the log-likelihood by the expected counts, [2, N]."""
-        weights = self._looked_up(here)
-        return np.asarray(here.counts * weights[:, 0] - weights[:, 1])
+        weights = self._count_weights_at(current)
+        return np.asarray(current.counts * weights[:, 0] - weights[:, 1])
 
-    def _jacobian(self, known: _Known, here: Derivatives) -> tuple[Real, Real]:
-        """Derivatives of expected counts by the nuisance parameters [6, 2, N], and of the phases' gradient, less.
+    def _by_nuisance(self, page: _FittedPage, current: Derivatives) -> tuple[Real, Real]:
+        """Finite differences by the nuisance parameters, those of the gain by its relative change and by its phase.
 
-        The gain's are by its relative change, and by its phase.
+        Returns:
+            Jacobian of the expected counts, [6, 2, N]; and the negative mixed second derivatives of the log-likelihood
+            by nuisance parameters and phases, [6, ny, nx].
         """
-        columns, slopes = [], []
-        gain = complex(*known.nuisance[GAIN])
+        jacobian: list[Real] = []
+        mixed: list[Real] = []
         for index, step in enumerate(_STEPS):
-            moved = known.nuisance.copy()
+            nuisance = page.nuisance.copy()
             if index < 2:
-                there = gain * (1 + step) if index == 0 else gain * np.exp(1j * step)
-                moved[GAIN] = there.real, there.imag
+                gain = page.gain * (1 + step) if index == 0 else page.gain * np.exp(1j * step)
+                nuisance[GAIN] = gain.real, gain.imag
             else:
-                moved[index] += step
-            other = self._at(known, moved)
-            columns.append((other.expected - here.expected) / step)
-            slopes.append((here.by_phase - other.by_phase) / step)
-        return np.stack(columns), np.stack(slopes)
+                nuisance[index] += step
+            changed = self._evaluate(page, nuisance)
+            jacobian.append((changed.expected - current.expected) / step)
+            mixed.append((current.by_phase - changed.by_phase) / step)
+        return np.stack(jacobian), np.stack(mixed)
 
-    def _fitted(self, known: _Known) -> Real:
-        """Nuisance parameters of a page by a Gauss-Newton step from those it has."""
-        here = self._at(known)
-        columns, _ = self._jacobian(known, here)
+    def _gauss_newton_step(self, page: _FittedPage) -> Real:
+        """Nuisance parameters of a page after one more Gauss-Newton step, [6]."""
+        current = self._evaluate(page)
+        jacobian, _ = self._by_nuisance(page, current)
         precision = np.diag([0, 0, *1 / PRIOR_DEVIATIONS**2])
-        normal = self._normal(columns, here) + precision
-        pull = here.every * np.einsum("knp,np->k", columns, self._score(here)) - precision @ known.nuisance
-        change = np.linalg.solve(normal, pull)
-        gain = complex(*known.nuisance[GAIN]) * (1 + change[0]) * np.exp(1j * change[1])
-        return np.array([gain.real, gain.imag, *(known.nuisance[2:] + change[2:])])
+        normal = self._normal_matrix(jacobian, current) + precision
+        by_counts = current.stride * np.einsum("knp,np->k", jacobian, self._score(current))
+        gradient = by_counts - precision @ page.nuisance
+        step = np.linalg.solve(normal, gradient)
+        gain = page.gain * (1 + step[0]) * np.exp(1j * step[1])
+        return np.array([gain.real, gain.imag, *(page.nuisance[2:] + step[2:])])
 
-    def _hessian(self, known: _Known, here: Derivatives, direction: Real) -> Real:
-        """Product of the Fisher information of the phases and a direction, [ny, nx], by finite differences."""
-        other = self._at(known, phases=known.phases + _PROBE_RAD * direction)
-        return np.asarray((here.by_phase - other.by_phase) / _PROBE_RAD)
+    def _hessian_product(self, page: _FittedPage, current: Derivatives, direction: Real) -> Real:
+        """Product of the negative Hessian by the phases and a direction, [ny, nx], by a finite difference."""
+        changed = self._evaluate(page, phases=page.phases + _PHASE_STEP_RAD * direction)
+        return np.asarray((current.by_phase - changed.by_phase) / _PHASE_STEP_RAD)
 
 
-def _plain_tables() -> SamplingTable:
-    """Tables for evaluations whose derivatives are not looked at."""
-    plain = CountStatistics(expected=(0.0, 1.0, 2.0, 3.0), mean=(0.0, 1.0, 2.0, 3.0), variance=(1.0,) * 4)
-    return count_tensors((plain, plain), 1.0)
+def _camera_statistics(evaluations: Sequence[Derivatives]) -> tuple[CountStatistics, CountStatistics]:
+    """Statistics of the in-phase and of the quadrature camera's counts over all pages."""
+    in_phase, quadrature = (
+        CountStatistics.measured(
+            np.concatenate([each.expected[camera] for each in evaluations]),
+            np.concatenate([each.counts[camera] for each in evaluations]),
+            f"known pages: counts of the {name} camera",
+        )
+        for camera, name in enumerate(("in-phase", "quadrature"))
+    )
+    return in_phase, quadrature
+
+
+def _conjugate_gradients(product: Callable[[Real], Real], right: Real, diagonal: Real) -> Real:
+    """Solve `product`(solution) = `right` by conjugate gradients, preconditioned by a diagonal, [ny, nx] each."""
+    solution = np.zeros_like(right)
+    residual = right
+    preconditioned = residual / diagonal
+    direction = preconditioned
+    power = np.sum(residual * preconditioned)
+    for _ in range(_SOLVER_ROUNDS):
+        curved = product(direction)
+        length = power / np.sum(direction * curved)
+        solution = solution + length * direction
+        residual = residual - length * curved
+        preconditioned = residual / diagonal
+        previous_power = power
+        power = np.sum(residual * preconditioned)
+        direction = preconditioned + power / previous_power * direction
+    return solution
+
+
+def _neutral_count_tensors() -> SamplingTable:
+    """Tensors of the counts for evaluations whose derivatives are not used."""
+    line = (0.0, 1.0, 2.0, 3.0)
+    camera = CountStatistics(expected=line, mean=line, variance=(1.0,) * len(line))
+    return count_tensors((camera, camera), 1.0)

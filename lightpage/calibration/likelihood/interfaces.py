@@ -1,7 +1,8 @@
-"""The likelihood of a page as calibration asks for it, computed by torch in training and by ONNX in the runtime."""
+"""The likelihood of a page as calibration asks for it: torch computes it in training, ONNX Runtime in the runtime."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -13,8 +14,11 @@ from lightpage.recording.frame_pair import FramePair
 
 Real = NDArray[np.float64]
 
+ProgressCallback = Callable[[float], None]
+"""Function that is called with the finished share of the work, 0 to 1. It may raise an exception to stop the work."""
+
 MOST_SAMPLES = 400_000
-"""Samples of a camera that statistics are taken of, about."""
+"""Approximate limit of the samples of a camera from which statistics are measured."""
 
 
 @dataclass(frozen=True)
@@ -24,23 +28,31 @@ class Derivatives:
     Attributes:
         by_phase: derivative by each symbol's phase, [ny, nx].
         by_nuisance: derivatives by the page's gain (relative change and phase), tilt and shift, [6].
-        expected: counts that the light would give perfect cameras, on an even share of the grid where both cameras have
-            a reference, [2, N].
-        counts: counts that came there, [2, N].
-        every: samples for which each of these stands.
+        expected: counts that the light would give perfect cameras, [2, N], at evenly chosen samples of the common grid
+            where both cameras have a reference.
+        counts: measured counts at the same samples, [2, N].
+        stride: number of such samples of the grid that each chosen one stands for.
     """
 
     by_phase: Real
     by_nuisance: Real
     expected: Real
     counts: Real
-    every: int
+    stride: int
 
 
-def sampled_evenly(lit: NDArray[np.bool_], *planes: NDArray[np.float32]) -> tuple[list[Real], int]:
-    """Samples of planes [2, Gy, Gx] where `lit` [Gy, Gx] is set, [2, N] each, and how many each stands for."""
-    every = max(1, int(np.count_nonzero(lit)) // MOST_SAMPLES)
-    return [plane[:, lit][:, ::every].astype(np.float64) for plane in planes], every
+def sampled_evenly(mask: NDArray[np.bool_], *planes: NDArray[np.float32]) -> tuple[list[Real], int]:
+    """Choose at most about `MOST_SAMPLES` samples of planes evenly.
+
+    Args:
+        mask: places that may be chosen, [Gy, Gx].
+        planes: planes of both cameras, [2, Gy, Gx] each.
+
+    Returns:
+        The chosen samples of each plane, [2, N], and the number of places that each stands for.
+    """
+    stride = max(1, int(np.count_nonzero(mask)) // MOST_SAMPLES)
+    return [plane[:, mask][:, ::stride].astype(np.float64) for plane in planes], stride
 
 
 class PageLikelihood(Protocol):

@@ -1,24 +1,22 @@
-"""Statistics of a calibrated device by its known pages, and the tensors by which its pages are estimated."""
+"""Measurement of a calibrated device on its known pages: statistics of its counts, and tensors of its estimator."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from lightpage.calibration.calibrate import KnownPage
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.likelihood.information import InformationFit
-from lightpage.calibration.likelihood.interfaces import PageLikelihood
+from lightpage.calibration.likelihood.interfaces import PageLikelihood, ProgressCallback
 from lightpage.calibration.likelihood.statistics import Statistics
 from lightpage.calibration.likelihood.table import launch_tensors
 from lightpage.calibration.sampling_table import APART, SamplingTable, sampling_table
 from lightpage.calibration.waves.wave_model import LaunchConditions
 
-Told = Callable[[float], None]
-
 
 def light_table(twin: Twin, device: CalibratedDevice, conditions: LaunchConditions) -> SamplingTable:
-    """Tensors of a device's geometry, references and launched light.
+    """Collect the tensors of a device's geometry, references and launched light.
 
     Args:
         twin: ray tracer of the nominal device.
@@ -26,11 +24,11 @@ def light_table(twin: Twin, device: CalibratedDevice, conditions: LaunchConditio
         conditions: illumination and blur of its pages.
     """
     traced = sampling_table(twin, device.parameters, device.quadrature_phase_rad, device.profile)
-    left_out = {"place_gradients", "phases", *APART} - {*device.apart_inputs}
+    excluded = {"place_gradients", "phases", *APART} - {*device.apart_inputs}
     return {
         "reference_in_phase": device.references.in_phase,
         "reference_quadrature": device.references.quadrature,
-        **{name: value for name, value in traced.items() if name not in left_out},
+        **{name: value for name, value in traced.items() if name not in excluded},
         **launch_tensors(device.profile, device.parameters, conditions, device.modulation),
     }
 
@@ -41,18 +39,18 @@ def measured_statistics(
     device: CalibratedDevice,
     pages: Sequence[KnownPage],
     conditions: LaunchConditions,
-    progress: Told = lambda share: None,
+    progress: ProgressCallback = lambda share: None,
 ) -> Statistics:
-    """Measure the statistics of a device's counts by known pages.
+    """Measure the statistics of a device's counts on known pages.
 
     Args:
-        likelihood: of the device's pages.
+        likelihood: likelihood of the device's pages.
         twin, device, conditions: see `light_table`.
         pages: known pages.
-        progress: function that takes the share of the work that is done; it may raise to stop it.
+        progress: called with the finished share of the work.
 
     Raises:
-        CalibrationError: pages that do not agree with the device.
+        CalibrationError: the pages' light does not agree with the device.
     """
     fit = InformationFit(likelihood, light_table(twin, device, conditions), pages, device, progress)
     return fit.statistics(conditions)
@@ -64,9 +62,9 @@ def estimator_table(
     device: CalibratedDevice,
     pages: Sequence[KnownPage],
     statistics: Statistics,
-    progress: Told = lambda share: None,
+    progress: ProgressCallback = lambda share: None,
 ) -> SamplingTable:
-    """Return all tensors by which a device's pages are estimated, but for noise and pilots.
+    """Return the tensors that the estimation of a device's pages needs, except noise and pilots.
 
     Args:
         likelihood, twin, device, pages, progress: see `measured_statistics`.

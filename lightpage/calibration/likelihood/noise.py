@@ -1,4 +1,4 @@
-"""Noise of estimated phases against what their Fisher information promises."""
+"""Noise of estimated phases, compared with the Cramér-Rao bound of their Fisher information."""
 
 from __future__ import annotations
 
@@ -10,41 +10,46 @@ from lightpage.von_mises import information as nats
 
 Real = NDArray[np.float64]
 
-_NORMAL = 0.4549
+_MEDIAN_CHI2 = 0.4549
 """Median of the square of a normal error, over its variance."""
-_SMALLEST = 1e-12
-"""Smallest part of a variance, over its median, that is told from none."""
+_LEAST_SHARE = 1e-12
+"""Least share of the variance that either part of the noise may have."""
 
 
 def fitted_noise(errors: Real, information: Real) -> NDArray[np.float32]:
-    """Fit the noise of estimates by their errors: the variance of a phase is noise[0] / information + noise[1].
+    """Fit the noise of estimated phases by maximum likelihood.
 
-    The likelihood is that of von Mises densities of such concentration.
+    An error has a von Mises density of concentration 1 / (noise[0] / information + noise[1]).
 
     Args:
-        errors: phases less known ones, radians, [N].
-        information: Fisher information of each, [N].
+        errors: estimated phases minus known ones, radians, [N].
+        information: Fisher information of each phase, [N].
 
     Returns:
-        [2]: factor on the variance that the information promises, and variance beside it, rad^2.
+        Noise: the factor on the Cramér-Rao bound, and an additional variance that all phases share, rad^2, [2].
     """
     relative = information / np.median(information)
-    variance = float(np.median(errors**2)) / _NORMAL
+    variance = float(np.median(errors**2)) / _MEDIAN_CHI2
 
     def loss(logarithms: Real) -> float:
         concentration = 1 / (np.exp(logarithms[0]) / relative + np.exp(logarithms[1]))
-        logarithm = np.log(scipy.special.i0e(concentration))
-        return float(np.mean(logarithm - concentration * (np.cos(errors) - 1)))
+        log_normalization = np.log(scipy.special.i0e(concentration))
+        return float(np.mean(log_normalization - concentration * (np.cos(errors) - 1)))
 
-    least = np.log(variance * _SMALLEST)
+    least = np.log(variance * _LEAST_SHARE)
     bounds = [(least, 3.0)] * 2
     starts = [np.log(variance * np.array(shares)) for shares in ((0.9, 0.1), (0.1, 0.9))]
-    found = [scipy.optimize.minimize(loss, start, method="Nelder-Mead", bounds=bounds) for start in starts]
-    best = np.exp(min(found, key=lambda one: float(one.fun)).x)
+    fits = [scipy.optimize.minimize(loss, start, method="Nelder-Mead", bounds=bounds) for start in starts]
+    best = np.exp(min(fits, key=lambda fit: float(fit.fun)).x)
     return np.array([best[0] * np.median(information), best[1]], np.float32)
 
 
 def expected_bits(noise: NDArray[np.float32], information: Real) -> float:
-    """Mean information of symbols with such noise, bits a symbol; see `fitted_noise`."""
+    """Expected information of symbols, bits a symbol.
+
+    Args:
+        noise: see `fitted_noise`, [2].
+        information: Fisher information of each symbol's phase.
+    """
     concentration = information / (noise[0] + noise[1] * information)
     return float(np.mean(nats(concentration)) / np.log(2))

@@ -21,13 +21,13 @@ class Statistics(TomlTable):
         blur: variance of the modulator's blur, over the square of its pixels' pitch.
         illumination_real, illumination_imaginary: coefficients of the illumination's terms, see
             `lightpage.calibration.waves.wave_model.illumination_terms`.
-        correlation: variance of the score of the known pages over their Fisher information, were samples independent:
-            neighbours on the grid are correlated, and light that the model leaves unexplained adds to them.
-        in_phase_expected, in_phase_mean, in_phase_variance: of the in-phase camera, see `CountStatistics`.
-        quadrature_expected, quadrature_mean, quadrature_variance: of the quadrature camera.
+        correlation: variance of the score of the known pages, over the Fisher information of independent samples. It
+            exceeds 1 because neighbours on the grid are correlated, and because of unexplained light.
+        in_phase_expected, in_phase_mean, in_phase_variance: statistics of the in-phase camera, see `CountStatistics`.
+        quadrature_expected, quadrature_mean, quadrature_variance: the same of the quadrature camera.
     """
 
-    blur: Finite
+    blur: Annotated[float, Field(ge=0, allow_inf_nan=False)]
     illumination_real: Coefficients
     illumination_imaginary: Coefficients
     correlation: Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -48,7 +48,7 @@ class Statistics(TomlTable):
     def of(
         cls, conditions: LaunchConditions, cameras: tuple[CountStatistics, CountStatistics], correlation: float
     ) -> Statistics:
-        """The statistics of launched light and of both cameras' counts."""
+        """Combine the conditions of launched light and the statistics of both cameras' counts."""
         names = zip(("in_phase", "quadrature"), cameras, strict=True)
         return cls(
             blur=float(conditions.blur),

@@ -1,4 +1,4 @@
-"""Tensors of a device that maximum likelihood needs beside its sampling table."""
+"""Tensors of a device that maximum likelihood needs in addition to its sampling table."""
 
 from __future__ import annotations
 
@@ -18,25 +18,28 @@ from lightpage.waves.lens import entrance_window
 Real = NDArray[np.float64]
 
 HARMONICS = 6
-"""Order of the series of the amplitude over the phase of light."""
-_FINE = 512
+"""Order of the Fourier series of the amplitude over the phase of light."""
+_PHASES = 512
+"""Phases at which the modulator's light is sampled."""
 POINT_SPREAD_REACH = 6
-"""Samples of the modulator to which the light of one spreads, by forward and adjoint waves."""
-_FACET = 257
-PILOT_PHASORS, PILOT_MASK = "pilot_phasors", "pilot_mask"
-"""Names of the tensors that differ from page to page, with the levels that are written."""
+"""Largest distance, in samples of the modulator, of the point spread of forward and adjoint waves."""
+_FACET_SAMPLES = 257
+"""Samples along an axis of the entrance facet."""
+PILOT_PHASORS = "pilot_phasors"
+PILOT_MASK = "pilot_mask"
+"""Names of the tensors that may be fed with each page, since pilots depend on the number of levels."""
 
 
 def launch_tensors(
     profile: Profile, parameters: Real, conditions: LaunchConditions, modulation: Modulation
 ) -> SamplingTable:
-    """Tensors of the light that is launched.
+    """Compute the tensors of the launched light.
 
     Args:
         profile: nominal device.
-        parameters: [P] fitted.
+        parameters: fitted parameters, [P].
         conditions: illumination and blur of a known page.
-        modulation: light that the modulator makes of its levels.
+        modulation: light of the modulator at its levels.
 
     Returns:
         blur []; illumination [2, 6], without its phase; amplitude_series [13] and slope_power [], see
@@ -54,31 +57,31 @@ def launch_tensors(
 
 
 def point_spread(profile: Profile, parameters: Real, blur: float) -> NDArray[np.float32]:
-    """Share of a sample's light that forward and adjoint waves bring to its neighbours along an axis.
+    """Compute the point spread of forward and adjoint waves together, along one axis of the modulator.
 
-    All light that enters the pipe comes back; so this is the autocorrelation of the modulator's samples by what the
-    entrance facet passes of them.
+    The pipe loses no light. So this is the point spread of the entrance facet's window alone.
 
     Args:
         profile, parameters, blur: see `launch_tensors`.
 
     Returns:
-        Relative to the sample's own, at distances of 0 to 6 samples, [1 + POINT_SPREAD_REACH].
+        Light at distances of 0 to 6 samples over that at 0, [1 + POINT_SPREAD_REACH].
     """
     geometry = fitted_geometry(profile, as_dict(parameters))
     pitch = profile.symbol_pitch_m / symbol_samples(profile)
-    facet = np.linspace(-0.5, 0.5, _FACET) * geometry.pipe_width_m
-    passed = entrance_window(geometry, facet, np.zeros(1), pitch, blur * profile.slm.pitch_m**2)[0] ** 2
-    turns = facet * pitch / (geometry.wavelength_m * geometry.focal_length_m)
-    spread = np.cos(2 * np.pi * np.arange(1 + POINT_SPREAD_REACH)[:, None] * turns) @ passed
+    facet = np.linspace(-0.5, 0.5, _FACET_SAMPLES) * geometry.pipe_width_m
+    transmission = entrance_window(geometry, facet, np.zeros(1), pitch, blur * profile.slm.pitch_m**2)[0] ** 2
+    cycles = facet * pitch / (geometry.wavelength_m * geometry.focal_length_m)
+    spread = np.cos(2 * np.pi * np.arange(1 + POINT_SPREAD_REACH)[:, None] * cycles) @ transmission
     return np.asarray(spread / spread[0], np.float32)
 
 
 def slope_power(series: NDArray[np.float32], modulation: Modulation) -> NDArray[np.float32]:
-    """Mean square of the derivative of the light by its phase over all levels, []."""
-    phase = np.angle(modulation.light(2 * np.pi * (np.arange(_FINE) + 0.5) / _FINE))
+    """Mean square of the derivative of the light by its phase, over all levels, []."""
+    phase = np.angle(modulation.light(2 * np.pi * (np.arange(_PHASES) + 0.5) / _PHASES))
     numbers = np.arange(1, HARMONICS + 1)
-    cosine, sine = np.cos(numbers * phase[:, None]), np.sin(numbers * phase[:, None])
+    cosine = np.cos(numbers * phase[:, None])
+    sine = np.sin(numbers * phase[:, None])
     amplitude = np.exp(series[0] + cosine @ series[1::2] + sine @ series[2::2])
     slope = (numbers * cosine) @ series[2::2] - (numbers * sine) @ series[1::2]
     return np.array(np.mean(amplitude**2 * (1 + slope**2)), np.float32)
@@ -86,15 +89,20 @@ def slope_power(series: NDArray[np.float32], modulation: Modulation) -> NDArray[
 
 def amplitude_series(modulation: Modulation) -> NDArray[np.float32]:
     """Fourier series of the logarithm of the amplitude over the phase of the light, [1 + 2 HARMONICS]."""
-    light = modulation.light(2 * np.pi * (np.arange(_FINE) + 0.5) / _FINE)
+    light = modulation.light(2 * np.pi * (np.arange(_PHASES) + 0.5) / _PHASES)
     phase = np.angle(light)
-    turns = [function(number * phase) for number in range(1, HARMONICS + 1) for function in (np.cos, np.sin)]
-    terms = np.stack([np.ones(_FINE), *turns], axis=1)
+    harmonics = [function(number * phase) for number in range(1, HARMONICS + 1) for function in (np.cos, np.sin)]
+    terms = np.stack([np.ones(_PHASES), *harmonics], axis=1)
     return np.asarray(np.linalg.lstsq(terms, np.log(np.abs(light)), rcond=None)[0], np.float32)
 
 
 def count_tensors(statistics: tuple[CountStatistics, CountStatistics], correlation: float) -> SamplingTable:
-    """Look-up tables of both cameras' counts: count_scale [2] and count_weights [2, 4, KNOTS]."""
+    """Look-up tables of both cameras' counts: `count_scale` [2] and `count_weights` [2, 4, KNOTS].
+
+    Args:
+        statistics: statistics of the in-phase and of the quadrature camera.
+        correlation: see `CountStatistics.weights`.
+    """
     return {
         "count_scale": np.array([camera.scale for camera in statistics], np.float32),
         "count_weights": np.stack([camera.weights(correlation) for camera in statistics]),
@@ -102,7 +110,7 @@ def count_tensors(statistics: tuple[CountStatistics, CountStatistics], correlati
 
 
 def pilot_tensors(pilots: Pilots) -> SamplingTable:
-    """Known phasors [2, ny, nx] of the pilots, and 1 where a symbol is a pilot, else 0, [ny, nx]."""
+    """Phasors of the pilots [2, ny, nx], and their mask, 1 at a pilot and 0 elsewhere, [ny, nx]."""
     phases = np.zeros(pilots.mask.shape)
     phases[pilots.mask] = pilots.phases
     return {

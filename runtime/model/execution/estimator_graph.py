@@ -1,4 +1,4 @@
-"""Maximum likelihood in ONNX Runtime: constants of a table, a first estimate, and a step that is repeated."""
+"""Maximum likelihood in ONNX Runtime: operators of a device, a first estimate of a page, and repeated steps."""
 
 from __future__ import annotations
 
@@ -15,25 +15,28 @@ from lightpage.runtime.model.execution.session import BoundSession, Port, Sessio
 from lightpage.runtime.model.execution.table_graph import GraphFile, HeldTable, check_table
 
 ESTIMATE = ("p", "nuisance", "deviations")
-"""State of the estimation, that a step takes and gives."""
-BEFORE = {name: f"{name}_before" for name in ESTIMATE}
-"""Names of the estimate as a step's input, by that of its output."""
+"""Outputs of the first estimate and of each step that the next step takes."""
+ESTIMATE_INPUTS = {name: f"{name}_before" for name in ESTIMATE}
+"""Names of the same tensors as a step's inputs, by their names as outputs."""
 PAGE = ("counts", "reference", "amplitude", "lit")
-"""Measurements of a page on the common grid, which all steps share."""
+"""Measurements of a page on the common grid: outputs of the first estimate that every step takes."""
 DEVIATION_PRECISION = "deviation_precision"
-"""Inverse variance of what the phases of the modulator's samples differ from their symbols'."""
+"""Inverse variance of the deviations of the modulator's samples from the phases of their symbols."""
 NO_DEVIATIONS = np.array(1e12, np.float32)
-"""Precision that keeps them at zero."""
+"""Precision that keeps the deviations at zero."""
 NOISE = "noise"
-"""Noise of a number of steps, a row each, from that of the first estimate on."""
+"""Noise of the first estimate and after each step, one row each."""
 EARLY_STEPS = 1
-"""Steps whose light may be predicted coarsely: what they err, later ones mend."""
+"""Number of first steps that predict the light coarsely. Later steps correct their errors."""
 DERIVATIVES = ("by_phase", "by_nuisance", "expected")
-ANSWERS = ("p", "phase", "concentration", "nuisance", "deviations")
-"""Outputs of the first estimate, and of each step."""
-STEP_OUTPUTS = (*ANSWERS, "chi_square", *DERIVATIVES, "by_sample")
+"""Outputs of a step that belong to the estimate it was given."""
+ESTIMATE_OUTPUTS = ("p", "phase", "concentration", "nuisance", "deviations")
+"""Outputs of the first estimate and of each step."""
+CHI_SQUARE = "chi_square"
+"""Output of a step: mean square of the counts' residuals over their variance, at the estimate it was given."""
+STEP_OUTPUTS = (*ESTIMATE_OUTPUTS, CHI_SQUARE, *DERIVATIVES, "by_sample")
 RESIDUAL = "residual"
-"""Output of the first estimate that no step changes."""
+"""Output of the first estimate that steps do not change."""
 _FRAMES = ("in_phase", "quadrature")
 
 
@@ -41,9 +44,9 @@ class EstimatorFiles(NamedTuple):
     """Serialised graphs of an estimator.
 
     Attributes:
-        operators: a table to the constants that the others take.
-        first: frames to a first estimate.
-        early, step: an estimate to the next one, coarsely and exactly.
+        operators: graph from a device's table to the wave operators, which the other graphs take.
+        first: graph from frames to the first estimate.
+        early, step: graphs from an estimate to the next one, with coarsely and accurately predicted light.
     """
 
     operators: bytes
@@ -53,26 +56,31 @@ class EstimatorFiles(NamedTuple):
 
 
 class EstimatorGraph:
-    """The graphs of an estimator and their table. It never changes; many threads may call its methods at once.
+    """The graphs of an estimator with their table.
+
+    It is immutable. Several threads may call its methods at the same time.
 
     Args:
-        files: its graphs.
-        defaults: graph of all in one, whose inputs have the table's defaults.
+        files: serialised graphs.
+        defaults: defaults of the table's tensors.
         subject: name of the bundle, for errors.
         threads: threads of one run; by default the cores that this process may use.
-        table: values instead of the defaults.
+        table: tensors that replace their defaults, by name.
         like: the same graphs with another table, whose sessions are shared.
-        provider: provider that computes pages; operators are computed on the CPU.
-        steps: largest number of steps; None for as many as the bundle has.
+        provider: execution provider of the pages' graphs; operators are computed on the CPU.
+        steps: largest number of steps; the number that the bundle has if left out.
 
     Attributes:
         ports: type and shape of every tensor of the table, by name.
+        table: tensors that replace their defaults, by name.
+        provider: execution provider of the pages' graphs.
         steps: number of steps.
 
     Raises:
-        InvalidInputError: a table that does not fit.
-        BundleError: a graph cannot be run, or lacks what it needs of the table.
-        ProviderError: there is no such provider here.
+        InvalidInputError: a tensor of `table` has an unknown name, a wrong type or shape, or values that are not
+            finite.
+        BundleError: a graph cannot be run, or takes an input that the table does not have.
+        ProviderError: this machine does not have the provider.
     """
 
     def __init__(
@@ -86,8 +94,11 @@ class EstimatorGraph:
         provider: Provider = ON_CPU,
         steps: int | None = None,
     ) -> None:
-        self._files, self._defaults, self._subject = files, defaults, subject
-        self._threads, self.provider = threads, provider
+        self._files = files
+        self._defaults = defaults
+        self._subject = subject
+        self._threads = threads
+        self.provider = provider
         self.ports = defaults.table_inputs
         self.table: SamplingTable = table or {}
         check_table(self.ports, self.table)
@@ -95,39 +106,51 @@ class EstimatorGraph:
         most = most_steps(self.ports, subject)
         self.steps = most if steps is None else min(steps, most)
         if like is None:
-            self._device = open_session(files.operators, f"{subject}: operators", threads, once=True)
-            self._first, self._early, self._step = (
-                open_session(model, f"{subject}: {what}", threads, provider=provider)
-                for what, model in {
-                    "first estimate": files.first,
-                    "early step": files.early,
-                    "step": files.step,
-                }.items()
-            )
+            self._operators = open_session(files.operators, f"{subject}: operators", threads, once=True)
+            self._first = open_session(files.first, f"{subject}: first estimate", threads, provider=provider)
+            self._early = open_session(files.early, f"{subject}: early step", threads, provider=provider)
+            self._step = open_session(files.step, f"{subject}: step", threads, provider=provider)
         else:
-            self._device, self._first, self._early, self._step = like._device, like._first, like._early, like._step
-        names = [node.name for node in self._device.get_outputs()]
-        feeds = {node.name: self.value(node.name) for node in self._device.get_inputs()}
+            self._operators = like._operators
+            self._first = like._first
+            self._early = like._early
+            self._step = like._step
+        names = [node.name for node in self._operators.get_outputs()]
+        feeds = {node.name: self.value(node.name) for node in self._operators.get_inputs()}
         with running(subject):
-            made = dict(zip(names, self._device.run(names, feeds), strict=True))
-        self._held = {name: self.value(name) for name in self.ports if name != NOISE} | made
+            operators = dict(zip(names, self._operators.run(names, feeds), strict=True))
+        self._constants = {name: self.value(name) for name in self.ports if name != NOISE} | operators
         self._bound = {session: self._with_constants(session) for session in (self._first, self._early, self._step)}
 
     def with_table(self, table: SamplingTable) -> EstimatorGraph:
-        """The graphs with other tensors in their table, by name; those left out stay. It raises as the constructor."""
-        merged = {**self.table, **table}
-        files, defaults, threads = self._files, self._defaults, self._threads
-        return EstimatorGraph(files, defaults, self._subject, threads, merged, self, self.provider, self._limit)
+        """Return the graphs with replaced tensors in their table.
+
+        Args:
+            table: new tensors, by name; the others stay.
+
+        Raises:
+            InvalidInputError, BundleError: see the constructor.
+        """
+        return EstimatorGraph(
+            self._files,
+            self._defaults,
+            self._subject,
+            self._threads,
+            {**self.table, **table},
+            like=self,
+            provider=self.provider,
+            steps=self._limit,
+        )
 
     @property
     def outputs(self) -> dict[str, Port]:
-        """Type and shape of what can be asked for, by name."""
+        """Types and shapes of the outputs of the first estimate and of the steps, by name."""
         nodes = (*self._first.get_outputs(), *self._step.get_outputs())
         return {node.name: Port.of(node) for node in nodes}
 
     @property
     def inputs(self) -> dict[str, Port]:
-        """Type and shape of what must be fed with each page, by name."""
+        """Types and shapes of the frames that each page needs, by name."""
         return {node.name: Port.of(node) for node in self._first.get_inputs() if node.name in _FRAMES}
 
     def value(self, name: str) -> NDArray[Any]:
@@ -141,7 +164,7 @@ class EstimatorGraph:
         return self.table[name] if name in self.table else self._defaults.default(name)
 
     def check(self, table: SamplingTable) -> None:
-        """Check tensors that are to stand in the table; see `check_table`."""
+        """Check new tensors of the table; see `check_table`."""
         check_table(self.ports, table)
 
     def run(
@@ -150,20 +173,21 @@ class EstimatorGraph:
         """Estimate a page.
 
         Args:
-            outputs: names of what is wanted.
-            feeds: frames, and table tensors for this page alone.
-            steps: number of steps; the graph's if left out.
+            outputs: names of outputs. `chi_square` needs at least one step.
+            feeds: frames, and tensors of the table for this page alone, by name.
+            steps: number of steps; `self.steps` if left out.
         """
-        found, steps = self.begun(feeds), self.steps if steps is None else steps
+        steps = self.steps if steps is None else steps
         noise = self.value(NOISE)
+        state = self.first_estimate(feeds)
         for number in range(steps):
-            wanted = (*ANSWERS, "chi_square") if number == steps - 1 else ESTIMATE
+            wanted = (*ESTIMATE_OUTPUTS, CHI_SQUARE) if number == steps - 1 else ESTIMATE
             session = self._early if number < EARLY_STEPS else self._step
-            found |= self._stepped(session, found, noise[number + 1], feeds, wanted)
-        return [found[name] for name in outputs]
+            state |= self._run_step(session, state, noise[number + 1], feeds, wanted)
+        return [state[name] for name in outputs]
 
     def run_whole(self, outputs: Sequence[str], feeds: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
-        """Estimate a page with all steps that the bundle has; arguments as for `run`."""
+        """Estimate a page with all steps of the bundle, whatever `self.steps` is; see `run`."""
         return self.run(outputs, feeds, len(self.value(NOISE)) - 1)
 
     def derivatives(
@@ -174,61 +198,73 @@ class EstimatorGraph:
         nuisance: NDArray[np.float32],
         outputs: Sequence[str] = DERIVATIVES,
     ) -> dict[str, NDArray[Any]]:
-        """Return outputs of a step from an estimate, by name.
+        """Evaluate a step at an estimate.
 
         Args:
-            page: measurements of the page and deviations, as `begun` returns them.
-            feeds: table tensors for this evaluation alone.
-            p, nuisance: the estimate.
-            outputs: names of `STEP_OUTPUTS`.
+            page: measurements of the page and deviations, see `first_estimate`.
+            feeds: tensors of the table for this evaluation alone, by name.
+            p: phases and concentrations of the symbols, [2, ny, nx].
+            nuisance: nuisance parameters of the page, [6].
+            outputs: names from `STEP_OUTPUTS`.
+
+        Returns:
+            The outputs by name.
         """
-        found = {**page, "p": p, "nuisance": nuisance}
-        return self._stepped(self._step, found, self.value(NOISE)[1], feeds, outputs)
+        state = {**page, "p": p, "nuisance": nuisance}
+        return self._run_step(self._step, state, self.value(NOISE)[1], feeds, outputs)
 
-    def begun(self, feeds: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """Return the first estimate and the measurements of a page, by name; feeds as for `run`."""
+    def first_estimate(self, feeds: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        """Compute the first estimate of a page.
+
+        Args:
+            feeds: see `run`.
+
+        Returns:
+            `ESTIMATE_OUTPUTS`, `RESIDUAL`, and the page's measurements (`PAGE`), by name.
+        """
         names = [node.name for node in self._first.get_outputs()]
-        return self._asked(self._first, names, {**feeds, NOISE: self.value(NOISE)[0]})
+        return self._run_session(self._first, names, {**feeds, NOISE: self.value(NOISE)[0]})
 
-    def _stepped(
+    def _run_step(
         self,
         session: Session,
-        found: Mapping[str, NDArray[Any]],
+        state: Mapping[str, NDArray[Any]],
         noise: NDArray[Any],
         feeds: Mapping[str, NDArray[Any]],
         outputs: Sequence[str],
     ) -> dict[str, NDArray[Any]]:
-        state = {BEFORE.get(name, name): found[name] for name in (*ESTIMATE, *PAGE)} | {NOISE: noise}
-        shared = {name: value for name, value in feeds.items() if name not in _FRAMES}
-        return self._asked(session, outputs, {**shared, **state})
+        table = {name: value for name, value in feeds.items() if name not in _FRAMES}
+        inputs = {ESTIMATE_INPUTS.get(name, name): state[name] for name in (*ESTIMATE, *PAGE)}
+        return self._run_session(session, outputs, {**table, **inputs, NOISE: noise})
 
-    def _asked(
+    def _run_session(
         self, session: Session, outputs: Sequence[str], feeds: Mapping[str, NDArray[Any]]
     ) -> dict[str, NDArray[Any]]:
-        taken = {node.name for node in session.get_inputs()}
-        given = {name: value for name, value in feeds.items() if name in taken}
-        return dict(zip(outputs, self._bound[session].run(outputs, given), strict=True))
+        inputs = {node.name for node in session.get_inputs()}
+        used = {name: value for name, value in feeds.items() if name in inputs}
+        return dict(zip(outputs, self._bound[session].run(outputs, used), strict=True))
 
     def _with_constants(self, session: Session) -> BoundSession:
-        """A session with all of the table and the operators that it takes."""
+        """Bind the tensors of the table and the operators that a session takes."""
         inputs = {node.name for node in session.get_inputs()}
-        held = {name: value for name, value in self._held.items() if name in inputs}
-        if missing := inputs - held.keys() - {*_FRAMES, *BEFORE.values(), *PAGE, NOISE}:
+        constants = {name: value for name, value in self._constants.items() if name in inputs}
+        if missing := inputs - constants.keys() - {*_FRAMES, *ESTIMATE_INPUTS.values(), *PAGE, NOISE}:
             raise BundleError(self._subject, f"graphs that want {', '.join(sorted(missing))}", "inputs of the table")
-        return BoundSession(session, self.provider, held, self._subject)
+        return BoundSession(session, self.provider, constants, self._subject)
 
 
 def most_steps(ports: Mapping[str, Port], subject: str) -> int:
-    """Number of steps whose noise the table of an estimator holds.
+    """Return the number of steps for which an estimator's table has noise.
 
     Args:
         ports: type and shape of every tensor of the table, by name.
         subject: name of the bundle or file, for errors.
 
     Raises:
-        BundleError: the table holds no noise, or that of no step.
+        BundleError: the table has no noise, noise of another type or shape, or noise of no step.
     """
-    port, wanted = ports.get(NOISE), "float32 [steps + 1, 2], a row for the first estimate and for each step"
+    port = ports.get(NOISE)
+    wanted = "float32 [steps + 1, 2], a row for the first estimate and for each step"
     if port is None:
         raise BundleError(f"{subject}: table input {NOISE}", "nothing", wanted)
     rows = port.shape[0] if len(port.shape) == 2 else None

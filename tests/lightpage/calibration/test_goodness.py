@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.goodness.frame_noise import noise_curve, noise_like, on_pixels
-from lightpage.calibration.goodness.light import SeenLight
+from lightpage.calibration.goodness.light import PageLight
 from lightpage.calibration.goodness.measure import measure_goodness
 from lightpage.calibration.goodness.verdict import Goodness
 from lightpage.calibration.parameters import NAMES
@@ -126,7 +126,7 @@ def test_counts_that_are_not_in_proportion_to_the_light_cost_nothing() -> None:
 def test_the_noise_of_the_verdict_is_that_of_the_sensor_at_every_brightness(settings: tuple[str, ...]) -> None:
     sensor = Device().with_settings(settings).sensor
     known, conditions, pair, symbols = fitted_page(*settings)
-    light = SeenLight(TWIN, known, conditions, pair, symbols)
+    light = PageLight(TWIN, known, conditions, pair, symbols)
     light.correct_amplitude()
     for frame, expected in zip((pair.in_phase, pair.quadrature), light.expected_frames(), strict=True):
         levels = np.geomspace(*np.nanquantile(expected, [0.05, 0.98]), 6)

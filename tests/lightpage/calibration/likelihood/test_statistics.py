@@ -27,6 +27,7 @@ def test_it_comes_back_from_toml() -> None:
         ("quadrature_variance", "[1.0, 1.0, 0.0, 1.0]", "quadrature_variance of 0"),
         ("in_phase_mean", "[0.0, nan, 2.0, 3.0]", "in_phase_mean.1 = nan .wanted a finite number"),
         ("illumination_real", "[1.0]", f"illumination_real = .1.0. .wanted at least {ILLUMINATIONS} entries"),
+        ("blur", "-0.1", "blur = -0.1 .wanted at least 0"),
         ("correlation", "0.0", "correlation = 0.0 .wanted more than 0"),
     ],
 )
