@@ -12,7 +12,7 @@ from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.document import Calibration
 from lightpage.calibration.known_pages import known_pages
 from lightpage.calibration.likelihood.measure import estimator_table
-from lightpage.calibration.likelihood.table import pilot_tensors
+from lightpage.calibration.likelihood.table import known_p, pilot_tensors
 from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.device.profile import Profile
 from lightpage.errors import CalibrationError, InvalidInputError
@@ -31,7 +31,6 @@ from lightpage.runtime.model.execution.estimator_graph import (
     EstimatorGraph,
 )
 from lightpage.runtime.model.execution.table_graph import HeldTable
-from lightpage.runtime.recalibration.estimator import known_p
 from lightpage.runtime.recalibration.noise import MOST_STEPS, KnownPhases, deviation_prior_scale, measured_noise
 from lightpage.train.models.likelihood.estimator import PhaseEstimator
 from lightpage.train.models.likelihood.torch_likelihood import TorchLikelihood

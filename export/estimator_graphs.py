@@ -28,10 +28,14 @@ from lightpage.runtime.model.execution.estimator_graph import (
     STEP_OUTPUTS,
     EstimatorFiles,
 )
-from lightpage.train.models.likelihood.estimator import Estimate, Operators, Page, PhaseEstimator
+from lightpage.train.models.likelihood.estimator import (
+    OPERATOR_INPUTS,
+    Estimate,
+    Operators,
+    Page,
+    PhaseEstimator,
+)
 
-DEVICE = ("parameters", "blur", "illumination")
-"""Tensors of the table from which the wave operators are computed."""
 PILOTS = (PILOT_PHASORS, PILOT_MASK)
 FIRST = (*TABLE_INPUTS, "information", *PILOTS)
 """Tensors of the table that the first estimate takes, without those of cameras in different planes."""
@@ -66,8 +70,8 @@ class OperatorsGraph(nn.Module):
         self.structure: tree.TreeSpec | None = None
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
-        """Compute the tensors of the operators from those of `DEVICE`."""
-        operators = self.estimator.operators(dict(zip(DEVICE, tensors, strict=True)))
+        """Compute the tensors of the operators from those of `OPERATOR_INPUTS`."""
+        operators = self.estimator.operators(dict(zip(OPERATOR_INPUTS, tensors, strict=True)))
         leaves, self.structure = tree.tree_flatten(operators)
         return tuple(leaves)
 
@@ -165,7 +169,7 @@ class WholeGraph(nn.Module):
         self.estimator = estimator
         self.steps = steps
         self._apart = apart
-        self.table_inputs = tuple(dict.fromkeys((*FIRST, *DEVICE, *STEP, NOISE, *apart)))
+        self.table_inputs = tuple(dict.fromkeys((*FIRST, *OPERATOR_INPUTS, *STEP, NOISE, *apart)))
 
     def forward(self, in_phase: Tensor, quadrature: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
         """Compute `outputs` from frames and `table_inputs`."""
@@ -210,7 +214,7 @@ def estimator_files(
     """
     tensors = {name: torch.from_numpy(np.array(value, order="C")) for name, value in table.items()}
     frame = torch.from_numpy(np.zeros(table["reference_in_phase"].shape, frame_dtype))
-    device_inputs = tuple(tensors[name] for name in DEVICE)
+    device_inputs = tuple(tensors[name] for name in OPERATOR_INPUTS)
     with torch.no_grad():
         device_graph = OperatorsGraph(estimator)
         operators = device_graph(*device_inputs)
@@ -240,7 +244,7 @@ def estimator_files(
         return exported(graph, inputs, input_names, STEP_OUTPUTS, None)
 
     models = [
-        exported(device_graph, device_inputs, DEVICE, names, None),
+        exported(device_graph, device_inputs, OPERATOR_INPUTS, names, None),
         exported(first_graph, first_inputs, first_names, first_outputs, None),
         step_model(backward, coarse=True),
         step_model(everything, coarse=False),

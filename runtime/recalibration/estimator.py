@@ -14,14 +14,13 @@ from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.likelihood.interfaces import Derivatives, ProgressCallback, Real, sampled_evenly
 from lightpage.calibration.likelihood.measure import estimator_table, measured_statistics
 from lightpage.calibration.likelihood.statistics import Statistics
+from lightpage.calibration.likelihood.table import known_p
 from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.calibration.waves.wave_model import LaunchConditions
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.execution.estimator_graph import NOISE, EstimatorGraph
 from lightpage.runtime.recalibration.noise import KnownPhases, deviation_prior_scale, measured_noise
 
-KNOWN_CONCENTRATION = 1e6
-"""Concentration of a known phase."""
 _FED = ("count_scale", "count_weights", "information", "responses", "nuisance_covariance", "nuisance_precision")
 """Tensors from which no wave operator is computed. They are fed with each evaluation."""
 
@@ -70,11 +69,6 @@ class GraphLikelihood:
             kept = pair, self._refitted.first_estimate(frames)
             self._pages[id(pair)] = kept
         return kept[1]
-
-
-def known_p(phases: Real) -> NDArray[np.float32]:
-    """Phases [ny, nx] that are known as the `p` of an estimate, [2, ny, nx]."""
-    return (KNOWN_CONCENTRATION * np.stack([np.cos(phases), np.sin(phases)])).astype(np.float32)
 
 
 def measured_anew(

@@ -25,6 +25,8 @@ POINT_SPREAD_REACH = 6
 """Largest distance, in samples of the modulator, of the point spread of forward and adjoint waves."""
 _FACET_SAMPLES = 257
 """Samples along an axis of the entrance facet."""
+KNOWN_CONCENTRATION = 1e6
+"""Concentration of a known phase."""
 PILOT_PHASORS = "pilot_phasors"
 PILOT_MASK = "pilot_mask"
 """Names of the tensors that may be fed with each page, since pilots depend on the number of levels."""
@@ -117,3 +119,8 @@ def pilot_tensors(pilots: Pilots) -> SamplingTable:
         PILOT_PHASORS: np.stack([np.cos(phases), np.sin(phases)]).astype(np.float32),
         PILOT_MASK: pilots.mask.astype(np.float32),
     }
+
+
+def known_p(phases: Real) -> NDArray[np.float32]:
+    """Phases [ny, nx] that are known as the `p` of an estimate, [2, ny, nx]."""
+    return (KNOWN_CONCENTRATION * np.stack([np.cos(phases), np.sin(phases)])).astype(np.float32)

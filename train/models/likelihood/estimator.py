@@ -26,11 +26,14 @@ from lightpage.train.models.prediction import expected_phasors
 from lightpage.train.models.waves import Fidelity, Real, WaveMatrices, Waves
 from lightpage.waves.grid import FieldGrid, symbol_samples
 
-FORWARD, BACKWARD = Fidelity(0.005, 0.007), Fidelity(0.06, 0.05)
-"""Fidelity of the predicted light, and of the way back: an error of that one moves the estimate by its share of the
-noise alone."""
+FORWARD = Fidelity(0.005, 0.007)
+"""Fidelity of the predicted light."""
+BACKWARD = Fidelity(0.06, 0.05)
+"""Fidelity of the adjoint. An error of the adjoint moves the estimate only by the same share of the noise."""
+OPERATOR_INPUTS = ("parameters", "blur", "illumination")
+"""Tensors of a table that the wave operators follow from."""
 _EVERY = 4
-"""Grid samples from one to the next at which residuals are looked at."""
+"""Distance, in grid samples, between the residuals that chi-square uses."""
 LARGEST_STEP_RAD = 1.0
 """Largest change of a phase by one step: the model is linear over less than a radian."""
 
@@ -70,7 +73,7 @@ class Estimate(NamedTuple):
     Attributes:
         p: phase and concentration of each symbol as a vector, [2, ny, nx]; the page's piston is taken off.
         nuisance: see `lightpage.train.models.likelihood.nuisances`, [6].
-        deviations: what the phases of the modulator's samples differ from their symbols', [ny S, nx S].
+        deviations: deviations of the samples' phases from those of their symbols, radians, [ny S, nx S].
     """
 
     p: Tensor
@@ -211,23 +214,22 @@ class PhaseEstimator(nn.Module):
         table: Mapping[str, Tensor],
         page: Page,
         estimate: Estimate,
-        found: Likelihood,
+        likelihood: Likelihood,
         noise: Tensor,
         *,
         coarse: bool = False,
     ) -> tuple[Estimate, Tensor]:
         """Move an estimate by the Gauss-Newton step of all phases and nuisance parameters together.
 
-        The Fisher information of the phases is taken for local (`LocalHessian`), but for what they share with the
-        nuisance parameters: `responses` are the changes of all phases by which the light says the least of a nuisance
-        parameter.
+        The Hessian of the phases is approximated as local (`LocalHessian`). Their coupling with the nuisance parameters
+        is kept: `responses` are the changes of all phases that compensate a unit change of a nuisance parameter best.
 
         Args:
             table: `amplitude_series`, `slope_power`, `count_scale`, `count_weights`, `information`, `responses`,
                 `nuisance_precision`, `nuisance_covariance`, `point_spread`, `deviation_precision`, `pilot_phasors`,
                 `pilot_mask`.
             page, estimate: see there.
-            found: derivatives at the estimate, see `likelihood`.
+            likelihood: derivatives at the estimate, see `likelihood`.
             noise: see `_concentration`, [2].
             coarse: whether light was predicted coarsely; deviations would follow its errors, and stay.
 
@@ -238,22 +240,23 @@ class PhaseEstimator(nn.Module):
         direction = estimate.direction
         amplitude, slope = amplitude_and_slope(direction, table["amplitude_series"])
         power = amplitude * amplitude * (1 + slope * slope) / table["slope_power"]
-        information, responses = gain2 * power * table["information"], table["responses"]
-        five = torch.cat([found.by_nuisance[:1], found.by_nuisance[2:]])
-        prior = torch.cat([torch.zeros_like(five[:1]), table["nuisance_precision"] * estimate.nuisance[2:]])
-        right = five - prior - (responses * found.by_phase).sum((1, 2))
-        change = table["nuisance_covariance"] @ right / gain2
+        information = gain2 * power * table["information"]
+        responses = table["responses"]
+        gradient = torch.cat([likelihood.by_nuisance[:1], likelihood.by_nuisance[2:]])
+        prior = torch.cat([torch.zeros_like(gradient[:1]), table["nuisance_precision"] * estimate.nuisance[2:]])
+        right_hand_side = gradient - prior - (responses * likelihood.by_phase).sum((1, 2))
+        change = table["nuisance_covariance"] @ right_hand_side / gain2
         hessian = self._hessian(table, estimate, slope, information)
-        turn, deviations = hessian.solve(found.by_sample, None if coarse else estimate.deviations)
-        turn = turn - (responses * change[:, None, None]).sum(0)
-        turn = torch.clamp(turn, -LARGEST_STEP_RAD, LARGEST_STEP_RAD)
+        step, deviations = hessian.solve(likelihood.by_sample, None if coarse else estimate.deviations)
+        step = step - (responses * change[:, None, None]).sum(0)
+        step = torch.clamp(step, -LARGEST_STEP_RAD, LARGEST_STEP_RAD)
         concentration = _concentration(information, noise)
-        turned = multiply(direction, (torch.cos(turn), torch.sin(turn)))
+        turned = multiply(direction, (torch.cos(step), torch.sin(step)))
         direction, piston = without_piston(turned, concentration, table)
         gain = multiply(scaled(parts(estimate.nuisance[:2]), 1 + change[0]), piston)
         nuisance = torch.cat([torch.stack(gain), estimate.nuisance[2:] + change[1:]])
-        after = Estimate(torch.stack(direction) * concentration, nuisance, deviations)
-        return after, _chi_square(table, page, found.expected)
+        advanced = Estimate(torch.stack(direction) * concentration, nuisance, deviations)
+        return advanced, _chi_square(table, page, likelihood.expected)
 
     def _hessian(
         self, table: Mapping[str, Tensor], estimate: Estimate, slope: Tensor, information: Tensor

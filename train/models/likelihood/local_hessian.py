@@ -1,4 +1,4 @@
-"""The Hessian of a page's log-likelihood by the phases of the modulator's samples, as what neighbours share alone.
+"""Local approximation of the Hessian of a page's log-likelihood by the phases of the modulator's samples.
 
 Forward and adjoint waves bring the light of one sample back to it and to its neighbours, by the point spread of the
 pipe's entrance; the cameras' weights vary like speckle, and on average they are one factor. So the product of the
@@ -15,7 +15,7 @@ from lightpage.train.models.likelihood.modulator import summed, to_samples
 from lightpage.train.models.parts import Parts, scaled
 
 ROUNDS = 4
-"""Rounds of conjugate gradients; more bring nothing, since the Hessian is known no better."""
+"""Rounds of conjugate gradients. More gain nothing, since the Hessian is approximate."""
 LARGEST_DEVIATION_RAD = 0.5
 DAMPING = 0.3
 """Curvature that deviations get beside their own, over a sample's information (Levenberg): the point spread alone has
@@ -41,8 +41,10 @@ class LocalHessian:
         of_symbol = point_spread[(apart[:, None] - apart).abs()].sum() ** 2
         self._light = scaled(direction, torch.sqrt(to_samples(information / of_symbol, self._samples)))
         of_sample = to_samples(information / self._samples**2, self._samples)
-        self._information, self._precision = information, precision
-        self._beside, self._own = precision + DAMPING * of_sample, precision + of_sample
+        self._information = information
+        self._precision = precision
+        self._damped = precision + DAMPING * of_sample
+        self._diagonal = precision + of_sample
 
     def solve(self, gradient: Tensor, deviations: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return the changes of the symbols' phases [ny, nx], and the samples' next deviations, [ny S, nx S].
@@ -51,8 +53,8 @@ class LocalHessian:
 
         Args:
             gradient: derivative of the log-likelihood by the samples' phases, [ny S, nx S].
-            deviations: what the samples' phases differ from their symbols', radians, with a mean of zero; None where
-                they are to stay zero.
+            deviations: deviations of the samples' phases from those of their symbols, radians, with a mean of zero;
+                None where they are to stay zero.
         """
         symbols = summed(gradient, self._samples)
         if deviations is None:
@@ -65,21 +67,23 @@ class LocalHessian:
 
     def _conjugate_gradients(self, residual: list[Tensor]) -> list[Tensor]:
         """Solve for changes of phases, and of deviations where the residual has both."""
-        diagonal = [self._information, self._own][: len(residual)]
+        diagonal = [self._information, self._diagonal][: len(residual)]
         solution = [torch.zeros_like(part) for part in residual]
         scaled_residual = [part / own for part, own in zip(residual, diagonal, strict=True)]
-        along, power = scaled_residual, _product(residual, scaled_residual)
+        direction = scaled_residual
+        power = _product(residual, scaled_residual)
         for number in range(ROUNDS):
-            curved = self._times(along)
-            length = power / (_product(along, curved) + _LEAST)
-            solution = [part + length * way for part, way in zip(solution, along, strict=True)]
+            product = self._times(direction)
+            length = power / (_product(direction, product) + _LEAST)
+            solution = [part + length * change for part, change in zip(solution, direction, strict=True)]
             if number == ROUNDS - 1:
                 break
-            residual = [part - length * way for part, way in zip(residual, curved, strict=True)]
+            residual = [part - length * change for part, change in zip(residual, product, strict=True)]
             scaled_residual = [part / own for part, own in zip(residual, diagonal, strict=True)]
-            before, power = power, _product(residual, scaled_residual)
-            share = power / (before + _LEAST)
-            along = [part + share * way for part, way in zip(scaled_residual, along, strict=True)]
+            previous = power
+            power = _product(residual, scaled_residual)
+            share = power / (previous + _LEAST)
+            direction = [part + share * change for part, change in zip(scaled_residual, direction, strict=True)]
         return solution
 
     def _times(self, change: list[Tensor]) -> list[Tensor]:
@@ -88,7 +92,7 @@ class LocalHessian:
         spread = filtered(torch.stack(scaled(self._light, samples)), self._weights)
         gradient = self._light[0] * spread[0] + self._light[1] * spread[1]
         symbols = summed(gradient, self._samples)
-        return [symbols, *(self._without_mean(gradient, symbols) + self._beside * part for part in change[1:])]
+        return [symbols, *(self._without_mean(gradient, symbols) + self._damped * part for part in change[1:])]
 
     def _without_mean(self, samples: Tensor, sums: Tensor) -> Tensor:
         """Samples less their mean over each symbol."""

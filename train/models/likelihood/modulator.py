@@ -34,6 +34,6 @@ def to_samples(symbols: Tensor, samples: int) -> Tensor:
 
 
 def summed(samples: Tensor, count: int) -> Tensor:
-    """Sum of `count` samples along either axis, [ny, nx] of [ny count, nx count]."""
+    """Sum over the `count` x `count` samples of each symbol, [ny, nx]."""
     ny, nx = samples.shape
     return samples.reshape(ny // count, count, nx // count, count).sum((1, 3))

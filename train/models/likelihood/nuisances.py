@@ -22,7 +22,7 @@ class PageNuisances(nn.Module):
 
     Args:
         profile: nominal device.
-        geometry: the device; its facet need be known no better.
+        geometry: the device. Nominal geometry is accurate enough for the facet.
         cells: sample intervals of the pipe along (y', x).
         grid: common grid.
     """
@@ -47,8 +47,8 @@ class PageNuisances(nn.Module):
 
     def at_exit(self, nuisance: Tensor) -> Parts:
         """Factor of gain and shift on the light of the exit facet, [fy, fx]."""
-        moved = phasor(self.ramp_x * nuisance[4] + self.ramp_y * nuisance[5])
-        return multiply((nuisance[0], nuisance[1]), moved)
+        ramp = phasor(self.ramp_x * nuisance[4] + self.ramp_y * nuisance[5])
+        return multiply((nuisance[0], nuisance[1]), ramp)
 
     def tilt(self, nuisance: Tensor) -> Parts:
         """Phasor of the tilt on the common grid, [Gy, Gx]."""
@@ -66,14 +66,14 @@ class PageNuisances(nn.Module):
             field: predicted field on the common grid, [Gy, Gx].
             score: derivative of the log-likelihood by the field, [Gy, Gx].
         """
-        same = (leaving[0] * back[0] + leaving[1] * back[1]).sum()
-        turned = _by_turn(leaving, back)
+        by_log_gain = (leaving[0] * back[0] + leaving[1] * back[1]).sum()
+        turned = _by_phase(leaving, back)
         shifts = [(turned * ramp).sum() for ramp in (self.ramp_x, self.ramp_y)]
-        at_camera = _by_turn(field, score)
+        at_camera = _by_phase(field, score)
         tilts = [at_camera.sum(0) @ self.x, (at_camera @ torch.ones_like(self.x)) @ self.y]
-        return torch.stack([same, turned.sum(), *tilts, *shifts])
+        return torch.stack([by_log_gain, turned.sum(), *tilts, *shifts])
 
 
-def _by_turn(light: Parts, score: Parts) -> Tensor:
+def _by_phase(light: Parts, score: Parts) -> Tensor:
     """Derivative by the phase of light: Re(conj(i light) score)."""
     return light[0] * score[1] - light[1] * score[0]
