@@ -291,7 +291,8 @@ def _append(whole: onnx.ModelProto, part: onnx.ModelProto, prefix: str, kept: di
     title = prefix.rstrip("0123456789.") or "operators"
     present = {held.name for held in whole.graph.initializer}
     inputs = {entry.name for entry in part.graph.input}
-    renamed = {held.name: f"{title}.{held.name}" for held in part.graph.initializer}
+    # an output may be a constant, as the deviations of a first estimate are
+    renamed = {held.name: kept.get(held.name, f"{title}.{held.name}") for held in part.graph.initializer}
     for held in part.graph.initializer:
         if renamed[held.name] not in present:
             whole.graph.initializer.add().CopyFrom(held)
