@@ -34,6 +34,8 @@ ANSWERS = ("p", "phase", "concentration", "nuisance", "deviations")
 STEP_OUTPUTS = (*ANSWERS, "chi_square", *DERIVATIVES, "by_sample")
 RESIDUAL = "residual"
 """Output of the first estimate that no step changes."""
+CHI_SQUARE = "chi_square"
+"""Output of each step by which a bundle judges its pages."""
 _FRAMES = ("in_phase", "quadrature")
 
 
