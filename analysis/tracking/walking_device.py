@@ -66,7 +66,9 @@ def read_along(point: Point, pages: int, seed: int) -> list[ReadPage]:
 
 @click.command()
 @click.option("--bundle", required=True, type=click.Path(path_type=Path, exists=True), help="Bundle of the device.")
-@click.option("--device", "state", type=click.Path(path_type=Path), help="True state (TOML); the usual one if left out.")
+@click.option(
+    "--device", "state", type=click.Path(path_type=Path), help="True state (TOML); the usual one if left out."
+)
 @click.option("--set", "settings", multiple=True, metavar="TABLE.KEY=VALUE", help="Number of the true state to change.")
 @click.option("--pages", default=200, show_default=True, type=click.IntRange(2), help="Pages that are read.")
 @click.option("--compared", default=50, show_default=True, type=click.IntRange(1), help="Pages of either end.")

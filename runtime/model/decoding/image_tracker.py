@@ -296,8 +296,7 @@ class ImageTracker:
 
     @staticmethod
     def _inferred(pair: FramePair, state: ImageState, pilots: Pilots) -> Inference:
-        """What the graph says of a page; an estimator's residual is large off the image, and judged once that is found.
-        """
+        """Return what the graph says of a page. An estimator's residual is judged later, where the image is found."""
         doubtful = isinstance(state.decoder.graph, EstimatorGraph)
         return state.decoder.infer(pair, state.table, pilots, doubtful=doubtful)
 

@@ -31,11 +31,11 @@ EARLY_STEPS = 1
 DERIVATIVES = ("by_phase", "by_nuisance", "expected")
 ANSWERS = ("p", "phase", "concentration", "nuisance", "deviations")
 """Outputs of the first estimate, and of each step."""
-STEP_OUTPUTS = (*ANSWERS, "chi_square", *DERIVATIVES, "by_sample")
-RESIDUAL = "residual"
-"""Output of the first estimate that no step changes."""
 CHI_SQUARE = "chi_square"
 """Output of each step by which a bundle judges its pages."""
+STEP_OUTPUTS = (*ANSWERS, CHI_SQUARE, *DERIVATIVES, "by_sample")
+RESIDUAL = "residual"
+"""Output of the first estimate that no step changes."""
 _FRAMES = ("in_phase", "quadrature")
 
 
@@ -159,7 +159,7 @@ class EstimatorGraph:
         found, steps = self.begun(feeds), self.steps if steps is None else steps
         noise = self.value(NOISE)
         for number in range(steps):
-            wanted = (*ANSWERS, "chi_square") if number == steps - 1 else ESTIMATE
+            wanted = (*ANSWERS, CHI_SQUARE) if number == steps - 1 else ESTIMATE
             session = self._early if number < EARLY_STEPS else self._step
             found |= self._stepped(session, found, noise[number + 1], feeds, wanted)
         return [found[name] for name in outputs]
