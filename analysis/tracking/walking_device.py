@@ -9,6 +9,7 @@ pages is compared with that of the first ones. A page that is not given out coun
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from dataclasses import asdict, dataclass
@@ -97,21 +98,22 @@ def main(
     first, last = (fmean(page.air for page in part) for part in (read[:compared], read[-compared:]))
     share = last / first if first > 0 else 0.0
     off = [np.subtract(page.seen_px, page.shift_px) for page in read if page.seen_px is not None]
+    lost, farthest_px = sum(page.lost is not None for page in read), max(math.hypot(*page.shift_px) for page in read)
+    seconds = median(page.seconds for page in read)
     figures = {
         "pages": pages,
         "compared": compared,
         "air_first": first,
         "air_last": last,
         "last_over_first": share,
-        "lost": sum(page.lost is not None for page in read),
-        "farthest_px": max(float(np.hypot(*page.shift_px)) for page in read),
+        "lost": lost,
+        "farthest_px": farthest_px,
         "position_error_px": float(np.std(off, axis=0).max()) if off else None,
-        "seconds_per_page": median(page.seconds for page in read),
+        "seconds_per_page": seconds,
     }
     click.echo(
         f"AIR of the last {compared} pages {last:.4f}, of the first {compared} {first:.4f} bit a symbol: "
-        f"{share:.4f}; {figures['lost']} of {pages} lost, walked up to {figures['farthest_px']:.2f} px; "
-        f"{1000 * figures['seconds_per_page']:.0f} ms a page"
+        f"{share:.4f}; {lost} of {pages} lost, walked up to {farthest_px:.2f} px; {1000 * seconds:.0f} ms a page"
     )
     asked = {"device": device.model_dump(mode="json"), "--pages": pages, "--compared": compared, "--seed": seed}
     kept = {"asked": asked, **figures, "read": [asdict(page) for page in read]}
