@@ -30,6 +30,7 @@ from lightpage.runtime.model.bundle.manifest import (
     Manifest,
     Provenance,
 )
+from lightpage.runtime.model.execution.estimator_graph import CHI_SQUARE
 from lightpage.runtime.model.execution.session import open_session
 from lightpage.runtime.model.execution.table_graph import GraphFile
 from lightpage.train.models.presets import REFLECTIONS
@@ -72,7 +73,7 @@ def export_calibration(
     progress("ask torch", 0.7)
     whole = WholeGraph(estimated.estimator, device.apart_inputs, estimated.steps).eval()
     defaults = {name: np.asarray(table[name]) for name in whole.table_inputs}
-    limit, pair, expected = golden_of(whole, estimated.pages[-1].pair, defaults, bits)
+    limit, pair, expected = golden_of(whole, estimated.pages[-1].pair, defaults, bits, CHI_SQUARE)
     decoder = whole_onnx(estimated.graphs, estimated.steps, table)
     progress("ask ONNX Runtime", 0.8)
     once = open_session(decoder, f"{out}: {DECODER}", once=True)
@@ -90,7 +91,7 @@ def export_calibration(
         frame_dtype="uint8" if estimated.frame_dtype == "uint8" else "uint16",
         calibrated_pages=calibration.calibrated_pages,
         table_inputs=tuple(sorted(GraphFile(decoder, str(out)).table_inputs)),
-        residual_output="residual",
+        residual_output=CHI_SQUARE,
         residual_limit=limit,
         provenance=Provenance(command=command(), commit=commit()),
     )

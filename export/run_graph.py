@@ -41,23 +41,34 @@ def graph_of(folder: Path, run: Run, references: FramePair, twin: RayTwin) -> tu
 
 
 def golden_of(
-    graph: Graph | WholeGraph, pair: FramePair, defaults: Tensors, bit_depth: int
+    graph: Graph | WholeGraph, pair: FramePair, defaults: Tensors, bit_depth: int, residual: str = "residual"
 ) -> tuple[float | None, FramePair, dict[str, NDArray[np.float32]]]:
-    """The residual's limit by a page of a run, the frames of the golden page, and what torch says to them."""
+    """The residual's limit by a page of a run, the frames of the golden page, and what torch says to them.
+
+    Args:
+        graph, defaults: decoder and its table.
+        pair: frames of the page.
+        bit_depth: bits of the counts.
+        residual: output by which the bundle judges its pages.
+    """
     answer = torch_answer(graph, pair, defaults)
-    limit, coarse = _residual_limit(graph, pair, defaults, answer), in_few_counts(pair, bit_depth)
+    limit, coarse = _residual_limit(graph, pair, defaults, answer, residual), in_few_counts(pair, bit_depth)
     to_coarse = torch_answer(graph, coarse, defaults)
-    if limit is not None and not shows_page(float(to_coarse["residual"]), limit):
+    if limit is not None and not shows_page(float(to_coarse[residual]), limit):
         return limit, pair, answer
     return limit, coarse, to_coarse
 
 
 def _residual_limit(
-    graph: Graph | WholeGraph, pair: FramePair, defaults: Tensors, answer: dict[str, NDArray[np.float32]]
+    graph: Graph | WholeGraph,
+    pair: FramePair,
+    defaults: Tensors,
+    answer: dict[str, NDArray[np.float32]],
+    residual: str,
 ) -> float | None:
     """Half way, in ratio, between the residuals of right and of swapped frames; None where both are alike."""
-    if "residual" not in graph.outputs:
+    if residual not in graph.outputs:
         return None
-    right = float(answer["residual"])
-    swapped = float(torch_answer(graph, FramePair(pair.quadrature, pair.in_phase), defaults)["residual"])
+    right = float(answer[residual])
+    swapped = float(torch_answer(graph, FramePair(pair.quadrature, pair.in_phase), defaults)[residual])
     return float(np.sqrt(right * swapped)) if swapped > _LEAST_CONTRAST * right else None

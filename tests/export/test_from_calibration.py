@@ -1,31 +1,36 @@
 """A bundle of a calibration alone reads its device's pages, with as many steps as it is asked for."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from analysis.tracking import walking_device
 from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.calibration.known_pages import known_pages
 from lightpage.calibration.likelihood.measure import measured_statistics
 from lightpage.calibration.likelihood.table import pilot_tensors
 from lightpage.calibration.waves.wave_fit import WaveFit
 from lightpage.device.state import Device
-from lightpage.errors import CalibrationError, InvalidInputError
+from lightpage.errors import BundleError, CalibrationError, FrameError, FramesDisagreeError, InvalidInputError
 from lightpage.export import from_calibration, proof
 from lightpage.export.estimated_device import check_counts
 from lightpage.export.from_calibration import export_calibration
 from lightpage.metrics.measures import measure
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols
+from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.run.job import Job
 from lightpage.runtime.archives.run.task import Choices, NamedBundle, Operation
 from lightpage.runtime.client.client import LightpageClient
 from lightpage.runtime.commands.client.decode import page_report
 from lightpage.runtime.console.last_pages import LastPages
-from lightpage.runtime.model.bundle.bundle import Bundle
-from lightpage.runtime.model.bundle.manifest import DECODER, TWIN
+from lightpage.runtime.model.bundle.bundle import Bundle, npz, write_bundle
+from lightpage.runtime.model.bundle.manifest import DECODER, GOLDEN, TWIN
+from lightpage.runtime.model.decoding.batches import Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.execution.estimator_graph import EstimatorGraph
@@ -239,3 +244,70 @@ def test_steps_are_those_that_the_bundle_has(bundle: Path, small_bundle: Path) -
             Decoder.load(path, steps=steps)
     with pytest.raises(InvalidInputError, match="steps"):
         Decoder(Bundle.open(bundle), steps=0)
+
+
+def page_of(settings: str, knock_px: float = 0.0) -> FramePair:
+    """A page of the device with one number of its state changed, its image moved along x."""
+    simulator = Simulator(PROFILE, Device().with_settings(["drift.shift_px=0", settings]), seed=3)
+    simulator.knock((knock_px, 0.0))
+    return simulator.page(random_symbols(PROFILE, 256, 1, np.random.default_rng([3, 0]))[0])
+
+
+def test_frames_are_judged_by_chi_square(bundle: Path, small_device: list[str]) -> None:
+    decoder = Decoder.load(bundle, 1)
+    manifest, tracker = decoder.bundle.manifest, tracker_for(decoder)
+    assert manifest.residual_output == "chi_square"
+    assert manifest.residual_limit is not None
+    with Recording.open(small_device[3]) as recording:
+        good, other, references = recording.frames(2), recording.frames(3), recording.references()
+    (early,) = decoder.graph.run(["chi_square"], {"in_phase": good.in_phase, "quadrature": good.quadrature}, 1)
+    assert early < manifest.residual_limit / 2
+    assert decoder.infer(good).residual == pytest.approx(1, abs=0.3)
+    swapped, mixed = FramePair(good.quadrature, good.in_phase), FramePair(good.in_phase, other.quadrature)
+    assert tracker.decode(good, 256).check.confirmed
+    for wrong in (swapped, mixed, page_of("geometry.page_shift_x_px=2.5")):
+        for decode in (decoder.decode, tracker.decode):
+            with pytest.raises(FramesDisagreeError, match="chi-square"):
+                decode(wrong, 256)
+    with pytest.raises(FrameError, match="no light"):
+        decoder.infer(references, doubtful=True)
+
+
+def test_chi_square_is_judged_where_the_image_is_found(bundle: Path) -> None:
+    decoder = Decoder.load(bundle, 1)
+    knocked = page_of("homodyne.quadrature_gain=0.95", 6.0)
+    with pytest.raises(FramesDisagreeError):
+        decoder.decode(knocked, 256)
+    tracker = tracker_for(decoder)
+    tracker.decode(page_of("homodyne.quadrature_gain=0.95"), 256)
+    for where in (tracker, tracker_for(decoder)):
+        page = where.decode(knocked, 256)
+        assert page.image is not None
+        assert page.image.shift_x_px == pytest.approx(6, abs=0.05)
+        assert page.check.confirmed
+
+
+def test_a_walking_device_is_followed_without_loss(bundle: Path, tmp_path: Path) -> None:
+    asked = ["--bundle", str(bundle), "--set", "drift.shift_px=0.3", "--pages", "6", "--compared", "2"]
+    done = CliRunner().invoke(walking_device.main, [*asked, "--json", str(tmp_path / "F.json")])
+    assert done.exit_code == 0, done.output
+    figures = json.loads((tmp_path / "F.json").read_text())
+    assert figures["lost"] == 0
+    assert figures["farthest_px"] > 0.5
+    assert figures["last_over_first"] > 0.95
+    assert figures["position_error_px"] < 0.03
+
+
+def test_a_damaged_golden_page_is_noticed(bundle: Path, tmp_path: Path) -> None:
+    opened, golden = Bundle.open(bundle), Bundle.open(bundle).golden
+    files, damaged = dict(opened.files), golden.p + np.float32(0.01 * np.abs(golden.p).max())
+    files[GOLDEN] = npz(in_phase=golden.pair.in_phase, quadrature=golden.pair.quadrature, p=damaged)
+    write_bundle(tmp_path / "B.zip", opened.manifest, files)
+    with pytest.raises(BundleError, match="golden"):
+        Decoder.load(tmp_path / "B.zip", 1)
+
+
+def test_its_pages_go_one_by_one_where_batches_are_wanted(bundle: Path, caplog: pytest.LogCaptureFixture) -> None:
+    decoder = Decoder.load(bundle, 1, batching=Batching(largest=4))
+    assert decoder.batches.largest == 1
+    assert "calibration alone" in caplog.text

@@ -72,9 +72,9 @@ class Manifest(BaseModel):
     table_inputs: tuple[str, ...] = ()
     """Inputs of decoder.onnx that carry a default and may be fed instead."""
     residual_output: str | None = None
-    """Optional scalar output of decoder.onnx: how badly the pair fits the homodyne equations."""
+    """Optional scalar output of decoder.onnx: how badly the pair fits the homodyne equations, or the calibration."""
     residual_limit: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
-    """A pair with a larger residual is refused: swapped frames, or frames of two shots."""
+    """A pair with a larger residual is refused: swapped frames, frames of two shots, or another device."""
     code: str | None = None
     """How user bytes are protected on this device's pages, TOML of a `lightpage.codec.code.Code`; None: not chosen."""
     precision: Precision = FLOAT32

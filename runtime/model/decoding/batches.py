@@ -29,6 +29,7 @@ from lightpage.runtime.model.decoding.batch_graph import (
 )
 from lightpage.runtime.model.decoding.page import Inference
 from lightpage.runtime.model.decoding.under_way import Phase, UnderWay
+from lightpage.runtime.model.execution.estimator_graph import EstimatorGraph
 from lightpage.runtime.model.execution.page_graph import REGISTRATION, PageGraph
 from lightpage.runtime.model.execution.providers import ON_CPU
 
@@ -247,9 +248,10 @@ class Batches(OneByOne):
         if batching.largest == 1:
             return OneByOne()
         if not holds_batches(bundle):
-            _log.warning(
-                "%s: no %s, so pages are computed one by one (lightpage export --batches)", bundle.subject, BATCH
+            cure = (
+                "as of every calibration alone" if isinstance(table, EstimatorGraph) else "lightpage export --batches"
             )
+            _log.warning("%s: no %s, so pages are computed one by one (%s)", bundle.subject, BATCH, cure)
             return OneByOne(_ALONE)
         if table.provider == ON_CPU:
             _log.warning("%s: batches on a CPU take longer than pages one by one", bundle.subject)

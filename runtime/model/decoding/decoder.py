@@ -26,7 +26,7 @@ from lightpage.runtime.model.decoding.camera_view import CameraView
 from lightpage.runtime.model.decoding.field_solver import BundleFieldSolver
 from lightpage.runtime.model.decoding.golden import check_golden
 from lightpage.runtime.model.decoding.page import OUTPUTS, DecodedPage, Inference, Timings, check_residual
-from lightpage.runtime.model.execution.estimator_graph import EstimatorGraph
+from lightpage.runtime.model.execution.estimator_graph import RESIDUAL, EstimatorGraph
 from lightpage.runtime.model.execution.page_graph import (
     PAGE_INPUTS,
     REGISTRATION,
@@ -216,13 +216,13 @@ class Decoder:
             table: tensors for this page alone, of `PAGE_INPUTS`; all others take `with_table`.
             pilots: known symbols of the page, those of 256 levels if left out; an estimator takes the piston off by
                 them.
-            doubtful: whether frames that contradict the homodyne equations are taken too.
+            doubtful: whether frames with a residual beyond the bundle's limit are taken too.
             alone: whether it is computed by itself, as exactly as the golden page says.
 
         Raises:
             InvalidInputError: a table that does not fit.
-            FrameError: the frames contradict the homodyne equations beyond the bundle's limit (then it is a
-                `FramesDisagreeError`), or show no page.
+            FrameError: the frames have a residual beyond the bundle's limit (then it is a `FramesDisagreeError`), or
+                show no page.
         """
         table = table or {}
         self.graph.check(table)
@@ -240,7 +240,7 @@ class Decoder:
             page = _inference(found, self.bundle.manifest.residual_output)
             if isinstance(self.graph, EstimatorGraph):
                 page = replace(page, steps=self.graph.steps)
-        check_residual(page.residual, self.bundle.manifest.residual_limit, doubtful=doubtful)
+        check_residual(page.residual, self.bundle.manifest, doubtful=doubtful)
         return self.view.seen(page, table.get(REGISTRATION))
 
     @cached_property
@@ -341,7 +341,7 @@ class Decoder:
         check_golden(self.bundle, answer, self.bundle.manifest.precision)
 
 
-_OF_ESTIMATE = ("nuisance", "chi_square")
+_OF_ESTIMATE = ("nuisance", RESIDUAL)
 """Further outputs of an estimator."""
 
 
@@ -353,7 +353,9 @@ def _inference(found: dict[str, NDArray[np.float32]], residual: str | None) -> I
         return page
     tilt, shift = found["nuisance"][2:4], found["nuisance"][4:6]
     drift = np.concatenate([shift, tilt]).astype(np.float64)
-    return replace(page, drift=drift, chi_square=float(found["chi_square"]))
+    # the counts of a reference alone are as expected of a page without light
+    has_light = bool(np.isfinite(found[RESIDUAL]).all())
+    return replace(page, drift=drift, residual=page.residual if has_light else np.nan)
 
 
 def _like(decoder: Decoder, bundle: Bundle, graph: PageGraph) -> Decoder:

@@ -20,9 +20,10 @@ from lightpage.runtime.model.bundle.manifest import FIELD
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_drift import SHIFT, TILT, BundleSearch, BundleTables, DriftModel, Estimate
 from lightpage.runtime.model.decoding.image_position import ImagePosition
-from lightpage.runtime.model.decoding.page import DecodedPage, Inference, Timings
+from lightpage.runtime.model.decoding.page import DecodedPage, Inference, Timings, check_residual
 from lightpage.runtime.model.decoding.tracking import NoTracker, Tracker, TrackerMemory, confirmed
 from lightpage.runtime.model.decoding.turns import Turn, Turns, patiently
+from lightpage.runtime.model.execution.estimator_graph import EstimatorGraph
 from lightpage.runtime.model.execution.twin import OnnxTwin
 
 Real = NDArray[np.float64]
@@ -262,6 +263,7 @@ class ImageTracker:
                 if self._in_batches:
                     begun, inference = self._in_turn(turn, pair, pilots, clock)
                 best, found, step = self._followed(pair, begun, inference, shown, pilots, clock)
+                check_residual(best.inference.residual, self._decoder.bundle.manifest)
                 learn = partial(self._learn, begun, best, step, searched=found is not None)
                 if self._in_batches:  # the page behind waits for it
                     learn()
@@ -283,7 +285,7 @@ class ImageTracker:
         while True:
             state, inference = self.state, None
             if state.settled:
-                inference = state.decoder.infer(pair, state.table, pilots)
+                inference = self._inferred(pair, state, pilots)
                 clock.add_inference(inference)
             else:
                 state.decoder.batches.put_off()
@@ -291,6 +293,12 @@ class ImageTracker:
             clock.add("turn_s")
             if is_next and not self._has_left(state):
                 return replace(self.state, table=state.table, looked_px=state.looked_px), inference
+
+    @staticmethod
+    def _inferred(pair: FramePair, state: ImageState, pilots: Pilots) -> Inference:
+        """Return what the graph says of a page. An estimator's residual is judged later, where the image is found."""
+        doubtful = isinstance(state.decoder.graph, EstimatorGraph)
+        return state.decoder.infer(pair, state.table, pilots, doubtful=doubtful)
 
     def _has_left(self, state: ImageState, before: int = 0) -> bool:
         """Return whether a page with so many before it, that was decoded with a state, is now to be decoded anew."""
@@ -346,7 +354,7 @@ class ImageTracker:
         best: _Attempt | None = None
         for _ in range(1 + CORRECTIONS):
             if inference is None:
-                inference = state.decoder.infer(pair, state.table, pilots)
+                inference = self._inferred(pair, state, pilots)
                 clock.add_inference(inference)
             attempt = self._read(inference, state, levels, pilots)
             clock.add("decision_s")

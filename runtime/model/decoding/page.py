@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lightpage.errors import FrameError, FramesDisagreeError
 from lightpage.page.pilots import PilotCheck
+from lightpage.runtime.model.bundle.manifest import Manifest
 from lightpage.runtime.model.decoding.image_position import ImagePosition
 from lightpage.von_mises import information
 from lightpage.words import brief, sides
@@ -27,10 +28,11 @@ class Inference:
 
     The length is zero where a camera does not show the symbol, whatever p is.
 
-    `residual` is the power that is left of the homodyne equations over the field's, zero where the graph tells none;
-    `waited_s` are the seconds for which the page waited for others of its batch. An estimator also says by what `drift`
-    the page's light lies off the table, [4] as in `lightpage.runtime.model.decoding.image_drift`, the mean square of
-    the counts' residuals over their variance, `chi_square`, and its number of Gauss-Newton `steps`.
+    `residual` is what the bundle judges its pages by, zero where it names no output for that: the power that is left of
+    the homodyne equations over the field's, or of an estimator the mean square of the counts' residuals over their
+    variance, not finite for frames without the light of a page. `waited_s` are the seconds for which the page waited
+    for others of its batch. An estimator also says by what `drift` the page's light lies off the table, [4] as in
+    `lightpage.runtime.model.decoding.image_drift`, and its number of Gauss-Newton `steps`.
     """
 
     p: NDArray[np.float32]
@@ -39,7 +41,6 @@ class Inference:
     residual: float = 0.0
     waited_s: float = 0.0
     drift: NDArray[np.float64] | None = None
-    chi_square: float | None = None
     steps: int = 0
 
     def turned(self, by: NDArray[np.floating]) -> Inference:
@@ -145,22 +146,25 @@ class DecodedPage:
         return float(np.sqrt(np.mean(np.square(self.phase_error))))
 
 
-def check_residual(residual: float, limit: float | None, *, doubtful: bool = False) -> None:
-    """Check how badly a pair of frames fits the homodyne equations.
+def check_residual(residual: float, manifest: Manifest, *, doubtful: bool = False) -> None:
+    """Check the residual of a pair of frames, see `Inference`.
 
     Args:
-        residual, limit: residual of the page, and limit of the bundle.
+        residual: residual of the page.
+        manifest: manifest of the bundle, with the name of its residual, and the limit.
         doubtful: see `lightpage.runtime.model.decoding.decoder.Decoder.infer`.
 
     Raises:
         FrameError: as `Decoder.infer` says.
     """
-    seen = np.isfinite(residual)
+    seen, limit = np.isfinite(residual), manifest.residual_limit
     if limit is not None and not residual <= limit and not (doubtful and seen):
-        got = f"frames that contradict each other (residual {residual:.3g})"
+        name = (manifest.residual_output or "residual").replace("_", "-")
+        whom = "each other" if name == "residual" else "each other or the calibration"
+        got = f"frames that contradict {whom} ({name} {residual:.3g})"
         raise (FramesDisagreeError if seen else FrameError)(
             "frame pair",
             got if seen else "no light of a page over the reference beam",
             f"an in-phase and a quadrature frame of one shot, not swapped, cameras and exposure as they were "
-            f"calibrated (residual up to {limit:.3g}; where frames are right, recalibrate)",
+            f"calibrated ({name} up to {limit:.3g}; where frames are right, recalibrate)",
         )
