@@ -310,7 +310,12 @@ def test_attempts_are_bounded_where_the_image_flees_and_a_fork_learns_on_its_own
     infer = FakeDecoder.infer
 
     def fleeing(
-        self: FakeDecoder, pair: FramePair, table: SamplingTable | None = None, pilots: Pilots | None = None
+        self: FakeDecoder,
+        pair: FramePair,
+        table: SamplingTable | None = None,
+        pilots: Pilots | None = None,
+        *,
+        doubtful: bool = False,
     ) -> Inference:
         device.drift[SHIFT] += 1.0
         return infer(self, pair, table)
