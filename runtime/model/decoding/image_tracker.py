@@ -285,7 +285,7 @@ class ImageTracker:
         while True:
             state, inference = self.state, None
             if state.settled:
-                inference = self._inferred(pair, state, pilots)
+                inference = _inferred(pair, state, pilots)
                 clock.add_inference(inference)
             else:
                 state.decoder.batches.put_off()
@@ -293,12 +293,6 @@ class ImageTracker:
             clock.add("turn_s")
             if is_next and not self._has_left(state):
                 return replace(self.state, table=state.table, looked_px=state.looked_px), inference
-
-    @staticmethod
-    def _inferred(pair: FramePair, state: ImageState, pilots: Pilots) -> Inference:
-        """Return what the graph says of a page. An estimator's residual is judged later, where the image is found."""
-        doubtful = isinstance(state.decoder.graph, EstimatorGraph)
-        return state.decoder.infer(pair, state.table, pilots, doubtful=doubtful)
 
     def _has_left(self, state: ImageState, before: int = 0) -> bool:
         """Return whether a page with so many before it, that was decoded with a state, is now to be decoded anew."""
@@ -354,7 +348,7 @@ class ImageTracker:
         best: _Attempt | None = None
         for _ in range(1 + CORRECTIONS):
             if inference is None:
-                inference = self._inferred(pair, state, pilots)
+                inference = _inferred(pair, state, pilots)
                 clock.add_inference(inference)
             attempt = self._read(inference, state, levels, pilots)
             clock.add("decision_s")
@@ -488,6 +482,12 @@ def tracker_for(decoder: Decoder, memory: TrackerMemory | None = None) -> Tracke
     else:
         _log.warning("%s: no field graph, so an image that is lost is not looked for", decoder.bundle.subject)
     return ImageTracker(decoder, DriftModel.of_decoder(decoder, twin), BundleTables(decoder, twin), search, memory)
+
+
+def _inferred(pair: FramePair, state: ImageState, pilots: Pilots) -> Inference:
+    """Return what the graph says of a page. An estimator's residual is judged later, where the image is found."""
+    doubtful = isinstance(state.decoder.graph, EstimatorGraph)
+    return state.decoder.infer(pair, state.table, pilots, doubtful=doubtful)
 
 
 def _search_may_pay(check: PilotCheck, begun: ImageState) -> bool:

@@ -69,7 +69,14 @@ class FakeDecoder:
     def __getattr__(self, name: str) -> object:
         return getattr(self._decoder, name)
 
-    def infer(self, pair: FramePair, table: SamplingTable | None = None, pilots: Pilots | None = None) -> Inference:
+    def infer(
+        self,
+        pair: FramePair,
+        table: SamplingTable | None = None,
+        pilots: Pilots | None = None,
+        *,
+        doubtful: bool = False,
+    ) -> Inference:
         device = self._device
         shift = (table or {}).get("shift", np.zeros(2))
         device.held = np.concatenate([np.asarray(shift, np.float64), self._tilt])
@@ -303,7 +310,12 @@ def test_attempts_are_bounded_where_the_image_flees_and_a_fork_learns_on_its_own
     infer = FakeDecoder.infer
 
     def fleeing(
-        self: FakeDecoder, pair: FramePair, table: SamplingTable | None = None, pilots: Pilots | None = None
+        self: FakeDecoder,
+        pair: FramePair,
+        table: SamplingTable | None = None,
+        pilots: Pilots | None = None,
+        *,
+        doubtful: bool = False,
     ) -> Inference:
         device.drift[SHIFT] += 1.0
         return infer(self, pair, table)
@@ -437,7 +449,14 @@ class NoiseDecoder(FakeDecoder):
 
     rng = np.random.default_rng(8)
 
-    def infer(self, pair: FramePair, table: SamplingTable | None = None, pilots: Pilots | None = None) -> Inference:
+    def infer(
+        self,
+        pair: FramePair,
+        table: SamplingTable | None = None,
+        pilots: Pilots | None = None,
+        *,
+        doubtful: bool = False,
+    ) -> Inference:
         sure = replace(self._decoder.infer(pair), concentration=np.full(toy.PAGE, 300.0, np.float32))
         return sure.turned(self.rng.uniform(-np.pi, np.pi, toy.PAGE))
 
@@ -477,7 +496,14 @@ def test_noise_is_not_given_out_however_few_the_pilots_are(device: FakeDevice, p
 class PhaseDecoder(FakeDecoder):
     """Shows drift in its phases alone, by the slopes of `tests.runtime.model.decoding.test_image_drift`."""
 
-    def infer(self, pair: FramePair, table: SamplingTable | None = None, pilots: Pilots | None = None) -> Inference:
+    def infer(
+        self,
+        pair: FramePair,
+        table: SamplingTable | None = None,
+        pilots: Pilots | None = None,
+        *,
+        doubtful: bool = False,
+    ) -> Inference:
         device = self._device
         shift = (table or {}).get("shift", np.zeros(2))
         device.held = np.concatenate([np.asarray(shift, np.float64), self._tilt])
