@@ -1,7 +1,7 @@
 """AIR of a device whose pages are read by its fitted waves alone, calibrated on two known pages.
 
-    python -m analysis.speed.waves --json F
-    python -m analysis.speed.waves --set sensor.full_well_e=32 --pages 24 --json F
+    python -m analysis.speed.waves --out D --json F
+    python -m analysis.speed.waves --set sensor.full_well_e=32 --pages 24 --out D --json F
 
 A device is simulated and calibrated, and its calibration is exported. Further pages are decoded as a service decodes
 them, with each number of steps up to the bundle's. The time of a page is compared with that of the shipped decoder, in

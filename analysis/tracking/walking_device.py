@@ -98,7 +98,8 @@ def main(
     first, last = (fmean(page.air for page in part) for part in (read[:compared], read[-compared:]))
     share = last / first if first > 0 else 0.0
     off = [np.subtract(page.seen_px, page.shift_px) for page in read if page.seen_px is not None]
-    lost, farthest_px = sum(page.lost is not None for page in read), max(math.hypot(*page.shift_px) for page in read)
+    lost = sum(page.lost is not None for page in read)
+    farthest_px = max(math.hypot(*page.shift_px) for page in read)
     seconds = median(page.seconds for page in read)
     figures = {
         "pages": pages,

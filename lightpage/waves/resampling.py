@@ -55,7 +55,8 @@ def corrected_interpolation(edge: float, step_px: int) -> CorrectedInterpolation
     stopped = _cosines(_PREFILTER_TAPS, np.linspace(max(0.5 - edge, _STOP), 0.5, _FREQUENCIES))
     after = _cosines(_CORRECTION_TAPS, step_px * frequencies)
     stop_weight = np.sqrt(_STOP_WEIGHT * _PLACES * 30 / _FREQUENCIES)
-    prefilter, correction = np.zeros(before.shape[1]), np.zeros(after.shape[1])
+    prefilter = np.zeros(before.shape[1])
+    correction = np.zeros(after.shape[1])
     for _ in range(_ROUNDS):
         gains = [
             gain * (1 + place * (1 - place) * (after @ correction)) for place, gain in zip(places, linear, strict=True)
@@ -90,6 +91,8 @@ def _symmetric(half: Real) -> Real:
 
 def _least_squares(rows: list[NDArray[np.number]], wanted: list[NDArray[np.number]]) -> Real:
     """Real solution of complex equations."""
-    left, right = np.concatenate(rows), np.concatenate(wanted)
-    both = np.concatenate([left.real, left.imag]), np.concatenate([right.real, right.imag])
-    return np.asarray(np.linalg.lstsq(*both, rcond=None)[0])
+    matrix = np.concatenate(rows)
+    values = np.concatenate(wanted)
+    real_matrix = np.concatenate([matrix.real, matrix.imag])
+    real_values = np.concatenate([values.real, values.imag])
+    return np.asarray(np.linalg.lstsq(real_matrix, real_values, rcond=None)[0])

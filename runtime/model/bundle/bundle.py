@@ -142,7 +142,7 @@ class Bundle:
 
     @property
     def is_estimator(self) -> bool:
-        """Whether it is of a calibration alone: pages are estimated by the fitted waves, without a network."""
+        """True for a bundle of a calibration alone: pages are estimated by the fitted waves, without a network."""
         return self.files.keys() >= set(ESTIMATOR_FILES)
 
     @cached_property

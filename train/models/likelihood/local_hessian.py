@@ -99,6 +99,6 @@ class LocalHessian:
         return samples - to_samples(sums / self._samples**2, self._samples)
 
 
-def _product(left: list[Tensor], right: list[Tensor]) -> Tensor:
-    total: Tensor = sum((one * other).sum() for one, other in zip(left, right, strict=True))  # type: ignore[assignment]
-    return total
+def _product(one: list[Tensor], other: list[Tensor]) -> Tensor:
+    """Scalar product of two lists of tensors of the same shapes."""
+    return torch.stack([(first * second).sum() for first, second in zip(one, other, strict=True)]).sum()
