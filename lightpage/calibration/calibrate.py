@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from lightpage.calibration.goodness.measure import measure_goodness
 from lightpage.calibration.goodness.suspects import LEVELS, NEIGHBOURS
 from lightpage.calibration.goodness.verdict import USABLE, Goodness
 from lightpage.calibration.interfaces import FieldSolver, RememberingTwin, Twin
-from lightpage.calibration.parameters import NAMES, PARAMETERS, indices, nominal
+from lightpage.calibration.parameters import NAMES, PARAMETERS, PRIORS, Prior, indices, nominal
 from lightpage.calibration.patch_fit import PatchFit, fit_parameters
 from lightpage.calibration.patches import (
     Measurement,
@@ -118,6 +118,7 @@ class Registered:
         quadrature_deviation: standard deviation of the angle between the arms, radians; None where it was not fitted.
         coherences: of each page, at the fitted geometry.
         conditions: illumination and blur of the first page; None where its waves were not fitted.
+        prior: prior of the parameters in the last fit.
     """
 
     parameters: Real
@@ -133,6 +134,7 @@ class Registered:
     quadrature_deviation: float | None = None
     coherences: tuple[float, ...] = ()
     conditions: LaunchConditions | None = None
+    prior: Prior = field(default_factory=lambda: Prior(nominal(), PRIORS))
 
 
 @dataclass(frozen=True)
@@ -418,6 +420,7 @@ class _Registration:
         self.parameters, self.centre = nominal(), nominal()
         self.any_orientation, self.orientations = False, tuple[str, ...]()
         self.effort: Effort = "full"
+        self.prior = Prior(self.centre, PRIORS)
         self.deviations = np.zeros_like(self.parameters)
         self.quadrature_phase = np.pi / 2
         self.quadrature_deviation: float | None = None
@@ -544,6 +547,7 @@ class _Registration:
         self.quadrature_phase, self.quadrature_deviation = found.quadrature_phase, found.quadrature_deviation
         self.modulation, self.modulation_deviations = found.modulation, found.modulation_deviations
         self.conditions = found.conditions
+        self.prior = Prior(self.centre, PRIORS * prior_scale)
 
     def result(self) -> Registered:
         """Judge the outcome."""
@@ -576,6 +580,7 @@ class _Registration:
             quadrature_deviation=self.quadrature_deviation,
             coherences=tuple(coherences),
             conditions=self.conditions,
+            prior=self.prior,
         )
 
     def _goodness(self) -> Goodness | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,6 +90,18 @@ _STEPS = {"axial": 1e-2, "tilt": 0.1, "tilt_apart": 0.1}
 STEPS: Real = PRIORS * [_STEPS.get(p.group, 3e-3) for p in PARAMETERS]
 """Steps of finite differences of the light: long enough for what rounding adds, though a plane's tilt changes little,
 and short enough for the light to be straight along them."""
+
+
+class Prior(NamedTuple):
+    """Normal distribution of a device's parameters before data are seen.
+
+    Attributes:
+        centre: mean, [P].
+        deviations: standard deviations, [P].
+    """
+
+    centre: Real
+    deviations: Real
 
 
 def nominal() -> Real:

@@ -117,10 +117,16 @@ def shifted(registration: NDArray[np.float32], shift_px: Real) -> NDArray[np.flo
 
     The shift is that of the image in the camera plane: a camera that is mirrored or turned sees it so.
     """
-    moved, powers = registration.copy(), monomial_powers()
-    shows = orientations(registration[..., [powers.index((1, 0)), powers.index((0, 1))]])
-    moved[..., powers.index((0, 0))] += np.asarray(shows @ shift_px, dtype=np.float32)
+    moved = registration.copy()
+    shift = registration_orientations(registration) @ shift_px
+    moved[..., monomial_powers().index((0, 0))] += np.asarray(shift, dtype=np.float32)
     return moved
+
+
+def registration_orientations(registration: NDArray[np.float32]) -> NDArray[np.floating]:
+    """Return the `orientations` of both cameras by their registration [2, 2, 10], [2, 2, 2]."""
+    powers = monomial_powers()
+    return orientations(registration[..., [powers.index((1, 0)), powers.index((0, 1))]])
 
 
 def moved_cameras(parameters: Real, shift_px: Real) -> Real:

@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 from lightpage.calibration.calibrate import KnownPage
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.interfaces import Twin
-from lightpage.calibration.likelihood.interfaces import Derivatives, ProgressCallback, Real, sampled_evenly
-from lightpage.calibration.likelihood.measure import estimator_table, measured_statistics
+from lightpage.calibration.likelihood.interfaces import Derivatives, ProgressCallback, Real, at_places, chosen_evenly
+from lightpage.calibration.likelihood.measure import estimator_table
 from lightpage.calibration.likelihood.statistics import Statistics
-from lightpage.calibration.likelihood.table import known_p
+from lightpage.calibration.likelihood.table import MEASUREMENT_INPUTS, known_p
 from lightpage.calibration.sampling_table import SamplingTable
-from lightpage.calibration.waves.wave_model import LaunchConditions
 from lightpage.recording.frame_pair import FramePair
-from lightpage.runtime.model.execution.estimator_graph import NOISE, EstimatorGraph
+from lightpage.runtime.model.execution.estimator_graph import DERIVATIVES, NOISE, EstimatorGraph
 from lightpage.runtime.recalibration.noise import KnownPhases, deviation_prior_scale, measured_noise
 
 _FED = ("count_scale", "count_weights", "information", "responses", "nuisance_covariance", "nuisance_precision")
@@ -32,34 +31,55 @@ class GraphLikelihood:
 
     Args:
         graph: graph of a bundle of the same device. The device may have drifted since.
+
+    Attributes:
+        graph: as given.
     """
 
     def __init__(self, graph: EstimatorGraph) -> None:
-        self._graph = graph
+        self.graph = graph
         self._refitted = graph
         self._key: list[bytes] = []
+        self._measured_by: list[bytes] = []
         self._pages: dict[int, tuple[FramePair, dict[str, NDArray[Any]]]] = {}
 
     def __call__(self, pair: FramePair, table: SamplingTable, phases: Real, nuisance: Real) -> Derivatives:
         """See `PageLikelihood`."""
-        tensors = {name: np.asarray(value) for name, value in table.items() if name in self._graph.ports}
+        page, outputs = self._outputs(pair, table, phases, nuisance, DERIVATIVES)
+        places, stride = chosen_evenly(page["lit"] > 0)
+        return Derivatives(
+            by_phase=outputs["by_phase"].astype(np.float64),
+            by_nuisance=outputs["by_nuisance"].astype(np.float64),
+            expected=at_places(outputs["expected"], places),
+            counts=at_places(page["counts"], places),
+            places=places,
+            stride=stride,
+        )
+
+    def expected(
+        self, pair: FramePair, table: SamplingTable, phases: Real, nuisance: Real, places: NDArray[np.intp]
+    ) -> Real:
+        """See `PageLikelihood`."""
+        _, outputs = self._outputs(pair, table, phases, nuisance, ("expected",))
+        return at_places(outputs["expected"], places)
+
+    def _outputs(
+        self, pair: FramePair, table: SamplingTable, phases: Real, nuisance: Real, names: Sequence[str]
+    ) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
+        """Compute the measurements of a page, and outputs of a step at an estimate, by name."""
+        tensors = {name: np.asarray(value) for name, value in table.items() if name in self.graph.ports}
         fed = {name: value for name, value in tensors.items() if name in _FED}
         constants = {name: value for name, value in tensors.items() if name not in _FED}
         key = [value.tobytes() for value in constants.values()]
         if key != self._key:
-            self._refitted = self._graph.with_table(constants)
+            self._refitted = self.graph.with_table(constants)
             self._key = key
+        measured_by = [tensors[name].tobytes() for name in MEASUREMENT_INPUTS if name in tensors]
+        if measured_by != self._measured_by:
+            self._measured_by = measured_by
             self._pages = {}
         page = self._page(pair)
-        outputs = self._refitted.derivatives(page, fed, known_p(phases), np.asarray(nuisance, np.float32))
-        (expected, counts), stride = sampled_evenly(page["lit"] > 0, outputs["expected"], page["counts"])
-        return Derivatives(
-            by_phase=outputs["by_phase"].astype(np.float64),
-            by_nuisance=outputs["by_nuisance"].astype(np.float64),
-            expected=expected,
-            counts=counts,
-            stride=stride,
-        )
+        return page, self._refitted.derivatives(page, fed, known_p(phases), np.asarray(nuisance, np.float32), names)
 
     def _page(self, pair: FramePair) -> dict[str, NDArray[Any]]:
         """Measurements of a page, computed once for each pair of frames."""
@@ -71,38 +91,30 @@ class GraphLikelihood:
         return kept[1]
 
 
-def measured_anew(
-    graph: EstimatorGraph,
+def measured_table(
+    likelihood: GraphLikelihood,
     twin: Twin,
     device: CalibratedDevice,
     pages: Sequence[KnownPage],
-    conditions: LaunchConditions,
+    statistics: Statistics,
     mask: NDArray[np.bool_],
     progress: ProgressCallback,
-) -> tuple[Statistics, SamplingTable]:
-    """Measure what the estimator needs of a re-fitted device.
+) -> SamplingTable:
+    """Measure the tensors of the graph's table that change with a re-fit.
 
     Args:
-        graph: graph of the bundle before the re-fit.
+        likelihood: likelihood by the graph of the bundle before the re-fit.
         twin: ray tracer of the nominal device.
         device: re-fitted device.
         pages: known pages.
-        conditions: illumination and blur of the pages.
+        statistics: statistics of the re-fitted device.
         mask: positions of the pilots, bool [ny, nx].
         progress: called with the finished share of the work.
-
-    Returns:
-        Statistics of the counts, and the tensors of the graph's table that change.
-
-    Raises:
-        CalibrationError: the pages' light does not agree with the device.
     """
-    likelihood = GraphLikelihood(graph)
-    statistics = measured_statistics(likelihood, twin, device, pages, conditions, lambda share: progress(0.4 * share))
-    table = estimator_table(likelihood, twin, device, pages, statistics, lambda share: progress(0.4 + 0.4 * share))
+    graph = likelihood.graph
+    table = estimator_table(likelihood, twin, device, pages, statistics, lambda share: progress(0.6 * share))
     table = {name: value for name, value in table.items() if name in graph.ports}
     known = [KnownPhases.of(page, device) for page in pages]
     steps = len(graph.value(NOISE)) - 1
     prior_scale = deviation_prior_scale(device.profile, statistics)
-    noise = measured_noise(graph.with_table(table), known, mask, prior_scale, steps)
-    return statistics, table | noise
+    return table | measured_noise(graph.with_table(table), known, mask, prior_scale, steps)

@@ -8,6 +8,7 @@ from lightpage.calibration.calibrate import LEAST_KEPT, KnownPage, refine
 from lightpage.calibration.document import Calibration
 from lightpage.calibration.image_search import REACH_PX
 from lightpage.calibration.interfaces import FieldSolver, Twin
+from lightpage.calibration.likelihood.device_fit import DeviceFit
 from lightpage.calibration.likelihood.table import launch_tensors
 from lightpage.calibration.sampling_table import apart_inputs, moved_cameras, sampling_table
 from lightpage.errors import BundleError, CalibrationError
@@ -22,7 +23,7 @@ from lightpage.runtime.model.decoding.image_drift import BundleSearch
 from lightpage.runtime.model.decoding.image_position import ImagePosition
 from lightpage.runtime.model.execution.estimator_graph import EstimatorGraph
 from lightpage.runtime.model.execution.twin import OnnxTwin
-from lightpage.runtime.recalibration.estimator import measured_anew
+from lightpage.runtime.recalibration.estimator import GraphLikelihood, measured_table
 from lightpage.runtime.recalibration.known_pages import KnownPages
 from lightpage.runtime.recalibration.recalibration import RefitReport, RefitResult
 
@@ -100,21 +101,35 @@ def refit(
             "drifted a little; else calibrate anew",
         )
     hashes = dict.fromkeys([*map(hash_frames, pages.pairs), *pages.fitted])
-    fitted = earlier.followed_by(Calibration.from_registered(registered, profile, [*hashes]))
-    check_as_good(earlier, fitted)
     graph = decoder.graph
-    if not isinstance(graph, EstimatorGraph) or registered.conditions is None:
+    conditions = registered.conditions
+    if not isinstance(graph, EstimatorGraph) or conditions is None:
+        fitted = earlier.followed_by(Calibration.from_registered(registered, profile, [*hashes]))
+        check_as_good(earlier, fitted)
         return traced(decoder, twin, references, fitted, image)
-    statistics, measured = measured_anew(
-        graph,
+    likelihood = GraphLikelihood(graph)
+    fit = DeviceFit(
+        likelihood,
+        twin,
+        profile,
+        references,
+        known,
+        lambda share: progress("likelihood of all known pages", share),
+    )
+    refined, statistics = fit.refined(registered, conditions)
+    fitted = earlier.followed_by(Calibration.from_registered(refined, profile, [*hashes], statistics))
+    check_as_good(earlier, fitted)
+    mask = bundle.pilot_mask if pages.pilot_mask is None else pages.pilot_mask
+    measured = measured_table(
+        likelihood,
         twin,
         fitted.device(profile, references),
         known,
-        registered.conditions,
-        bundle.pilot_mask if pages.pilot_mask is None else pages.pilot_mask,
-        lambda share: progress("statistics and noise of the estimator", share),
+        statistics,
+        mask,
+        lambda share: progress("noise of the estimator", share),
     )
-    result = traced(decoder, twin, references, fitted.model_copy(update={"statistics": statistics}), image)
+    result = traced(decoder, twin, references, fitted, image)
     return replace(result, table={**result.table, **measured})
 
 

@@ -10,7 +10,8 @@ from click.testing import CliRunner
 from analysis.tracking import walking_device
 from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.calibration.known_pages import known_pages
-from lightpage.calibration.likelihood.measure import measured_statistics
+from lightpage.calibration.likelihood.known_page_fit import KnownPageFit
+from lightpage.calibration.likelihood.measure import light_table
 from lightpage.calibration.likelihood.table import pilot_tensors
 from lightpage.calibration.waves.wave_fit import WaveFit
 from lightpage.device.state import Device
@@ -63,7 +64,9 @@ def calibration(small_device: list[str], small_bundle: Path) -> Calibration:
     fit = WaveFit(twin, PROFILE, pages[0].pair, references, pages[0].symbols)
     conditions = fit.fit(device.parameters, device.quadrature_phase_rad, ("launch",), effort="once").conditions
     likelihood = TorchLikelihood(PhaseEstimator(PROFILE, device.parameters).eval())
-    statistics = measured_statistics(likelihood, twin, device, pages, conditions)
+    statistics = KnownPageFit(likelihood, light_table(twin, device, conditions), pages, device.modulation).statistics(
+        conditions
+    )
     return right.model_copy(update={"statistics": statistics, "calibrated_pages": hashes, "pages_used": len(hashes)})
 
 

@@ -16,7 +16,7 @@ from lightpage.calibration.coherence import seen_share
 from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.calibration.goodness.figure import goodness_figure
 from lightpage.calibration.known_pages import first_lit_pages, known_pages
-from lightpage.calibration.likelihood.measure import measured_statistics
+from lightpage.calibration.likelihood.device_fit import DeviceFit
 from lightpage.cli.options import JSON, named_profile, new_file, profile_option
 from lightpage.cli.paths import OutputFile
 from lightpage.cli.progress_bar import percent_bar
@@ -147,19 +147,18 @@ def calibrate_recording(
         any_orientation=any_orientation,
     )
     hashes = [recording.page_hash(page) for page in pages]
-    calibration = Calibration.from_registered(registered, profile, hashes)
     if registered.conditions is None:
-        return calibration
-    likelihood = TorchLikelihood(PhaseEstimator(profile, registered.parameters).eval())
-    statistics = measured_statistics(
-        likelihood,
+        return Calibration.from_registered(registered, profile, hashes)
+    fit = DeviceFit(
+        TorchLikelihood(PhaseEstimator(profile, registered.parameters).eval()),
         twin,
-        calibration.device(profile, recording.references()),
+        profile,
+        recording.references(),
         known,
-        registered.conditions,
-        lambda share: progress("statistics of the counts", share),
+        lambda share: progress("likelihood of all known pages", share),
     )
-    return calibration.model_copy(update={"statistics": statistics})
+    refined, statistics = fit.refined(registered, registered.conditions)
+    return Calibration.from_registered(refined, profile, hashes, statistics)
 
 
 def figures(calibration: Calibration, profile: Profile, seconds: float, lost: int) -> dict[str, object]:

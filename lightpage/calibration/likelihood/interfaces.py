@@ -31,28 +31,35 @@ class Derivatives:
         expected: counts that the light would give perfect cameras, [2, N], at evenly chosen samples of the common grid
             where both cameras have a reference.
         counts: measured counts at the same samples, [2, N].
-        stride: number of such samples of the grid that each chosen one stands for.
+        places: numbers of the chosen samples in the flattened grid, [N].
+        stride: number of samples of the grid that each chosen one stands for.
     """
 
     by_phase: Real
     by_nuisance: Real
     expected: Real
     counts: Real
+    places: NDArray[np.intp]
     stride: int
 
 
-def sampled_evenly(mask: NDArray[np.bool_], *planes: NDArray[np.float32]) -> tuple[list[Real], int]:
-    """Choose at most about `MOST_SAMPLES` samples of planes evenly.
+def chosen_evenly(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], int]:
+    """Choose at most about `MOST_SAMPLES` samples of the grid evenly.
 
     Args:
-        mask: places that may be chosen, [Gy, Gx].
-        planes: planes of both cameras, [2, Gy, Gx] each.
+        mask: samples that may be chosen, [Gy, Gx].
 
     Returns:
-        The chosen samples of each plane, [2, N], and the number of places that each stands for.
+        Numbers of the chosen samples in the flattened grid, and the number of samples that each stands for.
     """
-    stride = max(1, int(np.count_nonzero(mask)) // MOST_SAMPLES)
-    return [plane[:, mask][:, ::stride].astype(np.float64) for plane in planes], stride
+    places = np.flatnonzero(mask)
+    stride = max(1, len(places) // MOST_SAMPLES)
+    return places[::stride], stride
+
+
+def at_places(planes: NDArray[np.float32], places: NDArray[np.intp]) -> Real:
+    """Values of both cameras' planes [2, Gy, Gx] at places of the flattened grid, [2, N]."""
+    return planes.reshape(len(planes), -1)[:, places].astype(np.float64)
 
 
 class PageLikelihood(Protocol):
@@ -66,5 +73,16 @@ class PageLikelihood(Protocol):
             table: table of the device, see `lightpage.calibration.likelihood.table`.
             phases: phases of the symbols' light, radians [ny, nx].
             nuisance: gain (real and imaginary part), tilt (x, y), radians, and shift (x, y), camera pixels, [6].
+        """
+        ...
+
+    def expected(
+        self, pair: FramePair, table: SamplingTable, phases: Real, nuisance: Real, places: NDArray[np.intp]
+    ) -> Real:
+        """Evaluate the expected counts alone, [2, N].
+
+        Args:
+            pair, table, phases, nuisance: as above.
+            places: numbers of samples in the flattened grid, [N].
         """
         ...

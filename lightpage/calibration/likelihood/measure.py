@@ -1,4 +1,4 @@
-"""Measurement of a calibrated device on its known pages: statistics of its counts, and tensors of its estimator."""
+"""Tensors of a calibrated device and of the estimation of its pages."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from lightpage.calibration.calibrate import KnownPage
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.interfaces import Twin
-from lightpage.calibration.likelihood.information import InformationFit
+from lightpage.calibration.likelihood.information import measured_information
 from lightpage.calibration.likelihood.interfaces import PageLikelihood, ProgressCallback
+from lightpage.calibration.likelihood.known_page_fit import KnownPageFit
 from lightpage.calibration.likelihood.statistics import Statistics
 from lightpage.calibration.likelihood.table import launch_tensors
 from lightpage.calibration.sampling_table import APART, SamplingTable, sampling_table
@@ -33,29 +34,6 @@ def light_table(twin: Twin, device: CalibratedDevice, conditions: LaunchConditio
     }
 
 
-def measured_statistics(
-    likelihood: PageLikelihood,
-    twin: Twin,
-    device: CalibratedDevice,
-    pages: Sequence[KnownPage],
-    conditions: LaunchConditions,
-    progress: ProgressCallback = lambda share: None,
-) -> Statistics:
-    """Measure the statistics of a device's counts on known pages.
-
-    Args:
-        likelihood: likelihood of the device's pages.
-        twin, device, conditions: see `light_table`.
-        pages: known pages.
-        progress: called with the finished share of the work.
-
-    Raises:
-        CalibrationError: the pages' light does not agree with the device.
-    """
-    fit = InformationFit(likelihood, light_table(twin, device, conditions), pages, device, progress)
-    return fit.statistics(conditions)
-
-
 def estimator_table(
     likelihood: PageLikelihood,
     twin: Twin,
@@ -67,8 +45,13 @@ def estimator_table(
     """Return the tensors that the estimation of a device's pages needs, except noise and pilots.
 
     Args:
-        likelihood, twin, device, pages, progress: see `measured_statistics`.
+        likelihood: likelihood of the device's pages.
+        twin, device: see `light_table`.
+        pages: known pages.
         statistics: statistics of the device.
+        progress: called with the finished share of the work.
     """
     table = light_table(twin, device, statistics.conditions)
-    return {**table, **InformationFit(likelihood, table, pages, device, progress).information(statistics)}
+    fit = KnownPageFit(likelihood, table, pages, device.modulation)
+    fit.fit_gains(statistics)
+    return {**table, **measured_information(fit, progress)}

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.likelihood.counts import CountStatistics
 from lightpage.calibration.parameters import as_dict
-from lightpage.calibration.sampling_table import SamplingTable
+from lightpage.calibration.sampling_table import APART, SamplingTable
 from lightpage.calibration.waves.wave_model import LaunchConditions, fitted_geometry
 from lightpage.device.profile import Profile
 from lightpage.page.modulation import Modulation
@@ -27,6 +27,8 @@ _FACET_SAMPLES = 257
 """Samples along an axis of the entrance facet."""
 KNOWN_CONCENTRATION = 1e6
 """Concentration of a known phase."""
+MEASUREMENT_INPUTS = ("reference_in_phase", "reference_quadrature", "registration", "homodyne", *APART)
+"""Names of the tensors that the measurements of a page on the common grid depend on."""
 PILOT_PHASORS = "pilot_phasors"
 PILOT_MASK = "pilot_mask"
 """Names of the tensors that may be fed with each page, since pilots depend on the number of levels."""

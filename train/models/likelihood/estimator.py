@@ -103,6 +103,22 @@ class Likelihood(NamedTuple):
     by_sample: Tensor
 
 
+class _Prediction(NamedTuple):
+    """Predicted light of an estimate.
+
+    Attributes:
+        exit_factor: factor of gain and shift on the exit facet, [fy, fx].
+        tilt: phasor of the tilt on the common grid, [Gy, Gx].
+        leaving: light on the exit facet.
+        field: light on the common grid.
+    """
+
+    exit_factor: Parts
+    tilt: Parts
+    leaving: Parts
+    field: Parts
+
+
 class PhaseEstimator(nn.Module):
     """Estimator of one device's pages.
 
@@ -191,23 +207,52 @@ class PhaseEstimator(nn.Module):
             cameras: defocus of cameras that stand apart.
             coarse: whether light is predicted with the fidelity of the way back, as is enough for a first step.
         """
-        waves, forward = (self.back, operators.backward) if coarse else (self.waves, operators.forward)
         direction, turned = estimate.direction, phasor(estimate.deviations)
         amplitude, slope = amplitude_and_slope(direction, table["amplitude_series"])
-        light = multiply(self._on_samples(scaled(parts(expected_phasors(estimate.p)), amplitude)), turned)
-        exit_factor, tilt = self.nuisances.at_exit(estimate.nuisance), self.nuisances.tilt(estimate.nuisance)
-        leaving = multiply(waves.to_exit(forward, multiply(light, operators.illumination)), exit_factor)
-        field = multiply(waves.exit_to_camera(forward, leaving), tilt)
-        score, expected = _score(table, page, field, cameras)
-        at_exit = self.back.back_to_exit(operators.backward, multiply(score, conjugate(tilt)))
-        back = self.back.exit_to_page(operators.backward, multiply(at_exit, conjugate(exit_factor)))
+        light = self._predicted(operators, amplitude, estimate, coarse=coarse)
+        score, expected = _score(table, page, light.field, cameras)
+        at_exit = self.back.back_to_exit(operators.backward, multiply(score, conjugate(light.tilt)))
+        back = self.back.exit_to_page(operators.backward, multiply(at_exit, conjugate(light.exit_factor)))
         back = multiply(back, conjugate(operators.illumination))
         symbol = multiply(self._on_samples(scaled(direction, amplitude)), turned)
         by_log = symbol[0] * back[0] + symbol[1] * back[1]
         by_turn = symbol[0] * back[1] - symbol[1] * back[0]
         by_sample = by_turn + to_samples(slope, self.samples) * by_log
-        by_nuisance = self.nuisances.gradient(leaving, at_exit, field, score)
+        by_nuisance = self.nuisances.gradient(light.leaving, at_exit, light.field, score)
         return Likelihood(summed(by_sample, self.samples), by_nuisance, expected, by_sample)
+
+    def expected_counts(
+        self,
+        operators: Operators,
+        table: Mapping[str, Tensor],
+        page: Page,
+        estimate: Estimate,
+        cameras: Cameras | None = None,
+    ) -> Tensor:
+        """Predict the counts that the light of an estimate would give perfect cameras, [2, Gy, Gx].
+
+        Args:
+            operators, table, page, estimate, cameras: see `likelihood`.
+        """
+        amplitude, _ = amplitude_and_slope(estimate.direction, table["amplitude_series"])
+        light = self._predicted(operators, amplitude, estimate, coarse=False)
+        return _score(table, page, light.field, cameras)[1]
+
+    def _predicted(self, operators: Operators, amplitude: Tensor, estimate: Estimate, *, coarse: bool) -> _Prediction:
+        """Predict the light of an estimate.
+
+        Args:
+            operators, estimate: see there.
+            amplitude: amplitudes of the symbols' light, [ny, nx].
+            coarse: see `likelihood`.
+        """
+        waves, forward = (self.back, operators.backward) if coarse else (self.waves, operators.forward)
+        light = self._on_samples(scaled(parts(expected_phasors(estimate.p)), amplitude))
+        launched = multiply(multiply(light, phasor(estimate.deviations)), operators.illumination)
+        exit_factor = self.nuisances.at_exit(estimate.nuisance)
+        tilt = self.nuisances.tilt(estimate.nuisance)
+        leaving = multiply(waves.to_exit(forward, launched), exit_factor)
+        return _Prediction(exit_factor, tilt, leaving, multiply(waves.exit_to_camera(forward, leaving), tilt))
 
     def advanced(
         self,

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from lightpage.calibration.likelihood.interfaces import Derivatives, Real, sampled_evenly
-from lightpage.calibration.likelihood.table import known_p
+from lightpage.calibration.likelihood.interfaces import Derivatives, Real, at_places, chosen_evenly
+from lightpage.calibration.likelihood.table import MEASUREMENT_INPUTS, known_p
 from lightpage.calibration.sampling_table import APART, SamplingTable
 from lightpage.recording.frame_pair import FramePair
 from lightpage.train.models.apart import Cameras
@@ -19,7 +22,15 @@ from lightpage.train.models.likelihood.estimator import (
     PhaseEstimator,
 )
 
-_MEASUREMENT_INPUTS = ("reference_in_phase", "reference_quadrature", "registration", "homodyne", *APART)
+
+class _State(NamedTuple):
+    """Arguments of `PhaseEstimator.likelihood`."""
+
+    operators: Operators
+    tensors: dict[str, Tensor]
+    page: Page
+    estimate: Estimate
+    cameras: Cameras | None
 
 
 class TorchLikelihood:
@@ -39,23 +50,39 @@ class TorchLikelihood:
 
     def __call__(self, pair: FramePair, table: SamplingTable, phases: Real, nuisance: Real) -> Derivatives:
         """See `PageLikelihood`."""
+        state = self._state(pair, table, phases, nuisance)
+        with torch.no_grad():
+            likelihood = self._estimator.likelihood(*state)
+        page = state.page
+        places, stride = chosen_evenly(page.lit.numpy() > 0)
+        return Derivatives(
+            by_phase=likelihood.by_phase.numpy().astype(np.float64),
+            by_nuisance=likelihood.by_nuisance.numpy().astype(np.float64),
+            expected=at_places(likelihood.expected.numpy(), places),
+            counts=at_places(page.counts.numpy(), places),
+            places=places,
+            stride=stride,
+        )
+
+    def expected(
+        self, pair: FramePair, table: SamplingTable, phases: Real, nuisance: Real, places: NDArray[np.intp]
+    ) -> Real:
+        """See `PageLikelihood`."""
+        with torch.no_grad():
+            expected = self._estimator.expected_counts(*self._state(pair, table, phases, nuisance))
+        return at_places(expected.numpy(), places)
+
+    def _state(self, pair: FramePair, table: SamplingTable, phases: Real, nuisance: Real) -> _State:
+        """Return the arguments of an evaluation."""
         tensors = {name: torch.from_numpy(np.array(value, order="C")) for name, value in table.items()}
         with torch.no_grad():
             operators = self.operators(table, tensors)
             page = self.page(pair, table, tensors)
-            no_deviations = torch.zeros_like(operators.illumination[0])
-            p, parameters = torch.from_numpy(known_p(phases)), torch.from_numpy(np.asarray(nuisance)).float()
-            estimate = Estimate(p, parameters, no_deviations)
-            likelihood = self._estimator.likelihood(operators, tensors, page, estimate, self.cameras(tensors))
-        mask, expected, counts = page.lit.numpy() > 0, likelihood.expected.numpy(), page.counts.numpy()
-        (expected_samples, count_samples), stride = sampled_evenly(mask, expected, counts)
-        return Derivatives(
-            by_phase=likelihood.by_phase.numpy().astype(np.float64),
-            by_nuisance=likelihood.by_nuisance.numpy().astype(np.float64),
-            expected=expected_samples,
-            counts=count_samples,
-            stride=stride,
-        )
+            cameras = self.cameras(tensors)
+        p = torch.from_numpy(known_p(phases))
+        no_deviations = torch.zeros_like(operators.illumination[0])
+        estimate = Estimate(p, torch.from_numpy(np.asarray(nuisance)).float(), no_deviations)
+        return _State(operators, tensors, page, estimate, cameras)
 
     def operators(self, table: SamplingTable, tensors: dict[str, Tensor]) -> Operators:
         """Wave operators of a device, computed once."""
@@ -66,7 +93,7 @@ class TorchLikelihood:
 
     def page(self, pair: FramePair, table: SamplingTable, tensors: dict[str, Tensor]) -> Page:
         """Measurements of a page, computed once for each pair of frames."""
-        key = _contents(table, _MEASUREMENT_INPUTS)
+        key = _contents(table, MEASUREMENT_INPUTS)
         if key != self._measured_by:
             self._measured_by, self._pages = key, {}
         kept = self._pages.get(id(pair))

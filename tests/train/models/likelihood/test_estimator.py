@@ -9,7 +9,8 @@ import torch
 
 from lightpage.calibration.calibrate import KnownPage
 from lightpage.calibration.likelihood.counts import CountStatistics
-from lightpage.calibration.likelihood.measure import estimator_table, light_table, measured_statistics
+from lightpage.calibration.likelihood.known_page_fit import KnownPageFit
+from lightpage.calibration.likelihood.measure import estimator_table, light_table
 from lightpage.calibration.likelihood.table import count_tensors, pilot_tensors
 from lightpage.calibration.sampling_table import APART, SamplingTable
 from lightpage.calibration.waves.wave_fit import WaveFit
@@ -178,7 +179,9 @@ def fitted() -> Fitted:
     conditions = waves.fit(device.parameters, device.quadrature_phase_rad, ("in_phase",)).conditions
     estimator = PhaseEstimator(PROFILE, device.parameters).eval()
     likelihood = TorchLikelihood(estimator)
-    statistics = measured_statistics(likelihood, TWIN, device, [known], conditions)
+    statistics = KnownPageFit(likelihood, light_table(TWIN, device, conditions), [known], device.modulation).statistics(
+        conditions
+    )
     return Fitted(estimator, estimator_table(likelihood, TWIN, device, [known], statistics))
 
 

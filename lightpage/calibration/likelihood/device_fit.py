@@ -1,0 +1,288 @@
+"""Maximum likelihood of a device's geometry, registration and light by the counts of all of its known pages together.
+
+The wave fit of one page weighs a share of its pixels by an approximate noise. Its result is refined here by Fisher
+scoring. All samples of the common grid count, with their measured mean and variance. Each page has nuisance parameters
+of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.calibration.calibrate import KnownPage, Registered, goodness_of
+from lightpage.calibration.calibrated_device import CalibratedDevice
+from lightpage.calibration.interfaces import Twin
+from lightpage.calibration.likelihood.interfaces import Derivatives, PageLikelihood, ProgressCallback
+from lightpage.calibration.likelihood.known_page_fit import NUISANCES, SHIFT, KnownPageFit, nuisance_precision
+from lightpage.calibration.likelihood.measure import light_table
+from lightpage.calibration.likelihood.statistics import Statistics
+from lightpage.calibration.likelihood.table import count_tensors
+from lightpage.calibration.parameters import SEEN_BY_CAMERAS, STEPS
+from lightpage.calibration.sampling_table import SamplingTable, cameras_apart, registration_orientations
+from lightpage.calibration.waves.wave_model import ILLUMINATIONS, LaunchConditions
+from lightpage.device.profile import Profile
+from lightpage.recording.frame_pair import FramePair
+from lightpage.waves.grid import field_grid
+
+Real = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+_ROUNDS = 3
+"""Largest number of scoring steps."""
+_LEAST_GAIN = 0.5
+"""Expected gain of the log-likelihood, nats a parameter, below which a further step does not pay: half a standard
+deviation of each."""
+_LINEARISED = 0.75
+"""Share of a round's work after which the next device is known, and its statistics are measured."""
+_TURN_STEP_RAD = 0.01
+"""Finite difference of the angle between the arms."""
+_BLUR_STEP = 0.02
+"""Finite difference of the blur's variance."""
+_BLUR_DEVIATION = 0.5
+"""Standard deviation of the blur's variance about zero before a page is seen."""
+_ILLUMINATION_STEP = 0.02
+"""Finite difference of an illumination's term, over the even one."""
+
+
+class _Solution(NamedTuple):
+    """Scoring step.
+
+    Attributes:
+        step: changes of the unknowns, [K].
+        deviations: their standard deviations, [K].
+        gain: expected gain of the log-likelihood, nats.
+    """
+
+    step: Real
+    deviations: Real
+    gain: float
+
+
+class DeviceFit:
+    """Fisher scoring of a registered device.
+
+    Unknowns are the parameters that the registration has fitted, the angle between the arms, the blur, the terms of the
+    illumination over the even one, and nuisance parameters of each page.
+
+    Args:
+        likelihood: likelihood of the device's pages.
+        twin: ray tracer of the nominal device.
+        profile: nominal device.
+        references: reference-only frames.
+        pages: known pages.
+        progress: called with the finished share of the work.
+    """
+
+    def __init__(
+        self,
+        likelihood: PageLikelihood,
+        twin: Twin,
+        profile: Profile,
+        references: FramePair,
+        pages: Sequence[KnownPage],
+        progress: ProgressCallback = lambda share: None,
+    ) -> None:
+        self._likelihood = likelihood
+        self._twin = twin
+        self._profile = profile
+        self._references = references
+        self._pages = pages
+        self._progress = progress
+        self._grid = field_grid(profile)
+
+    def refined(self, registered: Registered, conditions: LaunchConditions) -> tuple[Registered, Statistics]:
+        """Refine a registration.
+
+        Args:
+            registered: registration by the waves.
+            conditions: illumination and blur of its pages.
+
+        Returns:
+            The registration with refined parameters and their verdict, and the statistics of the pages' counts.
+
+        Raises:
+            CalibrationError: the pages' light does not agree with the device.
+        """
+        fitted = np.flatnonzero(registered.deviations)
+        seen_by_cameras = np.isin(fitted, [*SEEN_BY_CAMERAS])
+        of_light = fitted[~seen_by_cameras]
+        of_cameras = fitted[seen_by_cameras]
+        current = replace(registered, conditions=conditions)
+        fit, statistics = self._measured(current, conditions, 0.0)
+        for number in range(_ROUNDS):
+            solution = self._solved(fit, current, conditions, of_light, of_cameras, number)
+            moved, moved_conditions = _moved(
+                current, abs(fit.pages[0].gain), conditions, np.append(of_light, of_cameras), solution
+            )
+            moved_fit, moved_statistics = self._measured(moved, moved_conditions, number + _LINEARISED)
+            if not moved_fit.deviance(statistics) < fit.deviance(statistics):
+                break
+            current, conditions, fit, statistics = moved, moved_conditions, moved_fit, moved_statistics
+            if solution.gain < _LEAST_GAIN * len(solution.step):
+                break
+        goodness = goodness_of(self._twin, self._device(current), self._pages[0])
+        self._progress(1.0)
+        return replace(current, goodness=goodness), statistics
+
+    def _device(self, registered: Registered) -> CalibratedDevice:
+        return CalibratedDevice(
+            self._profile,
+            registered.parameters,
+            registered.quadrature_phase,
+            self._references,
+            registered.modulation,
+        )
+
+    def _measured(
+        self, registered: Registered, conditions: LaunchConditions, rounds: float
+    ) -> tuple[KnownPageFit, Statistics]:
+        """Fit the pages' nuisance parameters and the statistics of their counts, after so many finished `rounds`."""
+        table = light_table(self._twin, self._device(registered), conditions)
+        fit = KnownPageFit(self._likelihood, table, self._pages, registered.modulation)
+        share = 1 - _LINEARISED if rounds else 0.0
+        statistics = fit.statistics(conditions, lambda done: self._progress((rounds + share * done) / _ROUNDS))
+        fit.table |= count_tensors(statistics.cameras, statistics.correlation)
+        return fit, statistics
+
+    def _solved(
+        self,
+        fit: KnownPageFit,
+        registered: Registered,
+        conditions: LaunchConditions,
+        of_light: Indices,
+        of_cameras: Indices,
+        round_number: int,
+    ) -> _Solution:
+        """Solve for the scoring step of parameters `of_light` and `of_cameras`, turn, blur, illumination, nuisances."""
+        steps = [
+            *(self._parameter_step(fit.table, registered.parameters, index) for index in of_light),
+            *_other_steps(fit.table, registered.quadrature_phase, conditions.blur),
+        ]
+        evaluations = [fit.evaluate(page) for page in fit.pages]
+        columns: list[list[Real]] = []  # by unknown and page: operators are computed once for each unknown
+        for number, (tensors, step) in enumerate(steps):
+            self._progress((round_number + _LINEARISED * number / len(steps)) / _ROUNDS)
+            moved = [
+                self._likelihood.expected(page.pair, fit.table | tensors, page.phases, page.nuisance, here.places)
+                for page, here in zip(fit.pages, evaluations, strict=True)
+            ]
+            columns.append([(there - here.expected) / step for there, here in zip(moved, evaluations, strict=True)])
+        parameters = np.append(of_light, of_cameras)
+        common = len(columns) + len(of_cameras)
+        total = common + NUISANCES * len(fit.pages)
+        gradient = np.zeros(total)
+        information = np.zeros((total, total))
+        for number, (page, here) in enumerate(zip(fit.pages, evaluations, strict=True)):
+            by_nuisance = fit.by_nuisance(page, here)
+            by_cameras = self._by_cameras(registered.parameters, of_cameras, here, by_nuisance[SHIFT], fit.table)
+            by_unknown = [column[number] for column in columns]
+            split = len(of_light)
+            jacobian = np.stack([*by_unknown[:split], *by_cameras, *by_unknown[split:], *by_nuisance])
+            nuisances = common + NUISANCES * number + np.arange(NUISANCES)
+            own = np.append(np.arange(common), nuisances)
+            gradient[own] += fit.gradient(jacobian, here)
+            information[np.ix_(own, own)] += fit.normal_matrix(jacobian, here)
+            gradient[nuisances] -= nuisance_precision() * page.nuisance
+            information[nuisances, nuisances] += nuisance_precision()
+        prior = registered.prior
+        precision = 1 / prior.deviations[parameters] ** 2
+        count = np.arange(len(parameters))
+        gradient[count] -= precision * (registered.parameters - prior.centre)[parameters]
+        information[count, count] += precision
+        blur = len(parameters) + 1
+        gradient[blur] -= conditions.blur / _BLUR_DEVIATION**2
+        information[blur, blur] += 1 / _BLUR_DEVIATION**2
+        return _solution(gradient, information)
+
+    def _parameter_step(self, table: SamplingTable, parameters: Real, index: int) -> tuple[SamplingTable, float]:
+        """Tensors that change with a step along a parameter of the light, and the step."""
+        moved = parameters.copy()
+        moved[index] += STEPS[index]
+        apart = cameras_apart(moved, self._profile)
+        changed = {name: value for name, value in apart.items() if name in table}
+        return {"parameters": moved.astype(np.float32), **changed}, float(STEPS[index])
+
+    def _by_cameras(
+        self, parameters: Real, of_cameras: Indices, here: Derivatives, by_shift: Real, table: SamplingTable
+    ) -> list[Real]:
+        """Derivatives of the expected counts, [2, N] each, by parameters that move the cameras.
+
+        Counts that are measured elsewhere change as the expected counts do where the image is shifted the other way.
+
+        Args:
+            parameters: of the device, [P].
+            of_cameras: indices of the parameters.
+            here: evaluation of the page.
+            by_shift: derivatives of the expected counts by a shift (x, y) of the image, [2, 2, N].
+            table: table of the device.
+        """
+        rows, columns = np.unravel_index(here.places, self._grid.shape)
+        points = np.stack([self._grid.x_m[columns], self._grid.y_m[rows]], axis=-1)
+        pixels = self._twin.pixels(parameters, points)
+        to_image = registration_orientations(table["registration"])
+        derivatives: list[Real] = []
+        for index in of_cameras:
+            moved = parameters.copy()
+            moved[index] += STEPS[index]
+            displacement = (self._twin.pixels(moved, points) - pixels) / STEPS[index]
+            # the inverse of an orientation is its transpose
+            derivatives.append(np.einsum("acn,cni,cia->cn", by_shift, displacement, to_image))
+        return derivatives
+
+
+def _other_steps(table: SamplingTable, turn_rad: float, blur: float) -> list[tuple[SamplingTable, float]]:
+    """Tensors that change with steps along turn, blur and the terms of the illumination, and the steps."""
+    turned = turn_rad + _TURN_STEP_RAD
+    steps: list[tuple[SamplingTable, float]] = [
+        ({"homodyne": np.array([np.cos(turned), np.sin(turned)], np.float32)}, _TURN_STEP_RAD),
+        ({"blur": np.array(blur + _BLUR_STEP, np.float32)}, _BLUR_STEP),
+    ]
+    for term in range(1, ILLUMINATIONS):
+        illumination = table["illumination"].copy()
+        illumination[0, term] += _ILLUMINATION_STEP * illumination[0, 0]
+        steps.append(({"illumination": illumination}, _ILLUMINATION_STEP))
+    return steps
+
+
+def _solution(gradient: Real, information: Real) -> _Solution:
+    """Solve the normal equations, whose unknowns have units of very different size."""
+    unit = 1 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+    covariance = np.linalg.pinv(information * unit * unit[:, None], hermitian=True) * unit * unit[:, None]
+    step = covariance @ gradient
+    return _Solution(step, np.sqrt(np.diag(covariance)), float(step @ gradient) / 2)
+
+
+def _moved(
+    registered: Registered, gain: float, conditions: LaunchConditions, parameters: Indices, solution: _Solution
+) -> tuple[Registered, LaunchConditions]:
+    """Registration and conditions after a scoring step.
+
+    Args:
+        registered: registration before it.
+        gain: magnitude of the first page's gain, which the illumination then includes.
+        conditions: illumination and blur before it.
+        parameters: indices of the fitted parameters.
+        solution: the step.
+    """
+    count = len(parameters)
+    vector = registered.parameters.copy()
+    vector[parameters] += solution.step[:count]
+    deviations = registered.deviations.copy()
+    deviations[parameters] = solution.deviations[:count]
+    illumination = conditions.illumination * gain
+    illumination[1:] += solution.step[count + 2 : count + 1 + ILLUMINATIONS] * illumination[0]
+    moved = LaunchConditions(illumination, max(0.0, conditions.blur + float(solution.step[count + 1])))
+    refined = replace(
+        registered,
+        parameters=vector,
+        deviations=deviations,
+        quadrature_phase=registered.quadrature_phase + float(solution.step[count]),
+        quadrature_deviation=float(solution.deviations[count]),
+        conditions=moved,
+    )
+    return refined, moved
