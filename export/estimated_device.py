@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from lightpage.calibration.calibrate import KnownPage
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.document import Calibration
-from lightpage.calibration.known_pages import known_pages
+from lightpage.calibration.known_pages import known_pages, without_blemishes
 from lightpage.calibration.likelihood.measure import estimator_table
-from lightpage.calibration.likelihood.table import known_p, pilot_tensors
+from lightpage.calibration.likelihood.table import PIXEL_GAINS, known_p, pilot_tensors
 from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.device.profile import Profile
 from lightpage.errors import CalibrationError, InvalidInputError
@@ -20,7 +20,9 @@ from lightpage.export.estimator_graphs import estimator_files
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import pilot_mask
 from lightpage.progress import Progress, warn
+from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import narrow
+from lightpage.recording.pixels.blemishes import UNIT_GAIN, Blemishes
 from lightpage.recording.reader import Recording
 from lightpage.runtime.model.execution.estimator_graph import (
     CHI_SQUARE,
@@ -55,7 +57,9 @@ class EstimatedDevice:
         estimator: estimator of its pages, in torch.
         graphs: the estimator's graphs.
         table: every tensor that the graphs take.
-        pages: known pages, with frames in the type that the bundle takes.
+        optional: names of those that only some devices have.
+        pages: known pages without blemishes, with frames in the type that the bundle takes.
+        last_pair: frames of the last of them with their blemishes.
         pilot_mask: positions of the pilots, bool [ny, nx].
         pilot_phases: phases of the device's own fixed pilots, radians, 1-D; None if they are the profile's.
     """
@@ -65,7 +69,9 @@ class EstimatedDevice:
     estimator: PhaseEstimator
     graphs: EstimatorFiles
     table: SamplingTable
+    optional: tuple[str, ...]
     pages: list[KnownPage]
+    last_pair: FramePair
     pilot_mask: NDArray[np.bool_]
     pilot_phases: NDArray[np.float32] | None
 
@@ -106,8 +112,10 @@ def estimated_device(
         raise CalibrationError("calibration: statistics", "none", "statistics of the counts: calibrate anew")
     used = calibrated_pages(calibration, recording)
     bits = recording.bit_depth
-    pages = [KnownPage(narrow(page.pair, bits), page.symbols) for page in known_pages(recording, profile, used)]
-    device = calibration.device(profile, narrow(recording.references(), bits))
+    recorded = [KnownPage(narrow(page.pair, bits), page.symbols) for page in known_pages(recording, profile, used)]
+    blemishes = Blemishes.of(narrow(recording.references(), bits))
+    pages = without_blemishes(recorded, blemishes)
+    device = calibration.device(profile, blemishes.references)
     twin = RayTwin(profile)
     estimator = PhaseEstimator(profile, device.parameters).eval()
     table = estimator_table(
@@ -124,14 +132,20 @@ def estimated_device(
     table |= pilot_tensors(_pilots(device, mask, own))
     table[NOISE] = np.tile(np.array([1, 0], np.float32), (MOST_STEPS + 1, 1))
     table[DEVIATION_PRECISION] = NO_DEVIATIONS
+    optional = device.apart_inputs
+    if not blemishes.none:
+        table[PIXEL_GAINS] = np.full_like(blemishes.gains, UNIT_GAIN)  # the known pages have been mended
+        optional += (PIXEL_GAINS,)
     progress("graphs to ONNX", 0.0)
-    graphs = estimator_files(estimator, pages[0].pair.in_phase.dtype.name, device.apart_inputs, table)
+    graphs = estimator_files(estimator, pages[0].pair.in_phase.dtype.name, optional, table)
     progress("noise of the known pages", 0.0)
     graph = EstimatorGraph(graphs, HeldTable(table), "estimator", None)
     known = [KnownPhases.of(page, device) for page in pages]
     check_counts(graph, known[0], mask, f"recording {recording.path}, page {used[0]}")
     table |= measured_noise(graph, known, mask, deviation_prior_scale(profile, statistics), steps)
-    return EstimatedDevice(device, twin, estimator, graphs, table, pages, mask, own)
+    if PIXEL_GAINS in optional:
+        table[PIXEL_GAINS] = blemishes.gains
+    return EstimatedDevice(device, twin, estimator, graphs, table, optional, pages, recorded[-1].pair, mask, own)
 
 
 def check_counts(graph: EstimatorGraph, known: KnownPhases, mask: NDArray[np.bool_], subject: str) -> None:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.utils import _pytree as tree
 
 from lightpage.calibration.likelihood.table import PILOT_MASK, PILOT_PHASORS
-from lightpage.calibration.sampling_table import SamplingTable
+from lightpage.calibration.sampling_table import APART, SamplingTable
 from lightpage.export.graph import FRAME_INPUTS, TABLE_INPUTS, answers
 from lightpage.export.onnx_files import exported
 from lightpage.runtime.model.execution.estimator_graph import (
@@ -38,7 +38,7 @@ from lightpage.train.models.likelihood.estimator import (
 
 PILOTS = (PILOT_PHASORS, PILOT_MASK)
 FIRST = (*TABLE_INPUTS, "information", *PILOTS)
-"""Tensors of the table that the first estimate takes, without those of cameras in different planes."""
+"""Tensors of the table that the first estimate of every device takes."""
 COUNTS = ("amplitude_series", "slope_power", "count_scale", "count_weights")
 STEP = (
     "homodyne",
@@ -51,7 +51,7 @@ STEP = (
     "nuisance_precision",
     *PILOTS,
 )
-"""Tensors of the table that a step takes, without those of cameras in different planes."""
+"""Tensors of the table that a step of every device takes."""
 
 
 class OperatorsGraph(nn.Module):
@@ -81,7 +81,7 @@ class FirstGraph(nn.Module):
 
     Args:
         estimator: estimator of the device.
-        apart: names of the tensors of cameras in different planes.
+        optional: names of the table's tensors that only some devices have.
         structure: tree of the operators' tensors.
         used: indices of the operators' tensors that are inputs.
 
@@ -90,13 +90,13 @@ class FirstGraph(nn.Module):
     """
 
     def __init__(
-        self, estimator: PhaseEstimator, apart: tuple[str, ...], structure: tree.TreeSpec, used: Sequence[int]
+        self, estimator: PhaseEstimator, optional: tuple[str, ...], structure: tree.TreeSpec, used: Sequence[int]
     ) -> None:
         super().__init__()
         self.estimator = estimator
         self._structure = structure
         self._used = tuple(used)
-        self.names = (*FIRST, *apart)
+        self.names = (*FIRST, *optional)
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
         """Compute `ESTIMATE_OUTPUTS`, `RESIDUAL` and `PAGE` from frames, noise, the table's tensors and operators."""
@@ -112,7 +112,8 @@ class StepGraph(nn.Module):
     """Graph from an estimate to the next one.
 
     Args:
-        estimator, apart, structure, used: see `FirstGraph`.
+        estimator, structure, used: see `FirstGraph`.
+        apart: names of the tensors of cameras in different planes.
         coarse: see `PhaseEstimator.likelihood`.
 
     Attributes:
@@ -154,7 +155,8 @@ class WholeGraph(nn.Module):
     """Graph from frames and table to the estimate after a fixed number of steps.
 
     Args:
-        estimator, apart: see `FirstGraph`.
+        estimator: estimator of the device.
+        optional: names of the table's tensors that only some devices have.
         steps: number of steps.
 
     Attributes:
@@ -164,12 +166,12 @@ class WholeGraph(nn.Module):
 
     outputs = ("p", "phase", "concentration", "residual", "nuisance", "chi_square")
 
-    def __init__(self, estimator: PhaseEstimator, apart: tuple[str, ...], steps: int) -> None:
+    def __init__(self, estimator: PhaseEstimator, optional: tuple[str, ...], steps: int) -> None:
         super().__init__()
         self.estimator = estimator
         self.steps = steps
-        self._apart = apart
-        self.table_inputs = tuple(dict.fromkeys((*FIRST, *OPERATOR_INPUTS, *STEP, NOISE, *apart)))
+        self._apart = apart_of(optional)
+        self.table_inputs = tuple(dict.fromkeys((*FIRST, *OPERATOR_INPUTS, *STEP, NOISE, *optional)))
 
     def forward(self, in_phase: Tensor, quadrature: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
         """Compute `outputs` from frames and `table_inputs`."""
@@ -184,6 +186,11 @@ class WholeGraph(nn.Module):
             noise = table[NOISE][number + 1]
             estimate, chi_square = self.estimator.advanced(table, page, estimate, likelihood, noise, coarse=coarse)
         return *answers(estimate.p), residual, estimate.nuisance, chi_square
+
+
+def apart_of(optional: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names of the tensors of cameras in different planes."""
+    return tuple(name for name in optional if name in APART)
 
 
 def restored(structure: tree.TreeSpec, used: Sequence[int], tensors: Sequence[Tensor]) -> Operators:
@@ -202,16 +209,17 @@ def restored(structure: tree.TreeSpec, used: Sequence[int], tensors: Sequence[Te
 
 
 def estimator_files(
-    estimator: PhaseEstimator, frame_dtype: str, apart: tuple[str, ...], table: SamplingTable
+    estimator: PhaseEstimator, frame_dtype: str, optional: tuple[str, ...], table: SamplingTable
 ) -> EstimatorFiles:
     """Export the graphs of operators, first estimate, early step and step.
 
     Args:
         estimator: estimator of the device.
         frame_dtype: numpy type of a frame's counts.
-        apart: names of the tensors of cameras in different planes.
+        optional: names of the table's tensors that only some devices have.
         table: every tensor of the device.
     """
+    apart = apart_of(optional)
     tensors = {name: torch.from_numpy(np.array(value, order="C")) for name, value in table.items()}
     frame = torch.from_numpy(np.zeros(table["reference_in_phase"].shape, frame_dtype))
     device_inputs = tuple(tensors[name] for name in OPERATOR_INPUTS)
@@ -224,7 +232,7 @@ def estimator_files(
         everything = tuple(range(len(operators)))
         indices = tree.tree_unflatten(list(everything), structure)
         backward = tuple(tree.tree_leaves((indices.backward, indices.illumination)))
-        first_graph = FirstGraph(estimator, apart, structure, backward)
+        first_graph = FirstGraph(estimator, optional, structure, backward)
         first_inputs = (
             frame,
             frame.clone(),

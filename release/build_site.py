@@ -68,7 +68,7 @@ PARTS = {
         "device.acquisition.source": "FrameSource Shot",
         "device.acquisition.page_store": "PageStore",
         "lightpage.recording.layout": "FrameInfo",
-        "lightpage.recording.black_level": "DarkFrame",
+        "lightpage.recording.pixels.black_level": "DarkFrame",
     },
 }
 """Chapters behind the public names on the page of Python: names by module, of `lightpage.runtime` if not said."""

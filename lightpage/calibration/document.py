@@ -23,10 +23,12 @@ from lightpage.page import modulation as modulations
 from lightpage.page.modulation import NOMINAL, Modulation
 from lightpage.progress import warn
 from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.pixels.blemishes import Blemishes
 from lightpage.words import brief, counted
 
 Real = NDArray[np.float64]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+NonNegativeCount = Annotated[int, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 PageHash = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 _LATER = NAMES[KNOWN[0] :]
@@ -40,7 +42,7 @@ _ADDED = {
 independent of those beside them."""
 
 
-_OPTIONAL = ("turn_deviation_rad", "coherence_at_first", "goodness", "statistics")
+_OPTIONAL = ("turn_deviation_rad", "coherence_at_first", "goodness", "statistics", "blemishes")
 
 
 def _names_problem(values: dict[str, Any], names: tuple[str, ...] = NAMES) -> str:
@@ -60,6 +62,46 @@ def _just(names: tuple[str, ...]) -> AfterValidator:
         return {name: values[name] for name in names}
 
     return AfterValidator(ordered)
+
+
+class BlemishCounts(TomlTable):
+    """Numbers of pixels whose blemishes were corrected.
+
+    Attributes:
+        in_phase_lost, quadrature_lost: pixels without a signal, such as hot ones.
+        in_phase_shaded, quadrature_shaded: pixels behind dust.
+    """
+
+    in_phase_lost: NonNegativeCount = 0
+    in_phase_shaded: NonNegativeCount = 0
+    quadrature_lost: NonNegativeCount = 0
+    quadrature_shaded: NonNegativeCount = 0
+
+    @classmethod
+    def of(cls, blemishes: Blemishes) -> Self:
+        """Count the blemishes of both cameras."""
+        in_phase_lost, quadrature_lost = blemishes.lost
+        in_phase_shaded, quadrature_shaded = blemishes.shaded
+        return cls(
+            in_phase_lost=in_phase_lost,
+            in_phase_shaded=in_phase_shaded,
+            quadrature_lost=quadrature_lost,
+            quadrature_shaded=quadrature_shaded,
+        )
+
+    def __str__(self) -> str:
+        """Numbers of both cameras in words, empty where there are none."""
+        parts = [
+            f"{counted(number, 'pixel')} of the {camera} camera {what}"
+            for number, camera, what in (
+                (self.in_phase_lost, "in-phase", "without a signal"),
+                (self.quadrature_lost, "quadrature", "without a signal"),
+                (self.in_phase_shaded, "in-phase", "behind dust"),
+                (self.quadrature_shaded, "quadrature", "behind dust"),
+            )
+            if number
+        ]
+        return ", ".join(parts)
 
 
 class Calibration(TomlTable):
@@ -83,6 +125,7 @@ class Calibration(TomlTable):
         modulation_deviations: standard deviations of that, same names.
         goodness: how well the fit explains the light; None where that was not measured, as in documents of before.
         statistics: statistics of the light and of the cameras' counts; None in documents of before.
+        blemishes: numbers of the cameras' blemishes that were corrected; None in documents of before.
     """
 
     schema_version: Literal[1] = 1
@@ -102,6 +145,7 @@ class Calibration(TomlTable):
     modulation_deviations: Annotated[dict[str, NonNegative], _just(modulations.NAMES)] = NOMINAL.as_dict()
     goodness: Goodness | None = None
     statistics: Statistics | None = None
+    blemishes: BlemishCounts | None = None
 
     def __repr__(self) -> str:
         verdict = "" if self.goodness is None else f", a {self.goodness.verdict} fit"
@@ -116,7 +160,12 @@ class Calibration(TomlTable):
 
     @classmethod
     def from_registered(
-        cls, registered: Registered, profile: Profile, hashes: Sequence[str], statistics: Statistics | None = None
+        cls,
+        registered: Registered,
+        profile: Profile,
+        hashes: Sequence[str],
+        statistics: Statistics | None = None,
+        blemishes: BlemishCounts | None = None,
     ) -> Self:
         """The document of a registration.
 
@@ -125,6 +174,7 @@ class Calibration(TomlTable):
             profile: the nominal device.
             hashes: SHA-256 of the known pages, one each.
             statistics: statistics of the light and of the counts, where they were measured.
+            blemishes: numbers of the cameras' blemishes, where they were searched.
         """
         return cls(
             profile_name=profile.name,
@@ -142,19 +192,22 @@ class Calibration(TomlTable):
             modulation_deviations=Modulation(registered.modulation_deviations).as_dict(),
             goodness=registered.goodness,
             statistics=statistics,
+            blemishes=blemishes,
         )
 
     def followed_by(self, fitted: Self) -> Self:
         """A re-fit that started here, with what it has to remember of this one.
 
         It remembers the coherence at first, so that many small losses are not taken for none, and the pages of every
-        earlier fit, so that no figure counts one of them as held out. Statistics that the re-fit has not measured stay.
+        earlier fit, so that no figure counts one of them as held out. Statistics and blemishes that the re-fit has not
+        measured stay.
         """
         return fitted.model_copy(
             update={
                 "coherence_at_first": self.reference_coherence,
                 "calibrated_pages": (*self.calibrated_pages, *fitted.calibrated_pages),
                 "statistics": fitted.statistics or self.statistics,
+                "blemishes": fitted.blemishes or self.blemishes,
             }
         )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 
 import numpy as np
@@ -13,6 +13,7 @@ from lightpage.errors import FrameError, RecordingError
 from lightpage.page.symbols import symbol_phases
 from lightpage.recording.exposure import check_pair_light
 from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.pixels.blemishes import Blemishes
 from lightpage.recording.reader import Recording
 
 
@@ -73,3 +74,8 @@ def known_pages(recording: Recording, profile: Profile, indices: Iterable[int]) 
         check_pair_light(f"recording {recording.path}, page {index}, ", pair, recording.bit_depth)
         pages.append(KnownPage(pair, np.exp(1j * symbol_phases(symbols, recording.levels))))
     return pages
+
+
+def without_blemishes(pages: Sequence[KnownPage], blemishes: Blemishes) -> list[KnownPage]:
+    """Known pages with mended frames."""
+    return [KnownPage(blemishes.mended(page.pair), page.symbols) for page in pages]

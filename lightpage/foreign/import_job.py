@@ -22,10 +22,10 @@ from lightpage.foreign.array import spread
 from lightpage.foreign.frames import Counts, Frames, Pages
 from lightpage.page.symbols import check_symbols
 from lightpage.progress import note, track, warn
-from lightpage.recording.black_level import without_black
 from lightpage.recording.exposure import check_different, check_light, unused_low_bits
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import MAX_BIT_DEPTH
+from lightpage.recording.pixels.black_level import without_black
 from lightpage.recording.writer import RecordingWriter
 from lightpage.words import counted
 

@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from lightpage.errors import RecordingError
 from lightpage.progress import warn
-from lightpage.recording.black_level import without_black
 from lightpage.recording.exposure import describe, unused_low_bits
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.hdf5 import open_hdf5
@@ -41,6 +40,7 @@ from lightpage.recording.layout import (
     LostShot,
     hash_frames,
 )
+from lightpage.recording.pixels.black_level import without_black
 from lightpage.recording.stored import ArrayFile
 from lightpage.words import brief, counted, sides
 

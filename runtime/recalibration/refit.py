@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 
 from lightpage.calibration.calibrate import LEAST_KEPT, KnownPage, refine
-from lightpage.calibration.document import Calibration
+from lightpage.calibration.document import BlemishCounts, Calibration
 from lightpage.calibration.image_search import REACH_PX
 from lightpage.calibration.interfaces import FieldSolver, Twin
 from lightpage.calibration.likelihood.device_fit import DeviceFit
-from lightpage.calibration.likelihood.table import launch_tensors
+from lightpage.calibration.likelihood.table import PIXEL_GAINS, launch_tensors
 from lightpage.calibration.sampling_table import apart_inputs, moved_cameras, sampling_table
 from lightpage.errors import BundleError, CalibrationError
 from lightpage.page.pilots import Pilots
@@ -17,6 +17,7 @@ from lightpage.page.symbols import symbol_phases
 from lightpage.progress import Progress, warn
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import hash_frames
+from lightpage.recording.pixels.blemishes import UNIT_GAIN, Blemishes
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_drift import BundleSearch
@@ -63,7 +64,9 @@ def refit(
         among = f"{' or '.join(sorted(REFITTED))} among them"
         expected = f"{among}: this decoder holds its geometry itself; calibrate, train and export anew"
         raise BundleError(f"{bundle.subject}: table inputs", sorted(decoder.graph.ports), expected)
-    references = pages.references or decoder.references
+    graph = decoder.graph
+    blemishes = _blemishes(decoder, pages.references)
+    references = blemishes.references
     twin = OnnxTwin(bundle) if twin is None else twin
     progress("find the image", 0.0)
     image = _find(decoder, twin, pages, references) if pages.near is None else None
@@ -71,7 +74,7 @@ def refit(
     known_place = image is not None or pages.near is not None
     start = moved_cameras(earlier.vector, np.array(moved_px)) if known_place else earlier.vector
     known = [
-        KnownPage(pair, np.exp(1j * symbol_phases(symbols, pages.levels)))
+        KnownPage(blemishes.mended(pair), np.exp(1j * symbol_phases(symbols, pages.levels)))
         for pair, symbols in zip(pages.pairs, pages.symbols, strict=True)
     ]
     try:
@@ -101,13 +104,13 @@ def refit(
             "drifted a little; else calibrate anew",
         )
     hashes = dict.fromkeys([*map(hash_frames, pages.pairs), *pages.fitted])
-    graph = decoder.graph
     conditions = registered.conditions
     if not isinstance(graph, EstimatorGraph) or conditions is None:
         fitted = earlier.followed_by(Calibration.from_registered(registered, profile, [*hashes]))
         check_as_good(earlier, fitted)
         return traced(decoder, twin, references, fitted, image)
-    likelihood = GraphLikelihood(graph)
+    without_blemishes = {name: np.full_like(blemishes.gains, UNIT_GAIN) for name in graph.ports if name == PIXEL_GAINS}
+    likelihood = GraphLikelihood(graph.with_table(without_blemishes))
     fit = DeviceFit(
         likelihood,
         twin,
@@ -117,7 +120,8 @@ def refit(
         lambda share: progress("likelihood of all known pages", share),
     )
     refined, statistics = fit.refined(registered, conditions)
-    fitted = earlier.followed_by(Calibration.from_registered(refined, profile, [*hashes], statistics))
+    counts = BlemishCounts.of(blemishes)
+    fitted = earlier.followed_by(Calibration.from_registered(refined, profile, [*hashes], statistics, counts))
     check_as_good(earlier, fitted)
     mask = bundle.pilot_mask if pages.pilot_mask is None else pages.pilot_mask
     measured = measured_table(
@@ -130,7 +134,21 @@ def refit(
         lambda share: progress("noise of the estimator", share),
     )
     result = traced(decoder, twin, references, fitted, image)
-    return replace(result, table={**result.table, **measured})
+    gains = {name: blemishes.gains for name in without_blemishes}
+    return replace(result, table={**result.table, **measured, **gains})
+
+
+def _blemishes(decoder: Decoder, references: FramePair | None) -> Blemishes:
+    """Blemishes of the cameras: of new references, or as the bundle has them.
+
+    Graphs that take no gains read frames with their blemishes, and are fitted with them.
+    """
+    if PIXEL_GAINS not in decoder.graph.ports:
+        references = references or decoder.references
+        return Blemishes(np.full((2, *references.in_phase.shape), UNIT_GAIN, np.uint8), references)
+    if references is None:
+        return Blemishes(decoder.graph.value(PIXEL_GAINS), decoder.references)
+    return Blemishes.of(references)
 
 
 def check_as_good(earlier: Calibration, fitted: Calibration) -> None:

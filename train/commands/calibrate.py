@@ -13,9 +13,9 @@ import torch
 
 from lightpage.calibration.calibrate import calibrate as register
 from lightpage.calibration.coherence import seen_share
-from lightpage.calibration.document import Calibration, load_calibration
+from lightpage.calibration.document import BlemishCounts, Calibration, load_calibration
 from lightpage.calibration.goodness.figure import goodness_figure
-from lightpage.calibration.known_pages import first_lit_pages, known_pages
+from lightpage.calibration.known_pages import first_lit_pages, known_pages, without_blemishes
 from lightpage.calibration.likelihood.device_fit import DeviceFit
 from lightpage.cli.options import JSON, named_profile, new_file, profile_option
 from lightpage.cli.paths import OutputFile
@@ -25,6 +25,7 @@ from lightpage.errors import LightpageError
 from lightpage.files import replace_file, write_json
 from lightpage.pictures import write_figure_png
 from lightpage.progress import Progress, warn
+from lightpage.recording.pixels.blemishes import Blemishes
 from lightpage.recording.reader import Recording
 from lightpage.train.data.features import CPU
 from lightpage.train.data.torch_engine import torch_device
@@ -99,6 +100,8 @@ def calibrate(
         total = profile.page.columns * profile.page.rows
         what = f"{lost} of {total} symbols: most of their light misses a camera, so little of them can be read"
         warn(what)
+    if calibration.blemishes is not None and str(calibration.blemishes):
+        click.echo(f"\n{calibration.blemishes}")
     found = calibration.goodness
     if picture is not None and found is not None:
         replace_file(picture, lambda file: write_figure_png(file, goodness_figure(found), dpi=_DOTS), "picture")
@@ -136,29 +139,32 @@ def calibrate_recording(
         CalibrationError: nothing within the capture range explains the frames.
     """
     recording.header.check_against(profile)
-    known, twin = known_pages(recording, profile, pages), TorchTwin(RayTwin(profile))
+    twin = TorchTwin(RayTwin(profile))
+    blemishes = Blemishes.of(recording.references())
+    known = without_blemishes(known_pages(recording, profile, pages), blemishes)
     registered = register(
         twin,
         TorchFieldSolver(FieldRecovery(profile).to(compute)),
         profile,
-        recording.references(),
+        blemishes.references,
         known,
         progress,
         any_orientation=any_orientation,
     )
     hashes = [recording.page_hash(page) for page in pages]
+    counts = BlemishCounts.of(blemishes)
     if registered.conditions is None:
-        return Calibration.from_registered(registered, profile, hashes)
+        return Calibration.from_registered(registered, profile, hashes, blemishes=counts)
     fit = DeviceFit(
         TorchLikelihood(PhaseEstimator(profile, registered.parameters).eval()),
         twin,
         profile,
-        recording.references(),
+        blemishes.references,
         known,
         lambda share: progress("likelihood of all known pages", share),
     )
     refined, statistics = fit.refined(registered, registered.conditions)
-    return Calibration.from_registered(refined, profile, hashes, statistics)
+    return Calibration.from_registered(refined, profile, hashes, statistics, counts)
 
 
 def figures(calibration: Calibration, profile: Profile, seconds: float, lost: int) -> dict[str, object]:
@@ -175,6 +181,7 @@ def figures(calibration: Calibration, profile: Profile, seconds: float, lost: in
         "modulation": calibration.modulation,
         "symbols_beside_cameras": lost,
         "goodness": None if calibration.goodness is None else calibration.goodness.model_dump(),
+        "blemishes": None if calibration.blemishes is None else calibration.blemishes.model_dump(),
     }
 
 

@@ -24,6 +24,7 @@ from lightpage.calibration.waves.wave_fit import READ_NOISE
 from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError
 from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.pixels.blemishes import UNIT_GAIN
 from lightpage.train.models.apart import ROUNDS as ROUNDS_APART
 from lightpage.train.models.apart import (
     Cameras,
@@ -232,6 +233,7 @@ class FieldRecovery(nn.Module):
         quadrature: Tensor,
         homodyne: Tensor,
         *apart: Tensor,
+        gains: Tensor | None = None,
     ) -> Measured:
         """Measure the field against references that are known on the common grid already.
 
@@ -239,9 +241,16 @@ class FieldRecovery(nn.Module):
             blocks: references in blocks, [2, rows, columns].
             references: the same on the common grid.
             in_phase, quadrature, homodyne, apart: see `measure`.
+            gains: see `lightpage.recording.pixels.blemishes.Blemishes`, [2, H, W]; without binning. None for pixels
+                without blemishes.
         """
-        beyond = self.filtered(self.in_blocks(in_phase, quadrature) - blocks)
-        a, b = references.lit * self._resampled(beyond, references.where) / (2 * references.reference)
+        frames = self.in_blocks(in_phase, quadrature)
+        if gains is None:
+            beyond = frames - blocks
+        else:
+            gains = gains.to(torch.float32)
+            beyond = (frames * (gains / UNIT_GAIN) - blocks) * torch.clamp(gains, max=1)
+        a, b = references.lit * self._resampled(self.filtered(beyond), references.where) / (2 * references.reference)
         return Measured(a, b, homodyne[0], homodyne[1], references.amplitude, references.lit, self.cameras(*apart))
 
     def cameras(self, *apart: Tensor) -> Cameras | None:

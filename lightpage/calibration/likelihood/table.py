@@ -27,7 +27,9 @@ _FACET_SAMPLES = 257
 """Samples along an axis of the entrance facet."""
 KNOWN_CONCENTRATION = 1e6
 """Concentration of a known phase."""
-MEASUREMENT_INPUTS = ("reference_in_phase", "reference_quadrature", "registration", "homodyne", *APART)
+PIXEL_GAINS = "pixel_gains"
+"""Name of the gains of a camera with blemishes, see `lightpage.recording.pixels.blemishes.Blemishes`."""
+MEASUREMENT_INPUTS = ("reference_in_phase", "reference_quadrature", "registration", "homodyne", *APART, PIXEL_GAINS)
 """Names of the tensors that the measurements of a page on the common grid depend on."""
 PILOT_PHASORS = "pilot_phasors"
 PILOT_MASK = "pilot_mask"

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from lightpage.device.profile import StrictTable
 from lightpage.progress import warn
-from lightpage.recording.black_level import DarkFrame, PixelRepair, without_black
 from lightpage.recording.exposure import describe, greatest_count, unused_low_bits
 from lightpage.recording.layout import frame_type
+from lightpage.recording.pixels.black_level import DarkFrame, PixelRepair, without_black
 from lightpage.runtime.device.cameras.camera import Camera, Frame
 
 Counts = NDArray[np.unsignedinteger[Any]]

@@ -16,9 +16,9 @@ from lightpage.clock import SYSTEM, Clock
 from lightpage.device.profile import Profile, StrictTable
 from lightpage.errors import LostShotError, Reason, SourceError, raised_as
 from lightpage.page.levels import MAX_LEVELS
-from lightpage.recording.black_level import DarkFrame
 from lightpage.recording.exposure import check_pair_light
 from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.pixels.black_level import DarkFrame
 from lightpage.runtime.device.acquisition.beam_keeper import BeamKeeper
 from lightpage.runtime.device.acquisition.camera_image import CameraImage, Counts, View
 from lightpage.runtime.device.acquisition.page_store import PageStore

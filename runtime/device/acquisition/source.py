@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile
 from lightpage.errors import FrameError, InvalidInputError, LostShotError, RecordingError, SourceError, raised_as
-from lightpage.recording.black_level import DarkFrame
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import FrameInfo
+from lightpage.recording.pixels.black_level import DarkFrame
 from lightpage.runtime.device.acquisition.page_store import PageStore
 from lightpage.runtime.device.modulator.modulator import Beams, Modulator
 from lightpage.runtime.device.plugins import SOURCES, driver_of, names_of

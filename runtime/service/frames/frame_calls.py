@@ -12,9 +12,9 @@ import numpy as np
 
 from lightpage.errors import InvalidInputError, LightpageError, LimitError, MalformedError, StalledError
 from lightpage.page.pilots import Pilots
-from lightpage.recording.black_level import without_black
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import frame_type
+from lightpage.recording.pixels.black_level import without_black
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.client.wire.messages import FramePart
 from lightpage.runtime.client.wire.status import reason_told, refusal_of

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from lightpage.errors import CallerLeft, InvalidInputError, LimitError, MalformedError, PageError, StalledError
 from lightpage.page.levels import check_levels
 from lightpage.page.symbols import check_symbols
-from lightpage.recording.black_level import without_black
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import frame_type
+from lightpage.recording.pixels.black_level import without_black
 from lightpage.runtime.client.pb.lightpage.v1 import lightpage_pb2 as pb
 from lightpage.runtime.recalibration.known_pages import MIN_PAGES, KnownPages
 from lightpage.runtime.service.dataplane import DataPlane

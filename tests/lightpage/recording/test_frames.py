@@ -9,8 +9,8 @@ import pytest
 
 from lightpage.calibration.known_pages import known_pages
 from lightpage.errors import BlackFrameError, FrameError, SaturatedFrameError
-from lightpage.recording.black_level import DarkFrame, PixelRepair, without_black
 from lightpage.recording.exposure import check_light, greatest_count, unused_low_bits
+from lightpage.recording.pixels.black_level import DarkFrame, PixelRepair, without_black
 from lightpage.recording.reader import Recording
 from tests.lightpage.refused import refused
 from tests.lightpage.small import small_profile

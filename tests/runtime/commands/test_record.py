@@ -11,10 +11,10 @@ import pytest
 from lightpage.cli import main as cli_main
 from lightpage.cli.main import EXIT_ERROR, EXIT_LOST, lightpage
 from lightpage.errors import LostShotError, Reason
-from lightpage.recording.black_level import DarkFrame
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import FrameInfo
 from lightpage.recording.pages import PagesWriter
+from lightpage.recording.pixels.black_level import DarkFrame
 from lightpage.recording.reader import Recording
 from lightpage.runtime.commands.archives import record as module
 from lightpage.runtime.device.acquisition.page_store import PageStore

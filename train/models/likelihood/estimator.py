@@ -13,6 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from lightpage.calibration.likelihood.table import PIXEL_GAINS
+from lightpage.calibration.sampling_table import APART
 from lightpage.calibration.waves.wave_model import illumination_terms
 from lightpage.device.profile import Profile
 from lightpage.train.models.apart import Cameras
@@ -158,14 +160,15 @@ class PhaseEstimator(nn.Module):
         """Measure a frame pair on the common grid.
 
         Args:
-            table: `reference_in_phase`, `reference_quadrature`, `registration`, `homodyne`, and those of cameras that
-                stand apart, see `FieldRecovery.measure`.
+            table: `reference_in_phase`, `reference_quadrature`, `registration`, `homodyne`, those of cameras that stand
+                apart, see `FieldRecovery.measure`, and `pixel_gains` of cameras with blemishes.
             frames: in-phase and quadrature frame [H, W].
         """
-        apart = [table[name] for name in ("apart", "apart_beside", "apart_tilt") if name in table]
+        apart = [table[name] for name in APART if name in table]
         blocks = self.recovery.in_blocks(table["reference_in_phase"], table["reference_quadrature"])
         references = self.recovery.references(blocks, table["registration"])
-        measured = self.recovery.measure_against(blocks, references, *frames, table["homodyne"], *apart)
+        gains = table.get(PIXEL_GAINS)
+        measured = self.recovery.measure_against(blocks, references, *frames, table["homodyne"], *apart, gains=gains)
         counts = references.reference * (1 + 2 * torch.stack([measured.a, measured.b]))
         return Page(counts, references.reference, references.amplitude, references.lit), measured
 

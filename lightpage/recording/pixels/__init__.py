@@ -1,0 +1,1 @@
+"""Pixels of a camera that do not count light as the others do."""
