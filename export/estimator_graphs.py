@@ -15,6 +15,7 @@ from torch.utils import _pytree as tree
 
 from lightpage.calibration.likelihood.table import PILOT_MASK, PILOT_PHASORS
 from lightpage.calibration.sampling_table import APART, SamplingTable
+from lightpage.export.device_constants import move_device_constants
 from lightpage.export.graph import FRAME_INPUTS, TABLE_INPUTS, answers
 from lightpage.export.onnx_files import exported
 from lightpage.runtime.model.execution.estimator_graph import (
@@ -52,6 +53,10 @@ STEP = (
     *PILOTS,
 )
 """Tensors of the table that a step of every device takes."""
+
+
+OF_DEVICE = ("homodyne", "amplitude_series", "slope_power", "point_spread", "deviation_precision", *APART)
+"""Tensors of the table that no page has of its own. What follows from them is computed once for each device."""
 
 
 class OperatorsGraph(nn.Module):
@@ -251,12 +256,12 @@ def estimator_files(
         input_names = (*ESTIMATE_INPUTS.values(), NOISE, *PAGE, *graph.names, *(names[index] for index in used))
         return exported(graph, inputs, input_names, STEP_OUTPUTS, None)
 
-    models = [
-        exported(device_graph, device_inputs, OPERATOR_INPUTS, names, None),
-        exported(first_graph, first_inputs, first_names, first_outputs, None),
-        step_model(backward, coarse=True),
-        step_model(everything, coarse=False),
-    ]
+    device = exported(device_graph, device_inputs, OPERATOR_INPUTS, names, None)
+    first = exported(first_graph, first_inputs, first_names, first_outputs, None)
+    early = step_model(backward, coarse=True)
+    step = step_model(everything, coarse=False)
+    move_device_constants(device, {"first": first, "early": early, "step": step}, {*names, *OF_DEVICE})
+    models = [device, first, early, step]
     for model in models:
         onnx.checker.check_model(model)
     return EstimatorFiles(*(bytes(model.SerializeToString()) for model in models))

@@ -300,6 +300,19 @@ class FieldRecovery(nn.Module):
         residual = self.band(blocks.left(e) * blocks.amplitude)
         return (e * blocks.amplitude)[:, :ny, :nx], residual[:, :ny, :nx]
 
+    def solve_samples(self, measured: Measured) -> tuple[Tensor, Tensor]:
+        """Solve each sample of what was measured alone, for waves that pass the pipe's band only.
+
+        Where the cameras stand apart, samples are solved together, see `solve`.
+
+        Returns:
+            See `solve`; neither is limited to the pipe's band.
+        """
+        if measured.apart is not None:
+            return self.solve(measured)
+        root = self._nearest_root(measured, 1 / measured.amplitude)
+        return root * measured.amplitude, measured.left(root) * measured.amplitude
+
     def innovation(self, measured: Measured, field: Tensor, floor: Tensor | float) -> Tensor:
         """Return the change of a predicted field that the measurements ask for.
 
@@ -321,22 +334,14 @@ class FieldRecovery(nn.Module):
         closed root nearer to the linear estimate; from there averaged reflections (`reflected`), or descent with
         momentum towards the most likely field in the pipe's band. Where the cameras stand apart, descent gets stuck.
         """
-        a, b, cos, sin, amplitude, _, apart = measured
+        a, b, _, _, amplitude, _, apart = measured
         if apart is not None and not self.with_signal_power:
             both = torch.stack([a, b])
             return recovered_linearly(apart, both, measured.arms, amplitude, inverse_amplitude, self.band)
-        start = self.band(torch.stack([a, (b - cos * a) / sin]) * amplitude) * inverse_amplitude
         if not self.with_signal_power:
-            return torch.as_tensor(start)
-        # Im e = slope Re e - offset, from the difference of the equations; then a quadratic in Re e
-        slope, offset = (1 - cos) / sin, (a - b) / sin
-        quadratic = 1 + slope * slope
-        linear = 1 - slope * offset
-        discriminant = linear * linear - quadratic * (offset * offset - 2 * a)
-        middle = -linear / quadratic
-        root = torch.sqrt(torch.clamp(discriminant, min=0)) / quadratic
-        real = middle + torch.where(start[0] < middle, -root, root)
-        before = estimate = self.band(torch.stack([real, slope * real - offset]) * amplitude) * inverse_amplitude
+            return self._linear(measured, inverse_amplitude)
+        root = self._nearest_root(measured, inverse_amplitude)
+        before = estimate = self.band(root * amplitude) * inverse_amplitude
         if apart is not None or self.reflections:
             cameras, rounds = (CamerasTogether(), self.reflections) if apart is None else (apart, ROUNDS_APART)
             brightness = 1 + 2 * torch.stack([a, b])
@@ -347,6 +352,25 @@ class FieldRecovery(nn.Module):
             step = measured.pull(ahead, READ_NOISE, STEP)
             before, estimate = estimate, self.band((ahead + step) * amplitude) * inverse_amplitude
         return torch.as_tensor(estimate)
+
+    def _linear(self, measured: Measured, inverse_amplitude: Tensor) -> Tensor:
+        """Solve the equations without |e|^2 for e in the pipe's band, [2, ny, nx]."""
+        a, b, cos, sin, amplitude, *_ = measured
+        return torch.as_tensor(self.band(torch.stack([a, (b - cos * a) / sin]) * amplitude) * inverse_amplitude)
+
+    def _nearest_root(self, measured: Measured, inverse_amplitude: Tensor) -> Tensor:
+        """Solve each sample alone for e, [2, ny, nx]: of two roots, the one nearer to the linear field."""
+        a, b, cos, sin, *_ = measured
+        start = self._linear(measured, inverse_amplitude)
+        # Im e = slope Re e - offset, from the difference of the equations; then a quadratic in Re e
+        slope, offset = (1 - cos) / sin, (a - b) / sin
+        quadratic = 1 + slope * slope
+        linear = 1 - slope * offset
+        discriminant = linear * linear - quadratic * (offset * offset - 2 * a)
+        middle = -linear / quadratic
+        root = torch.sqrt(torch.clamp(discriminant, min=0)) / quadratic
+        real = middle + torch.where(start[0] < middle, -root, root)
+        return torch.stack([real, slope * real - offset])
 
     def _where(self, registration: Tensor, side: int, step: int = 1) -> Tensor:
         """Return the places of every `step`-th grid sample in frames of blocks, [2, ny, nx, 2] for grid_sample.
@@ -373,7 +397,10 @@ class FieldRecovery(nn.Module):
         if self.correction is None:
             return samples
         # counted in pixels; what lies beyond the frame has no reference
-        beyond_x, beyond_y = torch.remainder((where + 1) * where.new_tensor(self._size) / 2 - 0.5, 1).unbind(-1)
+        beyond_x, beyond_y = (
+            torch.remainder((place + 1) * (extent / 2) - 0.5, 1)
+            for place, extent in zip(where.unbind(-1), self._size, strict=True)
+        )
         samples = samples + beyond_x * (1 - beyond_x) * self.correction.along_rows(samples)
         return samples + beyond_y * (1 - beyond_y) * self.correction.along_columns(samples)
 

@@ -67,6 +67,11 @@ def multiply(left: Parts, right: Parts) -> Parts:
     return left[0] * right[0] - left[1] * right[1], left[0] * right[1] + left[1] * right[0]
 
 
+def multiply_conjugate(left: Parts, right: Parts) -> Parts:
+    """Product with the complex conjugate of `right`, element by element."""
+    return left[0] * right[0] + left[1] * right[1], left[1] * right[0] - left[0] * right[1]
+
+
 def scaled(value: Parts, factor: Tensor) -> Parts:
     """Times a real factor that broadcasts."""
     return value[0] * factor, value[1] * factor

@@ -23,7 +23,7 @@ from torch.nn import functional
 
 from lightpage.device.lens_path import SeidelTerms
 from lightpage.train.models import functions
-from lightpage.train.models.parts import Matrix, Parts, conjugate, multiply, phasor, scaled, stacked
+from lightpage.train.models.parts import Matrix, Parts, multiply, multiply_conjugate, phasor, scaled, stacked
 from lightpage.waves.geometry import WaveGeometry, couplings, on_facet
 from lightpage.waves.lens import LensPath
 from lightpage.waves.low_rank import Interpolation, Phase
@@ -302,12 +302,12 @@ class TiledLens(nn.Module):
         strips: list[Parts] = []
         for number in range(self.tiles[0]):
             one = _strip(lens, number)
-            light = self._across(multiply(field, conjugate(one.strip)), self.up_x.T)
-            light = multiply((light[0][None], light[1][None]), conjugate(one.tile))
+            light = self._across(multiply_conjugate(field, one.strip), self.up_x.T)
+            light = multiply_conjugate((light[0][None], light[1][None]), one.tile)
             light = self._along(self.up_y.T, light)
-            terms = multiply((light[0][:, None], light[1][:, None]), conjugate(one.facet))
-            terms = multiply(one.y.adjoint.times(terms), conjugate(one.between))
-            strips.append(_summed(multiply(one.x.adjoint.behind(terms), conjugate(one.plane)), 1))
+            terms = multiply_conjugate((light[0][:, None], light[1][:, None]), one.facet)
+            terms = multiply_conjugate(one.y.adjoint.times(terms), one.between)
+            strips.append(_summed(multiply_conjugate(one.x.adjoint.behind(terms), one.plane), 1))
         real, imaginary = (self._joined([strip[part] for strip in strips]) for part in (0, 1))
         return real, imaginary
 

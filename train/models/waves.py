@@ -25,7 +25,7 @@ from lightpage.calibration.waves.wave_model import (
 )
 from lightpage.device.profile import Profile
 from lightpage.train.models import functions
-from lightpage.train.models.parts import Parts, conjugate, multiply, parts, phasor
+from lightpage.train.models.parts import Parts, conjugate, multiply, multiply_conjugate, parts, phasor
 from lightpage.train.models.wave_lens import OVERSAMPLING, ROLL_MARGIN, LensMatrices, PlacedLens, TiledLens
 from lightpage.train.models.wave_pipe import BlockMatrices, TiledPipe
 from lightpage.waves.geometry import cells_for, highest_frequencies
@@ -199,14 +199,14 @@ class Waves(nn.Module):
 
     def back_to_exit(self, at: WaveMatrices, field: Parts) -> Parts:
         """Field on the common grid back to the exit facet, by the adjoint."""
-        light = torch.stack(multiply(field, conjugate(at.against_reference)))
+        light = torch.stack(multiply_conjugate(field, at.against_reference))
         sparse = self._back(self._up(light).transpose(-1, -2)).transpose(-1, -2)
         return self.delaunch.to_facet(at.delaunch, parts(sparse))
 
     def exit_to_page(self, at: WaveMatrices, leaving: Parts) -> Parts:
         """Field on the exit facet back to the modulator, by the adjoint."""
         page = self.launch.to_plane(at.launch, self._pipe(leaving, at.pipe, backwards=True))
-        return multiply(page, conjugate(at.at_launch))
+        return multiply_conjugate(page, at.at_launch)
 
 
 _BLOCK = 64

@@ -23,7 +23,7 @@ from lightpage.train.models.likelihood.counts import looked_up, score_of_counts
 from lightpage.train.models.likelihood.local_hessian import LocalHessian
 from lightpage.train.models.likelihood.modulator import amplitude_and_slope, summed, to_samples
 from lightpage.train.models.likelihood.nuisances import PageNuisances
-from lightpage.train.models.parts import Parts, conjugate, multiply, parts, phasor, scaled
+from lightpage.train.models.parts import Parts, multiply, multiply_conjugate, parts, phasor, scaled
 from lightpage.train.models.prediction import expected_phasors
 from lightpage.train.models.waves import Fidelity, Real, WaveMatrices, Waves
 from lightpage.waves.grid import FieldGrid, symbol_samples
@@ -181,9 +181,9 @@ class PhaseEstimator(nn.Module):
             The estimate; the page's measurements; power that is left of the homodyne equations over the field's, [].
         """
         page, measured = self.measured(table, *frames)
-        field, unexplained = self.recovery.solve(measured)
+        field, unexplained = self.recovery.solve_samples(measured)
         light = self.back.to_page(operators.backward, field * page.lit)
-        real, imaginary = multiply(parts(light), conjugate(operators.illumination))
+        real, imaginary = multiply_conjugate(parts(light), operators.illumination)
         symbols = summed(real, self.samples), summed(imaginary, self.samples)
         phasors = scaled(symbols, torch.rsqrt(symbols[0] * symbols[0] + symbols[1] * symbols[1] + 1e-20))
         concentration = _concentration(table["information"], noise)
@@ -214,9 +214,9 @@ class PhaseEstimator(nn.Module):
         amplitude, slope = amplitude_and_slope(direction, table["amplitude_series"])
         light = self._predicted(operators, amplitude, estimate, coarse=coarse)
         score, expected = _score(table, page, light.field, cameras)
-        at_exit = self.back.back_to_exit(operators.backward, multiply(score, conjugate(light.tilt)))
-        back = self.back.exit_to_page(operators.backward, multiply(at_exit, conjugate(light.exit_factor)))
-        back = multiply(back, conjugate(operators.illumination))
+        at_exit = self.back.back_to_exit(operators.backward, multiply_conjugate(score, light.tilt))
+        back = self.back.exit_to_page(operators.backward, multiply_conjugate(at_exit, light.exit_factor))
+        back = multiply_conjugate(back, operators.illumination)
         symbol = multiply(self._on_samples(scaled(direction, amplitude)), turned)
         by_log = symbol[0] * back[0] + symbol[1] * back[1]
         by_turn = symbol[0] * back[1] - symbol[1] * back[0]
