@@ -278,7 +278,8 @@ class FieldRecovery(nn.Module):
         where = self._where(registration, self.binning)
         reference = self._reference(blocks, registration)
         floor = _FLOOR * blocks.mean(dim=(1, 2))[:, None, None]
-        seen = (where.abs().amax(dim=-1) <= self._edge) & (reference > floor)
+        across, down = where.unbind(-1)
+        seen = (across.abs() <= self._edge) & (down.abs() <= self._edge) & (reference > floor)
         lit = (seen[0] & seen[1]).to(torch.float32)
         reference = torch.maximum(reference, floor)
         amplitude = torch.sqrt(reference[0])

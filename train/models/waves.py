@@ -54,6 +54,10 @@ ROUGH = Fidelity(0.06, 0.05)
 """Fidelity for light that is but a small rest: half the errors bring 0.006 bit."""
 
 
+THINNED = 2
+"""Distance of the samples of a thinned grid, in samples of the usual one: still above the Nyquist rate of the field."""
+
+
 class WaveMatrices(NamedTuple):
     """Everything that depends on the device's parameters."""
 
@@ -74,6 +78,7 @@ class Waves(nn.Module):
         samples: number of samples on the modulator, per symbol and axis.
         fidelity: how exactly light is followed.
         filled, grid: see `FittedWaves`. One filled sample per symbol stands for all of it.
+        thinned: whether light can be computed on every `THINNED`-th sample of the grid along either axis too.
     """
 
     def __init__(
@@ -85,6 +90,7 @@ class Waves(nn.Module):
         *,
         filled: bool = False,
         grid: FieldGrid | None = None,
+        thinned: bool = False,
     ) -> None:
         super().__init__()
         grid = grid or field_grid(profile)
@@ -128,6 +134,10 @@ class Waves(nn.Module):
         self.interpolations = down, across
         self._down, self._across = Banded(down), Banded(across)
         self._up, self._back = Banded(down.T), Banded(across.T)
+        if thinned:
+            thin_down, thin_across = down[::THINNED], across[::THINNED]
+            self._thin_down, self._thin_across = Banded(thin_down), Banded(thin_across)
+            self._thin_up, self._thin_back = Banded(thin_down.T), Banded(thin_across.T)
         self.default: Tensor
         self.register_buffer("default", torch.from_numpy(parameters).to(torch.float32), persistent=False)
 
@@ -191,22 +201,34 @@ class Waves(nn.Module):
         real, imaginary = self._pipe(entrance, at.pipe, backwards=False)
         return real, imaginary
 
-    def exit_to_camera(self, at: WaveMatrices, leaving: Parts) -> Parts:
-        """Field on the exit facet to the common grid [Gy, Gx], against the reference."""
+    def exit_to_camera(self, at: WaveMatrices, leaving: Parts, *, thinned: bool = False) -> Parts:
+        """Field on the exit facet to the common grid [Gy, Gx], or to the thinned one, against the reference."""
         sparse = torch.stack(self.delaunch.to_plane(at.delaunch, leaving))
-        light = self._across(self._down(sparse).transpose(-1, -2)).transpose(-1, -2)
-        return multiply(parts(light), at.against_reference)
+        down, across = (self._thin_down, self._thin_across) if thinned else (self._down, self._across)
+        light = across(down(sparse).transpose(-1, -2)).transpose(-1, -2)
+        return multiply(parts(light), _against_reference(at, thinned=thinned))
 
-    def back_to_exit(self, at: WaveMatrices, field: Parts) -> Parts:
-        """Field on the common grid back to the exit facet, by the adjoint."""
-        light = torch.stack(multiply_conjugate(field, at.against_reference))
-        sparse = self._back(self._up(light).transpose(-1, -2)).transpose(-1, -2)
+    def back_to_exit(self, at: WaveMatrices, field: Parts, *, thinned: bool = False) -> Parts:
+        """Field on the common grid, or on the thinned one, back to the exit facet, by the adjoint."""
+        light = torch.stack(multiply_conjugate(field, _against_reference(at, thinned=thinned)))
+        up, back = (self._thin_up, self._thin_back) if thinned else (self._up, self._back)
+        sparse = back(up(light).transpose(-1, -2)).transpose(-1, -2)
         return self.delaunch.to_facet(at.delaunch, parts(sparse))
 
     def exit_to_page(self, at: WaveMatrices, leaving: Parts) -> Parts:
         """Field on the exit facet back to the modulator, by the adjoint."""
         page = self.launch.to_plane(at.launch, self._pipe(leaving, at.pipe, backwards=True))
         return multiply_conjugate(page, at.at_launch)
+
+
+def thinned_plane(plane: Tensor) -> Tensor:
+    """Every `THINNED`-th sample of a plane of the grid along either axis, [..., Gy, Gx]."""
+    return plane[..., ::THINNED, ::THINNED]
+
+
+def _against_reference(at: WaveMatrices, *, thinned: bool) -> Parts:
+    real, imaginary = at.against_reference
+    return (thinned_plane(real), thinned_plane(imaginary)) if thinned else (real, imaginary)
 
 
 _BLOCK = 64

@@ -25,7 +25,7 @@ from lightpage.train.models.likelihood.modulator import amplitude_and_slope, sum
 from lightpage.train.models.likelihood.nuisances import PageNuisances
 from lightpage.train.models.parts import Parts, multiply, multiply_conjugate, parts, phasor, scaled
 from lightpage.train.models.prediction import expected_phasors
-from lightpage.train.models.waves import Fidelity, Real, WaveMatrices, Waves
+from lightpage.train.models.waves import THINNED, Fidelity, Real, WaveMatrices, Waves, thinned_plane
 from lightpage.waves.grid import FieldGrid, symbol_samples
 
 FORWARD = Fidelity(0.005, 0.007)
@@ -67,6 +67,11 @@ class Page(NamedTuple):
     reference: Tensor
     amplitude: Tensor
     lit: Tensor
+
+    @property
+    def thinned(self) -> Page:
+        """Measurements on the thinned grid."""
+        return Page(*map(thinned_plane, self))
 
 
 class Estimate(NamedTuple):
@@ -129,6 +134,9 @@ class PhaseEstimator(nn.Module):
         parameters: [P] fitted; they say how finely waves are sampled.
         grid: common grid, where it is not the usual one.
         forward, backward: fidelity of the waves either way.
+
+    Attributes:
+        thinned: whether coarse steps use the thinned grid. Its counts say less where noise is strong.
     """
 
     def __init__(
@@ -143,8 +151,9 @@ class PhaseEstimator(nn.Module):
         # the root nearest to the linear field is enough: the first step mends more than rounds of its own would
         self.recovery = FieldRecovery(profile, rounds=0, grid=grid, corrected=True)
         self.samples = symbol_samples(profile)
+        self.thinned = True
         self.waves = Waves(profile, parameters, self.samples, forward, filled=True, grid=grid)
-        self.back = Waves(profile, parameters, self.samples, backward, filled=True, grid=grid)
+        self.back = Waves(profile, parameters, self.samples, backward, filled=True, grid=grid, thinned=True)
         self.nuisances = PageNuisances(profile, self.waves.geometry, self.waves.cells, self.recovery.grid)
         self._half_width, self._half_height = profile.page_width_m / 2, profile.page_height_m / 2
 
@@ -208,20 +217,25 @@ class PhaseEstimator(nn.Module):
             operators, page, estimate: see there.
             table: `homodyne`, `amplitude_series`, `count_scale`, `count_weights`.
             cameras: defocus of cameras that stand apart.
-            coarse: whether light is predicted with the fidelity of the way back, as is enough for a first step.
+            coarse: whether light is predicted with the fidelity of the way back and on the thinned grid, as is enough
+                for a first step.
         """
         direction, turned = estimate.direction, phasor(estimate.deviations)
         amplitude, slope = amplitude_and_slope(direction, table["amplitude_series"])
-        light = self._predicted(operators, amplitude, estimate, coarse=coarse)
+        thinned = coarse and self.thinned and cameras is None  # cameras in different planes need neighbouring samples
+        page = page.thinned if thinned else page
+        light = self._predicted(operators, amplitude, estimate, coarse=coarse, thinned=thinned)
         score, expected = _score(table, page, light.field, cameras)
-        at_exit = self.back.back_to_exit(operators.backward, multiply_conjugate(score, light.tilt))
+        if thinned:
+            score = scaled(score, score[0].new_tensor(THINNED**2))
+        at_exit = self.back.back_to_exit(operators.backward, multiply_conjugate(score, light.tilt), thinned=thinned)
         back = self.back.exit_to_page(operators.backward, multiply_conjugate(at_exit, light.exit_factor))
         back = multiply_conjugate(back, operators.illumination)
         symbol = multiply(self._on_samples(scaled(direction, amplitude)), turned)
         by_log = symbol[0] * back[0] + symbol[1] * back[1]
         by_turn = symbol[0] * back[1] - symbol[1] * back[0]
         by_sample = by_turn + to_samples(slope, self.samples) * by_log
-        by_nuisance = self.nuisances.gradient(light.leaving, at_exit, light.field, score)
+        by_nuisance = self.nuisances.gradient(light.leaving, at_exit, light.field, score, THINNED if thinned else 1)
         return Likelihood(summed(by_sample, self.samples), by_nuisance, expected, by_sample)
 
     def expected_counts(
@@ -238,24 +252,28 @@ class PhaseEstimator(nn.Module):
             operators, table, page, estimate, cameras: see `likelihood`.
         """
         amplitude, _ = amplitude_and_slope(estimate.direction, table["amplitude_series"])
-        light = self._predicted(operators, amplitude, estimate, coarse=False)
+        light = self._predicted(operators, amplitude, estimate, coarse=False, thinned=False)
         return _score(table, page, light.field, cameras)[1]
 
-    def _predicted(self, operators: Operators, amplitude: Tensor, estimate: Estimate, *, coarse: bool) -> _Prediction:
+    def _predicted(
+        self, operators: Operators, amplitude: Tensor, estimate: Estimate, *, coarse: bool, thinned: bool
+    ) -> _Prediction:
         """Predict the light of an estimate.
 
         Args:
             operators, estimate: see there.
             amplitude: amplitudes of the symbols' light, [ny, nx].
             coarse: see `likelihood`.
+            thinned: whether light is predicted on the thinned grid.
         """
         waves, forward = (self.back, operators.backward) if coarse else (self.waves, operators.forward)
         light = self._on_samples(scaled(parts(expected_phasors(estimate.p)), amplitude))
         launched = multiply(multiply(light, phasor(estimate.deviations)), operators.illumination)
         exit_factor = self.nuisances.at_exit(estimate.nuisance)
-        tilt = self.nuisances.tilt(estimate.nuisance)
+        tilt = self.nuisances.tilt(estimate.nuisance, THINNED if thinned else 1)
         leaving = multiply(waves.to_exit(forward, launched), exit_factor)
-        return _Prediction(exit_factor, tilt, leaving, multiply(waves.exit_to_camera(forward, leaving), tilt))
+        field = multiply(waves.exit_to_camera(forward, leaving, thinned=thinned), tilt)
+        return _Prediction(exit_factor, tilt, leaving, field)
 
     def advanced(
         self,
@@ -304,7 +322,11 @@ class PhaseEstimator(nn.Module):
         gain = multiply(scaled(parts(estimate.nuisance[:2]), 1 + change[0]), piston)
         nuisance = torch.cat([torch.stack(gain), estimate.nuisance[2:] + change[1:]])
         advanced = Estimate(torch.stack(direction) * concentration, nuisance, deviations)
-        return advanced, _chi_square(table, page, likelihood.expected)
+        thinned = likelihood.expected.shape != page.counts.shape
+        if thinned:
+            page = page.thinned
+        every = _EVERY // THINNED if thinned else _EVERY
+        return advanced, _chi_square(table, page, likelihood.expected, every)
 
     def _hessian(
         self, table: Mapping[str, Tensor], estimate: Estimate, slope: Tensor, information: Tensor
@@ -364,9 +386,9 @@ def _score(table: Mapping[str, Tensor], page: Page, field: Parts, cameras: Camer
     return parts(gathered), torch.stack(expected)
 
 
-def _chi_square(table: Mapping[str, Tensor], page: Page, expected: Tensor) -> Tensor:
-    """Mean square of the counts' residuals over their variance, [], on a share of the grid."""
-    every = (slice(None), slice(None, None, _EVERY), slice(None, None, _EVERY))
+def _chi_square(table: Mapping[str, Tensor], page: Page, expected: Tensor, step: int) -> Tensor:
+    """Mean square of the counts' residuals over their variance, [], on every `step`-th sample of the page's grid."""
+    every = (slice(None), slice(None, None, step), slice(None, None, step))
     lit, total = page.lit[every[1:]], torch.zeros_like(page.lit[0, 0])
     for camera, (light, counts) in enumerate(zip(expected[every], page.counts[every], strict=True)):
         scale, weights = table["count_scale"][camera], table["count_weights"][camera]

@@ -50,12 +50,12 @@ class PageNuisances(nn.Module):
         ramp = phasor(self.ramp_x * nuisance[4] + self.ramp_y * nuisance[5])
         return multiply((nuisance[0], nuisance[1]), ramp)
 
-    def tilt(self, nuisance: Tensor) -> Parts:
-        """Phasor of the tilt on the common grid, [Gy, Gx]."""
-        along, down = phasor(nuisance[2] * self.x), phasor(nuisance[3] * self.y)
+    def tilt(self, nuisance: Tensor, every: int = 1) -> Parts:
+        """Phasor of the tilt on every so many samples of the common grid, [Gy, Gx]."""
+        along, down = phasor(nuisance[2] * self.x[::every]), phasor(nuisance[3] * self.y[::every])
         return multiply((along[0][None, :], along[1][None, :]), (down[0][:, None], down[1][:, None]))
 
-    def gradient(self, leaving: Parts, back: Parts, field: Parts, score: Parts) -> Tensor:
+    def gradient(self, leaving: Parts, back: Parts, field: Parts, score: Parts, every: int = 1) -> Tensor:
         """Return the derivative of the log-likelihood by the nuisance parameters, [6].
 
         Derivatives by the gain are those by a relative change of it, and by its phase.
@@ -65,12 +65,14 @@ class PageNuisances(nn.Module):
             back: derivative of the log-likelihood by it; d log L = Re(conj(back) d leaving).
             field: predicted field on the common grid, [Gy, Gx].
             score: derivative of the log-likelihood by the field, [Gy, Gx].
+            every: distance of the samples of the last two, in samples of the common grid.
         """
+        x, y = self.x[::every], self.y[::every]
         by_log_gain = (leaving[0] * back[0] + leaving[1] * back[1]).sum()
         turned = _by_phase(leaving, back)
         shifts = [(turned * ramp).sum() for ramp in (self.ramp_x, self.ramp_y)]
         at_camera = _by_phase(field, score)
-        tilts = [at_camera.sum(0) @ self.x, (at_camera @ torch.ones_like(self.x)) @ self.y]
+        tilts = [at_camera.sum(0) @ x, (at_camera @ torch.ones_like(x)) @ y]
         return torch.stack([by_log_gain, turned.sum(), *tilts, *shifts])
 
 
