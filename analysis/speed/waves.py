@@ -6,7 +6,8 @@
 A device is simulated and calibrated, and its calibration is exported. Further pages are decoded as a service decodes
 them, with each number of steps up to the bundle's. The time of a page is compared with that of the shipped decoder, in
 turns in the same run. With the figures of `python -m analysis.comparison.bound`, the AIR is compared with the bound of
-the light. `--out` keeps recording, calibration and bundle, so that an interrupted command can be repeated to continue.
+the light. `--near` shortens the calibration of a large device, which from nominal takes an hour. `--out` keeps
+recording, calibration and bundle, so that an interrupted command can be repeated to continue.
 """
 
 from __future__ import annotations
@@ -95,6 +96,7 @@ def _bits(path: Path) -> float:
 @click.option("--levels", default=256, show_default=True, type=click.IntRange(2, 256), help="Levels of the pages.")
 @click.option("--seed", default=7000, show_default=True, type=click.IntRange(0), help="Seed of pages and noise.")
 @click.option("--bound", type=click.Path(path_type=Path), help="Figures of `analysis.comparison.bound` of this light.")
+@click.option("--near", type=click.Path(path_type=Path), help="Calibration of the device from which the fit starts.")
 @click.option("--out", type=OutputFolder(), required=True, help="Folder that keeps recording, calibration and bundle.")
 @click.option("--json", "json_path", type=OutputFile(), required=True)
 def main(
@@ -107,6 +109,7 @@ def main(
     levels: int,
     seed: int,
     bound: Path | None,
+    near: Path | None,
     out: Path,
     json_path: Path,
 ) -> None:
@@ -119,7 +122,7 @@ def main(
         device = Device() if state is None else load_device(state)
     device = device.of_profile(profile).with_settings([*settings])
     asked = {"--profile": profile.to_toml(), "device": device.model_dump(mode="json"), "--pages": pages}
-    asked |= {"--levels": levels, "--seed": seed}
+    asked |= {"--levels": levels, "--seed": seed, "--near": near and str(near)}
     out.mkdir(parents=True, exist_ok=True)
     begin(out, asked)
     recording = out / "recording.h5"
@@ -129,7 +132,8 @@ def main(
     limit = None if bound is None else _bits(bound)
     with Recording.open(recording) as file, percent_bar() as progress:
         if not calibration.exists():
-            calibrate_recording(file, profile, range(CALIBRATED), progress).save(calibration)
+            start = None if near is None else load_calibration(near)
+            calibrate_recording(file, profile, range(CALIBRATED), progress, near=start).save(calibration)
         if not bundle.exists():
             export_calibration(load_calibration(calibration), file, profile, bundle, progress=progress)
     most = len(Decoder.load(bundle).graph.value(NOISE)) - 1

@@ -11,7 +11,7 @@ import click
 import numpy as np
 import torch
 
-from lightpage.calibration.calibrate import calibrate as register
+from lightpage.calibration import calibrate as registration
 from lightpage.calibration.coherence import seen_share
 from lightpage.calibration.document import BlemishCounts, Calibration, load_calibration
 from lightpage.calibration.goodness.figure import goodness_figure
@@ -131,26 +131,33 @@ def calibrate_recording(
     *,
     any_orientation: bool = False,
     compute: torch.device = CPU,
+    near: Calibration | None = None,
 ) -> Calibration:
-    """Calibrate from nominal with some pages of a recording.
+    """Calibrate with some pages of a recording.
+
+    Args:
+        recording: recording with known symbols.
+        profile: nominal device.
+        pages: numbers of the pages.
+        progress: called at the beginning of each stage, and with its finished share.
+        any_orientation: whether mirrored or turned cameras are accepted.
+        compute: processor that recovers the light's field.
+        near: earlier calibration of the same device, from which the fit starts; from nominal if left out.
 
     Raises:
         RecordingError: no symbols, no such page, or a recording of another profile.
-        CalibrationError: nothing within the capture range explains the frames.
+        CalibrationError: nothing within the capture range, or near the earlier calibration, explains the frames.
     """
     recording.header.check_against(profile)
     twin = TorchTwin(RayTwin(profile))
     blemishes = Blemishes.of(recording.references())
     known = without_blemishes(known_pages(recording, profile, pages), blemishes)
-    registered = register(
-        twin,
-        TorchFieldSolver(FieldRecovery(profile).to(compute)),
-        profile,
-        blemishes.references,
-        known,
-        progress,
-        any_orientation=any_orientation,
-    )
+    solver = TorchFieldSolver(FieldRecovery(profile).to(compute))
+    device = twin, solver, profile, blemishes.references, known
+    if near is None:
+        registered = registration.calibrate(*device, progress, any_orientation=any_orientation)
+    else:
+        registered = registration.refine(*device, near.vector, near.turn_rad, progress, near.modulator)
     hashes = [recording.page_hash(page) for page in pages]
     counts = BlemishCounts.of(blemishes)
     if registered.conditions is None:

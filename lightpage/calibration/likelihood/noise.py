@@ -12,6 +12,8 @@ Real = NDArray[np.float64]
 
 _MEDIAN_CHI2 = 0.4549
 """Median of the square of a normal error, over its variance."""
+_LEAST_VARIANCE = 1e-12
+"""Least variance of an error, rad^2: less than float32 can tell."""
 _LEAST_SHARE = 1e-12
 """Least share of the variance that either part of the noise may have."""
 
@@ -29,7 +31,7 @@ def fitted_noise(errors: Real, information: Real) -> NDArray[np.float32]:
         Noise: the factor on the Cramér-Rao bound, and an additional variance that all phases share, rad^2, [2].
     """
     relative = information / np.median(information)
-    variance = float(np.median(errors**2)) / _MEDIAN_CHI2
+    variance = max(float(np.median(errors**2)) / _MEDIAN_CHI2, _LEAST_VARIANCE)
 
     def loss(logarithms: Real) -> float:
         concentration = 1 / (np.exp(logarithms[0]) / relative + np.exp(logarithms[1]))

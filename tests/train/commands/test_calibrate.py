@@ -60,7 +60,7 @@ def fake_registration(monkeypatch: pytest.MonkeyPatch, outcome: Registered | Bas
             raise outcome
         return outcome
 
-    monkeypatch.setattr("lightpage.train.commands.calibrate.register", register)
+    monkeypatch.setattr("lightpage.train.commands.calibrate.registration.calibrate", register)
 
 
 REGISTERED = Registered(

@@ -46,3 +46,9 @@ def test_expected_bits_are_those_of_von_mises_densities() -> None:
     assert expected_bits(noise, information) == pytest.approx(expected, rel=1e-6)
     better = expected_bits(np.array([1.0, 0.01], np.float32), information)
     assert better > expected_bits(noise, information)
+
+
+def test_errors_of_zero_have_the_least_noise() -> None:
+    noise = fitted_noise(np.zeros(COUNT), np.full(COUNT, 200.0))
+    assert np.isfinite(noise).all()
+    assert expected_bits(noise, np.full(COUNT, 200.0)) > 15

@@ -27,7 +27,7 @@ from lightpage.train.models.likelihood.estimator import Estimate, Likelihood, Op
 from lightpage.train.models.likelihood.modulator import summed, to_samples
 from lightpage.train.models.likelihood.torch_likelihood import TorchLikelihood
 from lightpage.train.models.twin import RayTwin, TorchTwin
-from lightpage.train.models.waves import Fidelity
+from lightpage.train.models.waves import THINNED, Fidelity
 from tests.lightpage.small import random_phases, small_profile
 
 PROFILE = small_profile()
@@ -66,20 +66,23 @@ class Posed:
 
     VARIANCE = 4.0
 
-    def at(self, phases: np.ndarray, nuisance: np.ndarray) -> Likelihood:
+    def at(self, phases: np.ndarray, nuisance: np.ndarray, *, coarse: bool = False) -> Likelihood:
         p = torch.from_numpy(SURE * np.stack([np.cos(phases), np.sin(phases)])).float()
         still = torch.zeros_like(self.operators.illumination[0])
         estimate = Estimate(p, torch.from_numpy(nuisance).float(), still)
         cameras = self.estimator.recovery.cameras(*(self.table[name] for name in APART if name in self.table))
-        return self.estimator.likelihood(self.operators, self.table, self.page, estimate, cameras)
+        return self.estimator.likelihood(self.operators, self.table, self.page, estimate, cameras, coarse=coarse)
 
-    def logarithm(self, phases: np.ndarray, nuisance: np.ndarray) -> float:
-        missed = (self.page.counts - self.at(phases, nuisance).expected).double() * self.page.lit
-        return -float(missed.square().sum()) / (2 * self.VARIANCE)
+    def logarithm(self, phases: np.ndarray, nuisance: np.ndarray, *, coarse: bool = False) -> float:
+        page = self.page.thinned if coarse else self.page
+        missed = (page.counts - self.at(phases, nuisance, coarse=coarse).expected).double() * page.lit
+        return -float(missed.square().sum()) / (2 * self.VARIANCE) * (THINNED**2 if coarse else 1)
 
-    def slope(self, phases: np.ndarray, nuisance: np.ndarray, by: np.ndarray, ahead: np.ndarray) -> float:
+    def slope(
+        self, phases: np.ndarray, nuisance: np.ndarray, by: np.ndarray, ahead: np.ndarray, *, coarse: bool = False
+    ) -> float:
         """Derivative of the logarithm along changes of phases and nuisance parameters."""
-        there, back = (self.logarithm(phases + sign * by, nuisance + sign * ahead) for sign in (1, -1))
+        there, back = (self.logarithm(phases + sign * by, nuisance + sign * ahead, coarse=coarse) for sign in (1, -1))
         return (there - back) / 2
 
 
@@ -124,6 +127,21 @@ def test_the_derivative_by_nuisance_parameters_is_that_of_the_likelihood(posed: 
     step = 0.003
     expected = [posed.slope(PHASES, NUISANCE, np.zeros_like(PHASES), step * way) / step for way in ways]
     np.testing.assert_allclose(found, expected, rtol=0.01, atol=0.001 * np.abs(found[2:]).max())
+
+
+@pytest.mark.parametrize("posed", [0.0], indirect=True, ids=["one plane"])
+def test_the_derivative_on_the_thinned_grid_is_that_of_its_samples(posed: Posed) -> None:
+    found = posed.at(PHASES, NUISANCE, coarse=True)
+    rng = np.random.default_rng(0)
+    direction = 0.01 * rng.standard_normal(PHASES.shape)
+    slope = posed.slope(PHASES, NUISANCE, direction, np.zeros(6), coarse=True)
+    by_phase = found.by_phase.numpy().astype(float)
+    assert slope == pytest.approx(np.sum(direction * by_phase), abs=1e-4 * float(np.linalg.norm(by_phase)))
+    tilt = np.eye(6)[2] * 0.003
+    slope = posed.slope(PHASES, NUISANCE, np.zeros_like(PHASES), tilt, coarse=True) / 0.003
+    assert float(found.by_nuisance[2]) == pytest.approx(slope, rel=0.02)
+    exact = posed.at(PHASES, NUISANCE).by_phase.numpy().astype(float)
+    assert np.corrcoef(by_phase.ravel(), exact.ravel())[0, 1] > 0.95
 
 
 @pytest.mark.parametrize("posed", [0.0], indirect=True, ids=["one plane"])
