@@ -2,6 +2,7 @@
 
     python -m analysis.comparison.bound --json F
     python -m analysis.comparison.bound --set sensor.full_well_e=32 --pages 8 --symbols 100 --json F
+    python -m analysis.comparison.bound --draw 1000 --json F
 
 Symbols of random pages are drawn; of each, all others and the device are taken as known (see
 `lightpage.simulator.light_bound`). The least error of its phase is that of a von Mises posterior, whose information on
@@ -16,11 +17,12 @@ import sys
 from pathlib import Path
 
 import click
+import numpy as np
 
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import load_profile
-from lightpage.device.state import Device, load_device
+from lightpage.device.state import Device, draw_device, load_device
 from lightpage.errors import InvalidInputError
 from lightpage.metrics.provenance import write_figures
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
@@ -50,6 +52,7 @@ def earlier(path: Path, asked: dict[str, object]) -> list[list[float]]:
 @click.option("--profile", "profile_name", default="bench", show_default=True, help="Shipped profile or TOML file.")
 @click.option("--symbol-size", type=click.IntRange(1), help="Pixels; the profile's if left out.")
 @click.option("--device", "state", type=click.Path(path_type=Path), help="True state (TOML).")
+@click.option("--draw", type=click.IntRange(0), help="Seed of a device that is drawn from the capture range.")
 @click.option(
     "--set",
     "settings",
@@ -66,6 +69,7 @@ def main(
     profile_name: str,
     symbol_size: int | None,
     state: Path | None,
+    draw: int | None,
     settings: tuple[str, ...],
     levels: int,
     pages: int,
@@ -76,7 +80,11 @@ def main(
     """Print the bound with its standard error, bits a symbol."""
     profile = load_profile(profile_name)
     profile = profile.with_symbols_of(symbol_size or profile.page.symbol_size_px)
-    device = (Device() if state is None else load_device(state)).of_profile(profile).with_settings([*settings])
+    if draw is not None:
+        device = draw_device(np.random.default_rng(draw))
+    else:
+        device = Device() if state is None else load_device(state)
+    device = device.of_profile(profile).with_settings([*settings])
     asked: dict[str, object] = {
         "profile": profile.to_toml(),
         "device": device.model_dump(mode="json"),
