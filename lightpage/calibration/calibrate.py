@@ -300,6 +300,7 @@ def refine(
     near: CalibratedDevice | None = None,
     *,
     rough: bool = False,
+    judged: bool = True,
 ) -> Registered:
     """Register known pages from an earlier calibration that has drifted: the reflections need no search from nominal.
 
@@ -310,6 +311,7 @@ def refine(
         near: device at which the fit begins, if not at the earlier calibration. The priors stay about that one. Such a
             fit takes the derivative of the light once.
         rough: whether the fit may end before its optimum, in half of the time. Its `goodness` is not measured then.
+        judged: whether the `goodness` of other fits is measured.
         twin, solve_field, profile, references, pages, progress: see `calibrate`.
 
     Raises:
@@ -322,7 +324,8 @@ def refine(
     if near is not None:
         work.parameters, work.quadrature_phase = near.parameters.copy(), near.quadrature_phase_rad
         work.modulation = near.modulation
-    work.total = len(_DRIFTED) + (2 if rough else 3)
+    work.judged = judged and not rough
+    work.total = len(_DRIFTED) + (3 if work.judged else 2)
     known = tuple(group for group in _ALL_GROUPS if max(indices(group)) < twin.known)
     for stage in _DRIFTED:
         work.complex_field(replace(stage, groups=known), _DRIFT_SCALE)
@@ -420,6 +423,7 @@ class _Registration:
         self.parameters, self.centre = nominal(), nominal()
         self.any_orientation, self.orientations = False, tuple[str, ...]()
         self.effort: Effort = "full"
+        self.judged = True
         self.prior = Prior(self.centre, PRIORS)
         self.deviations = np.zeros_like(self.parameters)
         self.quadrature_phase = np.pi / 2
@@ -585,7 +589,7 @@ class _Registration:
 
     def _goodness(self) -> Goodness | None:
         """Verdict on the fit, by the light of the first page."""
-        if self.conditions is None or self.effort == "rough":
+        if self.conditions is None or not self.judged:
             return None
         self.begin("unexplained light")
         device = CalibratedDevice(

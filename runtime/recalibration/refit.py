@@ -89,6 +89,7 @@ def refit(
             progress=progress,
             modulation=earlier.modulator,
             near=pages.near,
+            judged=not isinstance(graph, EstimatorGraph),
         )
     except CalibrationError as error:
         if not known_place:

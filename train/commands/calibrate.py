@@ -157,7 +157,7 @@ def calibrate_recording(
     if near is None:
         registered = registration.calibrate(*device, progress, any_orientation=any_orientation)
     else:
-        registered = registration.refine(*device, near.vector, near.turn_rad, progress, near.modulator)
+        registered = registration.refine(*device, near.vector, near.turn_rad, progress, near.modulator, judged=False)
     hashes = [recording.page_hash(page) for page in pages]
     counts = BlemishCounts.of(blemishes)
     if registered.conditions is None:
