@@ -15,9 +15,9 @@ from torch.utils import _pytree as tree
 
 from lightpage.calibration.likelihood.table import PILOT_MASK, PILOT_PHASORS
 from lightpage.calibration.sampling_table import APART, SamplingTable
-from lightpage.export.device_constants import move_device_constants
 from lightpage.export.graph import FRAME_INPUTS, TABLE_INPUTS, answers
 from lightpage.export.onnx_files import exported
+from lightpage.export.operators.device_constants import move_device_constants
 from lightpage.runtime.model.execution.estimator_graph import (
     EARLY_STEPS,
     ESTIMATE,
