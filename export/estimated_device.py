@@ -139,7 +139,7 @@ def estimated_device(
     table[DEVIATION_PRECISION] = NO_DEVIATIONS
     optional = device.apart_inputs
     if not blemishes.none:
-        table[PIXEL_GAINS] = np.full_like(blemishes.gains, UNIT_GAIN)  # the known pages have been mended
+        table[PIXEL_GAINS] = np.full_like(blemishes.gains, UNIT_GAIN)  # the known pages have been corrected
         optional += (PIXEL_GAINS,)
     estimator.thinned = _thinned_grid_suffices(estimator, table, KnownPhases.of(pages[0], device), mask)
     progress("graphs to ONNX", 0.0)

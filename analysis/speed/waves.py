@@ -6,8 +6,8 @@
 A device is simulated and calibrated, and its calibration is exported. Further pages are decoded as a service decodes
 them, with each number of steps up to the bundle's. The time of a page is compared with that of the shipped decoder, in
 turns in the same run. With the figures of `python -m analysis.comparison.bound`, the AIR is compared with the bound of
-the light. `--near` shortens the calibration of a large device, which from nominal takes an hour. `--out` keeps
-recording, calibration and bundle, so that an interrupted command can be repeated to continue.
+the light. `--near` spares a large device the search from nominal. `--out` keeps recording, calibration and bundle, so
+that an interrupted command can be repeated to continue.
 """
 
 from __future__ import annotations

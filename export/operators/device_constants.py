@@ -28,9 +28,9 @@ def move_device_constants(
     for title, page in pages.items():
         inferred = onnx.shape_inference.infer_shapes(page)
         outputs |= _moved_from(inferred, page.graph, f"device.{title}", {*fixed}, moved)
-    taken = {entry.name for page in pages.values() for entry in page.graph.input}
+    used = {entry.name for page in pages.values() for entry in page.graph.input}
     device.graph.ClearField("output")
-    device.graph.output.extend(entry for name, entry in outputs.items() if name in taken)
+    device.graph.output.extend(entry for name, entry in outputs.items() if name in used)
     onnx.checker.check_model(device)
 
 
@@ -55,13 +55,13 @@ class _DeviceNodes:
 
     def add_initializer(self, tensor: onnx.TensorProto, name: str) -> str:
         """Add a constant unless the graph has it already, and return its name."""
-        found = self._initializers.get(_content(tensor))
-        if found is None:
-            found = self._initializers[_content(tensor)] = name
+        known_name = self._initializers.get(_content(tensor))
+        if known_name is None:
+            known_name = self._initializers[_content(tensor)] = name
             copied = self._graph.initializer.add()
             copied.CopyFrom(tensor)
             copied.name = name
-        return found
+        return known_name
 
     def add_node(self, node: onnx.NodeProto, names: dict[str, str], title: str) -> None:
         """Add a node unless the graph has the same one already.
@@ -74,15 +74,15 @@ class _DeviceNodes:
         inputs = tuple(names.get(name, name) for name in node.input)
         attributes = tuple(sorted(attribute.SerializeToString() for attribute in node.attribute))
         key = node.op_type, node.domain, inputs, attributes
-        found = self._known.get(key)
-        if found is None:
-            found = self._known[key] = tuple(name and f"{title}.{name}" for name in node.output)
+        outputs = self._known.get(key)
+        if outputs is None:
+            outputs = self._known[key] = tuple(name and f"{title}.{name}" for name in node.output)
             copied = self._graph.node.add()
             copied.CopyFrom(node)
             copied.name = f"{title}.{node.name}"
             copied.input[:] = inputs
-            copied.output[:] = found
-        names.update(zip(node.output, found, strict=True))
+            copied.output[:] = outputs
+        names.update(zip(node.output, outputs, strict=True))
 
 
 def _moved_from(
@@ -91,29 +91,29 @@ def _moved_from(
     """Move the nodes of one page graph; return the outputs that the device graph gets for it, by name."""
     varying = {entry.name for entry in graph.input} - fixed
     derived = set(fixed)
-    before: list[onnx.NodeProto] = []
-    behind: list[onnx.NodeProto] = []
+    device_nodes: list[onnx.NodeProto] = []
+    remaining: list[onnx.NodeProto] = []
     for node in graph.node:
         if varying.intersection(node.input):
             varying.update(node.output)
-            behind.append(node)
+            remaining.append(node)
         elif derived.intersection(node.input):
             derived.update(node.output)
-            before.append(node)
+            device_nodes.append(node)
         else:  # constants, which the runtime folds
-            behind.append(node)
-    computed = {name for node in before for name in node.output}
-    wanted = {name for node in behind for name in node.input} | {entry.name for entry in graph.output}
-    constants = _producers(behind, {name for node in before for name in node.input} - computed)
+            remaining.append(node)
+    computed = {name for node in device_nodes for name in node.output}
+    wanted = {name for node in remaining for name in node.input} | {entry.name for entry in graph.output}
+    constants = _producers(remaining, {name for node in device_nodes for name in node.input} - computed)
     inputs = {entry.name: entry for entry in graph.input}
     names: dict[str, str] = {}
-    used = {name for node in (*constants, *before) for name in node.input}
+    used = {name for node in (*constants, *device_nodes) for name in node.input}
     for name in used.intersection(inputs):
         moved.add_input(inputs[name])
     for tensor in graph.initializer:
         if tensor.name in used:
             names[tensor.name] = moved.add_initializer(tensor, f"{title}.{tensor.name}")
-    for node in (*constants, *before):
+    for node in (*constants, *device_nodes):
         moved.add_node(node, names, title)
     types = {entry.name: entry for entry in (*inferred.graph.value_info, *graph.output)}
     outputs: dict[str, onnx.ValueInfoProto] = {}
@@ -123,7 +123,7 @@ def _moved_from(
         entry.CopyFrom(types[name])
         entry.name = renamed[name] = names[name]
         outputs[entry.name] = entry
-    _keep(graph, behind, renamed, outputs.values())
+    _keep(graph, remaining, renamed, outputs.values())
     return outputs
 
 
@@ -147,12 +147,12 @@ def _keep(
 
 def _producers(nodes: Iterable[onnx.NodeProto], names: set[str]) -> list[onnx.NodeProto]:
     """Return the nodes that some tensors follow from, in order."""
-    found: list[onnx.NodeProto] = []
+    producers: list[onnx.NodeProto] = []
     for node in reversed([*nodes]):
         if names.intersection(node.output):
             names = names | {*node.input}
-            found.append(node)
-    return found[::-1]
+            producers.append(node)
+    return producers[::-1]
 
 
 def _content(tensor: onnx.TensorProto) -> bytes:

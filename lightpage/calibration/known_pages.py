@@ -77,5 +77,5 @@ def known_pages(recording: Recording, profile: Profile, indices: Iterable[int]) 
 
 
 def without_blemishes(pages: Sequence[KnownPage], blemishes: Blemishes) -> list[KnownPage]:
-    """Known pages with mended frames."""
-    return [KnownPage(blemishes.mended(page.pair), page.symbols) for page in pages]
+    """Known pages without the blemishes of their frames."""
+    return [KnownPage(blemishes.corrected(page.pair), page.symbols) for page in pages]

@@ -74,7 +74,7 @@ def refit(
     known_place = image is not None or pages.near is not None
     start = moved_cameras(earlier.vector, np.array(moved_px)) if known_place else earlier.vector
     known = [
-        KnownPage(blemishes.mended(pair), np.exp(1j * symbol_phases(symbols, pages.levels)))
+        KnownPage(blemishes.corrected(pair), np.exp(1j * symbol_phases(symbols, pages.levels)))
         for pair, symbols in zip(pages.pairs, pages.symbols, strict=True)
     ]
     try:

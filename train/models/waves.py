@@ -135,9 +135,10 @@ class Waves(nn.Module):
         self._down, self._across = Banded(down), Banded(across)
         self._up, self._back = Banded(down.T), Banded(across.T)
         if thinned:
-            thin_down, thin_across = down[::THINNED], across[::THINNED]
-            self._thin_down, self._thin_across = Banded(thin_down), Banded(thin_across)
-            self._thin_up, self._thin_back = Banded(thin_down.T), Banded(thin_across.T)
+            self._thin_down = Banded(down[::THINNED])
+            self._thin_across = Banded(across[::THINNED])
+            self._thin_up = Banded(down[::THINNED].T)
+            self._thin_back = Banded(across[::THINNED].T)
         self.default: Tensor
         self.register_buffer("default", torch.from_numpy(parameters).to(torch.float32), persistent=False)
 

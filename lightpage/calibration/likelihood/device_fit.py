@@ -24,6 +24,7 @@ from lightpage.calibration.likelihood.statistics import Statistics
 from lightpage.calibration.likelihood.table import count_tensors
 from lightpage.calibration.parameters import SEEN_BY_CAMERAS, STEPS
 from lightpage.calibration.sampling_table import SamplingTable, cameras_apart, registration_orientations
+from lightpage.calibration.waves.wave_fit import inverse_of_information
 from lightpage.calibration.waves.wave_model import ILLUMINATIONS, LaunchConditions
 from lightpage.device.profile import Profile
 from lightpage.recording.frame_pair import FramePair
@@ -122,7 +123,10 @@ class DeviceFit:
             moved_fit, moved_statistics = self._measured(moved, moved_conditions, number + _LINEARISED)
             if not moved_fit.deviance(statistics) < fit.deviance(statistics):
                 break
-            current, conditions, fit, statistics = moved, moved_conditions, moved_fit, moved_statistics
+            current = moved
+            conditions = moved_conditions
+            fit = moved_fit
+            statistics = moved_statistics
             if solution.gain < _LEAST_GAIN * len(solution.step):
                 break
         goodness = goodness_of(self._twin, self._device(current), self._pages[0])
@@ -250,9 +254,8 @@ def _other_steps(table: SamplingTable, turn_rad: float, blur: float) -> list[tup
 
 
 def _solution(gradient: Real, information: Real) -> _Solution:
-    """Solve the normal equations, whose unknowns have units of very different size."""
-    unit = 1 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
-    covariance = np.linalg.pinv(information * unit * unit[:, None], hermitian=True) * unit * unit[:, None]
+    """Solve the normal equations."""
+    covariance = inverse_of_information(information)
     step = covariance @ gradient
     return _Solution(step, np.sqrt(np.diag(covariance)), float(step @ gradient) / 2)
 

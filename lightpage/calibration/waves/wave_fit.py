@@ -265,7 +265,7 @@ class WaveFit:
             pull[len(directions) + 1] -= state.blur / _BLUR_PRIOR**2
             if levels:
                 pull[fitted_levels] -= prior[fitted_levels] * (state.levels - levels.centre.coefficients)
-            covariance = _inverse(information)
+            covariance = inverse_of_information(information)
             known = np.sqrt(np.diag(covariance))
             deviations = np.zeros(len(PARAMETERS))
             deviations[free] = known[others:]
@@ -484,7 +484,7 @@ def _weight(here: Complex, phasor: complex) -> Real:
     return np.asarray(1 / np.sqrt(np.abs(1 / phasor + here) ** 2 + READ_NOISE))
 
 
-def _inverse(information: Real) -> Real:
+def inverse_of_information(information: Real) -> Real:
     """Invert a symmetric matrix whose rows have units of very different size."""
     unit = 1 / np.sqrt(np.diag(information))
     inverse = np.linalg.pinv(information * unit * unit[:, None], hermitian=True)

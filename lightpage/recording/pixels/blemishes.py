@@ -70,8 +70,8 @@ class Blemishes:
     def of(cls, references: FramePair) -> Self:
         """Find the blemishes of both cameras on their reference-only frames."""
         frames = references.in_phase, references.quadrature
-        gains, mended = zip(*map(_camera_blemishes, frames), strict=True)
-        return cls(np.stack(gains), FramePair(*mended))
+        gains, corrected = zip(*map(_camera_blemishes, frames), strict=True)
+        return cls(np.stack(gains), FramePair(*corrected))
 
     @property
     def none(self) -> bool:
@@ -90,13 +90,13 @@ class Blemishes:
         in_phase, quadrature = np.count_nonzero(self.gains > UNIT_GAIN, axis=(1, 2)).tolist()
         return in_phase, quadrature
 
-    def mended(self, pair: FramePair) -> FramePair:
+    def corrected(self, pair: FramePair) -> FramePair:
         """Return the frames of a page without the blemishes; pixels without a signal count what their references do."""
         if self.none:
             return pair
         frames = pair.in_phase, pair.quadrature
         references = self.references.in_phase, self.references.quadrature
-        return FramePair(*map(_mended, frames, self.gains, references))
+        return FramePair(*map(_corrected, frames, self.gains, references))
 
 
 def _camera_blemishes(reference: Counts) -> tuple[NDArray[np.uint8], Counts]:
@@ -112,7 +112,7 @@ def _camera_blemishes(reference: Counts) -> tuple[NDArray[np.uint8], Counts]:
     passed = _passed(clean, beam)
     lost = hot | (passed < UNIT_GAIN / np.iinfo(np.uint8).max)
     gains = np.where(lost, 0, np.rint(UNIT_GAIN / np.where(lost, 1, passed))).astype(np.uint8)
-    return gains, _mended(reference, gains, np.rint(beam).astype(reference.dtype))
+    return gains, _corrected(reference, gains, np.rint(beam).astype(reference.dtype))
 
 
 def _passed(counts: Image, beam: Image) -> Image:
@@ -137,11 +137,11 @@ def _passed(counts: Image, beam: Image) -> Image:
     beside = scipy.ndimage.gaussian_filter((~near).astype(np.float32), _BESIDE_PX)
     # the beam within a shadow is as it is beside it
     relative /= scipy.ndimage.gaussian_filter(np.where(near, 0, relative), _BESIDE_PX) / np.maximum(beside, _TINY)
-    lit = ~near & (beam > np.median(beam))
+    unshaded = ~near & (beam > np.median(beam))
     filtered = relative
     for smoothing in _SMOOTHINGS_PX:
         filtered = scipy.ndimage.gaussian_filter(relative, smoothing) if smoothing else relative
-        if _spread(filtered[lit]) <= _MOST_NOISE:
+        if _spread(filtered[unshaded]) <= _MOST_NOISE:
             break
     return np.where(near & (filtered < 1 - _EDGE_SHADE), filtered, 1).astype(np.float32)
 
@@ -177,11 +177,11 @@ def _spread(values: NDArray[np.floating]) -> float:
     return _MAD * float(np.median(np.abs(values - np.median(values))))
 
 
-def _mended(frame: Counts, gains: NDArray[np.uint8], reference: Counts) -> Counts:
+def _corrected(frame: Counts, gains: NDArray[np.uint8], reference: Counts) -> Counts:
     """Frame [H, W] with the gains of its pixels, and with the reference where they have no signal."""
-    mended = frame.copy()
+    corrected = frame.copy()
     shaded = gains > UNIT_GAIN
     raised = np.rint(frame[shaded] * (gains[shaded] / UNIT_GAIN))
-    mended[shaded] = np.minimum(raised, np.iinfo(frame.dtype).max).astype(frame.dtype)
-    mended[gains == 0] = reference[gains == 0]
-    return mended
+    corrected[shaded] = np.minimum(raised, np.iinfo(frame.dtype).max).astype(frame.dtype)
+    corrected[gains == 0] = reference[gains == 0]
+    return corrected

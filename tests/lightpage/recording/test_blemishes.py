@@ -33,7 +33,7 @@ def test_a_clean_camera_has_none(sensor: Sensor) -> None:
     blemishes = found(sensor)
     assert blemishes.none
     pair = simulator(sensor).page(random_symbols(PROFILE, 256, 1, np.random.default_rng(0))[0])
-    assert blemishes.mended(pair) is pair
+    assert blemishes.corrected(pair) is pair
 
 
 @pytest.mark.parametrize("sensor", [DUSTY, DUSTY.model_copy(update={"full_well_e": 200})], ids=["bright", "dim"])
@@ -85,7 +85,7 @@ def test_the_graph_takes_off_what_is_mended_beforehand() -> None:
         measured = recovery.measure_against(blocks, on_grid, *tensors, gains=chosen)
         return torch.stack([measured.a, measured.b]).numpy()
 
-    mended = brightness(blemishes.mended(pair), None)
+    mended = brightness(blemishes.corrected(pair), None)
     in_graph = brightness(pair, blemishes.gains)
     assert np.sqrt(np.mean((in_graph - mended) ** 2)) < 2e-3  # a mended count is rounded
     assert np.abs(brightness(pair, None) - mended).max() > 0.1

@@ -67,7 +67,8 @@ class PageNuisances(nn.Module):
             score: derivative of the log-likelihood by the field, [Gy, Gx].
             every: distance of the samples of the last two, in samples of the common grid.
         """
-        x, y = self.x[::every], self.y[::every]
+        x = self.x[::every]
+        y = self.y[::every]
         by_log_gain = (leaving[0] * back[0] + leaving[1] * back[1]).sum()
         turned = _by_phase(leaving, back)
         shifts = [(turned * ramp).sum() for ramp in (self.ramp_x, self.ramp_y)]
