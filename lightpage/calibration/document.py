@@ -90,18 +90,16 @@ class BlemishCounts(TomlTable):
         )
 
     def __str__(self) -> str:
-        """Numbers of both cameras in words, empty where there are none."""
+        """Numbers of the in-phase and of the quadrature camera in words, empty where there are none."""
         parts = [
-            f"{counted(number, 'pixel')} of the {camera} camera {what}"
-            for number, camera, what in (
-                (self.in_phase_lost, "in-phase", "without a signal"),
-                (self.quadrature_lost, "quadrature", "without a signal"),
-                (self.in_phase_shaded, "in-phase", "behind dust"),
-                (self.quadrature_shaded, "quadrature", "behind dust"),
+            f"{in_phase} and {quadrature} pixels {what}"
+            for in_phase, quadrature, what in (
+                (self.in_phase_lost, self.quadrature_lost, "without a signal"),
+                (self.in_phase_shaded, self.quadrature_shaded, "behind dust"),
             )
-            if number
+            if in_phase or quadrature
         ]
-        return ", ".join(parts)
+        return f"corrected (in-phase and quadrature camera): {', '.join(parts)}" if parts else ""
 
 
 class Calibration(TomlTable):
